@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import (
     TrueStairs,
     edge_block,
@@ -100,7 +100,7 @@ class Recording:
     cell: HandEyeCell
     scene: Scene
     robot: TrueRobot
-    shots: Shots
+    shots: SimulatedShots
     target: Target
     truth: dict[str, Any]
 
@@ -130,7 +130,7 @@ def _scene(kind: str) -> Scene:
 
 def _shown(
     kind: str, cell: HandEyeCell, T_known_true: Array, rng: np.random.Generator
-) -> tuple[Shots, Target, dict[str, Any]]:
+) -> tuple[SimulatedShots, Target, dict[str, Any]]:
     count = SHOTS + CHECKS
     if kind == "sphere":
         shots = sphere_shots(cell, CENTRE, RADIUS_M, count, rng)

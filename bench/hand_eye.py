@@ -31,7 +31,7 @@ from bench.tables import Goal, Table
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.hand_eye.mount_problem import PoseNoise
-from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
 from robocal_ros.hand_eye.planning import PlannedTarget, SensorRange, check_plan
 from robocal_ros.hand_eye.quality import expected_error_m
 from robocal_ros.hand_eye.result import at_origin, increment
@@ -212,7 +212,7 @@ def plan_table() -> Table:
     line = np.stack([T_BASE_USER[:3, 3], T_BASE_USER[:3, 0]])
     planned: tuple[PlannedTarget, ...] = (
         PlannedSphere(RADIUS_M, sensor, (CENTRE[0], CENTRE[1], CENTRE[2])),
-        PlannedStep(target, sensor, ("near", "far")),
+        PlannedStairs(target, sensor, ("near", "far")),
         PlannedLine(sensor, line),
         PlannedLine(sensor),
     )

@@ -15,7 +15,7 @@ from bench.hand_eye_worlds import (
     T_BASE_USER,
     calibrated,
 )
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Robot, Shots
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Robot, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
 from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.cell_sim.ur10_station import Q_NEAR
@@ -55,7 +55,7 @@ class Calibration:
         return fit, self.task.classic(view, fit.state).T_flange_sensor
 
 
-def data_of(shots: Shots) -> HandEyeData:
+def data_of(shots: SimulatedShots) -> HandEyeData:
     """As an operator has them."""
     names = tuple(f"shot {i + 1}" for i in range(len(shots.profiles)))
     profiles = [profile_of(p, name) for p, name in zip(shots.profiles, names, strict=True)]

@@ -26,7 +26,13 @@ from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.diagnosis import look
 from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View, pivot_of
+from robocal_ros.hand_eye.mount_problem import (
+    MountProblem,
+    MountState,
+    PoseNoise,
+    TargetView,
+    pivot_of,
+)
 from robocal_ros.hand_eye.result import increment
 from robocal_ros.hand_eye.sightings import Index, Sightings, TargetModel
 from robocal_ros.hand_eye.step_task import StepTask
@@ -84,7 +90,7 @@ class World:
     pose: Index
     covariance: Array
     noise: Noise
-    exact: View = field(init=False)
+    exact: TargetView = field(init=False)
 
     def __post_init__(self) -> None:
         value = np.zeros((len(self.pose), 3))
@@ -104,7 +110,7 @@ class World:
         value = self.exact.sightings.value
         return np.array([value[:, 0].mean(), 0.0, value[:, 1].mean()])
 
-    def measured(self, rng: np.random.Generator) -> View:
+    def measured(self, rng: np.random.Generator) -> TargetView:
         """With errors of robot and sensor."""
         m, c = len(self.pose), self.sight.components
         root = np.linalg.cholesky(self.covariance[:, :c, :c])
@@ -132,10 +138,10 @@ class World:
         J = problem.linearise(state)[1].reshape(-1, len(problem.names))
         return np.asarray(np.linalg.inv(J.T @ J)[:6, :6])
 
-    def _view(self, T_base_flange: Array, value: Array) -> View:
+    def _view(self, T_base_flange: Array, value: Array) -> TargetView:
         names = tuple(f"{self.task.kind} {i + 1}" for i in range(len(self.pose)))
         sightings = Sightings(names, self.pose, self.pose, T_base_flange, value, self.covariance)
-        return View(self.model, sightings)
+        return TargetView(self.model, sightings)
 
 
 def sphere_world(rng: np.random.Generator, noise: Noise = NOISE, poses: int = 15) -> World:
@@ -207,7 +213,7 @@ def _corners(rng: np.random.Generator, poses: int) -> Array:
     return covariance
 
 
-def calibrated(task: Task, view: View) -> MountFit:
+def calibrated(task: Task, view: TargetView) -> MountFit:
     """As the solver does it with the features of profiles; no noise is told."""
     fit = fit_mount((view,), look(task, view))
     require_seen(fit)

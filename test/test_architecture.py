@@ -32,7 +32,8 @@ MAY_IMPORT = {
 ROS_FILES = {
     "node", "messages", "action", "settings", "report", "graph", "driver", "gap_sources",
     "outputs", "services", "controller", "source_guard", "replay_node", "recorder_node",
-    "recorded_topics", "replay_topics", "set_up_services",
+    "recorded_topics", "replay_topics", "set_up_services", "data_files", "plan",
+    "node_motion",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",

@@ -7,7 +7,7 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.maintenance import MaintenanceSession
 from robocal_ros.maintenance import requests as ask
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
@@ -40,7 +40,7 @@ class Carrier:
         self._ending: dict[str, int] = {}  # request that a thermal command answers
         self._measuring = 0  # request that the open run answers
 
-    def carry_out(self, request: ask.Request, now_s: float) -> None:
+    def carry_out(self, request: ask.DriverRequest, now_s: float) -> None:
         """Do what is asked, now or from now on."""
         match request:
             case ask.Move() | ask.Stop():
@@ -63,7 +63,7 @@ class Carrier:
         """Tell the maintenance, where it waits for this."""
         if (number := self._ending.pop(outcome.command.name, 0)) != 0:
             poses = (outcome.document or {}).get("poses", {})
-            answer = Answer(
+            answer = DriverAnswer(
                 outcome.status,
                 outcome.message,
                 outcome.calibration_id,
@@ -85,15 +85,15 @@ class Carrier:
     def _answer(self, number: int, act: Callable[[], None]) -> None:
         try:
             act()
-            self._maintenance.answered(number, Answer(Code.ACCEPT))
+            self._maintenance.answered(number, DriverAnswer(Code.ACCEPT))
         except RobocalError as error:
-            self._maintenance.answered(number, Answer(error.code, str(error)))
+            self._maintenance.answered(number, DriverAnswer(error.code, str(error)))
 
     def _measure(self, request: ask.Measure) -> None:
         try:
             self._driver.require_ready()
         except RobocalError as error:
-            self._maintenance.answered(request.number, Answer(error.code, str(error)))
+            self._maintenance.answered(request.number, DriverAnswer(error.code, str(error)))
             return
         arguments = {"mode": request.mode, "cycle_id": request.cycle_id, "by": "maintenance"}
         begun = self._to_tool(Command(events.MEASURE_TOOL, arguments))

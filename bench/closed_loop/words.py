@@ -7,7 +7,7 @@ from robocal_ros.correction.inputs import OfferedModel, OfferedTool
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.status import ToldCorrection
 from robocal_ros.maintenance.accuracy import Drift
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.session import ThermalSession
 from robocal_ros.tool.session import ToolSession
@@ -45,12 +45,12 @@ def tool_of(session: ToolSession, now_ns: int) -> OfferedTool:
     )
 
 
-def tool_answer(outcome: Outcome) -> Answer:
+def tool_answer(outcome: Outcome) -> DriverAnswer:
     """What a tool measurement tells the maintenance."""
     document = outcome.document
     if document is None:
-        return Answer(outcome.status, outcome.message, left_plan=outcome.left_plan)
-    return Answer(
+        return DriverAnswer(outcome.status, outcome.message, left_plan=outcome.left_plan)
+    return DriverAnswer(
         outcome.status,
         outcome.message,
         outcome.calibration_id,

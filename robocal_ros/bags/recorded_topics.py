@@ -58,7 +58,7 @@ TOPICS = (
 
 
 @dataclass
-class Recorded:
+class RecordedTopic:
     """A topic that is subscribed, and its name in the recording."""
 
     topic: str
@@ -86,12 +86,12 @@ class RecordedTopics:
     """
 
     def __init__(
-        self, node: Node, wanted: Collection[str], take: Callable[[Recorded, bytes], None]
+        self, node: Node, wanted: Collection[str], take: Callable[[RecordedTopic, bytes], None]
     ) -> None:
         self._node, self._take = node, take
         # Two of them may be remapped to one.
         self._wanted = list(dict.fromkeys(node.resolve_topic_name(topic) for topic in wanted))
-        self.found: dict[str, Recorded] = {}
+        self.found: dict[str, RecordedTopic] = {}
         self.latched: set[str] = set()
         self.unknown: dict[str, str] = {}
 
@@ -127,7 +127,7 @@ class RecordedTopics:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        recorded = self.found[topic] = Recorded(
+        recorded = self.found[topic] = RecordedTopic(
             topic, recorded_name(topic, msgtype), msgtype, reliable, latched
         )
         if latched:

@@ -9,7 +9,7 @@ from typing import Any
 from std_srvs.srv import Trigger
 
 from robocal_ros.bags.bag_recording import BagRecording
-from robocal_ros.bags.recorded_topics import DIAGNOSTICS, TOPICS, Recorded, RecordedTopics
+from robocal_ros.bags.recorded_topics import DIAGNOSTICS, TOPICS, RecordedTopic, RecordedTopics
 from robocal_ros.bags.recording_folders import MB, Maker, keep, make_room, new_folder, size_bytes
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import ConflictError, StorageError
@@ -89,7 +89,7 @@ class RecorderNode(HouseNode):
 
     # ---- what comes in --------------------------------------------------------------------------
 
-    def _take(self, recorded: Recorded, data: bytes) -> None:
+    def _take(self, recorded: RecordedTopic, data: bytes) -> None:
         if not self.is_active:
             return
         try:

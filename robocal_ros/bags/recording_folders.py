@@ -46,7 +46,7 @@ class Maker:
 
 
 @dataclass(frozen=True)
-class Recording:
+class MarkedRecording:
     """A recording as its marker describes it.
 
     ``number`` counts the recordings of one maker: their order, whatever became of the clock.
@@ -59,7 +59,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Room:
+class FreedSpace:
     """What became of the attempt to make room.
 
     Attributes
@@ -110,7 +110,7 @@ def new_folder(parent: Path, maker: Maker, wall_ns: int | None = None) -> Path:
     return folder
 
 
-def recordings(parent: Path, maker: Maker | None = None) -> list[Recording]:
+def recordings(parent: Path, maker: Maker | None = None) -> list[MarkedRecording]:
     """Recordings of a maker, the oldest first; None: of all."""
     found, _ = _look(parent)
     return [one for one in found if maker in (None, one.maker)]
@@ -126,7 +126,7 @@ def size_bytes(folder: Path) -> int:
     return total
 
 
-def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int) -> Room:
+def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int) -> FreedSpace:
     """Delete a maker's recordings, the oldest first, until the rest fits and enough is free.
 
     The newest one stays, and so do those that a process writes or that `keep` marked. One that
@@ -139,7 +139,7 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
         When the folder or its disk cannot be looked at.
     """
     if not parent.is_dir():
-        return Room((), {}, 0)
+        return FreedSpace((), {}, 0)
     found, left = _look(parent)
     free, total = shutil.disk_usage(parent).free, 0
     own = [one for one in found if one.maker == maker]
@@ -170,7 +170,7 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
         deleted.append(folder)
         # counted, not looked at again: some disks give free later what was deleted
         total, free = total - size, free + size
-    return Room(tuple(deleted), left, max(least_free_bytes - free, 0), tuple(rivals))
+    return FreedSpace(tuple(deleted), left, max(least_free_bytes - free, 0), tuple(rivals))
 
 
 def keep(folder: Path, why: str) -> None:
@@ -186,7 +186,7 @@ def keep(folder: Path, why: str) -> None:
     write_text(folder / KEEP, f"{why}\n")
 
 
-def _look(parent: Path) -> tuple[list[Recording], dict[str, str]]:
+def _look(parent: Path) -> tuple[list[MarkedRecording], dict[str, str]]:
     """Recordings, the oldest first, and why others of such names are none."""
     found, left = [], {}
     if not parent.is_dir():
@@ -201,7 +201,7 @@ def _look(parent: Path) -> tuple[list[Recording], dict[str, str]]:
     return found, left
 
 
-def _recording(folder: Path, disk: int) -> Recording:
+def _recording(folder: Path, disk: int) -> MarkedRecording:
     """Read a folder's marker; an error says why it is no recording of a recorder here."""
     state = folder.lstat()
     if stat.S_ISLNK(state.st_mode):
@@ -221,7 +221,7 @@ def _recording(folder: Path, disk: int) -> Recording:
         raise InputError(f"has a {MARKER} that cannot be read: {error}") from error
     if name != folder.name:
         raise InputError(f"was copied or renamed: its {MARKER} names {name}")
-    return Recording(folder, maker, number, begun_ns)
+    return MarkedRecording(folder, maker, number, begun_ns)
 
 
 def _delete(folder: Path) -> list[str]:

@@ -23,7 +23,7 @@ EVENTS = "session_events"
 NOT_BITS = "not to the last bit"
 
 
-class Recorded(Protocol):
+class RecordedMessage(Protocol):
     """A message of a bag: its topic and the message with the attributes of the ROS type.
 
     In place of messages that follow each other there may be a ``JointBlock``.
@@ -75,7 +75,7 @@ def topic_kind(topic: str) -> str:
     return topic.rsplit("/", 1)[-1]
 
 
-def first_configuration(messages: Iterable[Recorded]) -> Command | None:
+def first_configuration(messages: Iterable[RecordedMessage]) -> Command | None:
     """The first configuration among the events: whose they are, and the names of the inputs.
 
     Raises
@@ -90,7 +90,7 @@ def first_configuration(messages: Iterable[Recorded]) -> Command | None:
 
 
 def read_events(
-    messages: Iterable[Recorded], from_ns: int = 0
+    messages: Iterable[RecordedMessage], from_ns: int = 0
 ) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
     """Read the recorded commands, each with its outcome, and the configuration before them.
 
@@ -196,7 +196,7 @@ class One:
     message: Any
 
 
-def one_by_one(session: Replayed, messages: Iterable[Recorded]) -> Iterator[Recorded]:
+def one_by_one(session: Replayed, messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
     """Samples that may decide something; joint readings that do not, the session takes at once.
 
     It has the rest of a block of them before the next sample is asked for.
@@ -215,7 +215,7 @@ def one_by_one(session: Replayed, messages: Iterable[Recorded]) -> Iterator[Reco
 
 def feed(
     session: S,
-    recorded: Recorded,
+    recorded: RecordedMessage,
     topics: Mapping[str, str] | None,
     take: Callable[[S, str, Any], None],
 ) -> None:
@@ -230,7 +230,7 @@ def feed(
 
 def replay(
     session: S,
-    messages: Iterable[Recorded],
+    messages: Iterable[RecordedMessage],
     commands: Sequence[tuple[Command, Mapping[str, Any]]],
     topics: Mapping[str, str] | None,
     take: Callable[[S, str, Any], None],

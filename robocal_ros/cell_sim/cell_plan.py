@@ -10,7 +10,7 @@ from robocal_ros.cell_sim.beams import BeamStation, RoundTool
 from robocal_ros.cell_sim.heating import HeatPlan
 from robocal_ros.cell_sim.joint_motion import LAG_S
 from robocal_ros.cell_sim.profile_station import ProfileStation
-from robocal_ros.cell_sim.robot import Body, Effects, TrueRobot
+from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot
 from robocal_ros.cell_sim.sphere_station import SphereStation
 from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.cell_sim.trajectory_goal import ControllerOptions
@@ -91,7 +91,7 @@ def rigid_robot(nominal: SerialArm, error_m: float, rng: np.random.Generator) ->
         static_error=error_m * rng.standard_normal((n, 5)),
         motor_gain=still,
         link_gain=still,
-        body=Body(np.zeros(n), np.zeros((n, 3)), np.ones(n), 0.0),
+        body=FlexibleBody(np.zeros(n), np.zeros((n, 3)), np.ones(n), 0.0),
         eccentricity=np.zeros(n),
         phase=np.zeros(n),
         repeatability=0.0,

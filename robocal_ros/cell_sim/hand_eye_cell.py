@@ -104,7 +104,7 @@ class ArmRobot:
         return np.asarray(inverse(self.nominal, way, self.q_near)[-1])
 
 
-class View(NamedTuple):
+class WantedView(NamedTuple):
     """A sensor pose (4, 4) in base that is wanted, and the target's mark that the light lies on."""
 
     T_base_sensor: Array
@@ -112,7 +112,7 @@ class View(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
+class SimulatedShots:
     """What came of m standstills.
 
     Attributes
@@ -146,8 +146,8 @@ class HandEyeCell:
     roll_rad: float = float(np.radians(60.0))
 
     def shoot(
-        self, scene: Scene, wanted: Iterable[View], count: int, rng: np.random.Generator
-    ) -> Shots:
+        self, scene: Scene, wanted: Iterable[WantedView], count: int, rng: np.random.Generator
+    ) -> SimulatedShots:
         """``count`` shots of a scene from the first of the wanted poses that are in reach.
 
         Raises
@@ -172,7 +172,7 @@ class HandEyeCell:
         if len(stands) < count:
             raise LimitError(f"{len(stands)} of {count} views are in reach: move the target")
         q = [stand.q for stand in stands if stand.q is not None]
-        return Shots(
+        return SimulatedShots(
             np.array([stand.true_T_base_flange for stand in stands]),
             np.array([stand.T_base_flange for stand in stands]),
             profiles,

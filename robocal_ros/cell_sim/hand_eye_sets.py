@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, Shots, View, view
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, SimulatedShots, WantedView, view
 from robocal_ros.cell_sim.profile_targets import (
     Prism,
     Scene,
@@ -35,21 +35,21 @@ def sphere_shots(
     count: int,
     rng: np.random.Generator,
     signs: tuple[int, ...] = (-1, 1),
-) -> Shots:
+) -> SimulatedShots:
     """Shots of a ball on a stem; the laser plane passes the centre (3,), base, off by y.
 
     ``signs`` that y takes in turn.
     """
     scene = ball_on_table(centre, radius_m)
 
-    def wanted() -> Iterator[View]:
+    def wanted() -> Iterator[WantedView]:
         while True:
             for sign in signs:
                 y = sign * radius_m * rng.uniform(*OFF_CENTRE)
                 nearest = _distance(cell, rng, 0.5 * radius_m)
                 p = [_aside(rng), y, nearest + np.sqrt(radius_m**2 - y**2)]
                 turns = _turns(cell, rng, cell.roll_rad)
-                yield View(view(DOWN, turns, centre, p))
+                yield WantedView(view(DOWN, turns, centre, p))
 
     return cell.shoot(scene, wanted(), count, rng)
 
@@ -91,7 +91,7 @@ def step_shots(
     *,
     aim_m: float = 2e-4,
     level: bool = False,
-) -> Shots:
+) -> SimulatedShots:
     """Shots with the laser plane through the marks, which take turns; x of a profile goes upstairs.
 
     Parameters
@@ -106,7 +106,7 @@ def step_shots(
     along = min(cell.tilt_rad, float(np.arcsin(np.clip(steepest, 0.0, 1.0))))
     look = _look(target.T_base_user, target.height_m, target.depth_m)
 
-    def wanted() -> Iterator[View]:
+    def wanted() -> Iterator[WantedView]:
         while True:
             for mark in marks:
                 about_x = 0.0 if level else rng.uniform(-cell.tilt_rad, cell.tilt_rad)
@@ -114,7 +114,7 @@ def step_shots(
                 turns = [about_x, rng.uniform(-along, along), about_z]
                 middle = 0.5 * (cell.sensor.near_m + cell.sensor.far_m) - 0.5 * saw
                 p = [_aside(rng), aim_m * rng.standard_normal(), middle]
-                yield View(view(look, turns, target.middle(mark), p), mark)
+                yield WantedView(view(look, turns, target.middle(mark), p), mark)
 
     return cell.shoot(Scene((target.body,)), wanted(), count, rng)
 
@@ -126,7 +126,7 @@ def edge_block(T_base_user: Array) -> Prism:
 
 def edge_shots(
     cell: HandEyeCell, T_base_user: Array, count: int, rng: np.random.Generator
-) -> Shots:
+) -> SimulatedShots:
     """Shots across the upper edge of a block; the edge is x of the frame."""
     body = edge_block(T_base_user)
     return _line_shots(cell, body, _look(T_base_user, 1.0, 1.0), 0.5, count, rng)
@@ -134,7 +134,7 @@ def edge_shots(
 
 def groove_shots(
     cell: HandEyeCell, T_base_user: Array, count: int, rng: np.random.Generator
-) -> Shots:
+) -> SimulatedShots:
     """Shots across a V-groove; its bottom is x of the frame, z points up out of it."""
     body = grooved_block(T_base_user, BLOCK_M, 0.05, GROOVE_M, GROOVE_DEPTH_M)
     return _line_shots(cell, body, _look(T_base_user, 0.0, 1.0), 0.0, count, rng)
@@ -147,19 +147,19 @@ def _line_shots(
     behind: float,
     count: int,
     rng: np.random.Generator,
-) -> Shots:
+) -> SimulatedShots:
     """Shots of the line x of a body; ``behind``: share of the range that is left beyond it."""
     sensor, T = cell.sensor, body.T_base_user
     turned = min(cell.roll_rad, CROSSING_RAD)
 
-    def wanted() -> Iterator[View]:
+    def wanted() -> Iterator[WantedView]:
         while True:
             x = BLOCK_M * rng.uniform(0.3, 0.7)
             room = behind * (sensor.far_m - sensor.near_m)
             near = 0.0 if behind else GROOVE_DEPTH_M + ASIDE_M
             p = [_aside(rng), 0.0, _distance(cell, rng, room, near)]
             turns = _turns(cell, rng, turned)
-            yield View(view(look, turns, T[:3, 3] + x * T[:3, 0], p))
+            yield WantedView(view(look, turns, T[:3, 3] + x * T[:3, 0], p))
 
     return cell.shoot(Scene((body,)), wanted(), count, rng)
 

@@ -7,7 +7,7 @@ errors, encoder phases) is drawn from ``rng``.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.robot import Body, Effects, TrueRobot
+from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot
 from robocal_ros.cell_sim.sensor import SphereSensor
 from robocal_ros.cell_sim.thermal import WarmUp
 from robocal_ros.ground import frames
@@ -33,7 +33,7 @@ WARM_UP = WarmUp(
     link_tau_s=3600.0,
 )
 
-BODY = Body(
+BODY = FlexibleBody(
     mass=np.array([420.0, 190.0, 260.0, 70.0, 40.0, 120.0]),
     centre=np.array(
         [

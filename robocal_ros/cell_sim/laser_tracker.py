@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor
-from robocal_ros.cell_sim.profile_targets import Ball, Body, Scene, block
+from robocal_ros.cell_sim.profile_targets import Ball, ScannedBody, Scene, block
 from robocal_ros.cell_sim.robot import shift, turn
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.profile import profile_of
@@ -71,7 +71,7 @@ class TrackerCell:
     sensor: ProfileSensor = field(default_factory=ProfileSensor)
     edge_rad: float = float(np.radians(40.0))
     lean_rad: float = float(np.radians(7.0))
-    around: tuple[Body, ...] = ()
+    around: tuple[ScannedBody, ...] = ()
 
     @property
     def T_base_view(self) -> Array:

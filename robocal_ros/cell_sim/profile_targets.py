@@ -13,7 +13,7 @@ AWAY_M = 1e-9  # a ray does not meet the surface on which it begins
 TABLE_M = 2.0
 
 
-class Body(Protocol):
+class ScannedBody(Protocol):
     """Anything that a ray meets."""
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
@@ -32,7 +32,7 @@ class Ball:
     radius_m: float
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """See `Body`."""
+        """See `ScannedBody`."""
         away = origin - self.centre
         distance = _first_root(
             np.ones(len(away)),
@@ -52,7 +52,7 @@ class Stem:
     length_m: float
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """See `Body`."""
+        """See `ScannedBody`."""
         away = origin - self.start
         across = away - np.outer(away @ self.axis, self.axis)
         slant = direction - np.outer(direction @ self.axis, self.axis)
@@ -82,7 +82,7 @@ class Prism:
     length_m: float
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """See `Body`."""
+        """See `ScannedBody`."""
         R, t = self.T_base_user[:3, :3], self.T_base_user[:3, 3]
         p, d = (origin - t) @ R, direction @ R
         best, normal = np.full(len(p), np.inf), np.zeros_like(p)
@@ -120,10 +120,10 @@ class Prism:
 class Scene:
     """Bodies that stand still together."""
 
-    bodies: Sequence[Body]
+    bodies: Sequence[ScannedBody]
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """The first of all bodies that a ray meets; see `Body`."""
+        """The first of all bodies that a ray meets; see `ScannedBody`."""
         best, normal = np.full(len(origin), np.inf), np.zeros_like(origin)
         for body in self.bodies:
             distance, outward = body.meet(origin, direction)

@@ -47,7 +47,7 @@ class Effects:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class FlexibleBody:
     """Masses and joint stiffness.
 
     Attributes
@@ -82,7 +82,7 @@ class TrueRobot:
     static_error: Array
     motor_gain: Array
     link_gain: Array
-    body: Body
+    body: FlexibleBody
     eccentricity: Array
     phase: Array
     repeatability: float

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import cast
 
-from robocal_ros.cli.command import Command
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.command import CliCommand
+from robocal_ros.cli.output import CliResult
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Actions:
                 actions.add_parser(name, help=module.HELP, description=module.HELP)
             )
 
-    def run(self, args: argparse.Namespace) -> Outcome:
+    def run(self, args: argparse.Namespace) -> CliResult:
         """Do it. Raises `RobocalError` for what a user can mend."""
         return self._module(args.action).run(args)
 
-    def _module(self, action: str) -> Command:
-        return cast(Command, import_module(f"robocal_ros.cli.{self.modules[action]}"))
+    def _module(self, action: str) -> CliCommand:
+        return cast(CliCommand, import_module(f"robocal_ros.cli.{self.modules[action]}"))

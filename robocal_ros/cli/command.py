@@ -3,10 +3,10 @@
 import argparse
 from typing import Protocol
 
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.output import CliResult
 
 
-class Command(Protocol):
+class CliCommand(Protocol):
     """A module of this package; it imports what is heavy inside ``run``."""
 
     NAME: str
@@ -15,5 +15,5 @@ class Command(Protocol):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Declare the options."""
 
-    def run(self, args: argparse.Namespace) -> Outcome:
+    def run(self, args: argparse.Namespace) -> CliResult:
         """Do it. Raises `RobocalError` for what a user can mend."""

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     import numpy as np
 
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> Outcome:
     ]
     document["warnings"] = warnings
     warn(warnings)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _joints(args: argparse.Namespace, arm: "SerialArm") -> list[float]:

@@ -29,7 +29,7 @@ from robocal_ros.hand_eye.thermal import flange_poses
 from robocal_ros.kinematics import SerialArm
 
 if TYPE_CHECKING:
-    from robocal_ros.cli.recording import Recording
+    from robocal_ros.cli.recording import BagOverview
 
 BagShots = tuple[HandEyeData, dict[str, str]]
 
@@ -73,7 +73,7 @@ def _saved(path: Path, arm: SerialArm) -> HandEyeData:
     )
 
 
-def _recorded(recording: "Recording", arm: SerialArm) -> BagShots:
+def _recorded(recording: "BagOverview", arm: SerialArm) -> BagShots:
     path = recording.reader.info.path
     if PROFILE not in recording.inputs.values():
         raise InputError(
@@ -102,7 +102,7 @@ def _recorded(recording: "Recording", arm: SerialArm) -> BagShots:
 
 
 def _chosen(
-    recording: "Recording", found: list[StandingShot], rule: StandstillRule
+    recording: "BagOverview", found: list[StandingShot], rule: StandstillRule
 ) -> tuple[list[StandingShot], dict[str, str]]:
     """What the recorded session holds; without one, a shot of each standstill."""
     marks = captured_marks(recording.commands)

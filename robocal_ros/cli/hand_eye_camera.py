@@ -9,7 +9,7 @@ from robocal_ros.cli.arguments import positive
 from robocal_ros.cli.hand_eye_pairs import calibrate
 from robocal_ros.cli.hand_eye_shots import add_limit, add_robot, add_robot_sigma
 from robocal_ros.cli.hand_eye_view import show_judged, show_placed
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -71,12 +71,12 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.result import hand_eye_document
 
     document = hand_eye_document(calibrate(args))
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _board(value: str) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from robocal_ros.cli.hand_eye_shots import (
     settings_of,
 )
 from robocal_ros.cli.hand_eye_view import show_sigma, show_verdict
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.cli.tool_frames import three_numbers
 from robocal_ros.ground.errors import InputError
 
@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--propose", type=Path, metavar="CSV", help="write the proposed poses")
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.files import read_flange_mount
     from robocal_ros.hand_eye.planning import check_plan
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> Outcome:
         names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
         write_pose_table(args.propose, report.proposed, names=names, mark=marks)
     document = _document(report, table.names) | {"proposed_marks": marks}
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _sensor(args: argparse.Namespace) -> "SensorRange":
@@ -128,7 +128,7 @@ def _planned(
 ) -> "PlannedTarget":
     import numpy as np
 
-    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
     from robocal_ros.hand_eye.targets import SphereTarget, StepTarget
 
     if isinstance(target, SphereTarget):
@@ -139,16 +139,16 @@ def _planned(
     if center_mm is not None:
         raise InputError("--center-mm is a sphere's")
     if isinstance(target, StepTarget):
-        return PlannedStep(target, sensor, marks)
+        return PlannedStairs(target, sensor, marks)
     line = None if target is None else np.stack([target.point_base, target.direction_base])
     return PlannedLine(sensor, line)
 
 
 def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[str] | None:
     """Marks of the stairs on which proposed poses lay the light."""
-    from robocal_ros.hand_eye.planned_targets import PlannedStep
+    from robocal_ros.hand_eye.planned_targets import PlannedStairs
 
-    return list(target.lit(T_base_sensor)) if isinstance(target, PlannedStep) else None
+    return list(target.lit(T_base_sensor)) if isinstance(target, PlannedStairs) else None
 
 
 def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import text
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.ground.frame_texts import transform_document
     from robocal_ros.hand_eye.exports import exported
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> Outcome:
         "text": exported(T, parent, args.child, args.format),
         f"T_{mount.parent}_sensor": transform_document(T),
     }
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from robocal_ros.cli.arguments import text
 from robocal_ros.cli.hand_eye_shots import (
     KINDS,
-    Shots,
+    ReadShots,
     add_feature,
     add_limits,
     add_robot,
@@ -20,7 +20,7 @@ from robocal_ros.cli.hand_eye_shots import (
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_mount
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
 
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.joint import solve_joint
     from robocal_ros.hand_eye.result import hand_eye_document
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> Outcome:
         raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
     result = solve_joint(parts, settings, checks)
     document: Document = hand_eye_document(result)
-    return Outcome(document, partial(show_mount, document=document))
+    return CliResult(document, partial(show_mount, document=document))
 
 
 def _task(kind: str, folder: Path, line_kind: str) -> "Task":
@@ -85,5 +85,5 @@ def _task(kind: str, folder: Path, line_kind: str) -> "Task":
     return task_of(given_target(kind, file if known else None, None), line_kind)
 
 
-def _shots(folder: Path, table: str, arm: "SerialArm | None") -> Shots:
+def _shots(folder: Path, table: str, arm: "SerialArm | None") -> ReadShots:
     return read_shots(folder / table, folder / "profiles", arm)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.cli.output import Document
-from robocal_ros.cli.recording import Recording
+from robocal_ros.cli.recording import BagOverview
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
 from robocal_ros.ground.frame_texts import transform_document
 from robocal_ros.ground.proposals import Head
@@ -17,7 +17,7 @@ from robocal_ros.kinematics import SerialArm
 
 
 def replay_hand_eye(
-    recording: Recording, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
 ) -> Document:
     """Replay what a hand-eye node recorded: each calibration with its figures.
 

@@ -152,7 +152,7 @@ def arm_of(args: argparse.Namespace) -> "SerialArm | None":
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
+class ReadShots:
     """Shots, the table that holds them (None: a bag), and its profiles that are none, with why."""
 
     data: "HandEyeData"
@@ -162,7 +162,7 @@ class Shots:
 
 def given_shots(
     args: argparse.Namespace, arm: "SerialArm | None", judges: Path | None = None
-) -> Shots:
+) -> ReadShots:
     """Read the shots that are given, or those like them in the file of ``judges``.
 
     Raises
@@ -181,17 +181,17 @@ def given_shots(
     if arm is None:
         raise InputError("a bag holds joints, not poses: name its robot with --robot")
     data, rejected = read_bag_shots(judges or args.bag, arm, dict(args.topic))
-    return Shots(data, None, rejected)
+    return ReadShots(data, None, rejected)
 
 
-def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
+def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> ReadShots:
     """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
     from robocal_ros.hand_eye.tables import read_pose_table, read_profiles
     from robocal_ros.hand_eye.tasks import HandEyeData
 
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table)
-    return Shots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
+    return ReadShots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
 
 
 def require_unused(judges: "PoseTable", used: "PoseTable") -> None:

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from robocal_ros.cli.hand_eye_shots import (
-    Shots,
+    ReadShots,
     add_limits,
     add_shots,
     arm_of,
@@ -17,7 +17,7 @@ from robocal_ros.cli.hand_eye_shots import (
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_mount
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 
 METHODS = ("best", "classic")
@@ -37,7 +37,7 @@ def add_target_action(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = None) -> Outcome:
+def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = None) -> CliResult:
     """Place the sensor. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.result import hand_eye_document
     from robocal_ros.hand_eye.solve import solve_task
@@ -58,10 +58,10 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
         seen = held_out(task, judges.data, result.T_flange_sensor, result.place)
         result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
     document: Document = hand_eye_document(result)
-    return Outcome(document, partial(show_mount, document=document))
+    return CliResult(document, partial(show_mount, document=document))
 
 
-def _require_unused(args: argparse.Namespace, judges: Shots, used: Shots) -> None:
+def _require_unused(args: argparse.Namespace, judges: ReadShots, used: ReadShots) -> None:
     if judges.table is not None and used.table is not None:
         require_unused(judges.table, used.table)
     elif args.check.resolve() == args.bag.resolve():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
 from robocal_ros.cli.hand_eye_shots import add_limit
 from robocal_ros.cli.hand_eye_view import show_judged, show_placed
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _add_limits(parser: argparse.ArgumentParser) -> None:
     add_limit(parser, WHERE, LIMIT_MM)
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.result import hand_eye_document
     from robocal_ros.hand_eye.tracker import solve_tracker
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> Outcome:
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
     document = hand_eye_document(result)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _noise(args: argparse.Namespace) -> "TrackerNoise":

@@ -18,7 +18,7 @@ from robocal_ros.cli.hand_eye_shots import (
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_held_out, show_pose, show_verdict
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_limits(parser, "default 0.05 mm, 0.003 deg")
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
     from robocal_ros.ground.frame_texts import transform_document
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> Outcome:
         "per_sample_mm": dict(zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)),
         "verdict": verdict_document(found.verdict),
     }
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

@@ -18,7 +18,7 @@ from robocal_ros.cli.history_view import (
     show_entry,
     show_list,
 )
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.proposals import BEFORE_ANY, Decision, Entry
 
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             add_rollback_target(action)
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.history.calibrations import CalibrationHistory
     from robocal_ros.history.history_damage import damaged_files
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> Outcome:
         "damaged": str(damaged[-1]) if damaged else None,
     }
     complete = place | document
-    return Outcome(complete, lambda console: render(console, complete))
+    return CliResult(complete, lambda console: render(console, complete))
 
 
 def _only(serials: list[str], folder: Path) -> str:

@@ -26,7 +26,7 @@ _OTHER_SET_UP = (
 
 
 @dataclass(frozen=True)
-class Request:
+class IdentifyRequest:
     """What to identify from which files.
 
     ``check_file`` None: a share ``hold_out`` of the poses of ``data_file`` judges instead.
@@ -42,7 +42,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Answer:
+class IdentifyAnswer:
     """An identification, its document and what the user should know beside it."""
 
     judged: JudgedIdentification
@@ -50,7 +50,7 @@ class Answer:
     warnings: tuple[str, ...] = field(default=())
 
 
-def identify_files(arm: SerialArm, request: Request) -> Answer:
+def identify_files(arm: SerialArm, request: IdentifyRequest) -> IdentifyAnswer:
     """Identify from tables and judge.
 
     Raises
@@ -93,7 +93,7 @@ def identify_files(arm: SerialArm, request: Request) -> Answer:
         if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not request.check_refit:
             warnings.append(_OTHER_SET_UP)
     document = identification_document(judged) | {"data": _data_document(request, train, check)}
-    return Answer(judged, document, tuple(warnings))
+    return IdentifyAnswer(judged, document, tuple(warnings))
 
 
 def _read(path: Path, arm: SerialArm, warnings: list[str]) -> Measurements:
@@ -102,7 +102,7 @@ def _read(path: Path, arm: SerialArm, warnings: list[str]) -> Measurements:
     return data
 
 
-def _data_document(request: Request, train: Measurements, check: Measurements) -> Document:
+def _data_document(request: IdentifyRequest, train: Measurements, check: Measurements) -> Document:
     split = request.check_file is None
     return {
         "file": str(request.data_file),
@@ -117,7 +117,7 @@ def _data_document(request: Request, train: Measurements, check: Measurements) -
 
 
 def _require_check_fits(
-    judged: JudgedIdentification, check: Measurements, request: Request
+    judged: JudgedIdentification, check: Measurements, request: IdentifyRequest
 ) -> None:
     """Name the mistake in check data that miss the identified model, as for training data."""
     arm, refit, file = judged.identification.cell.arm, request.check_refit, str(request.check_file)
@@ -129,7 +129,7 @@ def _require_check_fits(
         raise InputError(mistake, file=file)
 
 
-def _require_other_data(train: Measurements, check: Measurements, request: Request) -> None:
+def _require_other_data(train: Measurements, check: Measurements, request: IdentifyRequest) -> None:
     known = {row.tobytes(): i for i, row in enumerate(_rows(train))}
     same = [i for i, row in enumerate(_rows(check)) if row.tobytes() in known]
     if same:
@@ -145,7 +145,9 @@ def _rows(data: Measurements) -> Any:
     return np.ascontiguousarray(np.hstack([data.q, data.position]))
 
 
-def _require_known_targets(train: Measurements, check: Measurements, request: Request) -> None:
+def _require_known_targets(
+    train: Measurements, check: Measurements, request: IdentifyRequest
+) -> None:
     unknown = [name for name in check.targets if name not in train.targets]
     if unknown and "tool" not in request.check_refit:
         raise InputError(
@@ -157,7 +159,7 @@ def _require_known_targets(train: Measurements, check: Measurements, request: Re
         )
 
 
-def _compared(train: Measurements, check: Measurements, request: Request) -> list[str]:
+def _compared(train: Measurements, check: Measurements, request: IdentifyRequest) -> list[str]:
     """What the user should know about the two files together."""
     found = []
     group = pose_groups(np.vstack([train.q, check.q]))

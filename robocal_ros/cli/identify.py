@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 from robocal_ros import __version__
 from robocal_ros.cli.arguments import PARTS, ROBOT_HELP, describe_robot, parts, seed, share, warn
 from robocal_ros.cli.identify_view import headline, show_identification
-from robocal_ros.cli.output import DONE, NO_ANSWER, Outcome, refusal, tell
+from robocal_ros.cli.output import DONE, NO_ANSWER, CliResult, refusal, tell
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from robocal_ros.cli.identification import Answer, Request
+    from robocal_ros.cli.identification import IdentifyAnswer, IdentifyRequest
     from robocal_ros.kinematics.robots import RobotDescription
 
 NAME = "identify"
@@ -76,7 +76,7 @@ def _add_judging(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
     from robocal_ros.cli.identification import identify_files
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> Outcome:
         document |= refusal(Code.TOO_FEW_SAMPLES, answer.judged.verdict.reason)
         tell(Code.TOO_FEW_SAMPLES.name, answer.judged.verdict.reason)
         status = NO_ANSWER
-    return Outcome(document, partial(show_identification, document=document), status)
+    return CliResult(document, partial(show_identification, document=document), status)
 
 
 def _require_sense(args: argparse.Namespace) -> None:
@@ -110,10 +110,10 @@ def _require_sense(args: argparse.Namespace) -> None:
         raise InputError("no such folder for --output", file=str(args.output.parent))
 
 
-def _request(args: argparse.Namespace) -> "Request":
-    from robocal_ros.cli.identification import Request
+def _request(args: argparse.Namespace) -> "IdentifyRequest":
+    from robocal_ros.cli.identification import IdentifyRequest
 
-    return Request(
+    return IdentifyRequest(
         data_file=args.data,
         check_file=args.check,
         check_refit=args.check_refit,
@@ -126,7 +126,7 @@ def _request(args: argparse.Namespace) -> "Request":
 
 def _save(
     robot: "RobotDescription",
-    answer: "Answer",
+    answer: "IdentifyAnswer",
     path: Path,
     document: dict[str, Any],
     warnings: list[str],

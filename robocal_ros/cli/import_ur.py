@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name of the robot, default that of the output file")
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.kinematics.robots import save_robot
 
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> Outcome:
         },
         "conversion_error_mm": float(_distances(dh, factory).max() * 1e3),
     }
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _arms(nominal: Path, calibration: Path, name: str) -> "tuple[SerialArm, SerialArm, SerialArm]":

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import warn
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted
 
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     import numpy as np
 
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> Outcome:
             )
     warn(warnings)
     document: Document = {"targets": targets, "warnings": warnings}
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _document(found: "Repeated") -> Document:

@@ -1,6 +1,6 @@
 """Entry point of ``robocal``.
 
-A command is a module of this package (see `Command`).
+A command is a module of this package (see `CliCommand`).
 """
 
 # ruff: noqa: E402  # threads are set before anything can load NumPy
@@ -17,14 +17,14 @@ from importlib import import_module
 from typing import TextIO, cast
 
 from robocal_ros import __version__
-from robocal_ros.cli.command import Command
+from robocal_ros.cli.command import CliCommand
 from robocal_ros.cli.output import (
     BAD_REQUEST,
     CRASHED,
     DONE,
     INTERRUPTED,
+    CliResult,
     Document,
-    Outcome,
     crash,
     exit_status,
     failure,
@@ -116,7 +116,7 @@ def _write_failure(document: Document, stream: TextIO, as_json: bool) -> None:
         write_json(document, stream)
 
 
-def _execute(arguments: Sequence[str]) -> Outcome:
+def _execute(arguments: Sequence[str]) -> CliResult:
     # Only the command that is named is imported; the help needs them all.
     named = next((word for word in arguments if not word.startswith("-")), None)
     chosen = [named] if named in COMMANDS else list(COMMANDS)
@@ -127,9 +127,9 @@ def _execute(arguments: Sequence[str]) -> Outcome:
     parsers = parser.add_subparsers(
         dest="command", required=True, metavar="command", parser_class=CommandParser
     )
-    commands: dict[str, Command] = {}
+    commands: dict[str, CliCommand] = {}
     for name in chosen:
-        module = cast(Command, import_module(f"robocal_ros.cli.{COMMANDS[name]}"))
+        module = cast(CliCommand, import_module(f"robocal_ros.cli.{COMMANDS[name]}"))
         module.add_arguments(parsers.add_parser(name, help=module.HELP, description=module.HELP))
         commands[name] = module
     args = parser.parse_args(arguments)

@@ -31,7 +31,7 @@ Document = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CliResult:
     """Result of a command.
 
     Attributes
@@ -90,7 +90,7 @@ def write_json(document: Document, stream: TextIO) -> None:
     stream.flush()
 
 
-def show(outcome: Outcome, stream: TextIO) -> None:
+def show(outcome: CliResult, stream: TextIO) -> None:
     """Print for people; a pipe gets wide lines, so that tables stay whole."""
     from rich.console import Console
 

@@ -26,7 +26,7 @@ INPUTS = (JOINTS, *MEASURED, TEMPERATURES)
 
 
 @dataclass(frozen=True)
-class Recording:
+class BagOverview:
     """What a bag says before its samples are read.
 
     Attributes
@@ -91,7 +91,7 @@ class Recording:
         return self.reader.messages(self.inputs, blocks=joints)
 
 
-def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
+def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
     """Read the events and find the inputs.
 
     ``given``: input (or ``session_events``) to topic, where the user named it.
@@ -112,7 +112,7 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
     inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
     start_ns = _first_joint_stamp(reader, inputs)
     configured, commands = read_events(reader.messages(told), start_ns)
-    return Recording(reader, event_topic, inputs, configured, commands, start_ns)
+    return BagOverview(reader, event_topic, inputs, configured, commands, start_ns)
 
 
 def _has(topics: Mapping[str, Any]) -> str:

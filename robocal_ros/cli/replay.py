@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, warn
-from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, Outcome, progress_console, tell
+from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, CliResult, progress_console, tell
 from robocal_ros.cli.replay_view import show_replay
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from robocal_ros.bags.bags import BagMessage
-    from robocal_ros.cli.recording import Recording
+    from robocal_ros.cli.recording import BagOverview
 
 NAME = "replay"
 HELP = "run a recorded bag (MCAP) through the sessions of the live nodes"
@@ -66,17 +66,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.cli.recorded_robot import find_robot
-    from robocal_ros.cli.replaying import Request, replay_bag
+    from robocal_ros.cli.replaying import ReplayRequest, replay_bag
 
     if args.auto and (args.cold or args.warm):
         raise InputError("--auto finds the cycles itself: leave out --cold and --warm")
     if args.cold and not args.warm:
         raise InputError("--cold alone identifies nothing: give a cycle with --warm T0:T1")
     warnings: list[str] = []
-    request = Request(
+    request = ReplayRequest(
         bag=args.bag,
         find_robot=partial(find_robot, args.robot, warnings),
         robot_named=args.robot is not None,
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> Outcome:
     document = replay_bag(request, _watch)
     document["warnings"] = [*warnings, *document["warnings"]]
     warn(document["warnings"])
-    return Outcome(document, partial(show_replay, document=document), _status(document))
+    return CliResult(document, partial(show_replay, document=document), _status(document))
 
 
 def _status(document: dict[str, Any]) -> int:
@@ -101,7 +101,7 @@ def _status(document: dict[str, Any]) -> int:
     return NO_ANSWER if error["code"] in _NO_ANSWER else BAD_REQUEST
 
 
-def _watch(what: str, recording: "Recording") -> "Iterator[BagMessage]":
+def _watch(what: str, recording: "BagOverview") -> "Iterator[BagMessage]":
     """Samples of a recording, with a progress bar on a terminal."""
     if not sys.stderr.isatty():
         yield from recording.blocks()

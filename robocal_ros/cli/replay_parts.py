@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 from robocal_ros import __version__
 from robocal_ros.bags.replay import ReplayReport, replay
 from robocal_ros.cli.output import Document
-from robocal_ros.cli.recording import Recording
+from robocal_ros.cli.recording import BagOverview
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.streams import JointStream
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -23,7 +23,7 @@ def seconds(stamp_ns: int | None) -> float:
     return (stamp_ns or 0) * 1e-9
 
 
-def gaps_document(stream: JointStream, recording: Recording) -> Document:
+def gaps_document(stream: JointStream, recording: BagOverview) -> Document:
     """Pauses of the joint readings, and damaged parts of the bag."""
     damaged = recording.reader.info.lost
     return {
@@ -44,7 +44,9 @@ def command_document(outcome: Outcome) -> Document:
     }
 
 
-def commanded_document(report: ReplayReport, session: Commanded, recording: Recording) -> Document:
+def commanded_document(
+    report: ReplayReport, session: Commanded, recording: BagOverview
+) -> Document:
     """What the replay of a recorded session tells, whatever it measures."""
     topic = {kind: name for name, kind in recording.inputs.items()}
     ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
@@ -64,7 +66,7 @@ def commanded_document(report: ReplayReport, session: Commanded, recording: Reco
 
 
 def replay_commanded(
-    recording: Recording,
+    recording: BagOverview,
     arm: SerialArm,
     history: CalibrationHistory,
     samples: Iterable[Any],

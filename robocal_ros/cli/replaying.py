@@ -12,7 +12,7 @@ from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
 from robocal_ros.cli.hand_eye_replaying import replay_hand_eye
 from robocal_ros.cli.output import Document, refusal
-from robocal_ros.cli.recording import UNASKED, Recording, open_recording
+from robocal_ros.cli.recording import UNASKED, BagOverview, open_recording
 from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
 from robocal_ros.cli.tool_replaying import replay_tool
 from robocal_ros.ground.errors import InputError
@@ -33,7 +33,7 @@ from robocal_ros.tool.recorded import is_tool_session
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
 Samples = Iterator[BagMessage]
-Watch = Callable[[str, Recording], Samples]
+Watch = Callable[[str, BagOverview], Samples]
 
 
 _OF_OTHER_NODES = (
@@ -43,7 +43,7 @@ _OF_OTHER_NODES = (
 
 
 @dataclass(frozen=True)
-class Request:
+class ReplayRequest:
     """What to replay and how.
 
     Attributes
@@ -66,10 +66,10 @@ class Request:
     topics: Mapping[str, str] = field(default_factory=dict)
     state: Path | None = None
     accept: bool = False
-    beside: Callable[[ThermalSession, Recording, Samples], Samples] | None = None
+    beside: Callable[[ThermalSession, BagOverview, Samples], Samples] | None = None
 
 
-def replay_bag(request: Request, watch: Watch) -> Document:
+def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
     """Replay a bag: the document, with ``error`` in it where the data gave no candidate.
 
     ``watch`` reads a recording's samples; it may show how far it is.
@@ -123,7 +123,7 @@ _NOT_REPLAYED = (
 _GOES_ON = "{} already holds calibrations: the replay went on from there"
 
 
-def _require_commands(request: Request, recording: Recording) -> None:
+def _require_commands(request: ReplayRequest, recording: BagOverview) -> None:
     """Refuse a recording without commands that can be obeyed."""
     if not recording.commands:
         configured = recording.configured
@@ -136,13 +136,13 @@ def _require_commands(request: Request, recording: Recording) -> None:
     recording.require_inputs()
 
 
-def _given(request: Request) -> bool:
+def _given(request: ReplayRequest) -> bool:
     """Whether the user says what to carry out, in place of the recorded commands."""
     return bool(request.auto or request.cold or request.warm)
 
 
 @contextmanager
-def _history(request: Request, arm: SerialArm) -> Iterator[CalibrationHistory]:
+def _history(request: ReplayRequest, arm: SerialArm) -> Iterator[CalibrationHistory]:
     serial = request.bag.resolve().stem
     with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
         state_dir = request.state or Path(folder)
@@ -152,15 +152,15 @@ def _history(request: Request, arm: SerialArm) -> Iterator[CalibrationHistory]:
             yield history
 
 
-def _session(recording: Recording, arm: SerialArm, history: CalibrationHistory) -> ThermalSession:
+def _session(recording: BagOverview, arm: SerialArm, history: CalibrationHistory) -> ThermalSession:
     if recording.configured is None:
         return ThermalSession(arm, history, ThermalConfig(), __version__)
     return session_as_recorded(arm, history, recording.configured, __version__)
 
 
 def _commands(
-    request: Request,
-    recording: Recording,
+    request: ReplayRequest,
+    recording: BagOverview,
     arm: SerialArm,
     history: CalibrationHistory,
     watch: Watch,
@@ -183,12 +183,12 @@ def _commands(
     return accepting(commands, by="replay") if request.accept else commands
 
 
-def _stamps(window: Window, recording: Recording) -> tuple[int, int]:
+def _stamps(window: Window, recording: BagOverview) -> tuple[int, int]:
     start, end = (recording.start_ns + round(t * 1e9) for t in window)
     return start, end
 
 
-def _document(report: ReplayReport, session: ThermalSession, recording: Recording) -> Document:
+def _document(report: ReplayReport, session: ThermalSession, recording: BagOverview) -> Document:
     placed = events.CALIBRATE_SENSOR  # what it found is no candidate for the model
     made = [o for o in report.outcomes if o.document is not None and o.command.name != placed]
     place = {outcome.calibration_id: index for index, outcome in enumerate(made)}

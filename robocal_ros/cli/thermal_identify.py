@@ -6,7 +6,7 @@ from pathlib import Path
 
 from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, text, warn
 from robocal_ros.cli.identify_view import show_identification
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.output import CliResult
 from robocal_ros.ground.errors import InputError
 
 NAME = "identify"
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
     from robocal_ros.cli.thermal_identification import (
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> Outcome:
         document = identify_fixed_files(arm, request)
     document |= {"arrangement": args.arrangement, "warnings": warnings}
     warn(warnings)
-    return Outcome(document, partial(show_identification, document=document))
+    return CliResult(document, partial(show_identification, document=document))
 
 
 def _require_sense(args: argparse.Namespace) -> None:

@@ -14,7 +14,7 @@ from robocal_ros.cli.arguments import (
     seed,
     warn,
 )
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", type=Path, metavar="CSV", help="write the poses")
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.cli.thermal_planning import plan_files
 
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> Outcome:
     arm = describe_robot(args.robot, warnings).arm
     document: Document = plan_files(arm, args) | {"warnings": warnings}
     warn(warnings)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.kinematics.tables import read_measurements
     from robocal_ros.thermal.documents import sensor_document
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> Outcome:
         warnings.append(f"{args.output} is not written: the verdict is {verdict['code']}")
     document["warnings"] = warnings
     warn(warnings)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

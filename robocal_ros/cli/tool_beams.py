@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, SIGMA_MM, describe_robot, positive, text, warn
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.tool.documents import laser_document
     from robocal_ros.tool.laser_frame import calibrate_laser
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> Outcome:
     if args.output is not None:
         _write(args, laser)
         document["output"] = str(args.output)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _require_together(args: argparse.Namespace) -> None:

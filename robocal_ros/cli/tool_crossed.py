@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import positive
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.cli.tool_crossed_run import add_run_options, run_whole
 from robocal_ros.ground.errors import InputError
 
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from math import isfinite
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> Outcome:
             "for one circle"
         )
     document = _circle(args, rule)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.cli.tool_frames import add_frame_options, given_frame
 from robocal_ros.ground.errors import InputError
 
@@ -33,7 +33,7 @@ def add_run_options(parser: "argparse._ActionsContainer") -> None:
     add_frame_options(parser, "--taught-mm", "--taught-rpy-deg")
 
 
-def run_whole(args: argparse.Namespace, rule: "InputRule") -> Outcome:
+def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.tool.crossed_run import estimate_tool
     from robocal_ros.tool.documents import classic_run_document, run_document
@@ -65,7 +65,7 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> Outcome:
         document = run_document(known, found, circles, judge_run(found, ToolLimits()))
     document["warnings"] = warnings
     warn(warnings)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

@@ -5,7 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import positive
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.cli.tool_frames import add_frame_options, given_frame, three_numbers
 from robocal_ros.ground.errors import InputError
 
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.ground.frame_texts import transform_document
     from robocal_ros.tool.exports import exported
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> Outcome:
         "text": exported(T_flange_tool, args.format, _load(args)),
         "T_flange_tool": transform_document(T_flange_tool),
     }
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _load(args: argparse.Namespace) -> "Load | None":

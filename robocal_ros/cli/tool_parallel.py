@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from math import isfinite
 
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> Outcome:
     x_m = None if args.x_mm is None else args.x_mm * 1e-3
     fit = fit_parallel(beams, x_m, read_sweeps(args.data))
     document: Document = parallel_document(fit.axis, fit.tip)
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

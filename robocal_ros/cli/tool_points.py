@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import positive
-from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.output import CliResult, Document
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.tool.documents import touch_document
     from robocal_ros.tool.tables import read_flange_poses
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> Outcome:
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
     document: Document = {"method": args.method}
     document |= touch_document(fit(read_flange_poses(args.data), sigma_m))
-    return Outcome(document, partial(_show, document=document))
+    return CliResult(document, partial(_show, document=document))
 
 
 def _show(console: "Console", document: Document) -> None:

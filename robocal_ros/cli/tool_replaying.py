@@ -5,7 +5,7 @@ from typing import Any
 
 from robocal_ros.bags.replay import ReplayReport
 from robocal_ros.cli.output import Document
-from robocal_ros.cli.recording import Recording
+from robocal_ros.cli.recording import BagOverview
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
 from robocal_ros.ground.frame_texts import transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -17,7 +17,7 @@ from robocal_ros.tool.session import ToolSession
 
 
 def replay_tool(
-    recording: Recording, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
 ) -> Document:
     """Replay what a tool node recorded: each run with its answer.
 
@@ -32,7 +32,7 @@ def replay_tool(
     return _document(report, session, recording)
 
 
-def _document(report: ReplayReport, session: ToolSession, recording: Recording) -> Document:
+def _document(report: ReplayReport, session: ToolSession, recording: BagOverview) -> Document:
     return commanded_document(report, session, recording) | {
         "runs": [_run(o) for o in report.outcomes if o.document is not None],
         "final_tool": transform_document(session.current.tool.T_flange_tool)

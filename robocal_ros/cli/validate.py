@@ -19,8 +19,8 @@ from robocal_ros.cli.arguments import ROBOT_HELP, count
 from robocal_ros.cli.output import (
     DONE,
     NO_ANSWER,
+    CliResult,
     Document,
-    Outcome,
     progress_console,
     refusal,
     tell,
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> Outcome:
+def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     workers = min(args.jobs or len(os.sched_getaffinity(0)), len(args.bags))
     if workers > 1 and args.scheduler is None:
@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> Outcome:
     if "error" in document:
         tell(document["error"]["code"], document["error"]["message"])
     status = NO_ANSWER if "error" in document else DONE
-    return Outcome(document, partial(_show, document=document), status)
+    return CliResult(document, partial(_show, document=document), status)
 
 
 def _jobs(paths: Sequence[Path], robot: str | None) -> "list[Job]":

@@ -14,8 +14,8 @@ from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, to
 from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth, above, is_simulated
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
-from robocal_ros.cli.recording import UNASKED, Recording, begin_ns, open_recording
-from robocal_ros.cli.replaying import Request, replay_bag
+from robocal_ros.cli.recording import UNASKED, BagOverview, begin_ns, open_recording
+from robocal_ros.cli.replaying import ReplayRequest, replay_bag
 from robocal_ros.cli.validating_cell import cell_courses
 from robocal_ros.cli.validating_cycles import shift_errors, thermal_document
 from robocal_ros.cli.validating_parts import (
@@ -106,7 +106,7 @@ def _utc(stamp_ns: int) -> str:
 
 def _events_of(
     reader: BagReader,
-) -> tuple[list[Recording], dict[str, str], dict[str, list[Document]]]:
+) -> tuple[list[BagOverview], dict[str, str], dict[str, list[Document]]]:
     """Sessions that can be replayed, others with why not, and what other nodes decided.
 
     Raises
@@ -114,7 +114,7 @@ def _events_of(
     InputError
         When an event cannot be read, or a session's joint states.
     """
-    sessions: list[Recording] = []
+    sessions: list[BagOverview] = []
     skipped: dict[str, str] = {}
     others: dict[str, list[Document]] = {}
     begin = begin_ns(reader)
@@ -137,7 +137,7 @@ def _events_of(
 class _Session:
     """One node's session in a bag; the whole bag where nobody told events."""
 
-    def __init__(self, job: Job, recording: Recording, truth: BagTruth) -> None:
+    def __init__(self, job: Job, recording: BagOverview, truth: BagTruth) -> None:
         self._job, self._recording, self._truth = job, recording, truth
         self._topic = topic = recording.events
         self._namespace = above(above(topic or ""))  # of the node that told its events
@@ -167,7 +167,7 @@ class _Session:
 
     def _replayed(self, folder: Path) -> Document:
         auto = not self._recording.commands
-        request = Request(
+        request = ReplayRequest(
             bag=Path(self._job.path),
             find_robot=self._robot,
             auto=auto,
@@ -241,5 +241,5 @@ class _ReplayError(RobocalError):
         self.code = Code[told["code"]]
 
 
-def _silent(what: str, recording: Recording) -> Iterator[BagMessage]:
+def _silent(what: str, recording: BagOverview) -> Iterator[BagMessage]:
     return recording.blocks()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robocal_ros.bags.bags import BagMessage
 from robocal_ros.cli.bag_truth import CheckPoints
 from robocal_ros.cli.output import Document
-from robocal_ros.cli.recording import Recording
+from robocal_ros.cli.recording import BagOverview
 from robocal_ros.ground.proposals import THERMAL, Action, Entry
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -37,7 +37,7 @@ class Forecasts:
     known: list[tuple[int, float, float]] = field(default_factory=list)
 
     def beside(
-        self, session: ThermalSession, recording: Recording, samples: Iterator[BagMessage]
+        self, session: ThermalSession, recording: BagOverview, samples: Iterator[BagMessage]
     ) -> Iterator[BagMessage]:
         """Ask before each measurement; the session learns of a cycle only when it ends."""
         for sample in samples:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.room import Room, room_in
+from robocal_ros.correction.room import Workspace, room_in
 from robocal_ros.correction.solution import CONVERGED, TCP_ROTATION, TCP_SHIFT, correct_staged
 from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
@@ -20,7 +20,7 @@ MOST_STEPS = 20
 
 
 @lean
-def _stand(q: Array, links: Array, root: Array, tool: Array, room: Room) -> None:
+def _stand(q: Array, links: Array, root: Array, tool: Array, room: Workspace) -> None:
     """Joint axes, pose ``here`` and Jacobian of a model's tool at joints q."""
     walk(q, links, root, room.turns, room.frames, room.here)
     newton.at_tool(room.here, tool)

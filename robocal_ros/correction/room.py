@@ -21,7 +21,7 @@ POSES, SQUARES, TWISTS = 6, 3, 5
 STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
 
 
-class Room(NamedTuple):
+class Workspace(NamedTuple):
     """Where a solution is worked out: parts of ``work``.
 
     Attributes
@@ -77,7 +77,7 @@ def work_size(n: int) -> int:
 
 
 @lean
-def room_in(work: Array, n: int) -> Room:
+def room_in(work: Array, n: int) -> Workspace:
     """Divide ``work``."""
     links, at = work[: 18 * n].reshape(2, n, 9), 18 * n
     poses, at = work[at : at + 16 * POSES].reshape(POSES, 4, 4), at + 16 * POSES
@@ -92,7 +92,7 @@ def room_in(work: Array, n: int) -> Room:
     constants, at = work[at : at + six.CONSTANTS], at + six.CONSTANTS
     came, at = work[at : at + straight.LANES * six.N], at + straight.LANES * six.N
     goes, at = work[at : at + straight.LANES * straight.ROWS], at + straight.LANES * straight.ROWS
-    return Room(
+    return Workspace(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
         turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
         twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
@@ -102,7 +102,7 @@ def room_in(work: Array, n: int) -> Room:
 
 @lean
 def settle(
-    models: Array, largest: Array, steepness: float, per_error: float, free: bool, room: Room
+    models: Array, largest: Array, steepness: float, per_error: float, free: bool, room: Workspace
 ) -> None:
     """Put models (2, n + 2, 9), reference and actual, and the damping's settings into a room."""
     n = room.links.shape[0]

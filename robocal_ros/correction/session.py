@@ -32,7 +32,7 @@ from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.status import CorrectionStatus, Offset
 from robocal_ros.correction.stepping import LARGEST, REDUCED, REMAINING, SHIFT
-from robocal_ros.correction.streams import Phase, TargetStream
+from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.kinematics import SerialArm
@@ -94,7 +94,10 @@ class CorrectionSession:
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
         self._held: dict[Reason, str] = {}
-        self._interrupted: tuple[SentPath | None, Phase] = None, Phase.IDLE  # by the last path
+        self._interrupted: tuple[SentPath | None, StreamPhase] = (
+            None,
+            StreamPhase.IDLE,
+        )  # by the last path
         # of each kind and source: the last stamp, ns, and when it came
         self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
         self._refused: Counter[Reason] = Counter()
@@ -129,7 +132,7 @@ class CorrectionSession:
             self.output.mismatch = ""
         elif self.output.mismatch:
             self.output.acknowledge(now_s)
-            self.stream.phase = Phase.IDLE
+            self.stream.phase = StreamPhase.IDLE
         self._stamps.clear()
 
     def take_over(self) -> None:
@@ -256,7 +259,7 @@ class CorrectionSession:
         path.scale(self._state.scaling, now_s)
         self.output.path = path
         self._interrupted = path, self.stream.phase
-        self.stream.phase = Phase.IDLE
+        self.stream.phase = StreamPhase.IDLE
         self._goal[:] = q[-1]
         self._note_withheld(path.withheld, q)
         return corrected
@@ -274,7 +277,7 @@ class CorrectionSession:
         """The controller did not take a trajectory: what it took the place of goes on there."""
         self.output.reject(path)
         rejected, phase = self._interrupted
-        if path is rejected and self.output.path is None and self.stream.phase is Phase.IDLE:
+        if path is rejected and self.output.path is None and self.stream.phase is StreamPhase.IDLE:
             self.stream.phase = phase
 
     def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:

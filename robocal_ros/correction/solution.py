@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from robocal_ros.correction import kernels as k
 from robocal_ros.correction import straight, straight_damped
 from robocal_ros.correction import straight_kinematics as six
-from robocal_ros.correction.room import IS_STRAIGHT, PER_ERROR, STEEPNESS, Room, room_in, settle
+from robocal_ros.correction.room import (
+    IS_STRAIGHT,
+    PER_ERROR,
+    STEEPNESS,
+    Workspace,
+    room_in,
+    settle,
+)
 from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.kernels import walk
@@ -33,7 +40,7 @@ REPORT = 7
 
 
 @lean
-def _residual_at(q: Array, free: bool, room: Room) -> None:
+def _residual_at(q: Array, free: bool, room: Workspace) -> None:
     """Residual ``e`` of the pose ``here`` at joints q + x."""
     for i in range(q.shape[0]):
         room.x[i] += q[i]
@@ -45,7 +52,7 @@ def _residual_at(q: Array, free: bool, room: Room) -> None:
 
 
 @lean
-def _jacobian(free: bool, room: Room, J: Array) -> None:
+def _jacobian(free: bool, room: Workspace, J: Array) -> None:
     """Columns of the Jacobian ``here``, without what is about a free axis."""
     newton.columns(room.links, room.frames, room.here, J)
     for i in range(J.shape[0]):
@@ -61,7 +68,7 @@ def _jacobian(free: bool, room: Room, J: Array) -> None:
 
 
 @lean
-def _damp(free: bool, room: Room) -> bool:
+def _damp(free: bool, room: Workspace) -> bool:
     """Damping ``D`` for J and the residual at the taught joints; whether a direction is weak."""
     n, M, D, settings = room.x.shape[0], room.M, room.D, room.settings
     position, both = 0.0, 0.0
@@ -90,7 +97,7 @@ def _damp(free: bool, room: Room) -> bool:
 
 
 @lean
-def _add_step(q: Array, free: bool, room: Room) -> float:
+def _add_step(q: Array, free: bool, room: Workspace) -> float:
     """One step with the factored matrix; returns its largest component in the joints."""
     step, size = room.step, 0.0
     for r in range(6):
@@ -111,7 +118,7 @@ def _add_step(q: Array, free: bool, room: Room) -> float:
 
 
 @lean
-def _newton(q: Array, free: bool, room: Room) -> int:
+def _newton(q: Array, free: bool, room: Workspace) -> int:
     """Multipliers y and shift x = J^T y with e(q + x) = D y; iterations, 0 where none is found."""
     for iteration in range(1, MOST_ITERATIONS + 1):
         if iteration > 1:
@@ -133,7 +140,7 @@ def _newton(q: Array, free: bool, room: Room) -> int:
 
 
 @lean
-def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
+def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
     """One point: ``out`` (n + 7), joints, then the report."""
     n, e = q.shape[0], room.e
     walk(q, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
@@ -164,14 +171,14 @@ def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> No
 
 
 @lean
-def _put(q: Array, lane: int, lanes: int, room: Room) -> None:
+def _put(q: Array, lane: int, lanes: int, room: Workspace) -> None:
     """A point becomes one of those that `straight` solves."""
     for i in range(six.N):
         room.came[i * lanes + lane] = q[i]
 
 
 @lean
-def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
+def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
     """A point of `straight`, with its report; False where it must be solved here."""
     goes, n = room.goes, six.N
     for i in range(n):
@@ -187,7 +194,7 @@ def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
 
 
 @lean
-def _correct_one(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
+def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
     if room.settings[IS_STRAIGHT] > 0.5:
         _put(q, 0, 1, room)
         straight.correct_one(room.constants, room.came, room.goes)
@@ -200,7 +207,7 @@ def _correct_one(q: Array, largest: Array, free: bool, room: Room, out: Array) -
 
 
 @lean
-def _correct_weak(q: Array, largest: Array, room: Room, out: Array) -> None:
+def _correct_weak(q: Array, largest: Array, room: Workspace, out: Array) -> None:
     """Those of the points (m, 6) of which ``out`` says that they are not solved."""
     count, n = 0, six.N
     for i in range(q.shape[0]):

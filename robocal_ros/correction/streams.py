@@ -46,7 +46,7 @@ LATE = 0.8  # of `CATCH_UP_S`: one that lags more catches up at the joints' spee
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
 
 
-class Phase(Enum):
+class StreamPhase(Enum):
     """What a stream does."""
 
     IDLE = "nothing goes out"
@@ -75,7 +75,7 @@ class TargetStream:
         self._unlimited = ~np.isfinite(self._fastest)
         self._speeds = np.tile(config.velocity_limits, (2, 1))  # of the joints, in a step and ever
         self._velocity = np.zeros(arm.n)  # of the newest message
-        self.phase, self.lag_s = Phase.IDLE, 0.0
+        self.phase, self.lag_s = StreamPhase.IDLE, 0.0
         self._why: RefusedError | None = None
         self._active = np.zeros(arm.n)  # 1 where a joint is commanded
         self._goal = np.full(arm.n, np.nan)  # of the newest message
@@ -99,9 +99,9 @@ class TargetStream:
 
     def runs(self, now_s: float) -> bool:
         """Whether it is under way."""
-        if self.phase is Phase.ENDING:
+        if self.phase is StreamPhase.ENDING:
             return True
-        return self.phase is Phase.RUNNING and now_s - self._came_s <= self._gap_s()
+        return self.phase is StreamPhase.RUNNING and now_s - self._came_s <= self._gap_s()
 
     def _note_interval(self, now_s: float) -> None:
         """The period: half of the time is in intervals that are so long or longer.
@@ -158,21 +158,21 @@ class TargetStream:
         Raises `RefusedError` when it cannot be corrected, nothing may begin there, or it is too
         far ahead; to `end` the stream is for the caller.
         """
-        if self.phase is Phase.ENDING and self._why is not None:
+        if self.phase is StreamPhase.ENDING and self._why is not None:
             raise RefusedError(self._why.reason, f"the stream is ended for: {self._why.detail}")
         if self._output.mismatch:
             raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
         pause = now_s - self._came_s
-        if self.phase is Phase.RUNNING and pause > self._gap_s():
+        if self.phase is StreamPhase.RUNNING and pause > self._gap_s():
             self._look_after_pause(q, pause, now_s)
-        if self.phase is Phase.IDLE:
+        if self.phase is StreamPhase.IDLE:
             self._active[:] = 0.0
             self._intervals.clear()
             self._way.clear()
             self._sent.clear()
             self.period_s, self._beat_s = np.nan, now_s
         self._note_interval(now_s)
-        if index is not self._index or self.phase is Phase.IDLE:
+        if index is not self._index or self.phase is StreamPhase.IDLE:
             self._choose(index, q, now_s)
         self._goal = q
         self._note(self._way, q, now_s, SPEED_S)
@@ -180,7 +180,7 @@ class TargetStream:
         if command.velocity is not None:
             self._velocity[index] = command.velocity
         self._output.path = None
-        self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
+        self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self._advance(now_s)
         return self._message(command)
 
@@ -206,7 +206,7 @@ class TargetStream:
         ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
         known = np.isfinite(ahead).all() and np.isfinite(moved).all()
         if not known or pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):
-            self.phase = Phase.IDLE
+            self.phase = StreamPhase.IDLE
 
     def _begin(self, new: Index, q: Array, now_s: float) -> None:
         """Joints begin where the controller is; the offset of a path that is left goes on."""
@@ -223,12 +223,12 @@ class TargetStream:
         output.taught[new], output.out[new] = q[new], q[new] + offset
         for _, out in self._sent:
             out[new] = output.out[new]
-        if self.phase is Phase.IDLE:
+        if self.phase is StreamPhase.IDLE:
             output.out_s = now_s
 
     def come_to_rest(self, now_s: float) -> None:
         """The offset stands where nothing went out for so long that the controller holds."""
-        if self.phase is not Phase.ENDING and self._holds(now_s - self._output.out_s):
+        if self.phase is not StreamPhase.ENDING and self._holds(now_s - self._output.out_s):
             self._output.limiter.state[OFFSET_RATE] = 0.0
 
     def _advance(self, now_s: float) -> None:
@@ -379,7 +379,7 @@ class TargetStream:
         After a silence the controller has held the last target since: the robot stands, and
         nothing more goes out, which would set it in motion again.
         """
-        if self.phase is not Phase.RUNNING:
+        if self.phase is not StreamPhase.RUNNING:
             return
         output, index, self._why = self._output, self._index, why
         speed = np.zeros(len(index))
@@ -391,21 +391,23 @@ class TargetStream:
         lasts = np.max(np.abs(speed) / slowdown[index], initial=0.0)
         self.lag_s = 0.0
         if not self._step_period_s() < lasts < np.inf:  # what takes one step is none
-            self.phase = Phase.IDLE
+            self.phase = StreamPhase.IDLE
             return
-        self.phase, self._lasts_s, self._slowed_s = Phase.ENDING, float(lasts), 0.0
+        self.phase, self._lasts_s, self._slowed_s = StreamPhase.ENDING, float(lasts), 0.0
         self._end_out, self._end_speed = output.out[index].copy(), speed
 
     @property
     def has_tail(self) -> bool:
         """Whether it goes on without a message: slowed down, or behind its last target."""
-        return self.phase is Phase.ENDING or (self.phase is Phase.RUNNING and self.lag_s > 0.0)
+        return self.phase is StreamPhase.ENDING or (
+            self.phase is StreamPhase.RUNNING and self.lag_s > 0.0
+        )
 
     def tail(self, now_s: float) -> JointCommand | None:
         """What must go out now without a message; None when nothing must."""
         if self._command is None:
             return None
-        if self.phase is Phase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
+        if self.phase is StreamPhase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
             command = replace(self._command, position=self._goal[self._index], velocity=None)
             self._note(self._way, self._goal, now_s, SPEED_S)
             try:
@@ -413,14 +415,14 @@ class TargetStream:
                 return self._message(command)
             except RefusedError as error:  # another model has come, or the bounds are narrower
                 self.end(error, now_s)
-        return self._slowed(self._command, now_s) if self.phase is Phase.ENDING else None
+        return self._slowed(self._command, now_s) if self.phase is StreamPhase.ENDING else None
 
     def _slowed(self, command: JointCommand, now_s: float) -> JointCommand | None:
         """The slow-down, as far as it is by the time since the last output."""
         output, index = self._output, self._index
         elapsed = max(now_s - output.out_s, 0.0)
         if self._holds(elapsed):  # it was held up itself
-            self.phase = Phase.IDLE
+            self.phase = StreamPhase.IDLE
             return None
         self._slowed_s = min(self._slowed_s + elapsed, self._lasts_s)
         t = self._slowed_s
@@ -433,5 +435,5 @@ class TargetStream:
         if command.velocity is not None:
             velocity = self._end_speed * (1.0 - t / self._lasts_s)
         if t >= self._lasts_s:
-            self.phase = Phase.IDLE
+            self.phase = StreamPhase.IDLE
         return replace(command, position=place, velocity=velocity, mark=CORRECTED)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.freedom import Freedom, require_told
-from robocal_ros.estimation.loss import Loss, Problem, Run, information_of
+from robocal_ros.estimation.loss import DescentState, Loss, Problem, information_of
 
 Array = NDArray[np.float64]
 S = TypeVar("S")
@@ -48,11 +48,11 @@ class Descent(Generic[S]):
 
     def run(
         self,
-        run: Run[S],
+        run: DescentState[S],
         keep: NDArray[np.bool_],
         huber: Array | None = None,
         tolerance: float = STEP_TOLERANCE,
-    ) -> Run[S]:
+    ) -> DescentState[S]:
         """Minimise the cost until a step is far below a standard deviation.
 
         ``huber`` (m,): length of each sample's residual from which it counts linearly.
@@ -69,7 +69,7 @@ class Descent(Generic[S]):
             if to_go < tolerance**2 * k:
                 near = run.residual + run.jacobian @ step  # exact enough so near
                 state = self.problem.retract(run.state, step)
-                return Run(state, near, run.jacobian, run.iterations + 1, True)
+                return DescentState(state, near, run.jacobian, run.iterations + 1, True)
             for damping in DAMPINGS:
                 if damping:
                     step = _damped_step(information, gradient, damping)
@@ -81,13 +81,18 @@ class Descent(Generic[S]):
             run = self._shortened(loss, run, trial, step, gradient)
         return run
 
-    def _moved(self, run: Run[S], step: Array) -> Run[S]:
+    def _moved(self, run: DescentState[S], step: Array) -> DescentState[S]:
         state = self.problem.retract(run.state, step)
-        return Run(state, *self.problem.linearise(state), run.iterations + 1, False)
+        return DescentState(state, *self.problem.linearise(state), run.iterations + 1, False)
 
     def _shortened(
-        self, loss: Loss[S], run: Run[S], trial: Run[S], step: Array, gradient: Array
-    ) -> Run[S]:
+        self,
+        loss: Loss[S],
+        run: DescentState[S],
+        trial: DescentState[S],
+        step: Array,
+        gradient: Array,
+    ) -> DescentState[S]:
         """Where the step ends; short of that if the way down has long been passed there.
 
         Residuals that curve, as those of a path through noisy readings, let Gauss-Newton's steps
@@ -141,7 +146,7 @@ class Descent(Generic[S]):
         return _found(left, middle * left.count)
 
     def final_scale(
-        self, run: Run[S], keep: NDArray[np.bool_], information: Array
+        self, run: DescentState[S], keep: NDArray[np.bool_], information: Array
     ) -> tuple[float, float]:
         """The estimated scale; with given sigmas 1, or the misfit where chi-square rejects 1.
 
@@ -189,7 +194,7 @@ class Descent(Generic[S]):
         inverse = np.linalg.inv(information * np.outer(unit, unit))
         return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
 
-    def inliers(self, run: Run[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def inliers(self, run: DescentState[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Samples whose residual fits its own predicted covariance (studentised, chi-square)."""
         m, c, _ = run.jacobian.shape
         J, information = run.jacobian, information_of(run.jacobian, keep)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.descent import FIRST_TOLERANCE, Descent
-from robocal_ros.estimation.loss import Problem, Run, information_of, rows_of
+from robocal_ros.estimation.loss import DescentState, Problem, information_of, rows_of
 from robocal_ros.estimation.observability import Observability, describe, observability
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 
@@ -113,7 +113,7 @@ def solve(
         _require_enough(jacobian, int(np.sum(counts)), problem.names)
     unscaled = 0 if noise_known else problem.scale_components
     descent = Descent(problem, prior, unscaled, counts, freedom)
-    run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
+    run, keep = _settle(descent, DescentState(start, residual, jacobian, 0, False), robust, flat)
     information = information_of(run.jacobian, keep)
     seen = observability(rows_of(run.jacobian, keep), information)
     if flat:
@@ -144,8 +144,8 @@ def _linearised(problem: Problem[S], start: S) -> tuple[Array, Array]:
 
 
 def _settle(
-    descent: Descent[S], run: Run[S], robust: bool, flat: bool
-) -> tuple[Run[S], NDArray[np.bool_]]:
+    descent: Descent[S], run: DescentState[S], robust: bool, flat: bool
+) -> tuple[DescentState[S], NDArray[np.bool_]]:
     """Descend and reject in turn until the samples in use no longer change."""
     keep = np.ones(len(run.jacobian), dtype=np.bool_)
     if robust:

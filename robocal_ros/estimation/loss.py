@@ -32,7 +32,7 @@ class Problem(Protocol[S]):
 
 
 @dataclass(frozen=True)
-class Run(Generic[S]):
+class DescentState(Generic[S]):
     """Where a descent stands: the state, its residual (m, c) and Jacobian (m, c, k)."""
 
     state: S
@@ -67,14 +67,14 @@ class Loss(Generic[S]):
         away = self.problem.deviation(state)
         return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
 
-    def gradient(self, run: Run[S]) -> Array:
+    def gradient(self, run: DescentState[S]) -> Array:
         """Half of it, (k,)."""
         J = run.jacobian.reshape(-1, run.jacobian.shape[2])
         weighted = (run.residual * self._weight(run.residual)[:, None]).ravel()
         by_data = J.T @ weighted / self.scale**2
         return np.asarray(by_data + self.prior @ self.problem.deviation(run.state))
 
-    def information(self, run: Run[S]) -> Array:
+    def information(self, run: DescentState[S]) -> Array:
         """Half of the second derivative (k, k), without the curvature of the residuals."""
         weight = self._weight(run.residual)
         return information_of(run.jacobian, weight) / self.scale**2 + self.prior

@@ -36,7 +36,7 @@ class Action(StrEnum):
     ROLLBACK = "rollback"
 
 
-class State(StrEnum):
+class CalibrationState(StrEnum):
     """Where a calibration stands; follows from its verdict and the decisions log."""
 
     PENDING = "pending"
@@ -140,7 +140,7 @@ class Entry(Candidate):
     """
 
     id: int
-    state: State
+    state: CalibrationState
     revision: int
     decisions: tuple[Decision, ...]
 

@@ -138,11 +138,11 @@ def fit_pairs(
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
     near = PairState(sound, np.zeros(count))
     far = None if start is None else PairState(start, np.zeros(count))
-    return _Search(pairs, known).run(near, far)
+    return _NoiseSearch(pairs, known).run(near, far)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _NoiseSearch:
     """Noise and placements in turn; ``known`` (6,) variances are nan where they are unknown."""
 
     pairs: PosePairs

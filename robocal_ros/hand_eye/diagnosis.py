@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError, RobocalError
 from robocal_ros.hand_eye.mistakes import explain, undone
 from robocal_ros.hand_eye.mount_fit import first_look, misfit
-from robocal_ros.hand_eye.mount_problem import MountState, View
+from robocal_ros.hand_eye.mount_problem import MountState, TargetView
 from robocal_ros.hand_eye.profile import Profile
 from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task
 
@@ -68,13 +68,13 @@ def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
     return near
 
 
-def _shown(view: View, data: HandEyeData) -> bool:
+def _shown(view: TargetView, data: HandEyeData) -> bool:
     """Whether most of the profiles show the target where it must be."""
     usable = sum(isinstance(profile, Profile) for profile in data.profiles)
     return len(np.unique(view.sightings.shot)) > SHOWN * usable
 
 
-def look(task: Task, view: View) -> MountState:
+def look(task: Task, view: TargetView) -> MountState:
     """The state nearest to the sightings to which a start leads, before the noise is known.
 
     Raises
@@ -101,7 +101,7 @@ def _name_mistake(
 ) -> None:
     """Raise with the mistake that explains a misfit, m, or an error; nothing where none does."""
 
-    def followed(task: Task, view: View) -> float:
+    def followed(task: Task, view: TargetView) -> float:
         if not _shown(view, data):
             return np.inf
         first = task.starts(view)[0]

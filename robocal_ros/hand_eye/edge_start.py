@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.estimation import solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
 from robocal_ros.hand_eye.sightings import Sightings, in_plane
 
 Array = NDArray[np.float64]
@@ -144,7 +144,7 @@ def _held(
     return cost, solution[:, :3], points if point is not None else solution[:, 3:] @ across
 
 
-def least_distances(view: View, near: MountState) -> MountState:
+def least_distances(view: TargetView, near: MountState) -> MountState:
     """Classic: the sum of squared distances from the line, every feature alike.
 
     Raises
@@ -153,6 +153,6 @@ def least_distances(view: View, near: MountState) -> MountState:
         When the poses leave a direction open.
     """
     plain = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
-    alike = View(view.model, replace(view.sightings, covariance=plain))
+    alike = TargetView(view.model, replace(view.sightings, covariance=plain))
     problem = MountProblem((alike,), PoseNoise(0.0, 0.0), near)
     return solve(problem, near, robust=False, sizes=problem.sizes).settled()

@@ -3,11 +3,11 @@
 from robocal_ros.ground.proposals import THERMAL, Head, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.documents import arm_of
-from robocal_ros.session.followed import Followed
+from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import History
 
 
-class HandEyeInForce(Followed):
+class HandEyeInForce(HistoryFollower):
     """What the history has in force for a sensor, as of the last look.
 
     Attributes

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.estimation import solve
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.mount_fit import MountFit, distances, without
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, View
+from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, TargetView
 
 Array = NDArray[np.float64]
 
 
-def solved_again(fit: MountFit) -> Callable[[tuple[View, ...]], MountState]:
+def solved_again(fit: MountFit) -> Callable[[tuple[TargetView, ...]], MountState]:
     """How the mount is found from part of the views of a fit: nothing is rejected any more."""
 
-    def again(views: tuple[View, ...]) -> MountState:
+    def again(views: tuple[TargetView, ...]) -> MountState:
         part = MountProblem(views, fit.noise, fit.state)
         return solve(
             part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
@@ -26,7 +26,7 @@ def solved_again(fit: MountFit) -> Callable[[tuple[View, ...]], MountState]:
 
 
 def leave_one_out(
-    views: tuple[View, ...], solved: Callable[[tuple[View, ...]], MountState]
+    views: tuple[TargetView, ...], solved: Callable[[tuple[TargetView, ...]], MountState]
 ) -> Array | None:
     """Distance of each sighting from what is ``solved`` without its pose, m.
 

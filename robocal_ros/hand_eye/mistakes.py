@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.mount_fit import MountFit
-from robocal_ros.hand_eye.mount_problem import View
+from robocal_ros.hand_eye.mount_problem import TargetView
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: flo
     return best
 
 
-def swapped(fit: MountFit, lost: View, place: Array, shots: Sequence[str]) -> dict[str, str]:
+def swapped(fit: MountFit, lost: TargetView, place: Array, shots: Sequence[str]) -> dict[str, str]:
     """Which rejected sightings fit the pose of another rejected shot: names and reasons.
 
     ``lost`` holds the rejected sightings; ``shots``: the name of each.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.estimation.observability import observability
 from robocal_ros.ground.errors import RankDeficientError
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
 from robocal_ros.hand_eye.naming import describe_motion, joined
 from robocal_ros.hand_eye.restricted_noise import FIRST_NOISE, averaged_covariance, restricted_noise
 from robocal_ros.hand_eye.result import at_origin, increment, moved_origin
@@ -41,7 +41,7 @@ class MountFit:
     creeping : why this is no solution, in words; empty where it is one.
     """
 
-    views: tuple[View, ...]
+    views: tuple[TargetView, ...]
     state: MountState
     covariance: Array
     scale: float
@@ -59,24 +59,24 @@ class MountFit:
         return distances(self.views, self.state)
 
 
-def distances(views: tuple[View, ...], state: MountState) -> Array:
+def distances(views: tuple[TargetView, ...], state: MountState) -> Array:
     """Distance of each sighting from its target, m."""
     pairs = zip(views, state.places, strict=True)
     return np.concatenate([_distance(view, state, place) for view, place in pairs])
 
 
-def misfit(views: tuple[View, ...], state: MountState) -> float:
+def misfit(views: tuple[TargetView, ...], state: MountState) -> float:
     """Median distance of sightings from their target, m."""
     return float(np.median(distances(views, state)))
 
 
-def _distance(view: View, state: MountState, place: Array) -> Array:
+def _distance(view: TargetView, state: MountState, place: Array) -> Array:
     T = view.sightings.T_base_flange @ state.T_flange_sensor
     return view.model.distance(T, place, view.sightings.value)
 
 
 def fit_mount(
-    views: tuple[View, ...], start: MountState, noise: PoseNoise | None = None
+    views: tuple[TargetView, ...], start: MountState, noise: PoseNoise | None = None
 ) -> MountFit:
     """Estimate the sensor's pose and what is unknown of its targets.
 
@@ -113,7 +113,7 @@ def fit_mount(
     )
 
 
-def first_look(views: tuple[View, ...], start: MountState) -> MountState:
+def first_look(views: tuple[TargetView, ...], start: MountState) -> MountState:
     """Where a start leads, robustly, the noise as the misfit tells it. Raises as `fit_mount`.
 
     So a state that is far off, or poses that cannot fit, are not followed to the last digit.
@@ -128,7 +128,7 @@ def first_look(views: tuple[View, ...], start: MountState) -> MountState:
 
 
 def _settle(
-    views: tuple[View, ...],
+    views: tuple[TargetView, ...],
     state: MountState,
     noise: PoseNoise,
     given: PoseNoise | None,
@@ -245,8 +245,8 @@ def open_directions(covariance: Array, reach_m: float, T_base_flange: Array) -> 
 
 
 def without(
-    views: tuple[View, ...], wrong: NDArray[np.bool_], rejected: dict[str, str]
-) -> tuple[View, ...]:
+    views: tuple[TargetView, ...], wrong: NDArray[np.bool_], rejected: dict[str, str]
+) -> tuple[TargetView, ...]:
     """The views without sightings marked in ``wrong`` (m,); those are named in ``rejected``."""
     kept, first = [], 0
     for view in views:

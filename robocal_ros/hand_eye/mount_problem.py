@@ -40,15 +40,15 @@ class PoseNoise:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class TargetView:
     """Sightings of one target, and its model."""
 
     model: TargetModel
     sightings: Sightings
 
-    def take(self, rows: NDArray[np.bool_] | Index) -> "View":
+    def take(self, rows: NDArray[np.bool_] | Index) -> "TargetView":
         """The sightings at ``rows``."""
-        return View(self.model.take(rows), self.sightings.take(rows))
+        return TargetView(self.model.take(rows), self.sightings.take(rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class MountProblem:
 
     def __init__(
         self,
-        views: tuple[View, ...],
+        views: tuple[TargetView, ...],
         noise: PoseNoise,
         near: MountState,
         together: bool = True,
@@ -207,7 +207,7 @@ class MountProblem:
         return information
 
 
-def pivot_of(views: tuple[View, ...]) -> Array:
+def pivot_of(views: tuple[TargetView, ...]) -> Array:
     """The middle (3,) of what was seen, sensor frame: there shifts and turns hardly correlate."""
     value = np.concatenate([view.sightings.value for view in views])
     return np.array([value[:, 0].mean(), 0.0, value[:, 1].mean()])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.look_point import OFF_EQUATOR, looked_at
-from robocal_ros.hand_eye.mount_problem import View
+from robocal_ros.hand_eye.mount_problem import TargetView
 from robocal_ros.hand_eye.planning import SensorRange
 from robocal_ros.hand_eye.sightings import Seen, Sightings, TargetModel, same_pose
 from robocal_ros.hand_eye.sphere_start import FEWEST_PROFILES
@@ -52,12 +52,16 @@ def _places(sensor: SensorRange, heights: tuple[float, ...], behind_m: float = 0
     return np.array(list(product(aside, heights, far)))
 
 
-def _expected(model: TargetModel, seen: Seen, T_base_flange: Array, covariance: Array) -> View:
+def _expected(
+    model: TargetModel, seen: Seen, T_base_flange: Array, covariance: Array
+) -> TargetView:
     """A view in which everything is seen as predicted."""
     m = len(T_base_flange)
     names = tuple(f"pose {i + 1}" for i in range(m))
     pose = same_pose(T_base_flange)
-    return View(model, Sightings(names, np.arange(m), pose, T_base_flange, seen.value, covariance))
+    return TargetView(
+        model, Sightings(names, np.arange(m), pose, T_base_flange, seen.value, covariance)
+    )
 
 
 def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict[int, str]:
@@ -90,7 +94,7 @@ class PlannedSphere:
         ]
         return np.asarray(centres[min(range(len(blind)), key=lambda i: (blind[i], misfit[i]))])
 
-    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
         """Circles, with the covariance that their arcs will have."""
         model = SphereModel(self.radius_m)
         seen = model.see(T_base_flange @ T_flange_sensor, place)
@@ -104,7 +108,7 @@ class PlannedSphere:
             model, seen, T_base_flange, self.sensor.noise_m**2 * (step / r)[:, None, None] * unit
         )
 
-    def unseen(self, view: View) -> dict[int, str]:
+    def unseen(self, view: TargetView) -> dict[int, str]:
         """Out of the field of view, or beside the sphere."""
         x, z, r = view.sightings.value.T
         found = _out_of_range(x, z - r, NEEDED * r, self.sensor)
@@ -141,7 +145,7 @@ class PlannedLine:
         normal = T_base_sensor[:, :3, 1].mean(axis=0)
         return np.stack([point, normal / np.linalg.norm(normal)])
 
-    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
         """Points of the edge."""
         model = LineModel(self.line is not None)
         seen = model.see(T_base_flange @ T_flange_sensor, place)
@@ -149,7 +153,7 @@ class PlannedLine:
         spread = np.diag([(0.5 * step) ** 2, self.sensor.noise_m**2 / EDGE_POINTS, 1.0])
         return _expected(model, seen, T_base_flange, np.tile(spread, (len(T_base_flange), 1, 1)))
 
-    def unseen(self, view: View) -> dict[int, str]:
+    def unseen(self, view: TargetView) -> dict[int, str]:
         """Out of the field of view."""
         x, z, nothing = view.sightings.value.T
         return _out_of_range(x, z, nothing, self.sensor)
@@ -163,7 +167,7 @@ class PlannedLine:
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedStep:
+class PlannedStairs:
     """A staircase; ``marks`` of the planned poses: None where all lay the light on the first.
 
     Raises
@@ -184,7 +188,7 @@ class PlannedStep:
         """The taught user frame."""
         return self.target.T_base_user
 
-    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
         """All corners of the mark on which each pose lays the light."""
         marks = self.lit(T_base_flange @ T_flange_sensor)
         corners = [self.target.corners[mark] for mark in marks]
@@ -197,7 +201,7 @@ class PlannedStep:
         spread = np.diag(sigma**2 + self.target.sigma_m**2)
         names = tuple(f"pose {i + 1}" for i in shot)
         pose, covariance = same_pose(T_base_flange)[shot], np.tile(spread, (len(shot), 1, 1))
-        return View(model, Sightings(names, shot, pose, T, seen.value, covariance))
+        return TargetView(model, Sightings(names, shot, pose, T, seen.value, covariance))
 
     def lit(self, T_base_sensor: Array) -> tuple[str, ...]:
         """The mark that is nearest to the laser plane of each sensor pose (m, 4, 4)."""
@@ -212,7 +216,7 @@ class PlannedStep:
         known = list(self.target.corners)
         return known[:1] if self.marks is None else known
 
-    def unseen(self, view: View) -> dict[int, str]:
+    def unseen(self, view: TargetView) -> dict[int, str]:
         """Poses that see less than two corners, or not the only one of a mark."""
         x, z, _ = view.sightings.value.T
         found: dict[int, str] = {}

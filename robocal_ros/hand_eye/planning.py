@@ -15,7 +15,7 @@ from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
 from robocal_ros.ground.codes import Code
 from robocal_ros.hand_eye.mount_fit import OPEN_M, open_directions
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
 from robocal_ros.hand_eye.naming import joined
 from robocal_ros.hand_eye.quality import expected_error_m, expected_errors_m
 from robocal_ros.hand_eye.result import at_origin
@@ -65,10 +65,10 @@ class PlannedTarget(Protocol):
     def place(self, T_base_sensor: Array) -> Array:
         """Where it is expected, from sensor poses (m, 4, 4) that look at it."""
 
-    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
         """Sightings to expect from flange poses (m, 4, 4); those with their pose's index."""
 
-    def unseen(self, view: View) -> dict[int, str]:
+    def unseen(self, view: TargetView) -> dict[int, str]:
         """Poses from which it is out of view, and why."""
 
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
@@ -158,7 +158,7 @@ class _Shown:
         return np.sqrt(np.diag(at_origin(self.covariance[:6, :6], sensor.pivot)))
 
 
-def _shown(view: View, state: MountState, noise: PoseNoise, sensor: SensorRange) -> _Shown:
+def _shown(view: TargetView, state: MountState, noise: PoseNoise, sensor: SensorRange) -> _Shown:
     k = 6 + len(view.model.names)
     if not view.sightings.names:
         return _Shown(0, np.zeros((k, k)), None, ["no pose sees the target"])

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ConflictError, InputError, LimitError, RobocalError
-from robocal_ros.ground.proposals import State
+from robocal_ros.ground.proposals import CalibrationState
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import DataSet
@@ -28,7 +28,10 @@ Array = NDArray[np.float64]
 ROBOT_SIGMA_M = 5e-5  # of a reported pose in each axis, where it is not given
 MOST_POSES = 200
 FEWEST_SEEN = 3  # samples that tell on which side of the laser plane a sphere lies
-TO_GO_BY = (State.PENDING, State.STALE)  # what was refused or taken back tells nothing
+TO_GO_BY = (
+    CalibrationState.PENDING,
+    CalibrationState.STALE,
+)  # what was refused or taken back tells nothing
 
 
 # ---- what a request holds -----------------------------------------------------------------------
@@ -239,7 +242,7 @@ def judged_plan(
 def _planned(
     data: DataSet, marks: Sequence[str], sensor: "SensorRange", centre: Array | None
 ) -> "PlannedTarget":
-    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
 
     target = target_of(data.target)
     if isinstance(target, SphereTarget):
@@ -248,7 +251,7 @@ def _planned(
         x, y, z = centre.tolist()
         return PlannedSphere(target.radius_m, sensor, (x, y, z))
     if isinstance(target, StepTarget):
-        return PlannedStep(target, sensor, tuple(marks) or None)
+        return PlannedStairs(target, sensor, tuple(marks) or None)
     if isinstance(target, LineTarget):
         return PlannedLine(sensor, np.stack([target.point_base, target.direction_base]))
     if data.kind == "line":

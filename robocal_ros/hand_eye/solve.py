@@ -11,7 +11,7 @@ from robocal_ros.hand_eye.diagnosis import features, looked
 from robocal_ros.hand_eye.leave_one_out import leave_one_out, solved_again
 from robocal_ros.hand_eye.mistakes import swapped
 from robocal_ros.hand_eye.mount_fit import MountFit, distances, fit_mount, require_seen
-from robocal_ros.hand_eye.mount_problem import View, pivot_of
+from robocal_ros.hand_eye.mount_problem import TargetView, pivot_of
 from robocal_ros.hand_eye.profile import Profile
 from robocal_ros.hand_eye.quality import (
     HandEyeSettings,
@@ -82,7 +82,7 @@ def solve_task(
     return result_of([task], fit, [read], data, settings)
 
 
-def _swapped(view: View, fit: MountFit, place: Array, shots: Sequence[str]) -> dict[str, str]:
+def _swapped(view: TargetView, fit: MountFit, place: Array, shots: Sequence[str]) -> dict[str, str]:
     names = np.array([name in fit.rejected for name in view.sightings.names])
     return swapped(fit, view.take(names), place, shots) if np.sum(names) > 1 else {}
 
@@ -135,7 +135,7 @@ def field_of(data: HandEyeData) -> Array:
     return field_points([p.points for p in data.profiles if isinstance(p, Profile)])
 
 
-def _shots(views: tuple[View, ...]) -> int:
+def _shots(views: tuple[TargetView, ...]) -> int:
     return len(np.unique(np.concatenate([view.sightings.shot for view in views])))
 
 

@@ -15,7 +15,7 @@ from robocal_ros.ground.frame_texts import transform_document
 from robocal_ros.hand_eye.corner_matching import Match, along, nearest
 from robocal_ros.hand_eye.edge_start import closed_corners, robust_corners
 from robocal_ros.hand_eye.mount_fit import MountFit, first_look, misfit
-from robocal_ros.hand_eye.mount_problem import MountState, View
+from robocal_ros.hand_eye.mount_problem import MountState, TargetView
 from robocal_ros.hand_eye.profile import Profile
 from robocal_ros.hand_eye.sightings import Sightings, same_pose
 from robocal_ros.hand_eye.target_models import CornerModel
@@ -60,25 +60,25 @@ class StepTask:
             near = turned if misfit((other,), turned) < TURNED * miss else near
         return near.T_flange_sensor
 
-    def _look(self, view: View) -> MountState:
+    def _look(self, view: TargetView) -> MountState:
         """Where the closed form leads: alone it may be far off where corners are nearly in line."""
         return first_look((view,), self.starts(view)[0])
 
-    def posed(self, view: View, data: HandEyeData) -> View:
+    def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Which corner is which depends on the poses."""
         return self.read(data).view
 
-    def starts(self, view: View) -> list[MountState]:
+    def starts(self, view: TargetView) -> list[MountState]:
         """The closed form of the corners that agree."""
         X = robust_corners(view.sightings.value, _in_flange(view))
         return [MountState(X, (self.target.T_base_user,))]
 
-    def classic(self, view: View, near: MountState) -> MountState:
+    def classic(self, view: TargetView, near: MountState) -> MountState:
         """The closed form of all corners."""
         X = closed_corners(view.sightings.value, _in_flange(view))
         return MountState(X, (self.target.T_base_user,))
 
-    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+    def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """The taught user frame."""
         return self.target.T_base_user
 
@@ -166,7 +166,7 @@ class _Reader:
                 self.rejected[name] = "shows no corner where the target's must be"
         return matches
 
-    def view(self, matches: Mapping[str, Match]) -> View:
+    def view(self, matches: Mapping[str, Match]) -> TargetView:
         """The matched corners as sightings."""
         names, shots, values, covariances, corners = [], [], [], [], []
         for name, match in matches.items():
@@ -188,7 +188,7 @@ class _Reader:
             np.array(values).reshape(-1, 3),
             np.array(covariances).reshape(-1, 3, 3),
         )
-        return View(self._task.model(np.array(corners).reshape(-1, 3)), sightings)
+        return TargetView(self._task.model(np.array(corners).reshape(-1, 3)), sightings)
 
 
 def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
@@ -204,7 +204,7 @@ def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
         raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
 
 
-def _in_flange(view: View) -> Array:
+def _in_flange(view: TargetView) -> Array:
     """Marks (m, 3) of a view in the flange frame of their pose."""
     if not isinstance(view.model, CornerModel):
         raise ValueError("a view of corners is needed")

@@ -21,7 +21,7 @@ from robocal_ros.kinematics.flange_units import flange_unit_fault
 from robocal_ros.kinematics.table_columns import (
     POSITION,
     QUATERNION,
-    Layout,
+    TableLayout,
     check_plain,
     read_pose_columns,
 )
@@ -110,7 +110,7 @@ def read_pose_table(
     InputError
         With file, row and column, when the table is not as its contract says.
     """
-    found: list[Layout] = []
+    found: list[TableLayout] = []
     words = ("sample", "stamp_s", "mark", *((file_column,) if file_column else FILE_COLUMNS))
 
     def check(header: list[str], file: str) -> None:
@@ -155,7 +155,7 @@ def _files(table: Cells, column: str) -> tuple[str, ...]:
     return files
 
 
-def _poses(table: Cells, layout: Layout, arm: SerialArm | None, q: Array | None) -> Array:
+def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | None) -> Array:
     if layout.orientation is None:
         if arm is None or q is None:
             raise ValueError("a layout without poses has joints")

@@ -12,7 +12,7 @@ from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.ground.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.hand_eye.edge_start import least_distances, line_starts
 from robocal_ros.hand_eye.mount_fit import MountFit
-from robocal_ros.hand_eye.mount_problem import MountState, View
+from robocal_ros.hand_eye.mount_problem import MountState, TargetView
 from robocal_ros.hand_eye.profile import Profile
 from robocal_ros.hand_eye.result import TargetKind
 from robocal_ros.hand_eye.sightings import Sightings, TargetModel, same_pose
@@ -58,7 +58,7 @@ class Read:
     points : profile points (n, 2) that each feature rests on, where they are on the target.
     """
 
-    view: View
+    view: TargetView
     rejected: Mapping[str, str]
     points: Mapping[str, Array] = field(default_factory=dict)
 
@@ -84,16 +84,16 @@ class Task(Protocol):
         Where the sensor is known to sit, one will do.
         """
 
-    def posed(self, view: View, data: HandEyeData) -> View:
+    def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """The same features from other poses, those of ``data``."""
 
-    def starts(self, view: View) -> list[MountState]:
+    def starts(self, view: TargetView) -> list[MountState]:
         """First states, best first."""
 
-    def classic(self, view: View, near: MountState) -> MountState:
+    def classic(self, view: TargetView, near: MountState) -> MountState:
         """The classic estimate; ``near`` is a state near the solution."""
 
-    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+    def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """Where the target is, roughly, if the sensor sits there."""
 
     def found(self, place: Array) -> Document:
@@ -152,22 +152,22 @@ class SphereTask:
         if unit is not None and not found:
             raise unit  # no profile's fault: the radius is in another unit
         usable(found, rejected, fewest, "the sphere")
-        view = View(SphereModel(self.target.radius_m), _gathered(data, found))
+        view = TargetView(SphereModel(self.target.radius_m), _gathered(data, found))
         return Read(view, rejected, points)
 
-    def posed(self, view: View, data: HandEyeData) -> View:
+    def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Circles depend neither on poses nor on the radius."""
         return with_poses(view, SphereModel(self.target.radius_m), data.T_base_flange)
 
-    def starts(self, view: View) -> list[MountState]:
+    def starts(self, view: TargetView) -> list[MountState]:
         """All sides of the laser plane are tried."""
         return sphere_starts(view.sightings, self.target.radius_m)
 
-    def classic(self, view: View, near: MountState) -> MountState:
+    def classic(self, view: TargetView, near: MountState) -> MountState:
         """Linear differences."""
         return classic_sphere(view.sightings, self.target.radius_m, near)
 
-    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+    def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """The centre on which the profiles agree best, each on either side."""
         return agreed_centre(view.sightings, self.target.radius_m, T_flange_sensor)
 
@@ -223,24 +223,26 @@ class LineTask:
             found[name] = i, np.array([*edge.point, 0.0]), covariance
         fewest = self.fewest if T_flange_sensor is None else 1
         usable(found, rejected, fewest, "the line")
-        return Read(View(LineModel(self.target is not None), _gathered(data, found)), rejected)
+        return Read(
+            TargetView(LineModel(self.target is not None), _gathered(data, found)), rejected
+        )
 
-    def posed(self, view: View, data: HandEyeData) -> View:
+    def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Points do not depend on poses."""
         return with_poses(view, view.model, data.T_base_flange)
 
-    def starts(self, view: View) -> list[MountState]:
+    def starts(self, view: TargetView) -> list[MountState]:
         """Rotations, and directions of an unknown line, are tried."""
         line = None
         if self.target is not None:
             line = np.stack([self.target.point_base, self.target.direction_base])
         return line_starts(view.sightings, line)
 
-    def classic(self, view: View, near: MountState) -> MountState:
+    def classic(self, view: TargetView, near: MountState) -> MountState:
         """Least squares of the distances from the line, all alike."""
         return least_distances(view, near)
 
-    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+    def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """The known line, or the one along the points."""
         if self.target is not None:
             return np.stack([self.target.point_base, self.target.direction_base])
@@ -278,11 +280,11 @@ def seen(profile: Profile | RobocalError) -> Array:
     return profile.points
 
 
-def with_poses(view: View, model: TargetModel, T_base_flange: Array) -> View:
+def with_poses(view: TargetView, model: TargetModel, T_base_flange: Array) -> TargetView:
     """A view of a target from other poses (m, 4, 4)."""
     s = view.sightings
     pose = same_pose(T_base_flange)[s.shot]
-    return View(model, replace(s, pose=pose, T_base_flange=T_base_flange[s.shot]))
+    return TargetView(model, replace(s, pose=pose, T_base_flange=T_base_flange[s.shot]))
 
 
 def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:

@@ -29,7 +29,7 @@ from robocal_ros.hand_eye.tracker_quality import (
     verdict_of,
 )
 from robocal_ros.hand_eye.tracker_skew import AxisPair
-from robocal_ros.hand_eye.tracker_state import SENSOR, TrackerState
+from robocal_ros.hand_eye.tracker_state import SENSOR, TrackerUnknowns
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def _best(
     target: TrackerTarget,
     classic: Classic,
     problem: TrackerProblem,
-    estimate: Estimate[TrackerState],
+    estimate: Estimate[TrackerUnknowns],
     limit_m: float,
 ) -> HandEyeResult:
     covariance = estimate.covariance[SENSOR, SENSOR]
@@ -128,7 +128,7 @@ def _left_out(
     data: TrackerData,
     target: TrackerTarget,
     classic: Classic,
-    states: Sequence[TrackerState | None],
+    states: Sequence[TrackerUnknowns | None],
 ) -> Array | None:
     """Rms distance (n,), m, of each profile's points from the target as found without it.
 
@@ -141,9 +141,9 @@ def _left_out(
     return distance_m[seen]
 
 
-def _state(classic: Classic) -> TrackerState:
+def _state(classic: Classic) -> TrackerUnknowns:
     cube = classic.tracked
-    return TrackerState(
+    return TrackerUnknowns(
         classic.T_tracker_flange, classic.T_flange_sensor, classic.reflector,
         cube.centre, cube.normals, cube.offsets, np.zeros(2),
     )  # fmt: skip
@@ -151,7 +151,7 @@ def _state(classic: Classic) -> TrackerState:
 
 def solve_best(
     data: TrackerData, target: TrackerTarget, noise: TrackerNoise, classic: Classic
-) -> tuple[TrackerProblem, Estimate[TrackerState]]:
+) -> tuple[TrackerProblem, Estimate[TrackerUnknowns]]:
     """All measurements at once, from the closed form on; the noise of the profiles is theirs.
 
     Raises
@@ -185,7 +185,7 @@ def _with_noise(lines: Lines, noise_m: float) -> Lines:
     return replace(lines, z_sigma=lines.z_sigma * noise_m, slope_sigma=lines.slope_sigma * noise_m)
 
 
-def _rejected(problem: TrackerProblem, estimate: Estimate[TrackerState]) -> dict[str, str]:
+def _rejected(problem: TrackerProblem, estimate: Estimate[TrackerUnknowns]) -> dict[str, str]:
     worst: dict[str, float] = {}
     for index in np.flatnonzero(estimate.rejected):
         name = problem.rows[index]
@@ -199,7 +199,7 @@ def _result(
     data: TrackerData,
     target: TrackerTarget,
     classic: Classic,
-    state: TrackerState,
+    state: TrackerUnknowns,
     method: Method,
 ) -> HandEyeResult:
     """What both methods tell, not judged yet."""

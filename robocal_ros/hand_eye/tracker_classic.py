@@ -86,7 +86,7 @@ def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise)
     T_tracker_flange = flange_pose(data, axes, target)
     tracked = tracked_cube(data.faces, data.sphere, target.reflector_radius_m, noise.tracker_m)
     scan = Scan.of(data.profiles, data.motion)
-    search = _Search(tracked, T_tracker_flange, target)
+    search = _CubeSearch(tracked, T_tracker_flange, target)
     match = search.best(scan.thinned(THINNED))
     X = match.T_flange_sensor
     parts = parts_of(scan, X, match.seen, target.sphere_radius_m)
@@ -105,7 +105,7 @@ def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise)
 
 def each_without(classic: Classic, target: TrackerTarget, profiles: int) -> list[Array | None]:
     """T_flange_sensor without each of the profiles, solved again; None where that fails."""
-    search = _Search(classic.tracked, classic.T_tracker_flange, target)
+    search = _CubeSearch(classic.tracked, classic.T_tracker_flange, target)
     found: list[Array | None] = []
     for profile in range(profiles):
         first, second, ball = (part.part(part.profile != profile) for part in classic.parts)
@@ -118,7 +118,7 @@ def each_without(classic: Classic, target: TrackerTarget, profiles: int) -> list
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _CubeSearch:
     tracked: Cube
     T_tracker_flange: Array
     target: TrackerTarget

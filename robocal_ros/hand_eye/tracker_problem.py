@@ -33,7 +33,7 @@ from robocal_ros.hand_eye.tracker_state import (
     REFLECTOR,
     SENSOR,
     UNKNOWNS,
-    TrackerState,
+    TrackerUnknowns,
     adjoint,
 )
 
@@ -55,7 +55,7 @@ class TrackerProblem:
     data: TrackerData
     target: TrackerTarget
     noise: TrackerNoise
-    start: TrackerState
+    start: TrackerUnknowns
     axes: AxisPair
     lines: Sequence[Lines]
     caps: Caps
@@ -70,11 +70,11 @@ class TrackerProblem:
         """The noise is known."""
         return 1
 
-    def retract(self, state: TrackerState, step: Array) -> TrackerState:
+    def retract(self, state: TrackerUnknowns, step: Array) -> TrackerUnknowns:
         """Move the state."""
         return state.moved(step)
 
-    def deviation(self, state: TrackerState) -> Array:
+    def deviation(self, state: TrackerUnknowns) -> Array:
         """No prior."""
         return np.zeros(UNKNOWNS)
 
@@ -92,7 +92,7 @@ class TrackerProblem:
         profiles, _ = np.nonzero(self._seen)
         return tuple(found + [self.data.profiles[i].name for i in profiles.tolist()])
 
-    def linearise(self, state: TrackerState) -> tuple[Array, Array]:
+    def linearise(self, state: TrackerUnknowns) -> tuple[Array, Array]:
         """Whitened rows (r, 1), and their Jacobian (r, 1, 26)."""
         parts = [self._arc(state, i) for i in (0, 1)]
         parts += [self._sphere(state), *(self._face(state, i) for i in (0, 1))]
@@ -107,7 +107,7 @@ class TrackerProblem:
             np.concatenate([J for _, J in parts])[:, None],
         )
 
-    def _arc(self, state: TrackerState, which: int) -> tuple[Array, Array]:
+    def _arc(self, state: TrackerUnknowns, which: int) -> tuple[Array, Array]:
         arc, white = self.data.arcs[which], self._arc_whitening[which]
         share = self.axes.share_of(arc.q)
         T = self.axes.carried(self._motions[which], state.mismatch, share)
@@ -123,13 +123,13 @@ class TrackerProblem:
         rows = white @ np.concatenate([residual[..., None], J], axis=2)
         return rows[..., 0].ravel(), rows[..., 1:].reshape(-1, UNKNOWNS)
 
-    def _sphere(self, state: TrackerState) -> tuple[Array, Array]:
+    def _sphere(self, state: TrackerUnknowns) -> tuple[Array, Array]:
         sigma = self.noise.tracker_m
         J = np.zeros((len(self.data.sphere), 3, UNKNOWNS))
         J[..., CENTRE] = np.eye(3) / sigma
         return ((state.centre - self.data.sphere) / sigma).ravel(), J.reshape(-1, UNKNOWNS)
 
-    def _face(self, state: TrackerState, face: int) -> tuple[Array, Array]:
+    def _face(self, state: TrackerUnknowns, face: int) -> tuple[Array, Array]:
         points, normal, sigma = self.data.faces[face], state.normals[face], self.noise.tracker_m
         J = np.zeros((len(points), UNKNOWNS))
         J[:, NORMALS[face]] = points @ tangents(normal) / sigma
@@ -137,19 +137,19 @@ class TrackerProblem:
         off = points @ normal - state.offsets[face] - self.target.reflector_radius_m
         return off / sigma, J
 
-    def _mismatch(self, state: TrackerState) -> tuple[Array, Array]:
+    def _mismatch(self, state: TrackerUnknowns) -> tuple[Array, Array]:
         J = np.zeros((2, UNKNOWNS))
         J[:, MISMATCH] = np.diag(1.0 / self.axes.sigma)
         return state.mismatch / self.axes.sigma, J
 
-    def _height(self, state: TrackerState) -> tuple[Array, Array]:
+    def _height(self, state: TrackerUnknowns) -> tuple[Array, Array]:
         axis = self.axes.height_axis
         sigma, height_m = self.target.height_sigma_m, self.target.height_m or 0.0
         J = np.zeros((1, UNKNOWNS))
         J[0, REFLECTOR] = axis / sigma
         return np.array([(axis @ state.reflector - height_m) / sigma]), J
 
-    def _profiles(self, state: TrackerState) -> tuple[Array, Array, Array]:
+    def _profiles(self, state: TrackerUnknowns) -> tuple[Array, Array, Array]:
         """Rows (m, 7) of the profiles, their Jacobian (m, 7, 26), and by the sensor's twist."""
         share = self.axes.share_of(self.data.q)
         motion = self.axes.carried(self.data.motion, state.mismatch, share)
@@ -163,7 +163,7 @@ class TrackerProblem:
         J[..., MISMATCH] = J[..., FLANGE] @ self.axes.twists(motion, share)
         return residual, J, twist
 
-    def _line(self, state: TrackerState, P: Array, face: int) -> tuple[Array, Array, Array]:
+    def _line(self, state: TrackerUnknowns, P: Array, face: int) -> tuple[Array, Array, Array]:
         lines, m = self.lines[face], len(P)
         R, t = P[:, :3, :3], P[:, :3, 3]
         n = state.normals[face] @ R
@@ -183,7 +183,7 @@ class TrackerProblem:
         J[..., OFFSETS.start + face] = by_d[..., 0]
         return residual, twist / sigma[..., None], J / sigma[..., None]
 
-    def _cap(self, state: TrackerState, P: Array) -> tuple[Array, Array, Array]:
+    def _cap(self, state: TrackerUnknowns, P: Array) -> tuple[Array, Array, Array]:
         root = self.caps.root
         s = sphere_in(P, state.centre)
         shift = np.einsum("mij,mj->mi", root, s - self.caps.place)

@@ -11,7 +11,7 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.hand_eye.tracker_data import FACES, TrackerData, TrackerTarget
 from robocal_ros.hand_eye.tracker_problem import TrackerProblem
 from robocal_ros.hand_eye.tracker_scan import Scan
-from robocal_ros.hand_eye.tracker_state import TrackerState
+from robocal_ros.hand_eye.tracker_state import TrackerUnknowns
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ def profile_distances(
     data: TrackerData,
     target: TrackerTarget,
     parts: Sequence[Scan],
-    states: Sequence[TrackerState],
+    states: Sequence[TrackerUnknowns],
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Rms distance (m,), m, of each profile's points from the target, and which show it.
 
@@ -48,8 +48,8 @@ def profile_distances(
 
 
 def states_without(
-    problem: TrackerProblem, estimate: Estimate[TrackerState], names: Sequence[str]
-) -> list[TrackerState | None]:
+    problem: TrackerProblem, estimate: Estimate[TrackerUnknowns], names: Sequence[str]
+) -> list[TrackerUnknowns | None]:
     """The solution without each of these profiles, to first order; None where it is none.
 
     Without the rows i the estimate moves by M J_i^T (I - J_i M J_i^T)^-1 r_i, M the inverse
@@ -58,7 +58,7 @@ def states_without(
     J = problem.linearise(estimate.state)[1][:, 0]
     M = estimate.covariance / estimate.scale**2
     rows = np.array(problem.rows)
-    found: list[TrackerState | None] = []
+    found: list[TrackerUnknowns | None] = []
     for name in names:
         own = (rows == name) & ~estimate.rejected
         rest = np.eye(int(own.sum())) - J[own] @ M @ J[own].T
@@ -70,13 +70,13 @@ def states_without(
     return found
 
 
-def misfit(estimate: Estimate[TrackerState]) -> float:
+def misfit(estimate: Estimate[TrackerUnknowns]) -> float:
     """Root mean square of the whitened residuals in use, unknowns counted: about 1."""
     used = estimate.residual[~estimate.rejected]
     return float(np.sqrt(np.sum(used**2) / max(used.size - len(estimate.names), 1)))
 
 
-def verdict_of(estimate: Estimate[TrackerState], working_m: float, limit_m: float) -> Verdict:
+def verdict_of(estimate: Estimate[TrackerUnknowns], working_m: float, limit_m: float) -> Verdict:
     """Whether a solution may be used; ``working_m``: error to expect at the working distance."""
     over = misfit(estimate)
     what = (

@@ -32,7 +32,7 @@ NAMES = tuple(
 
 
 @dataclass(frozen=True, eq=False)
-class TrackerState:
+class TrackerUnknowns:
     """All unknowns, SI.
 
     Attributes
@@ -51,13 +51,13 @@ class TrackerState:
     offsets: Array
     mismatch: Array
 
-    def moved(self, step: Array) -> "TrackerState":
+    def moved(self, step: Array) -> "TrackerUnknowns":
         """The state after an increment (26,)."""
         tilts = np.array(
             [tangents(n) @ step[part] for n, part in zip(self.normals, NORMALS, strict=True)]
         )
         normals = self.normals + tilts
-        return TrackerState(
+        return TrackerUnknowns(
             T_tracker_flange=moved(self.T_tracker_flange, step[FLANGE]),
             T_flange_sensor=moved(self.T_flange_sensor, step[SENSOR]),
             reflector=self.reflector + step[REFLECTOR],

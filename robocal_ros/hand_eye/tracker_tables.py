@@ -18,7 +18,7 @@ from robocal_ros.hand_eye.tracker_data import FACES, Arc, TrackerData, TrackerTa
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.made_files import read_fields
 from robocal_ros.kinematics.robot_fields import Fields
-from robocal_ros.kinematics.table_columns import POSITION, Layout, read_layout
+from robocal_ros.kinematics.table_columns import POSITION, TableLayout, read_layout
 from robocal_ros.kinematics.tables import joint_texts
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def read_tracker_points(path: Path, arm: SerialArm) -> TrackerPoints:
     InputError
         With file, row and column, when the table is not as docs/hand_eye_tracker.md says.
     """
-    found: list[Layout] = []
+    found: list[TableLayout] = []
     table = read_cells(path, lambda header, file: found.append(_layout(header, arm, file)))
     layout = found[0]
     roles = np.array(table.words("role"))
@@ -67,7 +67,7 @@ def read_tracker_points(path: Path, arm: SerialArm) -> TrackerPoints:
     return TrackerPoints((first, second), points[roles == SPHERE], faces)
 
 
-def _layout(header: list[str], arm: SerialArm, file: str) -> Layout:
+def _layout(header: list[str], arm: SerialArm, file: str) -> TableLayout:
     names = [name.strip() for name in header]
     if names.count("role") != 1:
         raise InputError(
@@ -82,7 +82,7 @@ def _layout(header: list[str], arm: SerialArm, file: str) -> Layout:
     return layout
 
 
-def _joints(table: Cells, layout: Layout, on_arc: NDArray[np.bool_]) -> Array:
+def _joints(table: Cells, layout: TableLayout, on_arc: NDArray[np.bool_]) -> Array:
     q = np.column_stack([table.numbers(name, gaps=True) for name in layout.joints])
     for joint, name in enumerate(layout.joints):
         empty = np.flatnonzero(on_arc & np.isnan(q[:, joint]))

@@ -16,7 +16,7 @@ from robocal_ros.hand_eye.mount_problem import (
     MountProblem,
     MountState,
     PoseNoise,
-    View,
+    TargetView,
 )
 from robocal_ros.hand_eye.quality import HandEyeSettings, judge_residuals
 from robocal_ros.hand_eye.restricted_noise import FIRST_NOISE
@@ -135,8 +135,8 @@ def _verdict(far: Array, lost: int, settings: HandEyeSettings) -> Verdict:
 
 
 def fit_place(
-    view: View, start: MountState, noise: PoseNoise, rejected: dict[str, str]
-) -> tuple[View, MountState]:
+    view: TargetView, start: MountState, noise: PoseNoise, rejected: dict[str, str]
+) -> tuple[TargetView, MountState]:
     """The target's most likely place with the sensor held; outliers are named in ``rejected``.
 
     Raises

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import ConflictError, RobocalError, StaleError
-from robocal_ros.ground.proposals import Action, Candidate, Decision, State, require_measured_with
+from robocal_ros.ground.proposals import (
+    Action,
+    CalibrationState,
+    Candidate,
+    Decision,
+    require_measured_with,
+)
 from robocal_ros.history.history_schema import DamagedError
 
 NOMINAL = 0
@@ -30,7 +36,7 @@ class _Standing:
     revision: int = 0  # as which it was accepted
     parent: int | None = None  # what was in force before it; None = nominal
     rejected: bool = False
-    left: State | None = None  # how it went out of force
+    left: CalibrationState | None = None  # how it went out of force
     decisions: tuple[Decision, ...] = ()
 
 
@@ -54,19 +60,21 @@ class Ledger:
         """Tell what the log says of a calibration; the default when it says nothing."""
         return self._standings.get(calibration_id, _Standing())
 
-    def state(self, calibration_id: int, candidate: Candidate) -> State:
+    def state(self, calibration_id: int, candidate: Candidate) -> CalibrationState:
         """Where a calibration stands."""
         standing = self.standing(calibration_id)
         revision, in_force = self.head(candidate.kind)
         if calibration_id == in_force:
-            return State.IN_FORCE
+            return CalibrationState.IN_FORCE
         if standing.left is not None:
             return standing.left
         if standing.rejected:
-            return State.REJECTED
+            return CalibrationState.REJECTED
         if candidate.code is not Code.ACCEPT:
-            return State.REFUSED
-        return State.PENDING if candidate.based_on == revision else State.STALE
+            return CalibrationState.REFUSED
+        return (
+            CalibrationState.PENDING if candidate.based_on == revision else CalibrationState.STALE
+        )
 
     def extend(self, decisions: Iterable[Decision]) -> None:
         """Add the decisions that follow. Raises `DamagedError`, see `apply`."""
@@ -97,7 +105,7 @@ class Ledger:
             if in_force is not None:
                 out = self._standings[in_force]
                 accepted = decision.action is Action.ACCEPT
-                out.left = State.SUPERSEDED if accepted else State.ROLLED_BACK
+                out.left = CalibrationState.SUPERSEDED if accepted else CalibrationState.ROLLED_BACK
                 out.decisions += (decision,)
             self._heads[decision.kind] = (decision.head_after, decision.calibration_id)
         self.last_seq = decision.seq

@@ -50,7 +50,7 @@ class CellModel:
 
 
 @dataclass(frozen=True)
-class Layout:
+class UnknownLayout:
     """Which increments are unknown, and their columns.
 
     Order: the model parameters ``slots`` (n, 5), six of the base from ``base`` (translation of
@@ -122,7 +122,7 @@ def make_layout(
     base: bool,
     tool: bool,
     orientation: bool,
-) -> Layout:
+) -> UnknownLayout:
     """Lay out the unknowns: the model parameters of these names, the base, the targets."""
     chosen = arm.parameters.subset(geometry)
     size = 6 if orientation else 3
@@ -131,7 +131,7 @@ def make_layout(
     if tool:
         names += tuple(f"{target}_{axis}" for target in targets for axis in _AXES[:size])
     columns = np.arange(len(targets), dtype=np.int64) * size + first_tool
-    return Layout(
+    return UnknownLayout(
         names=names,
         slots=chosen.slots(arm.n),
         base=len(chosen) if base else -1,
@@ -151,7 +151,7 @@ class CellProblem:
     prior_mdh : (n, 5) mean of the model parameters' prior.
     """
 
-    layout: Layout
+    layout: UnknownLayout
     data: Measurements
     targets: tuple[str, ...]
     sigma: Array

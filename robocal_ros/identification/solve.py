@@ -12,7 +12,7 @@ from robocal_ros.estimation.freedom import require_told
 from robocal_ros.estimation.observability import describe, observability
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification.cell import CellModel, CellProblem, Layout, make_layout
+from robocal_ros.identification.cell import CellModel, CellProblem, UnknownLayout, make_layout
 from robocal_ros.identification.priors import default_prior, fitted_prior
 from robocal_ros.identification.start import linear_start
 from robocal_ros.kinematics import SerialArm
@@ -45,7 +45,7 @@ class Identification:
 
     nominal: SerialArm
     cell: CellModel
-    layout: Layout
+    layout: UnknownLayout
     method: Method
     estimate: estimation.Estimate[CellModel]
     held: tuple[str, ...]
@@ -143,7 +143,7 @@ def identify(
     names = arm.parameters.names if "geometry" in parts else ()
     orientation = data.rotation is not None
 
-    def layout_of(geometry: tuple[str, ...]) -> Layout:
+    def layout_of(geometry: tuple[str, ...]) -> UnknownLayout:
         return make_layout(
             arm, initial.targets, geometry=geometry, base=base, tool=tool, orientation=orientation
         )
@@ -172,7 +172,7 @@ def identify(
 def _solve(
     arm: SerialArm,
     data: Measurements,
-    layout: Layout,
+    layout: UnknownLayout,
     initial: CellModel,
     prior_covariance: Array | None,
     robust: bool,
@@ -238,7 +238,9 @@ def _learned_prior(arm: SerialArm, estimate: estimation.Estimate[CellModel]) -> 
     return np.diag(fitted_prior(arm, found, estimate.covariance[:count, :count]))
 
 
-def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> tuple[str, ...]:
+def _redundant(
+    layout: UnknownLayout, cell: CellModel, arm: SerialArm, count: int
+) -> tuple[str, ...]:
     """Model parameters whose effect base, targets or earlier parameters have at every posture."""
     q = random_postures(arm)
     target = np.repeat(np.arange(len(cell.targets)), len(q))
@@ -268,8 +270,8 @@ def _report(
     arm: SerialArm,
     data: Measurements,
     estimate: estimation.Estimate[CellModel],
-    layout: Layout,
-    complete: Layout,
+    layout: UnknownLayout,
+    complete: UnknownLayout,
     method: Method,
     held: tuple[str, ...],
     lever: float,

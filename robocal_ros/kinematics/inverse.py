@@ -25,7 +25,7 @@ _WHAT_TO_DO = "Move the station, or begin in another posture"
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class JointDerivatives:
     """Joints (m, n), rad (prismatic: m), and their first two derivatives by time."""
 
     q: Array
@@ -53,7 +53,7 @@ def follow(
     twist_rate: Array,
     q_near: ArrayLike,
     p_flange: ArrayLike = (0.0, 0.0, 0.0),
-) -> Followed:
+) -> JointDerivatives:
     """Joints that carry a point of the flange along a path.
 
     Parameters
@@ -79,7 +79,7 @@ def follow(
         raise LimitError("poses or joints are not finite: check where they come from")
     ends = np.stack([arm.T_base_root, np.eye(4)])
     ends[1, :3, 3] = p_flange
-    path = Followed(*(np.zeros((len(goals), arm.n)) for _ in range(3)))
+    path = JointDerivatives(*(np.zeros((len(goals), arm.n)) for _ in range(3)))
     reached, outcome = following.follow_batch(
         goals,
         np.array(twist, dtype=np.float64, order="C"),

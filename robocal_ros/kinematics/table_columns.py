@@ -36,7 +36,7 @@ _NO_ARM = "the table has joints but no flange poses: name the robot, whose model
 
 
 @dataclass(frozen=True)
-class Layout:
+class TableLayout:
     """Where each quantity stands in a row, and the factors to SI.
 
     ``joints`` and ``position`` hold column names; ``orientation`` is one of ``ORIENTATIONS`` or
@@ -70,7 +70,7 @@ def known_columns(arm: SerialArm) -> tuple[str, ...]:
     return (*joints, *positions, *orientations, *NUMBERS, *WORDS)
 
 
-def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> Layout:
+def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> TableLayout:
     """Understand a header.
 
     Raises
@@ -84,7 +84,7 @@ def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> Layout:
     place = {name: i for i, name in enumerate(names)}
     joints, factors = _joint_columns(place, arm, file)
     position, factor = _position_columns(place, file)
-    return Layout(place, joints, factors, position, factor, orientation_columns(place, file))
+    return TableLayout(place, joints, factors, position, factor, orientation_columns(place, file))
 
 
 def read_joint_columns(
@@ -108,7 +108,7 @@ def read_joint_columns(
 
 def read_pose_columns(
     header: Sequence[str], arm: SerialArm | None, file: str, words: Sequence[str]
-) -> Layout:
+) -> TableLayout:
     """Understand a header of flange poses, of joint readings, or of both, and ``words``.
 
     Without ``arm`` columns of joints are known by their form alone, and are left out of the layout.
@@ -137,12 +137,12 @@ def read_pose_columns(
     if orientation is None and not any(n in place for group in POSITION.values() for n in group):
         if not columns:
             _fail(_NO_ARM if joints else _NO_POSE, file)
-        return Layout(place, columns, factors, (), 1.0, None)
+        return TableLayout(place, columns, factors, (), 1.0, None)
     position, factor = _position_columns(place, file)
     if orientation is None:
         ways = "; or ".join(", ".join(group) for group in ORIENTATIONS)
         _fail(f"the flange's orientation is missing: add {ways}", file)
-    return Layout(place, columns, factors, position, factor, orientation)
+    return TableLayout(place, columns, factors, position, factor, orientation)
 
 
 def check_plain(

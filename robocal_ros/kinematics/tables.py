@@ -16,7 +16,7 @@ from robocal_ros.kinematics.table_columns import (
     EULER,
     QUATERNION,
     ROTATION_VECTOR,
-    Layout,
+    TableLayout,
     read_layout,
 )
 
@@ -46,7 +46,7 @@ def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
     return measurements_of(*read_table(Path(path), arm), arm)
 
 
-def measurements_of(table: Cells, layout: Layout, arm: SerialArm) -> Measurements:
+def measurements_of(table: Cells, layout: TableLayout, arm: SerialArm) -> Measurements:
     """Measurements in a table that was read."""
     numbers = np.column_stack([table.numbers(name) for name in layout.numeric])
     n = arm.n
@@ -114,9 +114,9 @@ def joint_texts(q: Array, arm: SerialArm) -> dict[str, list[str]]:
     return columns
 
 
-def read_table(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
+def read_table(path: Path, arm: SerialArm) -> tuple[Cells, TableLayout]:
     """Cells of a table of measurements, and where its columns are."""
-    found: list[Layout] = []
+    found: list[TableLayout] = []
     table = read_cells(path, lambda header, file: found.append(read_layout(header, arm, file)))
     return table, found[0]
 

@@ -24,14 +24,14 @@ status          what is said
 from robocal_ros.maintenance.config import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.maintenance.memory import CycleResult
 from robocal_ros.maintenance.session import MaintenanceSession
-from robocal_ros.maintenance.status import State, Status
+from robocal_ros.maintenance.status import MaintenanceState, Status
 
 __all__ = [
     "AcceptBounds",
     "CycleResult",
     "MaintenanceConfig",
     "MaintenanceSession",
-    "State",
+    "MaintenanceState",
     "Status",
     "Times",
 ]

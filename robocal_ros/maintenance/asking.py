@@ -8,7 +8,7 @@ from itertools import count
 from typing import Any, TypeVar
 
 from robocal_ros.ground.errors import ConflictError
-from robocal_ros.maintenance.requests import Answer, Request
+from robocal_ros.maintenance.requests import DriverAnswer, DriverRequest
 
 R = TypeVar("R")
 Script = Generator[None, None, R]
@@ -32,32 +32,32 @@ class Asking:
 
     def __init__(self) -> None:
         self.now_s = 0.0
-        self.out: list[Request] = []
-        self._waiting: dict[int, Answer | None] = {}
+        self.out: list[DriverRequest] = []
+        self._waiting: dict[int, DriverAnswer | None] = {}
 
-    def handed_out(self) -> list[Request]:
+    def handed_out(self) -> list[DriverRequest]:
         """The requests that wait; they are somebody else's now."""
         found, self.out = self.out, []
         return found
 
-    def request(self, kind: Callable[..., Request], *given: Any) -> int:
+    def request(self, kind: Callable[..., DriverRequest], *given: Any) -> int:
         """Ask, without waiting; its number."""
         number = next(self._numbers)
         self.out.append(kind(number, *given))
         return number
 
-    def answered(self, number: int, answer: Answer) -> None:
+    def answered(self, number: int, answer: DriverAnswer) -> None:
         """An answer came; one that nobody waits for is none."""
         if number in self._waiting:
             self._waiting[number] = answer
 
-    def expect(self, kind: Callable[..., Request], *given: Any) -> int:
+    def expect(self, kind: Callable[..., DriverRequest], *given: Any) -> int:
         """Ask; `waited_for` gives the answer."""
         number = self.request(kind, *given)
         self._waiting[number] = None
         return number
 
-    def waited_for(self, number: int, within_s: float, what: str) -> Script[Answer]:
+    def waited_for(self, number: int, within_s: float, what: str) -> Script[DriverAnswer]:
         """Wait for an answer.
 
         Raises
@@ -74,7 +74,7 @@ class Asking:
         del self._waiting[number]
         return answer
 
-    def ask(self, within_s: float, what: str, kind: Any, *given: Any) -> Script[Answer]:
+    def ask(self, within_s: float, what: str, kind: Any, *given: Any) -> Script[DriverAnswer]:
         """Ask and wait, as `waited_for`."""
         return (yield from self.waited_for(self.expect(kind, *given), within_s, what))
 

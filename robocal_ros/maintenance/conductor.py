@@ -10,7 +10,7 @@ from robocal_ros.maintenance.asking import Script
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import Memory
 from robocal_ros.maintenance.mover import FaultError
-from robocal_ros.maintenance.run import Run
+from robocal_ros.maintenance.run import CycleRun
 
 ENDED, FAULT = "maintenance_ended", "fault"
 UNSAVED_S = 2.0  # a fault is written by then, whatever the robot may be doing
@@ -32,12 +32,12 @@ class Conductor:
 
     def __init__(self, hands: Hands, memory: Memory, tell: Tell) -> None:
         self._hands, self._memory, self._tell = hands, memory, tell
-        self.run: Run | None = None
+        self.run: CycleRun | None = None
         self.broken: tuple[Code, str] | None = None
         self._script: Script[None] | None = None
         self._unsaved, self._save_by_s = False, 0.0
 
-    def begin(self, run: Run) -> None:
+    def begin(self, run: CycleRun) -> None:
         """A run begins at the next tick; nothing moves before the tool's driver is disarmed."""
         self._hands.doubt()
         self.run, self._script, self.broken = run, self._whole(run), None
@@ -118,12 +118,12 @@ class Conductor:
         else:
             self._end(Code.CONFLICT, why)
 
-    def _whole(self, run: Run) -> Script[None]:
+    def _whole(self, run: CycleRun) -> Script[None]:
         if self._hands.tool.engaged:
             yield from self._hands.disarmed()
         yield from run.script()
 
-    def _script_ended(self, run: Run) -> None:
+    def _script_ended(self, run: CycleRun) -> None:
         robot = self._hands.robot
         if away := robot.beside_home():
             code = Code.TOO_FEW_SAMPLES if robot.unheard else Code.LIMIT_EXCEEDED
@@ -155,7 +155,7 @@ class Conductor:
         self._note(run, code, message)
         self._save()
 
-    def _note(self, run: Run | None, code: Code, message: str, fault: str = "") -> None:
+    def _note(self, run: CycleRun | None, code: Code, message: str, fault: str = "") -> None:
         if run is None:
             self._memory.set_fault(code, fault)
             return

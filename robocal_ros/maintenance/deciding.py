@@ -12,10 +12,10 @@ from robocal_ros.ground.proposals import (
     THERMAL,
     TOOL,
     Action,
+    CalibrationState,
     Decision,
     Entry,
     Head,
-    State,
     require_measured_with,
 )
 from robocal_ros.kinematics import SerialArm
@@ -36,9 +36,9 @@ MOST_AT_ONCE = 2  # of a kind: each takes up to 20 ms, in which nobody watches t
 LOOKED_AT = 200  # newest decisions that a call without an id may mean
 REPEAT_NS = 60 * 1_000_000_000  # a call without an id is repeated within
 DONE = {  # what a repeated decision finds
-    ACCEPT: State.IN_FORCE,
-    REJECT: State.REJECTED,
-    ROLLBACK: State.IN_FORCE,
+    ACCEPT: CalibrationState.IN_FORCE,
+    REJECT: CalibrationState.REJECTED,
+    ROLLBACK: CalibrationState.IN_FORCE,
 }
 
 
@@ -92,7 +92,7 @@ class Decider:
     def accepted_here(self, calibration_id: int) -> bool:
         """Whether it is in force since it was accepted without a person."""
         entry = self._history.get(calibration_id)
-        return entry.state is State.IN_FORCE and entry.decisions[-1].by == BY
+        return entry.state is CalibrationState.IN_FORCE and entry.decisions[-1].by == BY
 
     def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
         """Carry out a decision about one calibration; one that was made before is its answer again.
@@ -115,7 +115,7 @@ class Decider:
             return Outcome(
                 command, Code.ACCEPT, words, None, calibration_id, head.revision, repeated=True
             )
-        if name == ACCEPT and entry.state is State.STALE:
+        if name == ACCEPT and entry.state is CalibrationState.STALE:
             raise StaleError(
                 f"calibration {calibration_id} was solved against revision {entry.based_on}, in "
                 f"force is {head.revision}: measure again"
@@ -221,7 +221,7 @@ class Decider:
         if not bounds.automatic:
             return "auto_accept is off"
         entry = self._history.get(calibration_id)
-        if entry.state is not State.PENDING:
+        if entry.state is not CalibrationState.PENDING:
             return f"it is {entry.state.value}"
         if entry.kind == THERMAL:
             return self._shift_withheld(calibration_id)

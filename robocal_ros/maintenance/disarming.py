@@ -16,7 +16,7 @@ was stopped from here, and the robot rests: until then it is in doubt as well.
 import numpy as np
 
 from robocal_ros.ground.errors import ConflictError
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 
 AGAIN_S = 0.5
 GONE_S = 5.0
@@ -51,7 +51,7 @@ class Disarming:
         self._asked.add(number)
         self._newest, self._heard, self._asked_s = number, False, now_s
 
-    def answered(self, number: int, answer: Answer, now_s: float) -> None:
+    def answered(self, number: int, answer: DriverAnswer, now_s: float) -> None:
         """What came of a disarm; of anything else nothing follows."""
         if number not in self._asked:
             return

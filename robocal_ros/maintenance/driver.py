@@ -12,14 +12,14 @@ from std_srvs.srv import SetBool
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.maintenance import requests as asked
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.motion.driver import MotionDriver, guarded
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.tool.services import ANSWERS, MODES
 
 MODE_OF = {name: number for number, name in MODES.items()}
 WORDS_OF = {number: words for words, number in ANSWERS.items()}
-Answered = Callable[[int, Answer], None]
+Answered = Callable[[int, DriverAnswer], None]
 
 
 class MaintenanceDriver:
@@ -52,7 +52,7 @@ class MaintenanceDriver:
         self._measure.destroy()
         self._motion.close()
 
-    def carry_out(self, request: asked.Request) -> None:
+    def carry_out(self, request: asked.DriverRequest) -> None:
         """Do it; the answer comes later."""
         number = request.number
         match request:
@@ -76,10 +76,12 @@ class MaintenanceDriver:
             case asked.CancelMeasure():
                 self._cancel_measures()
 
-    def _call(self, client: Any, request: Any, number: int, read: Callable[[Any], Answer]) -> None:
+    def _call(
+        self, client: Any, request: Any, number: int, read: Callable[[Any], DriverAnswer]
+    ) -> None:
         if not client.service_is_ready():
             words = f"{client.srv_name} is not there: start its node"
-            self._answered(number, Answer(Code.CONFLICT, words, absent=True))
+            self._answered(number, DriverAnswer(Code.CONFLICT, words, absent=True))
             return
         client.call_async(request).add_done_callback(
             guarded(self._node, lambda future: self._answered(number, read(future.result())))
@@ -88,7 +90,7 @@ class MaintenanceDriver:
     def _begin_measure(self, number: int, mode: str, cycle_id: str) -> None:
         if not self._measure.server_is_ready():
             words = "the action tcf_node/measure is not there: start its node"
-            self._answered(number, Answer(Code.CONFLICT, words))
+            self._answered(number, DriverAnswer(Code.CONFLICT, words))
             return
         self._goals[number] = None
         goal = MeasureTool.Goal(mode=MODE_OF[mode], cycle_id=cycle_id, only_in_gap=True)
@@ -100,7 +102,7 @@ class MaintenanceDriver:
         handle: Any = future.result()
         if not handle.accepted:
             self._goals.pop(number, None)
-            self._answered(number, Answer(Code.CONFLICT, "tcf_node rejected the goal"))
+            self._answered(number, DriverAnswer(Code.CONFLICT, "tcf_node rejected the goal"))
             return
         self._goals[number] = handle
         if number in self._cancelled:
@@ -116,7 +118,7 @@ class MaintenanceDriver:
         found_mm = [result.deviation_mm, result.sigma_mm]
         self._answered(
             number,
-            Answer(
+            DriverAnswer(
                 _code(result.status),
                 result.message,
                 result.candidate_id,
@@ -140,16 +142,16 @@ def _code(status: int) -> Code:
     return Code(status) if status in set(Code) - {Code.NONE} else Code.BAD_INPUT
 
 
-def _done(response: Any) -> Answer:
-    return Answer(Code.ACCEPT if response.success else Code.CONFLICT, response.message)
+def _done(response: Any) -> DriverAnswer:
+    return DriverAnswer(Code.ACCEPT if response.success else Code.CONFLICT, response.message)
 
 
-def _status(response: Any) -> Answer:
-    return Answer(_code(response.status), response.message)
+def _status(response: Any) -> DriverAnswer:
+    return DriverAnswer(_code(response.status), response.message)
 
 
-def _cycle(response: Any) -> Answer:
-    return Answer(
+def _cycle(response: Any) -> DriverAnswer:
+    return DriverAnswer(
         _code(response.status),
         response.message,
         response.candidate_id,

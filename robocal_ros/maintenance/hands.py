@@ -10,7 +10,7 @@ from robocal_ros.maintenance.asking import Asking, Script
 from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.disarming import SENT, Disarming
 from robocal_ros.maintenance.mover import FaultError, Mover
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.maintenance.ways import HOME, STATION, Route, Ways
 from robocal_ros.motion.gap import Gap
 from robocal_ros.tool.phases import SETTLED_S, STANDS_S
@@ -84,7 +84,7 @@ class Hands(Asking):
         if self.config.T_base_laser is not None:
             self.tool.doubt()
 
-    def answered(self, number: int, answer: Answer) -> None:
+    def answered(self, number: int, answer: DriverAnswer) -> None:
         """An answer came; one that nobody waits for is none."""
         doubted = self.tool.engaged
         self.tool.answered(number, answer, self.now_s)
@@ -94,7 +94,7 @@ class Hands(Asking):
             self._measuring = 0
         super().answered(number, answer)
 
-    def arm(self) -> Script[Answer]:
+    def arm(self) -> Script[DriverAnswer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
         self.doubt()
         self.tool.armed, self._deaf_s, self.left_home = True, np.inf, True
@@ -169,7 +169,7 @@ class Hands(Asking):
     def _ask_disarm(self) -> None:
         self.tool.asked(self.request(asked.Disarm), self.now_s)
 
-    def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[Answer]:
+    def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[DriverAnswer]:
         """Let the armed driver measure, for a limited time; a longer run is broken off.
 
         Raises

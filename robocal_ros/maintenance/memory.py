@@ -14,7 +14,7 @@ REMEMBERED = 200  # ended cycles
 VERSION = 2  # of the document; one without a version is the first, which knew no runs and stamps
 
 
-class Keeper(Protocol):
+class DocumentStore(Protocol):
     """Keeps one document; whole or not at all.
 
     Attributes
@@ -120,7 +120,7 @@ class Memory:
     earlier : ids of the cycles that had ended before this start.
     """
 
-    keeper: Keeper
+    keeper: DocumentStore
     cycles: dict[str, CycleResult] = field(default_factory=dict)
     tool: ToolRecord = field(default_factory=ToolRecord)
     fault_code: Code = Code.NONE
@@ -131,7 +131,7 @@ class Memory:
     earlier: frozenset[str] = frozenset()
 
     @classmethod
-    def load(cls, keeper: Keeper) -> "Memory":
+    def load(cls, keeper: DocumentStore) -> "Memory":
         """Read what is kept; a fault where a cycle was open, or where what was kept is gone.
 
         Raises
@@ -165,7 +165,7 @@ class Memory:
         return memory
 
     @classmethod
-    def _of_document(cls, keeper: Keeper, document: Mapping[str, Any]) -> "Memory":
+    def _of_document(cls, keeper: DocumentStore, document: Mapping[str, Any]) -> "Memory":
         try:
             if not 1 <= (version := int(document.get("version", 1))) <= VERSION:
                 raise ValueError(f"version {version}")

@@ -22,11 +22,11 @@ from robocal_ros.ground.samples import (
 from robocal_ros.ground.state_files import StateFile
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance import MaintenanceSession, State
+from robocal_ros.maintenance import MaintenanceSession, MaintenanceState
 from robocal_ros.maintenance.driver import MaintenanceDriver
 from robocal_ros.maintenance.inputs import require_robot, told_correction, told_drift
 from robocal_ros.maintenance.outputs import MaintenanceOutputs
-from robocal_ros.maintenance.requests import Answer, Move, Request
+from robocal_ros.maintenance.requests import DriverAnswer, DriverRequest, Move
 from robocal_ros.maintenance.services import MaintenanceServices, Now
 from robocal_ros.maintenance.settings import SETTINGS, session_config
 from robocal_ros.motion.driver import LeaseHolder, MotionDriver
@@ -193,7 +193,7 @@ class MaintenanceNode(HouseNode):
             self._session.robot.reported(report)
             self._tick()  # a motion that was rejected, or a stop, is seen to now
 
-    def _answered(self, number: int, answer: Answer) -> None:
+    def _answered(self, number: int, answer: DriverAnswer) -> None:
         if self._session is not None:
             self._session.answered(number, answer)
 
@@ -219,7 +219,7 @@ class MaintenanceNode(HouseNode):
         stops = session is not None and session.robot.stopping.under_way
         self._lease.hold(cycle or "a stop" * stops)
 
-    def _carry_out(self, requests: list[Request]) -> None:
+    def _carry_out(self, requests: list[DriverRequest]) -> None:
         for request in requests:
             if isinstance(request, Move) and self._looked() and self._others.violation:
                 continue  # the cycle has ended by that
@@ -288,7 +288,7 @@ class MaintenanceNode(HouseNode):
         for step, worst_s in session.worst_cases().items():
             values[f"worst case of {step}"] = f"{worst_s:.1f} s"
         health.values = values
-        if status.state is State.FAULT:
+        if status.state is MaintenanceState.FAULT:
             health.worsen(ERROR, status.fault)
         if trouble := session.robot.trouble(self._steady.now_s()):
             health.worsen(WARN, trouble)

@@ -7,38 +7,38 @@ from robocal_ros.motion.plan import JointPlan
 
 
 @dataclass(frozen=True)
-class Request:
+class DriverRequest:
     """Asked of the driver; ``number`` comes back with the answer."""
 
     number: int
 
 
 @dataclass(frozen=True)
-class BeginCycle(Request):
+class BeginCycle(DriverRequest):
     """Open a thermal cycle (`ThermalSession`, `thermal_node` ``~/begin_cycle``)."""
 
     cycle_id: str
 
 
 @dataclass(frozen=True)
-class EndCycle(Request):
+class EndCycle(DriverRequest):
     """End it and identify the model; the answer carries the candidate."""
 
     cycle_id: str
 
 
 @dataclass(frozen=True)
-class Arm(Request):
+class Arm(DriverRequest):
     """Let the tool's driver move the robot (`ToolDriver.arm`, `tcf_node` ``~/arm``)."""
 
 
 @dataclass(frozen=True)
-class Disarm(Request):
+class Disarm(DriverRequest):
     """Forbid it; a motion of its own is stopped at once."""
 
 
 @dataclass(frozen=True)
-class Measure(Request):
+class Measure(DriverRequest):
     """Measure the tool; ``mode`` of `sessions.tool_results`. Answered when the run has ended."""
 
     mode: str
@@ -46,12 +46,12 @@ class Measure(Request):
 
 
 @dataclass(frozen=True)
-class CancelMeasure(Request):
+class CancelMeasure(DriverRequest):
     """Break the open tool run off; its `Measure` is answered."""
 
 
 @dataclass(frozen=True)
-class Move(Request):
+class Move(DriverRequest):
     """Send a plan to the controller; reported by `MaintenanceSession.reported`.
 
     ``worst_s``: until the robot is back at home at the latest, counted from now.
@@ -62,21 +62,21 @@ class Move(Request):
 
 
 @dataclass(frozen=True)
-class Stop(Request):
+class Stop(DriverRequest):
     """Send a stop to the controller."""
 
     plan: JointPlan
 
 
 @dataclass(frozen=True)
-class HardStop(Request):
+class HardStop(DriverRequest):
     """Stop a robot that does not obey its controller by other means, where there are any."""
 
     why: str
 
 
 @dataclass(frozen=True)
-class Answer:
+class DriverAnswer:
     """What came of a request.
 
     Attributes

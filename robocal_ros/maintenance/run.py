@@ -11,9 +11,9 @@ from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import CycleResult, Memory
 from robocal_ros.maintenance.mover import FaultError
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.maintenance.settling import is_accepted, settled
-from robocal_ros.maintenance.thermal_part import MEASUREMENT, NONE_BETTER, CycleBook, ThermalPart
+from robocal_ros.maintenance.thermal_part import MEASUREMENT, NONE_BETTER, ThermalCycle, ThermalPart
 from robocal_ros.maintenance.tool_part import ToolPart
 from robocal_ros.session.events import LEAVE, Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
@@ -21,7 +21,7 @@ from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
 
 
-class Run:
+class CycleRun:
     """The script of a cycle, and its result as it grows.
 
     Parameters
@@ -39,7 +39,7 @@ class Run:
         self,
         result: CycleResult,
         hands: Hands,
-        book: CycleBook,
+        book: ThermalCycle,
         decider: Decider,
         memory: Memory,
         decided: Callable[[Outcome], None],
@@ -96,7 +96,7 @@ class Run:
         try:
             answer, left = yield from self._thermal.script(self.result.cycle_id)
         except SilentError as error:
-            answer, left = Answer(Code.CONFLICT, str(error)), MEASUREMENT
+            answer, left = DriverAnswer(Code.CONFLICT, str(error)), MEASUREMENT
             yield from self._hands.go_home()
         if left:
             self._left(left)

@@ -23,11 +23,11 @@ from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.heard import Heard
-from robocal_ros.maintenance.memory import CycleResult, Keeper, Memory
-from robocal_ros.maintenance.requests import Answer, Request
-from robocal_ros.maintenance.run import Run
-from robocal_ros.maintenance.status import State, Status, status_of
-from robocal_ros.maintenance.thermal_part import CycleBook, ThermalPart
+from robocal_ros.maintenance.memory import CycleResult, DocumentStore, Memory
+from robocal_ros.maintenance.requests import DriverAnswer, DriverRequest
+from robocal_ros.maintenance.run import CycleRun
+from robocal_ros.maintenance.status import MaintenanceState, Status, status_of
+from robocal_ros.maintenance.thermal_part import ThermalCycle, ThermalPart
 from robocal_ros.maintenance.ways import Ways
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.session.history import History
@@ -58,7 +58,7 @@ class MaintenanceSession:
         nominal: SerialArm,
         history: History,
         config: MaintenanceConfig,
-        keeper: Keeper,
+        keeper: DocumentStore,
         record: Callable[[Command, Outcome], None] = lambda command, outcome: None,
     ) -> None:
         self.config, self.ways = config, Ways(nominal, config)
@@ -67,7 +67,7 @@ class MaintenanceSession:
         self._hands = Hands(config, self.ways)
         self.robot = self._hands.robot
         self._hands.doubt()  # whoever ran before may have left the tool's driver armed
-        self._book = CycleBook()
+        self._book = ThermalCycle()
         self._record = record
         self._conductor = Conductor(self._hands, self.memory, self._tell)
         self._heard = Heard(config)
@@ -117,7 +117,7 @@ class MaintenanceSession:
         """What the joint correction says of itself."""
         self._heard.take_correction(told, now_s)
 
-    def answered(self, number: int, answer: Answer) -> None:
+    def answered(self, number: int, answer: DriverAnswer) -> None:
         """What came of a request."""
         self._hands.answered(number, answer)
 
@@ -152,7 +152,7 @@ class MaintenanceSession:
         except LimitError as error:
             self._conductor.fault(error.code, str(error))
             raise
-        run = Run(
+        run = CycleRun(
             memory.begin(cycle_id, wall_ns),
             hands,
             self._book,
@@ -227,7 +227,7 @@ class MaintenanceSession:
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words
 
-    def tick(self, now_s: float, wall_ns: int) -> list[Request]:
+    def tick(self, now_s: float, wall_ns: int) -> list[DriverRequest]:
         """Look at everything, and go on; what is to be carried out now, in this order."""
         hands, self._hands.now_s = self._hands, now_s
         hands.gap.look(now_s)
@@ -235,7 +235,7 @@ class MaintenanceSession:
         self._conductor.tick(wall_ns)
         return hands.handed_out()
 
-    def give_up(self, reason: str, now_s: float) -> list[Request]:
+    def give_up(self, reason: str, now_s: float) -> list[DriverRequest]:
         """The driver goes: stop and disarm, to be carried out at once; a fault unless at home.
 
         Then call `close`.
@@ -272,13 +272,17 @@ class MaintenanceSession:
         return None if run is None else run.result
 
     @property
-    def state(self) -> State:
+    def state(self) -> MaintenanceState:
         """What it is at."""
         if self.memory.fault:
-            return State.FAULT
+            return MaintenanceState.FAULT
         if self._conductor.run is None:
-            return State.IDLE
-        return State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
+            return MaintenanceState.IDLE
+        return (
+            MaintenanceState.RUNNING
+            if self._conductor.broken is None
+            else MaintenanceState.BREAKING_OFF
+        )
 
     def status(self, now_s: float) -> Status:
         """Everything at once."""

@@ -11,7 +11,7 @@ from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import CycleResult, Memory
 
 
-class State(IntEnum):
+class MaintenanceState(IntEnum):
     """Numbers of ``MaintenanceStatus.msg``; 0 is never sent."""
 
     IDLE = 1
@@ -43,7 +43,7 @@ class Status:
     trouble : why nobody knows what waits; empty: the pending ids are true.
     """
 
-    state: State
+    state: MaintenanceState
     cycle_id: str
     doing: str
     left_s: float
@@ -60,7 +60,7 @@ class Status:
 
 
 def status_of(
-    state: State,
+    state: MaintenanceState,
     running: CycleResult | None,
     memory: Memory,
     hands: Hands,

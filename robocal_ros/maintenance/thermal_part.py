@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground.codes import Code
 from robocal_ros.maintenance.asking import Script, SilentError
 from robocal_ros.maintenance.hands import Hands
-from robocal_ros.maintenance.requests import Answer, BeginCycle, EndCycle
+from robocal_ros.maintenance.requests import BeginCycle, DriverAnswer, EndCycle
 from robocal_ros.maintenance.ways import HOME
 from robocal_ros.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.tool.phases import STANDS_S
@@ -22,7 +22,7 @@ FOUND = (Code.ACCEPT, *NONE_BETTER)  # verdicts that tell the drift; any other o
 
 
 @dataclass
-class CycleBook:
+class ThermalCycle:
     """The thermal cycle that is open; over several gaps where one is too short.
 
     Attributes
@@ -48,7 +48,7 @@ class CycleBook:
 class ThermalPart:
     """Measures the drift; what does not fit is done in the next gap."""
 
-    def __init__(self, hands: Hands, book: CycleBook) -> None:
+    def __init__(self, hands: Hands, book: ThermalCycle) -> None:
         self._hands, self._book = hands, book
         self._times = hands.config.times
 
@@ -72,7 +72,7 @@ class ThermalPart:
         book.forget()
         return words
 
-    def script(self, cycle_id: str) -> Script[tuple[Answer | None, str]]:
+    def script(self, cycle_id: str) -> Script[tuple[DriverAnswer | None, str]]:
         """The answer of the cycle's end, None where it is not reached, and what is left.
 
         Raises
@@ -115,7 +115,7 @@ class ThermalPart:
                 found.append(q)
         return len(found)
 
-    def _begin(self, cycle_id: str) -> Script[Answer]:
+    def _begin(self, cycle_id: str) -> Script[DriverAnswer]:
         book, hands = self._book, self._hands
         hands.doing = "thermal cycle begins"
         name = book.id or cycle_id
@@ -162,7 +162,7 @@ class ThermalPart:
             yield
         return False
 
-    def _end(self) -> Script[Answer]:
+    def _end(self) -> Script[DriverAnswer]:
         book, hands = self._book, self._hands
         hands.doing = "thermal cycle ends"
         name = book.id
@@ -170,7 +170,7 @@ class ThermalPart:
         try:
             answer = yield from hands.ask(self._times.solve_s, NODE, EndCycle, name)
         except SilentError as error:
-            return Answer(Code.CONFLICT, str(error))
+            return DriverAnswer(Code.CONFLICT, str(error))
         book.moved = answer.code is Code.SENSOR_OR_ROBOT_MOVED
         return answer
 

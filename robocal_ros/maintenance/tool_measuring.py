@@ -10,7 +10,7 @@ from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import Memory, ToolRecord
 from robocal_ros.maintenance.mover import FaultError
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.thermal.accuracy import ToolError
 from robocal_ros.tool.phases import STANDS_S
 from robocal_ros.tool.results import FULL, QUICK
@@ -40,8 +40,8 @@ class ToolOutcome:
     left : what did not fit.
     """
 
-    first: Answer | None = None
-    last: Answer | None = None
+    first: DriverAnswer | None = None
+    last: DriverAnswer | None = None
     checked: str = ""
     bent: bool = False
     candidate_id: int = 0
@@ -50,7 +50,7 @@ class ToolOutcome:
     told: str = ""
     left: str = ""
 
-    def came(self, answer: Answer) -> None:
+    def came(self, answer: DriverAnswer) -> None:
         """Of a measurement."""
         self.first, self.last = self.first or answer, answer
 
@@ -97,7 +97,7 @@ class ToolMeasuring:
         self.outcome = ToolOutcome()
         self.revision = self.wall_ns = 0
 
-    def measured(self, mode: str, cycle_id: str) -> Script[Answer | None]:
+    def measured(self, mode: str, cycle_id: str) -> Script[DriverAnswer | None]:
         """The answer; None where it did not fit, or gave no result for the tool in force.
 
         Raises
@@ -109,7 +109,7 @@ class ToolMeasuring:
         yield  # what was kept just before may have taken its time: the gap is looked at again
         if hands.tool.absent:
             outcome.left = f"tool measurement ({mode})"
-            outcome.came(Answer(Code.CONFLICT, hands.tool.words(), absent=True))
+            outcome.came(DriverAnswer(Code.CONFLICT, hands.tool.words(), absent=True))
             return None
         if not hands.fits(hands.tool_worst_s(mode)):
             outcome.left = f"tool measurement ({mode})"
@@ -123,7 +123,7 @@ class ToolMeasuring:
                 limit_s = times.check_s if mode == QUICK else times.full_s
                 answer = yield from hands.measure(mode, cycle_id, limit_s)
         except SilentError as error:
-            answer = Answer(Code.CONFLICT, str(error))
+            answer = DriverAnswer(Code.CONFLICT, str(error))
         before = self._memory.tool
         self._learn(mode, answer)
         yield from hands.disarmed()
@@ -133,7 +133,7 @@ class ToolMeasuring:
         yield from hands.go_home()
         return self._credited(mode, answer, before)
 
-    def _learn(self, mode: str, answer: Answer) -> None:
+    def _learn(self, mode: str, answer: DriverAnswer) -> None:
         """Remember it at once: the run may be broken off on the way home."""
         outcome = self.outcome
         outcome.came(answer)
@@ -154,7 +154,7 @@ class ToolMeasuring:
         elif answer.code in FAILED:
             self._failed(answer)
 
-    def _failed(self, answer: Answer) -> None:
+    def _failed(self, answer: DriverAnswer) -> None:
         """What an older check found of the tool holds no more."""
         self._memory.note_tool(
             answer="failed",
@@ -164,7 +164,7 @@ class ToolMeasuring:
             candidate=0,
         )
 
-    def _note(self, answer: Answer, verdict: str, candidate: int = 0) -> None:
+    def _note(self, answer: DriverAnswer, verdict: str, candidate: int = 0) -> None:
         self._memory.note_tool(
             answer=verdict,
             words=answer.message,
@@ -177,7 +177,7 @@ class ToolMeasuring:
             wall_ns=self.wall_ns,
         )
 
-    def _credited(self, mode: str, answer: Answer, before: ToolRecord) -> Answer | None:
+    def _credited(self, mode: str, answer: DriverAnswer, before: ToolRecord) -> DriverAnswer | None:
         """The answer, where it is of the tool in force; kept at home, where nothing moves."""
         outcome = self.outcome
         current = self.revision == self._decider.revision(TOOL)

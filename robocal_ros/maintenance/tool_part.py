@@ -10,7 +10,7 @@ from robocal_ros.maintenance.deciding import BY, Decider
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import Memory
 from robocal_ros.maintenance.settling import is_accepted, patiently, settled
-from robocal_ros.maintenance.thermal_part import CycleBook
+from robocal_ros.maintenance.thermal_part import ThermalCycle
 from robocal_ros.maintenance.tool_measuring import ToolMeasuring, ToolOutcome
 from robocal_ros.session.events import ROLLBACK, Command, Outcome
 from robocal_ros.thermal.accuracy import ToolError
@@ -38,7 +38,7 @@ class ToolPart:
     def __init__(
         self,
         hands: Hands,
-        book: CycleBook,
+        book: ThermalCycle,
         decider: Decider,
         memory: Memory,
         decided: Callable[[Outcome], None],

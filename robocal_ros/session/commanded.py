@@ -13,7 +13,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.decisions import decide, outside_decision
 from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
-from robocal_ros.session.followed import Followed
+from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import BY, History, bring_into_force
 from robocal_ros.session.ignored import Ignored
 
@@ -39,7 +39,9 @@ class Commanded:
     newest_ns : newest stamp of each topic.
     """
 
-    def __init__(self, nominal: SerialArm, history: History, kind: str, current: Followed) -> None:
+    def __init__(
+        self, nominal: SerialArm, history: History, kind: str, current: HistoryFollower
+    ) -> None:
         self.nominal, self._history, self._kind = nominal, history, kind
         self._followed = current
         self._queue: list[Command] = []

@@ -5,7 +5,7 @@ from robocal_ros.ground.proposals import Decision, Head
 from robocal_ros.session.history import History
 
 
-class Followed:
+class HistoryFollower:
     """Heads of a history as of the last look; a subclass reads those that it is about.
 
     Parameters

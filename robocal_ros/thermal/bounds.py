@@ -9,7 +9,7 @@ from robocal_ros.ground.samples import JOINTS, JUMPS
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, joints_awaited_ns, reached
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.cycles import CycleBook
+from robocal_ros.thermal.cycles import OpenCycle
 from robocal_ros.thermal.observations import ObservationDesk
 from robocal_ros.thermal.windows import Windows
 
@@ -20,7 +20,7 @@ class Bounds:
     """Gives commands what replay needs to find the same samples."""
 
     def __init__(
-        self, desk: ObservationDesk, cycle: CycleBook, windows: Windows, config: ThermalConfig
+        self, desk: ObservationDesk, cycle: OpenCycle, windows: Windows, config: ThermalConfig
     ) -> None:
         self._desk, self._cycle, self._windows, self._config = desk, cycle, windows, config
 

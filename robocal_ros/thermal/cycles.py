@@ -11,7 +11,7 @@ REMEMBERED = 200  # calibrations back to which a cycle's id is known
 
 
 @dataclass
-class CycleBook:
+class OpenCycle:
     """The open cycle.
 
     Attributes

@@ -7,7 +7,7 @@ import numpy as np
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.ground.proposals import THERMAL, Entry, State
+from robocal_ros.ground.proposals import THERMAL, CalibrationState, Entry
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.history import History
@@ -23,7 +23,7 @@ from robocal_ros.thermal.reference import reference_of
 LEARN_FROM = 2000
 MOST_SHIFTS = 5  # the newest; learning takes half a second each
 FEWEST_WITH_TEMPERATURES = 2  # shifts, so that what one motor does is not what all of them do
-WRONG = (State.REJECTED, State.ROLLED_BACK)  # somebody did not believe it
+WRONG = (CalibrationState.REJECTED, CalibrationState.ROLLED_BACK)  # somebody did not believe it
 
 
 def expected_drift(nominal: SerialArm, history: History) -> tuple[LearnedProcess | None, str]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.thermal.heat import Heat
-from robocal_ros.thermal.tracking import TrackerState
+from robocal_ros.thermal.tracking import DriftState
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class FollowerState:
         time of the first of those that were refused in a row.
     """
 
-    tracker: TrackerState
+    tracker: DriftState
     heat: Heat | None
     stamp_ns: int
     cycles: int
@@ -95,7 +95,7 @@ class FollowerState:
         rows, columns = np.triu_indices(len(mean))
         P[rows, columns] = P[columns, rows] = half
         heat = Heat.of_array(arrays[HEAT]) if HEAT in arrays else None
-        tracker = TrackerState(times[0], mean, P)
+        tracker = DriftState(times[0], mean, P)
         stamp_ns, cycles, anchor_ns = (int(value) for value in clock)
         return cls(tracker, heat, stamp_ns, cycles, anchor_ns, moved, times[1])
 

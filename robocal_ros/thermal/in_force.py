@@ -4,14 +4,14 @@ from robocal_ros.ground.errors import ConflictError
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.documents import arm_of
-from robocal_ros.session.followed import Followed
+from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import History
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
 
 REFERENCE = "reference"
 
 
-class InForce(Followed):
+class InForce(HistoryFollower):
     """The thermal model and the cold reference in force, as of the last look.
 
     Attributes

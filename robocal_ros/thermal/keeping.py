@@ -12,7 +12,7 @@ from robocal_ros.session.history import History
 from robocal_ros.thermal.in_force import InForce
 
 
-class Keeper:
+class CandidateStore:
     """Puts candidates of one session into the history.
 
     Parameters

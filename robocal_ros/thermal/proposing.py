@@ -21,7 +21,7 @@ from robocal_ros.thermal.documents import cycle_document
 from robocal_ros.thermal.drift_following import DriftFollower, Following
 from robocal_ros.thermal.identification import identify_subset
 from robocal_ros.thermal.in_force import InForce
-from robocal_ros.thermal.keeping import Keeper
+from robocal_ros.thermal.keeping import CandidateStore
 from robocal_ros.thermal.reference import ColdReference
 from robocal_ros.thermal.steps import FixedSphere, fixed_sphere
 from robocal_ros.thermal.windows import Beside
@@ -53,7 +53,7 @@ class Proposer:
         config: ThermalConfig,
         current: InForce,
         following: Following,
-        keeper: Keeper,
+        keeper: CandidateStore,
     ) -> None:
         self._nominal = nominal
         self._config = config

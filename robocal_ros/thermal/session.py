@@ -29,10 +29,10 @@ from robocal_ros.session.history import History
 from robocal_ros.thermal.accuracy_state import Accuracy, accuracy_of
 from robocal_ros.thermal.bounds import Bounds
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.cycles import TIME_OUT, CycleBook, ended
+from robocal_ros.thermal.cycles import TIME_OUT, OpenCycle, ended
 from robocal_ros.thermal.drift_following import DriftFollower, Following
 from robocal_ros.thermal.in_force import InForce
-from robocal_ros.thermal.keeping import Keeper
+from robocal_ros.thermal.keeping import CandidateStore
 from robocal_ros.thermal.observations import ObservationDesk
 from robocal_ros.thermal.proposing import Proposer
 from robocal_ros.thermal.reference import ColdReference
@@ -76,11 +76,11 @@ class ThermalSession:
         self._queue: list[Command] = []
         self._current = InForce(history, nominal)
         self.temperatures = MotorTemperatures(nominal.joint_names)
-        self.cycle = CycleBook()
+        self.cycle = OpenCycle()
         self.windows = Windows(self.desk, self.cycle, self._current, config)
         self._bounds = Bounds(self.desk, self.cycle, self.windows, config)
         self._following = Following(history, self._current, config.sigma_m, config.work)
-        keeper = Keeper(nominal, history, software, self._current)
+        keeper = CandidateStore(nominal, history, software, self._current)
         self._set_up = SetUp(nominal, history, config, self._current, keeper)
         self._proposer = Proposer(nominal, config, self._current, self._following, keeper)
 

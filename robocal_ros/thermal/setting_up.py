@@ -17,7 +17,7 @@ from robocal_ros.thermal.documents import sensor_document
 from robocal_ros.thermal.drift_following import EXPECTED, default_process
 from robocal_ros.thermal.expectation import expected_drift
 from robocal_ros.thermal.in_force import REFERENCE, InForce
-from robocal_ros.thermal.keeping import Keeper
+from robocal_ros.thermal.keeping import CandidateStore
 from robocal_ros.thermal.process_documents import process_document
 from robocal_ros.thermal.reference import (
     COMMISSIONED,
@@ -42,7 +42,7 @@ class SetUp:
         history: History,
         config: ThermalConfig,
         current: InForce,
-        keeper: Keeper,
+        keeper: CandidateStore,
     ) -> None:
         self._nominal, self._history, self._config = nominal, history, config
         self._current, self._keeper = current, keeper

@@ -14,7 +14,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.cycle_verdict import conclude
 from robocal_ros.thermal.identification import FEWEST_POSES, CycleDrift
 from robocal_ros.thermal.steps import FixedSphere, possible_causes, step_words
-from robocal_ros.thermal.tracking import DriftTracker, Innovation, TrackerState
+from robocal_ros.thermal.tracking import DriftState, DriftTracker, Innovation
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def _found(
 
 
 def _left_out(
-    tracker: DriftTracker, before: TrackerState, warm: Measurements, innovation: Innovation
+    tracker: DriftTracker, before: DriftState, warm: Measurements, innovation: Innovation
 ) -> tuple[Array, Array, Array]:
     """Error (m, 3) at each pose of what all else says, its rms length (m,), and drifts (m, k).
 

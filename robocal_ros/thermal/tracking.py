@@ -30,7 +30,7 @@ OUTLIER_M = 1e-3  # a sample that fits nothing lies anywhere within so much
 
 
 @dataclass(frozen=True, eq=False)
-class TrackerState:
+class DriftState:
     """Mean (d,) and covariance (d, d) at a time, s."""
 
     time_s: float
@@ -104,7 +104,7 @@ class DriftTracker:
         covariance[own, own] = np.repeat(sigma_m**2 / spots.visits, 3)
         own = np.arange(self._setup + SETUP, size)
         covariance[own, own] = process.setup_sigma_m**2
-        self.state = TrackerState(time_s, mean, covariance)
+        self.state = DriftState(time_s, mean, covariance)
 
     @property
     def gains(self) -> HeatGains | None:
@@ -127,7 +127,7 @@ class DriftTracker:
             raise InputError("this tracker has no gains for motor temperatures: learn them first")
         self.heat = self.heat.read(temperature, time_s)
 
-    def at(self, time_s: float) -> TrackerState:
+    def at(self, time_s: float) -> DriftState:
         """The state at a later time, without new measurements.
 
         Raises
@@ -154,7 +154,7 @@ class DriftTracker:
                 before = rows[part].reshape(2, len(variance), -1)
                 rows[part] = np.tensordot(F, before, 1).reshape(2 * len(variance), -1)
             P[part, part] += np.kron(noise, variance)
-        return TrackerState(time_s, mean, P)
+        return DriftState(time_s, mean, P)
 
     def drift(self, time_s: float) -> tuple[Array, Array]:
         """Parameters' drift (k,) since the cold reference and its covariance (k, k), SI.
@@ -223,9 +223,7 @@ class DriftTracker:
         self.state = self.state if state is None else state
         return innovation
 
-    def _examine(
-        self, cycle: Measurements, time_s: float
-    ) -> tuple[Innovation, TrackerState | None]:
+    def _examine(self, cycle: Measurements, time_s: float) -> tuple[Innovation, DriftState | None]:
         """What a cycle brings, and the state after it; None where it is not applied."""
         state, after = self.at(time_s), None
         y, H, R = self.observation(cycle, time_s)
@@ -241,7 +239,7 @@ class DriftTracker:
         if applied:
             gain = np.linalg.solve(S, PH.T).T
             P = state.covariance - gain @ PH.T
-            after = TrackerState(time_s, state.mean + gain @ v, 0.5 * (P + P.T))
+            after = DriftState(time_s, state.mean + gain @ v, 0.5 * (P + P.T))
         innovation = Innovation(
             time_s=time_s,
             squared=squared,

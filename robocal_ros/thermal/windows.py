@@ -11,7 +11,7 @@ from robocal_ros.ground.samples import JOINTS, REFERENCE_SPHERE, Measurements
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.cycles import TIME_OUT, CycleBook
+from robocal_ros.thermal.cycles import TIME_OUT, OpenCycle
 from robocal_ros.thermal.in_force import InForce
 from robocal_ros.thermal.observation import Observation, as_measurements, one_per_visit
 from robocal_ros.thermal.observations import ObservationDesk
@@ -39,7 +39,7 @@ class Windows:
     """Takes the observations of a command from the desk."""
 
     def __init__(
-        self, desk: ObservationDesk, cycle: CycleBook, current: InForce, config: ThermalConfig
+        self, desk: ObservationDesk, cycle: OpenCycle, current: InForce, config: ThermalConfig
     ) -> None:
         self._desk, self._cycle, self._current, self._config = desk, cycle, current, config
         self._pause_ns = int(config.cycle_timeout_s * 1e9)

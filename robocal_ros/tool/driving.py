@@ -26,7 +26,7 @@ from robocal_ros.tool.phases import (
     SETTLED_S,
     SILENT_ARMED_S,
     STANDS_S,
-    Phase,
+    DrivePhase,
     StopError,
     station_cell,
 )
@@ -64,7 +64,7 @@ class ToolDriver:
     ) -> None:
         self._session, self._config = session, config
         self._send, self._ask, self._closed = send, ask, closed
-        self.phase, self.armed, self.told = Phase.IDLE, False, ""
+        self.phase, self.armed, self.told = DrivePhase.IDLE, False, ""
         self._armed_at_s = 0.0
         self._hard_stop = hard_stop
         self.robot = RobotWatch(session.nominal, config)
@@ -89,7 +89,7 @@ class ToolDriver:
             raise ConflictError(f"{why}: nothing may move")
         if self.robot.silent_s > self._config.silence_s:
             raise ConflictError("joint states are missing: nothing can be armed without them")
-        if self.phase is not Phase.IDLE:
+        if self.phase is not DrivePhase.IDLE:
             raise ConflictError(f"the robot is {self.phase.value}: arm it when it stands")
         if self._session.run is not None:
             raise ConflictError("a run is open: cancel it, then arm, then measure")
@@ -99,7 +99,7 @@ class ToolDriver:
 
     def disarm(self, reason: str, now_s: float) -> None:
         """Forbid motions; one that is under way is stopped, and an open run ends."""
-        if self.phase is not Phase.IDLE or self._session.run is not None:
+        if self.phase is not DrivePhase.IDLE or self._session.run is not None:
             self._fault(Code.CONFLICT, reason, now_s)
         self.armed, self.told = False, reason
 
@@ -122,12 +122,12 @@ class ToolDriver:
 
     def on_its_way(self, now_s: float) -> bool:
         """Whether a step is being driven: a robot that rests then only pauses."""
-        return self.phase is Phase.MEASURE and not self.robot.at_end(now_s)
+        return self.phase is DrivePhase.MEASURE and not self.robot.at_end(now_s)
 
     @property
     def moves(self) -> bool:
         """Whether it moves the robot, or may at once."""
-        return self.armed or self.phase is not Phase.IDLE or self._stopping.under_way
+        return self.armed or self.phase is not DrivePhase.IDLE or self._stopping.under_way
 
     # ---- what happens ---------------------------------------------------------------------------
 
@@ -153,7 +153,7 @@ class ToolDriver:
         if self._stopping.under_way:
             if report.failed:
                 self._stopping.rejected(report.words)
-        elif self.phase is not Phase.IDLE and report.failed:
+        elif self.phase is not DrivePhase.IDLE and report.failed:
             self._fault(Code.CONFLICT, report.words, now_s, lost=True)
         elif report.ended:
             self.robot.ended()
@@ -166,7 +166,7 @@ class ToolDriver:
         if (why := self._stopping.failed) != self._failed:
             self._failed = why
             self._hard_stop(why) if why else None
-        busy = self.armed or self.phase is not Phase.IDLE
+        busy = self.armed or self.phase is not DrivePhase.IDLE
         if busy and (why := self._closed(now_s)):
             self.disarm(why, now_s)
         try:
@@ -180,19 +180,19 @@ class ToolDriver:
         if self._session.run is None:
             self._without_run(now_s)
             return
-        if self.phase is not Phase.IDLE:
+        if self.phase is not DrivePhase.IDLE:
             self._supervise(now_s)
         at_end = self.robot.at_end(now_s)
-        if self.phase is Phase.APPROACH and at_end:
+        if self.phase is DrivePhase.APPROACH and at_end:
             self._measure(now_s)
-        elif self.phase is Phase.MEASURE and at_end and self._number() != self._driven:
-            self.phase = Phase.IDLE
-        if self.phase is Phase.IDLE and self.armed and self._number() != self._driven:
+        elif self.phase is DrivePhase.MEASURE and at_end and self._number() != self._driven:
+            self.phase = DrivePhase.IDLE
+        if self.phase is DrivePhase.IDLE and self.armed and self._number() != self._driven:
             self._begin(now_s)
 
     def _without_run(self, now_s: float) -> None:
         """Let the last motion end, or an arming that nobody used."""
-        if self.phase is not Phase.IDLE:
+        if self.phase is not DrivePhase.IDLE:
             self.armed, self.told = False, "the run has ended"
             self._supervise(now_s)
             if self.robot.at_end(now_s):
@@ -205,7 +205,7 @@ class ToolDriver:
             self._settle(f"no run within {self._config.armed_s:g} s")
 
     def _settle(self, reason: str) -> None:
-        self.phase, self.armed, self.told = Phase.IDLE, False, reason
+        self.phase, self.armed, self.told = DrivePhase.IDLE, False, reason
         self._driven, self._kind = NO_RUN, ""
         self.robot.forget()
 
@@ -228,7 +228,7 @@ class ToolDriver:
             raise ConflictError("no run is open")
         self._cell = station_cell(self._session.run, self._config)
         plan = approach(self._cell, step, q, after_circle=self._kind == "circle")
-        self._start(plan, self._cell, Phase.APPROACH, now_s)
+        self._start(plan, self._cell, DrivePhase.APPROACH, now_s)
 
     def _measure(self, now_s: float) -> None:
         q, step = self._resting(SETTLED_S), self._session.awaited
@@ -237,9 +237,9 @@ class ToolDriver:
         plan = measuring(self._cell, step, q)
         self._kind = step.kind
         self._ask(Command(STEP_BEGINS, {"step": step.name, "number": step.number}))
-        self._start(plan, self._cell, Phase.MEASURE, now_s)
+        self._start(plan, self._cell, DrivePhase.MEASURE, now_s)
 
-    def _start(self, plan: JointPlan, cell: MotionCell, phase: Phase, now_s: float) -> None:
+    def _start(self, plan: JointPlan, cell: MotionCell, phase: DrivePhase, now_s: float) -> None:
         self._beams.clear()
         self._stopping.forget()
         self.phase = phase
@@ -255,13 +255,13 @@ class ToolDriver:
         silent_s = self.robot.silent_s
         if silent_s > self._config.silence_s:
             raise StopError(Code.TOO_FEW_SAMPLES, f"joint states are silent for {silent_s:.2f} s")
-        if self.phase is Phase.APPROACH and self._beams[True]:
+        if self.phase is DrivePhase.APPROACH and self._beams[True]:
             raise StopError(
                 Code.BEAM_EDGES_WRONG,
                 "a beam was broken on the way to a step: the tool is bent beyond the circle, or "
                 "something is in the way",
             )
-        if self.phase is Phase.MEASURE and self._beams.total() > MOST_EDGES[self._kind]:
+        if self.phase is DrivePhase.MEASURE and self._beams.total() > MOST_EDGES[self._kind]:
             raise StopError(Code.BEAM_EDGES_WRONG, "more edges than a tool makes: look for it")
         self.robot.require_on_plan(now_s, REST_WITHIN_S)
         if self.robot.ended_for_s(now_s) > REST_WITHIN_S:
@@ -270,7 +270,7 @@ class ToolDriver:
     def _stop_overdue(self) -> None:
         """Raise why a motion that ended long ago is not over."""
         ended = f"the motion ended {REST_WITHIN_S:g} s ago, but"
-        if self.phase is not Phase.MEASURE:
+        if self.phase is not DrivePhase.MEASURE:
             raise LeftPlanError(f"{ended} the robot does not rest where it ends")
         missing = "edges are missing" if self._beams.total() else "no edge came"
         raise StopError(
@@ -286,7 +286,7 @@ class ToolDriver:
         ``lost``: the controller does not drive the plan any more.
         """
         robot = self.robot
-        moving = self.phase is not Phase.IDLE and robot.heard
+        moving = self.phase is not DrivePhase.IDLE and robot.heard
         keeps = not lost and robot.keeps(*robot.away())
         state = robot.state(now_s, keeps=keeps) if moving else None
         self._settle(reason)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.documents import arm_of
-from robocal_ros.session.followed import Followed
+from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import History
 from robocal_ros.tool.config import ToolConfig, made_with
 from robocal_ros.tool.judging import KnownTool
@@ -17,7 +17,7 @@ from robocal_ros.tool.run_traits import RunTraits
 Array = NDArray[np.float64]
 
 
-class ToolInForce(Followed):
+class ToolInForce(HistoryFollower):
     """What the history has in force for a tool, as of the last look.
 
     Attributes

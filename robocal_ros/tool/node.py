@@ -25,14 +25,14 @@ from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
 from robocal_ros.ros.stamp_watch import StampWatch
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
-from robocal_ros.tool import motion as tcf_motion
+from robocal_ros.tool import node_motion
 from robocal_ros.tool.edge_log import EDGES
 from robocal_ros.tool.in_force import ToolInForce
 from robocal_ros.tool.inputs import take_tool_message
 from robocal_ros.tool.laser_files import read_laser_for
 from robocal_ros.tool.measuring_motion import load_measuring
 from robocal_ros.tool.measuring_plan import PlannedStep
-from robocal_ros.tool.motion import TcfMotion
+from robocal_ros.tool.node_motion import TcfMotion
 from robocal_ros.tool.outputs import TcfOutputs
 from robocal_ros.tool.recorded import configuration
 from robocal_ros.tool.results import WITNESS, WITNESS_REFERENCE
@@ -49,7 +49,7 @@ class TcfNode(HouseNode):
     """Drives a `ToolSession` with live messages and calls."""
 
     NAME = "tcf_node"
-    SETTINGS = (*SETTINGS, *tcf_motion.SETTINGS)
+    SETTINGS = (*SETTINGS, *node_motion.SETTINGS)
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

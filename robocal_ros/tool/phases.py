@@ -17,7 +17,7 @@ MOST_EDGES = {"circle": 24, "plunge": 16}  # with bounces; more is no tool on it
 NO_RUN = (0, 0)
 
 
-class Phase(Enum):
+class DrivePhase(Enum):
     """What the robot does."""
 
     IDLE = "idle"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import (
     TrueStairs,
     edge_shots,
@@ -38,7 +38,7 @@ def known_stairs() -> StepTarget:
     return StepTarget(T_BASE_USER, same.marked_corners(), same.edge_user)
 
 
-def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 0) -> Shots:
+def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 0) -> SimulatedShots:
     """Shots of a target."""
     rng = np.random.default_rng(seed)
     if kind == "sphere":
@@ -58,7 +58,7 @@ def target_of(kind: str) -> Target:
 def write_part(
     folder: Path,
     table: str,
-    shots: Shots,
+    shots: SimulatedShots,
     rows: Sequence[int],
     T_base_flange: Array | None = None,
     **more: Any,

@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 
 from robocal_ros import __version__
 from robocal_ros.cli import main as frame
-from robocal_ros.cli.output import Outcome, exit_status, failure
+from robocal_ros.cli.output import CliResult, exit_status, failure
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import (
     ConflictError,
@@ -183,14 +183,14 @@ class TestOutcomes:
         assert "ZeroDivisionError: oh" in err
 
     def test_nan_never_leaves(self, monkeypatch, capsys):
-        with_command(monkeypatch, lambda args: Outcome({"x": float("nan")}, lambda console: None))
+        with_command(monkeypatch, lambda args: CliResult({"x": float("nan")}, lambda console: None))
         assert frame.main(["probe", "--json"]) == 1
         assert json.loads(capsys.readouterr().out)["error"]["code"] == "NONE"
 
     def test_exit_code_and_noise(self, monkeypatch, capsys):
         def run(args):
             print("a library speaks")
-            return Outcome({"x": 1}, lambda console: console.print("one"), exit_code=3)
+            return CliResult({"x": 1}, lambda console: console.print("one"), exit_code=3)
 
         with_command(monkeypatch, run)
         assert frame.main(["--json", "probe"]) == 3
@@ -202,7 +202,9 @@ class TestOutcomes:
 
     def test_negative_values(self, monkeypatch):
         seen = []
-        with_command(monkeypatch, lambda args: seen.append(args.at) or Outcome({}, lambda c: None))
+        with_command(
+            monkeypatch, lambda args: seen.append(args.at) or CliResult({}, lambda c: None)
+        )
         probe = frame.import_module("")
         probe.add_arguments = lambda parser: parser.add_argument("--at")
         for value in ("-90,0,1", "-.5", "-1e-3"):
@@ -272,7 +274,7 @@ def test_piped_tables_stay_whole(monkeypatch):
     stream = io.StringIO()
     from robocal_ros.cli.output import show
 
-    show(Outcome({}, lambda console: console.print("x" * 150)), stream)
+    show(CliResult({}, lambda console: console.print("x" * 150)), stream)
     assert stream.getvalue() == "x" * 150 + "\n"
 
 

@@ -27,7 +27,7 @@ from hand_eye_tables import (
 from scipy.stats import chi2
 
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, Shots, View, view
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, SimulatedShots, WantedView, view
 from robocal_ros.cell_sim.hand_eye_sets import DOWN, sphere_shots
 from robocal_ros.cell_sim.profile_targets import ball_on_table
 from robocal_ros.cell_sim.ur10_station import Q_NEAR
@@ -359,14 +359,14 @@ def step(T: np.ndarray, p: np.ndarray) -> np.ndarray:
     return T @ frames.transform(np.eye(3), p)
 
 
-def same_place() -> Shots:
+def same_place() -> SimulatedShots:
     """Shots with the sphere always at one place of the profile."""
     rng = np.random.default_rng(4)
     at = [0.0, 0.6 * RADIUS_M, 0.2 + 0.8 * RADIUS_M]
 
     def wanted():
         while True:
-            yield View(
+            yield WantedView(
                 view(DOWN, np.radians([25.0, 25.0, 60.0]) * rng.uniform(-1, 1, 3), CENTRE, at)
             )
 

@@ -14,7 +14,7 @@ from command import conforms, environment, robocal, robocal_json
 from jsonschema import ValidationError
 
 from robocal_ros.ground.codes import Code
-from robocal_ros.ground.proposals import Proposal, State
+from robocal_ros.ground.proposals import CalibrationState, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.correction_record import CorrectionRecord
 
@@ -176,7 +176,7 @@ class TestDeciding:
         assert document["verdict"]["accept"]
         with CalibrationHistory.open(SERIAL, state_dir=state) as history:
             decision = history.get(2).decisions[-1]
-            assert history.get(1).state is State.SUPERSEDED
+            assert history.get(1).state is CalibrationState.SUPERSEDED
         assert (decision.by, decision.reason) == ("Ada", "probe")
         assert before < decision.wall_ns < time.time_ns()
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.cli.recording import Recording
-from robocal_ros.cli.replaying import Request, replay_bag
+from robocal_ros.cli.recording import BagOverview
+from robocal_ros.cli.replaying import ReplayRequest, replay_bag
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 
@@ -16,13 +16,13 @@ def replayed(bag: Path, robot: str, state: Path, *, blocks: bool):
     """The document, all that the history keeps, and how many messages or blocks were read."""
     taken = []
 
-    def watch(what: str, recording: Recording):
+    def watch(what: str, recording: BagOverview):
         for message in recording.blocks() if blocks else recording.samples():
             taken.append(message)
             yield message
 
     arm = load_robot(robot)
-    request = Request(bag, lambda configured: arm, state=state, auto="shift" in bag.name)
+    request = ReplayRequest(bag, lambda configured: arm, state=state, auto="shift" in bag.name)
     document = replay_bag(request, watch)
     with CalibrationHistory.open(bag.stem, state_dir=state) as history:
         kept = [

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import TrueStairs
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
@@ -26,7 +26,7 @@ def stairs_target(T_base_user=T_BASE_USER, **known):
     return StepTarget(T_base_user, drawn.marked_corners(), drawn.edge_user, **known)
 
 
-def data_of(shots: Shots) -> HandEyeData:
+def data_of(shots: SimulatedShots) -> HandEyeData:
     names = tuple(f"p{i + 1}" for i in range(len(shots.profiles)))
     profiles = []
     for name, points in zip(names, shots.profiles, strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.estimation.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent
-from robocal_ros.estimation.loss import Run
+from robocal_ros.estimation.loss import DescentState
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,13 @@ class Rough:
         return np.zeros(2)
 
 
-def descended(ripple: float, start: float) -> Run:
+def descended(ripple: float, start: float) -> DescentState:
     problem = Rough(ripple)
     descent = Descent(problem, np.zeros((2, 2)), 0, np.full(10, 2))
     state = np.full(2, start)
-    return descent.run(Run(state, *problem.linearise(state), 0, False), np.ones(10, dtype=bool))
+    return descent.run(
+        DescentState(state, *problem.linearise(state), 0, False), np.ones(10, dtype=bool)
+    )
 
 
 def test_a_smooth_problem_converges():
@@ -92,7 +94,7 @@ def test_a_step_that_overshoots_for_ever_is_shortened(share, start):
     """Whole steps of Gauss-Newton end at -share times where they began: 0.99 needs 500 of them."""
     problem = Bent(share)
     state = np.array([start])
-    begin = Run(state, *problem.linearise(state), 0, False)
+    begin = DescentState(state, *problem.linearise(state), 0, False)
     run = Descent(problem, np.zeros((1, 1)), 0, np.full(2, 1)).run(begin, np.ones(2, dtype=bool))
     assert run.converged
     assert abs(run.state[0]) < STEP_TOLERANCE  # of the sigma, which is one

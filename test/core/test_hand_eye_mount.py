@@ -10,7 +10,13 @@ from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_ta
 from robocal_ros.ground import frames
 from robocal_ros.ground.codes import Code
 from robocal_ros.hand_eye.mount_fit import SETTLED, fit_mount
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View, pivot_of
+from robocal_ros.hand_eye.mount_problem import (
+    MountProblem,
+    MountState,
+    PoseNoise,
+    TargetView,
+    pivot_of,
+)
 from robocal_ros.hand_eye.quality import HandEyeSettings, judge
 from robocal_ros.hand_eye.restricted_noise import RestrictedLikelihood
 from robocal_ros.hand_eye.result import increment
@@ -46,7 +52,7 @@ def sphere_view(rng, count):
     at = np.column_stack([rng.uniform(-5e-3, 5e-3, count), y, rng.uniform(0.19, 0.21, count)])
     T = sensor_poses(rng, count, CENTRE, at)
     value = np.column_stack([at[:, 0], at[:, 2], np.sqrt(RADIUS_M**2 - y**2)])
-    return View(SphereModel(RADIUS_M), sightings(rng, T, value, np.arange(count), 3)), CENTRE
+    return TargetView(SphereModel(RADIUS_M), sightings(rng, T, value, np.arange(count), 3)), CENTRE
 
 
 def line_view(rng, count):
@@ -55,7 +61,7 @@ def line_view(rng, count):
     T = sensor_poses(rng, count, LINE[0] + rng.uniform(-0.04, 0.04, (count, 1)) * LINE[1], at)
     p = pierced(T, *LINE)
     value = np.column_stack([p[:, 0], p[:, 2], np.zeros(count)])
-    return View(LineModel(), sightings(rng, T, value, np.arange(count), 2)), LINE
+    return TargetView(LineModel(), sightings(rng, T, value, np.arange(count), 2)), LINE
 
 
 def step_view(rng, count):
@@ -72,7 +78,7 @@ def step_view(rng, count):
     user = user + along[:, None] * target.edge_user
     value = np.column_stack([p[:, 0], p[:, 2], np.zeros(len(p))])
     pose = np.repeat(np.arange(count), len(corners))
-    return View(StepTask(target).model(user), sightings(rng, T, value, pose, 3)), T_BASE_USER
+    return TargetView(StepTask(target).model(user), sightings(rng, T, value, pose, 3)), T_BASE_USER
 
 
 def sightings(rng, T_base_sensor, value, pose, size):
@@ -119,7 +125,7 @@ def test_effect_of_a_pose_error_is_the_numeric_one(kind):
             moved = view.sightings.T_base_flange @ frames.transform(
                 frames.exp_rotation(d[3:]), d[:3]
             )
-            other = View(view.model, replace(view.sightings, T_base_flange=moved))
+            other = TargetView(view.model, replace(view.sightings, T_base_flange=moved))
             ends.append(MountProblem((other,), NOISE, state).linear(state).residual)
         numeric = (ends[0] - ends[1]) / (2.0 * step)
         assert np.allclose(numeric, common[:, :, i], atol=1e-6 * (1.0 + np.abs(numeric).max()))
@@ -146,7 +152,9 @@ def test_a_moved_base_gives_the_same_mount():
     T = frames.transform(frames.exp_rotation([0.4, -0.2, 1.1]), [2.0, -1.0, 0.5])
     moved = replace(view.sightings, T_base_flange=T @ view.sightings.T_base_flange)
     here = fit_mount((view,), MountState(X, (place,)))
-    there = fit_mount((View(view.model, moved),), MountState(X, (T[:3, :3] @ place + T[:3, 3],)))
+    there = fit_mount(
+        (TargetView(view.model, moved),), MountState(X, (T[:3, :3] @ place + T[:3, 3],))
+    )
     pivot = pivot_of(here.views)
     off = increment(here.state.T_flange_sensor, there.state.T_flange_sensor, pivot)
     assert off @ np.linalg.solve(here.covariance[:6, :6], off) < (2.0 * SETTLED) ** 2  # of both
@@ -163,7 +171,7 @@ def test_covariance_counts_that_few_poses_tell_their_noise_badly():
     """With n numbers to spare the mean of the noise's square is n / (n - 3) of the likeliest."""
     view, place = sphere_view(np.random.default_rng(10), 6)
     exact = replace(view.sightings, covariance=np.tile(1e-18 * np.eye(3), (6, 1, 1)))
-    fit = fit_mount((View(view.model, exact),), MountState(X, (place,)))
+    fit = fit_mount((TargetView(view.model, exact),), MountState(X, (place,)))
     assert not fit.rejected
     jacobian = MountProblem(fit.views, fit.noise, fit.state).linearise(fit.state)[1]
     rows = jacobian.reshape(-1, jacobian.shape[2])
@@ -203,7 +211,7 @@ def test_one_wrong_profile_is_named_and_left_out():
     view, place = sphere_view(np.random.default_rng(6), 15)
     value = view.sightings.value.copy()
     value[4, 0] += 3e-3
-    wrong = View(view.model, replace(view.sightings, value=value))
+    wrong = TargetView(view.model, replace(view.sightings, value=value))
     fit = fit_mount((wrong,), MountState(X, (place,)))
     assert list(fit.rejected) == [view.sightings.names[4]]
 
@@ -230,6 +238,6 @@ def test_one_wrong_corner_is_left_out_and_the_others_of_its_profile_stay():
     view, place = step_view(np.random.default_rng(7), 6)
     value = view.sightings.value.copy()
     value[8, 1] += 2e-3
-    wrong = View(view.model, replace(view.sightings, value=value))
+    wrong = TargetView(view.model, replace(view.sightings, value=value))
     fit = fit_mount((wrong,), MountState(X, (place,)))
     assert list(fit.rejected) == [view.sightings.names[8]]

@@ -15,13 +15,13 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import Shots
+from robocal_ros.cell_sim.hand_eye_cell import SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
 from robocal_ros.cell_sim.profile_targets import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.codes import Code
 from robocal_ros.hand_eye.mount_problem import PoseNoise
-from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
 from robocal_ros.hand_eye.planning import SensorRange, check_plan
 from robocal_ros.hand_eye.quality import HandEyeSettings, apart, expected_error_m
 from robocal_ros.hand_eye.result import at_origin
@@ -51,7 +51,7 @@ PLANNED = {
         lambda: edge_shots(CELL, T_BASE_USER, 5, np.random.default_rng(1)).true_T_base_flange,
     ),
     "step": (
-        PlannedStep(stairs_target(), SENSOR, ("near", "far")),
+        PlannedStairs(stairs_target(), SENSOR, ("near", "far")),
         lambda: (
             step_shots(CELL, STAIRS, 2, np.random.default_rng(2), level=True).true_T_base_flange
         ),
@@ -112,7 +112,7 @@ def test_marks_with_one_corner_each():
     target = StepTarget(T_BASE_USER, drawn.marked_corners(), drawn.edge_user)
     poses = step_shots(CELL, stairs, 6, np.random.default_rng(2)).true_T_base_flange
     poses[1, :3, 3] += [0.0, 0.0, 0.1]
-    plan = judged(PlannedStep(target, SENSOR, ("near", "far")), poses, 1e-4)
+    plan = judged(PlannedStairs(target, SENSOR, ("near", "far")), poses, 1e-4)
     assert list(plan.unseen) == [1]
     assert len(plan.proposed) >= 1
     assert plan.proposed_error_m < plan.working_error_m
@@ -187,7 +187,7 @@ def test_proposed_poses_do_what_they_promise(turned):
     profiles = [CELL.sensor.shoot(T @ CELL.T_flange_sensor, scene, rng) for T in every]
     stands = [CELL.robot.stand(T, rng) for T in every]
     reported = np.array([stand.T_base_flange for stand in stands])
-    shots = Shots(every, reported, profiles, [""] * len(every), None)
+    shots = SimulatedShots(every, reported, profiles, [""] * len(every), None)
     result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", HandEyeSettings())
     assert result.verdict.accept
     assert len(result.rejected) <= 1  # nothing that is proposed is out of view

@@ -18,7 +18,7 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import (
     edge_block,
     edge_shots,
@@ -302,7 +302,7 @@ class TestLine:
         assert np.allclose(np.cross(turns, T_BASE_USER[:3, 0]), 0.0, atol=1e-9)
         extent_deg = np.degrees(np.ptp(turns @ T_BASE_USER[:3, 0]))
         assert most_deg <= extent_deg <= 2.0 * most_deg + 1e-6
-        data = data_of(Shots(reported, reported, profiles, [""] * 20, None))
+        data = data_of(SimulatedShots(reported, reported, profiles, [""] * 20, None))
         with pytest.raises(RankDeficientError, match=words):
             solve_line(data, LINE, "best", SETTINGS, EdgeRule())
 

@@ -24,7 +24,7 @@ from tool_cell_live import STREAM
 from robocal_ros import __version__
 from robocal_ros.bags import replay
 from robocal_ros.bags.bags import BagReader
-from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.session_events import EVENTS
@@ -85,7 +85,7 @@ def tool_settings(config: Any, laser: Path) -> dict[str, Any]:
     }
 
 
-def play_runs(graph: Any, node: TcfNode, bag: BagReader, recording: Recording) -> None:
+def play_runs(graph: Any, node: TcfNode, bag: BagReader, recording: BagOverview) -> None:
     """Joints and edges of each run, from its begin to its end; nothing else decides anything."""
     inputs = {topic: node.inputs[kind] for topic, kind in recording.inputs.items()}
     kinds = {s.topic_name: s.msg_type for s in node.subscriptions if s.topic_name in inputs}
@@ -118,7 +118,7 @@ def play_runs(graph: Any, node: TcfNode, bag: BagReader, recording: Recording) -
 ASKED = (events.MEASURE_TOOL, events.STEP_BEGINS, events.ACCEPT)
 
 
-def spans(recording: Recording) -> list[tuple[int, int]]:
+def spans(recording: BagOverview) -> list[tuple[int, int]]:
     """Stamps of a reading somewhat before each run's begin, and of the one that ends it."""
     found: list[tuple[int, int]] = []
     for command, _ in recording.commands:

@@ -30,7 +30,7 @@ from robocal_ros import __version__
 from robocal_ros.bags import replay
 from robocal_ros.bags.bag_writer import BagWriter
 from robocal_ros.bags.bags import BagReader
-from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.proposals import THERMAL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -92,7 +92,7 @@ def test_the_thermal_node_says_what_a_replay_says(
     assert [said(event) for event in commands_of(live)] == [told(o) for o in own.outcomes]
 
 
-def seed(recording: Recording, state: Path) -> None:
+def seed(recording: BagOverview, state: Path) -> None:
     """What was in force, and where the tracker stood, as a node that was killed finds them."""
     configured = recording.configured
     assert configured is not None
@@ -119,7 +119,7 @@ def seed(recording: Recording, state: Path) -> None:
         )
 
 
-def marked(bag: BagReader, recording: Recording, path: Path) -> Path:
+def marked(bag: BagReader, recording: BagOverview, path: Path) -> Path:
     """The inputs, with a mark and a pause of the log time where a call is to be made."""
     names = {topic: bag.info.topics[topic].msgtype for topic in recording.inputs}
     with BagWriter(path) as writer:
@@ -134,7 +134,7 @@ def marked(bag: BagReader, recording: Recording, path: Path) -> Path:
     return path
 
 
-def play_cycles(graph: Any, recording: Recording, bag: Path, live: list[SessionEvent]) -> None:
+def play_cycles(graph: Any, recording: BagOverview, bag: Path, live: list[SessionEvent]) -> None:
     """Play the marked bag; make the calls at its marks, the decisions right after them."""
     marks = graph.collect(String, MARKS)
     heard = Heard(graph)
@@ -175,7 +175,7 @@ def ask(graph: Any, name: str, cycle_id: str) -> None:
     assert answer.success, answer.message
 
 
-def thermal_settings(recording: Recording) -> dict[str, Any]:
+def thermal_settings(recording: BagOverview) -> dict[str, Any]:
     """The live node's parameters that give the recorded settings."""
     assert recording.configured is not None
     config, recorded = setting.THERMAL, recording.configured.arguments["config"]
@@ -230,7 +230,7 @@ class Heard:
 
 
 def replayed(
-    recording: Recording, configured: Command | None, commands: Any, state: Path
+    recording: BagOverview, configured: Command | None, commands: Any, state: Path
 ) -> replay.ReplayReport:
     """The excerpt through a session that starts so and is told this."""
     assert configured is not None

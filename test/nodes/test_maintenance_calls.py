@@ -25,7 +25,7 @@ from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.documents import model_document
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode
 from robocal_ros.ros import qos
 from robocal_ros.ros.session_events import EVENTS
@@ -344,7 +344,7 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     call.call_async(RunMaintenanceCycle.Request(cycle_id="a", gap_s=30.0))
     graph.spin_until(lambda: plc.node._session.running, "it runs")
     plc.node._show()
-    assert plc.node._session.state is State.RUNNING
+    assert plc.node._session.state is MaintenanceState.RUNNING
     plc.node.trigger_deactivate()
     graph.spin_until(lambda: plc.statuses[-1].last.cycle_id == "a", "the last word")
     assert plc.statuses[-1].state == MaintenanceStatus.IDLE

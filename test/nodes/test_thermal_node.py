@@ -27,7 +27,7 @@ from robocal_ros import __version__
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.bags.replay import input_topics, read_events, replay
 from robocal_ros.ground.codes import Code
-from robocal_ros.ground.proposals import Head, Proposal, State
+from robocal_ros.ground.proposals import CalibrationState, Head, Proposal
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -329,11 +329,11 @@ def require_old_or_new(graph: Any, serial: str, before: Head, chosen: int) -> No
         state = history.get(chosen).state
     if after.revision == before.revision:
         assert after == before
-        assert state is State.PENDING
+        assert state is CalibrationState.PENDING
     else:
         assert (after.revision, after.calibration_id) == (before.revision + 1, chosen)
         assert after.model == model
-        assert state is State.IN_FORCE
+        assert state is CalibrationState.IN_FORCE
 
 
 COMMANDS = 9

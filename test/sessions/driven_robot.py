@@ -14,7 +14,7 @@ from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session.events import MEASURE_TOOL, TOOL_STEP, Command
-from robocal_ros.tool.driving import Phase, ToolDriver
+from robocal_ros.tool.driving import DrivePhase, ToolDriver
 from robocal_ros.tool.edge_samples import EdgeSample
 from robocal_ros.tool.session import ToolSession
 
@@ -150,7 +150,7 @@ class Robot:
 
     def at_rest(self) -> bool:
         """Whether all is over."""
-        return not self.driver.armed and self.driver.phase is Phase.IDLE
+        return not self.driver.armed and self.driver.phase is DrivePhase.IDLE
 
     def stands_still(self, since_s: float) -> bool:
         count = round((self.now_s - since_s) / PERIOD_S)

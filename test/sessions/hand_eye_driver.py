@@ -11,7 +11,7 @@ import numpy as np
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import sphere_shots
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.robot import Effects
@@ -57,7 +57,7 @@ class Recorded(NamedTuple):
 
 
 @cache
-def sphere_set(count: int = 14) -> tuple[HandEyeCell, Shots]:
+def sphere_set(count: int = 14) -> tuple[HandEyeCell, SimulatedShots]:
     """Shots of a sphere by a UR10 that repeats to a hundredth of a millimetre."""
     rng = np.random.default_rng(8)
     noise = replace(Effects.none(), noise=True)

@@ -17,10 +17,10 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.documents import model_document
-from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
+from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, MaintenanceState, Times
 from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.accuracy import Drift
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.maintenance.ways import STATION, Ways
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
@@ -132,9 +132,11 @@ class Cell:
     config: MaintenanceConfig = field(default_factory=config_of)
     shelf: Shelf = field(default_factory=Shelf)
     services: dict[str, str] = field(default_factory=dict)
-    thermal: Answer = field(default_factory=lambda: Answer(Code.NO_SIGNIFICANT_GAIN, "warm"))
-    check: Answer = field(default_factory=lambda: passed())
-    full: Callable[["Cell"], Answer] = field(default=lambda cell: same_tool())
+    thermal: DriverAnswer = field(
+        default_factory=lambda: DriverAnswer(Code.NO_SIGNIFICANT_GAIN, "warm")
+    )
+    check: DriverAnswer = field(default_factory=lambda: passed())
+    full: Callable[["Cell"], DriverAnswer] = field(default=lambda cell: same_tool())
     drift: Drift | None = None  # told by the thermal node
     silent: bool = False  # joint states
     measures_every: int = 5  # ticks
@@ -144,7 +146,7 @@ class Cell:
         self.now_s = 10.0
         self.motion = AheadMotion(HOME)
         self.coming: list[tuple[float, JointPlan]] = []
-        self.due: list[tuple[float, int, Answer]] = []
+        self.due: list[tuple[float, int, DriverAnswer]] = []
         self.tool = ToolNode()
         self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
         self.beats_every_s = BEAT_S
@@ -153,7 +155,7 @@ class Cell:
         self.counted_s, self.read = -np.inf, 0  # the newest beat: when it was counted; as read
         self.offset = np.zeros(ARM.n)
         self.clock_s = 0.0  # the joints' own clock, ahead of all others
-        self.log: list[ask.Request] = []
+        self.log: list[ask.DriverRequest] = []
         self.events: list[tuple[str, Any]] = []
         self.begun: list[str] = []
         self.ends_s = -np.inf
@@ -192,13 +194,13 @@ class Cell:
     def finish(self, within_s: float = 200.0) -> Any:
         """Until the run has ended; its result."""
         end_s = self.now_s + within_s
-        while self.state in (State.RUNNING, State.BREAKING_OFF):
+        while self.state in (MaintenanceState.RUNNING, MaintenanceState.BREAKING_OFF):
             self.step()
             assert self.now_s < end_s, self.session.status(self.now_s)
         return self.session.status(self.now_s).last
 
     @property
-    def state(self) -> State:
+    def state(self) -> MaintenanceState:
         return self.session.state
 
     @property
@@ -264,7 +266,7 @@ class Cell:
 
     # ---- the nodes ------------------------------------------------------------------------------
 
-    def _carry_out(self, request: ask.Request) -> None:
+    def _carry_out(self, request: ask.DriverRequest) -> None:
         self.log.append(request)
         if isinstance(request, ask.Move | ask.Arm | ask.Measure):
             self._require_allowed(request)
@@ -280,40 +282,42 @@ class Cell:
             case ask.Stop():
                 self.coming.append((self.now_s + LAG_S, request.plan))
             case ask.Arm() | ask.Disarm() if not self.tool.there:
-                gone = Answer(Code.CONFLICT, "not there: start its node", absent=True)
+                gone = DriverAnswer(Code.CONFLICT, "not there: start its node", absent=True)
                 self.session.answered(request.number, gone)
             case ask.BeginCycle() | ask.EndCycle():
                 self._answer("thermal", request.number, self.thermal)
                 if isinstance(request, ask.BeginCycle):
-                    self._answer("thermal", request.number, Answer(Code.ACCEPT))
+                    self._answer("thermal", request.number, DriverAnswer(Code.ACCEPT))
             case ask.Arm():
                 if self.services.get("arm", OK) in (OK, SLOW):
                     self.tool.armed = True
-                self._answer("arm", request.number, Answer(Code.ACCEPT))
+                self._answer("arm", request.number, DriverAnswer(Code.ACCEPT))
             case ask.Disarm():
                 if self.services.get("disarm", OK) != SILENT:
                     self._halt_tool("disarmed")
                     self.tool.armed = False
-                    self._answer("disarm", request.number, Answer(Code.ACCEPT))
+                    self._answer("disarm", request.number, DriverAnswer(Code.ACCEPT))
             case ask.CancelMeasure():
                 if self.services.get("cancel", OK) == OK:
                     self._halt_tool("cancelled")
             case ask.Measure():
                 self._measure(request)
 
-    def _answer(self, service: str, number: int, answer: Answer) -> None:
+    def _answer(self, service: str, number: int, answer: DriverAnswer) -> None:
         how = self.services.get(service, OK)
         if how == SILENT or any(item[1] == number for item in self.due):
             self.due = [i if i[1] != number else (i[0], number, answer) for i in self.due]
             return
         if how == REFUSED:
-            answer = Answer(Code.CONFLICT, f"{service} refuses")
+            answer = DriverAnswer(Code.CONFLICT, f"{service} refuses")
         self.due.append((self.now_s + (0.4 if how == SLOW else 0.03), number, answer))
 
     def _measure(self, request: ask.Measure) -> None:
         how = self.services.get("measure", OK)
         if not self.tool.armed or how == REFUSED:
-            self.due.append((self.now_s + 0.03, request.number, Answer(Code.CONFLICT, "not armed")))
+            self.due.append(
+                (self.now_s + 0.03, request.number, DriverAnswer(Code.CONFLICT, "not armed"))
+            )
             return
         self.tool.measuring = request.number
         long = {SLOW: 60.0, SILENT: np.inf}.get(how, 1.0)
@@ -335,12 +339,14 @@ class Cell:
     def _halt_tool(self, why: str) -> None:
         if self.tool.measuring:
             self.motion.hold(self.now_s)
-            self.due.append((self.now_s + 0.03, self.tool.measuring, Answer(Code.CONFLICT, why)))
+            self.due.append(
+                (self.now_s + 0.03, self.tool.measuring, DriverAnswer(Code.CONFLICT, why))
+            )
             self.tool.measuring, self.tool.armed = 0, False
 
     # ---- what must never be ---------------------------------------------------------------------
 
-    def _require_allowed(self, request: ask.Request) -> None:
+    def _require_allowed(self, request: ask.DriverRequest) -> None:
         if not self.heard or self.now_s - self.beat_s > STALE_S:
             raise NeverError(f"{type(request).__name__} while the gap is closed or stale")
         if isinstance(request, ask.Move) and self.tool.armed:
@@ -418,25 +424,25 @@ def proposed(
     return _kept(history, TOOL, tool.document() | model)
 
 
-def new_tool(number: int) -> Answer:
+def new_tool(number: int) -> DriverAnswer:
     """The answer of a full measurement that led to a candidate."""
-    return Answer(Code.ACCEPT, "a new tool", number, (), True, "", 1.0, 0.03)
+    return DriverAnswer(Code.ACCEPT, "a new tool", number, (), True, "", 1.0, 0.03)
 
 
-def passed() -> Answer:
-    return Answer(Code.ACCEPT, "pass: 0.05 mm", 0, (), True, "pass", 0.05, 0.03)
+def passed() -> DriverAnswer:
+    return DriverAnswer(Code.ACCEPT, "pass: 0.05 mm", 0, (), True, "pass", 0.05, 0.03)
 
 
-def bent() -> Answer:
-    return Answer(Code.LIMIT_EXCEEDED, "recalibrate", 0, (), True, "recalibrate", 1.5, 0.03)
+def bent() -> DriverAnswer:
+    return DriverAnswer(Code.LIMIT_EXCEEDED, "recalibrate", 0, (), True, "recalibrate", 1.5, 0.03)
 
 
-def same_tool() -> Answer:
-    return Answer(Code.NO_SIGNIFICANT_GAIN, "same tool", 1, (), True, "", 0.02, 0.03)
+def same_tool() -> DriverAnswer:
+    return DriverAnswer(Code.NO_SIGNIFICANT_GAIN, "same tool", 1, (), True, "", 0.02, 0.03)
 
 
-def wrong_tool() -> Answer:
-    return Answer(Code.WRONG_TOOL, "5 mm too thick: another tool is mounted")
+def wrong_tool() -> DriverAnswer:
+    return DriverAnswer(Code.WRONG_TOOL, "5 mm too thick: another tool is mounted")
 
 
 def over(cell: Cell, *, fault: bool = False) -> None:
@@ -444,7 +450,7 @@ def over(cell: Cell, *, fault: bool = False) -> None:
     cell.pass_time(1.5)
     assert not cell.tool.armed
     assert cell.now_s - cell.moved_s > 1.0
-    assert (cell.state is State.FAULT) == fault
+    assert (cell.state is MaintenanceState.FAULT) == fault
     assert fault or cell.at_home()
 
 

@@ -18,7 +18,7 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.maintenance import requests as ask
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
 
@@ -66,5 +66,5 @@ def until_verified(cell: Cell) -> None:
 def thermal_candidate(cell: Cell) -> int:
     """What the thermal node answers from now on."""
     number = thermal_proposed(cell.history, 10.0)
-    cell.thermal = Answer(Code.ACCEPT, "warm", number)
+    cell.thermal = DriverAnswer(Code.ACCEPT, "warm", number)
     return number

@@ -31,7 +31,7 @@ from maintenance_cell import (
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import InputError, StorageError
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.mover import Mover
@@ -164,7 +164,7 @@ def test_a_gap_that_closes_while_the_robot_is_at_home_is_no_fault(cell):
 def test_a_cancelled_run_goes_home(cell, which):
     until_moving(cell, which)
     assert cell.session.cancel("by the PLC")
-    assert cell.state is State.BREAKING_OFF
+    assert cell.state is MaintenanceState.BREAKING_OFF
     result = cell.finish()
     assert (result.code, result.message) == (Code.CONFLICT, "by the PLC")
     over(cell)
@@ -178,7 +178,7 @@ def test_after_a_fault_the_ways_begin_at_home_again(cell):
     cell.pass_time(0.4)
     cell.is_open = False
     cell.pass_time(1.5)
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     cell.motion = AheadMotion(HOME)
     cell.open_gap()
     cell.pass_time(0.5)
@@ -240,7 +240,7 @@ def test_a_run_that_cannot_be_kept_does_not_begin(cell, monkeypatch):
 
     monkeypatch.setattr(cell.shelf, "save", full)
     assert cell.run("c1", LONG_S) is Code.STORAGE_FAILED
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE
     cell.pass_time(1.0)
     assert cell.log == []
 
@@ -251,7 +251,7 @@ def test_worst_cases_hold(cell):
     worst = cell.session.worst_cases()
     cell.run("c1", LONG_S)
     begun = {}
-    while cell.state is State.RUNNING:
+    while cell.state is MaintenanceState.RUNNING:
         count = len(cell.log)
         cell.step()
         begun |= {type(r).__name__: cell.now_s for r in cell.log[count:]}
@@ -277,7 +277,7 @@ def test_a_pose_takes_its_worst_case_and_no_more(history):
     cell.open_gap()
     cell.run("c1", cell.session.worst_cases()["the first measuring pose"])
     sent: list[tuple[float, ask.Move]] = []
-    while cell.state is State.RUNNING:
+    while cell.state is MaintenanceState.RUNNING:
         if sent:
             cell.offset[-1] = unsettled_rad(cell.now_s + TICK_S, sent[-1][0], sent[-1][1].plan)
         count = len(cell.log)

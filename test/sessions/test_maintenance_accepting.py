@@ -39,7 +39,7 @@ from robocal_ros.ground.proposals import THERMAL, TOOL, Action, Decision, Head
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import insert_decision
 from robocal_ros.maintenance import AcceptBounds
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.motion.gap import STALL_S
 from robocal_ros.session.decisions import decide
 from robocal_ros.session.events import ACCEPT, WITHHOLD, Command, Outcome
@@ -74,7 +74,7 @@ def test_a_tool_without_a_thermal_result_waits(history, how):
 def test_a_tool_with_a_known_drift_is_accepted(history, poses, code):
     """No other model explains this cycle better than the one in force."""
     cell = automatic(history, poses=poses)
-    cell.thermal = Answer(code, "warm")
+    cell.thermal = DriverAnswer(code, "warm")
     number = measured_in_full(cell)
     while not cell.history.head(TOOL).revision:
         cell.step()

@@ -32,7 +32,7 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import ConflictError, StorageError
 from robocal_ros.ground.proposals import THERMAL, TOOL, Action
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.settling import HELD_S
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
@@ -85,7 +85,7 @@ def test_an_acceptance_that_meets_a_held_history_comes_later(history, kind):
         until_back_home(cell)
     with held_by_another(history):
         cell.pass_time(HELD_S / 2.0)
-        assert cell.state is State.RUNNING
+        assert cell.state is MaintenanceState.RUNNING
         assert history.head(kind).calibration_id is None
     cell.check = passed()
     assert cell.finish().accepted == (number,)
@@ -179,7 +179,7 @@ def test_what_a_person_chose_while_the_history_was_held_is_not_taken_back(histor
     with held_by_another(history):
         until_back_home(cell)
         cell.pass_time(HELD_S / 4.0)
-        assert cell.state is State.RUNNING
+        assert cell.state is MaintenanceState.RUNNING
     history.rollback(first, kind=TOOL, by="a person", reason="", wall_ns=0)
     result = cell.finish()
     assert history.head(TOOL).calibration_id == first
@@ -269,7 +269,7 @@ def test_a_tool_that_cannot_be_taken_back_is_a_fault(history, monkeypatch, where
     assert result.accepted == (number,)
     assert result.code is Code.CONFLICT
     assert "could not be taken back: the history is held" in result.message
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert not cell.tool.armed
     assert cell.at_home()
 

@@ -7,9 +7,9 @@ import pytest
 from maintenance_cell import LONG_S, POSES, REFUSED, SILENT, Cell, config_of, kinds, opened
 
 from robocal_ros.ground.codes import Code
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import requests as ask
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 
 UNKNOWN = set(Code) - {
     Code.NONE,
@@ -40,7 +40,7 @@ def test_a_thermal_node_that_fails_leaves_the_measurement(cell, how):
 
 @pytest.mark.parametrize("code", sorted(UNKNOWN), ids=lambda code: code.name)
 def test_a_verdict_that_does_not_tell_the_drift_leaves_it(cell, code):
-    cell.thermal = Answer(code, "why")
+    cell.thermal = DriverAnswer(code, "why")
     cell.run("c1", LONG_S)
     result = cell.finish()
     assert (result.complete, result.left) == (False, ("thermal measurement",))
@@ -49,7 +49,7 @@ def test_a_verdict_that_does_not_tell_the_drift_leaves_it(cell, code):
 
 def test_a_pose_that_was_not_measured_is_left_by_its_number(cell):
     cell.run("c1", LONG_S)
-    while cell.state is State.RUNNING:
+    while cell.state is MaintenanceState.RUNNING:
         at_second = "measuring pose 2 of" in cell.session.status(cell.now_s).doing
         cell.services["sensor"] = SILENT if at_second else "ok"
         cell.step()

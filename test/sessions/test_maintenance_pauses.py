@@ -24,7 +24,7 @@ from maintenance_cell import (
 )
 
 from robocal_ros.ground.codes import Code
-from robocal_ros.maintenance import AcceptBounds, State
+from robocal_ros.maintenance import AcceptBounds, MaintenanceState
 from robocal_ros.maintenance.conductor import UNSAVED_S
 from robocal_ros.maintenance.hands import DEAF_S
 from robocal_ros.maintenance.requests import Stop
@@ -73,7 +73,7 @@ def test_a_pause_of_its_own_that_a_cycle_bears_in_a_motion(history, beats_every_
         assert cell.moved_s == cell.now_s
         cell.pause(pause_s)
         cell.pass_time(1.0)
-        assert cell.state is State.RUNNING, cell.session.status(cell.now_s).fault
+        assert cell.state is MaintenanceState.RUNNING, cell.session.status(cell.now_s).fault
 
 
 @pytest.mark.parametrize("pause_s", PAUSES_S)
@@ -140,7 +140,7 @@ def test_a_pause_in_a_motion_stops_the_robot(cell):
     cell.pause(0.6)
     result = cell.finish()
     assert result.code is Code.CONFLICT
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert "Stop" in kinds(cell)
 
 
@@ -166,7 +166,7 @@ def test_a_stop_does_not_wait_for_the_disk(cell):
     cell.pass_time(0.5)
     cell.shelf.takes = lambda: cell.pause(0.6)
     cell.is_open, closed_s = False, cell.now_s
-    while cell.state is State.RUNNING:
+    while cell.state is MaintenanceState.RUNNING:
         cell.step()
     cell.pass_time(1.0)
     assert cell.moved_s <= closed_s + BEAT_S + SHORTEST_STOP_S + LAG_S + 2.0 * TICK_S
@@ -212,8 +212,8 @@ def test_a_fault_that_is_not_on_the_disk_yet_outlives_a_kill(cell):
     while "Move" not in kinds(cell):
         cell.step()
     cell.is_open = False
-    while cell.state is State.RUNNING:
+    while cell.state is MaintenanceState.RUNNING:
         cell.step()
     cell.restart()
     status = cell.session.status(cell.now_s)
-    assert (status.state, status.last.code) == (State.FAULT, Code.CONFLICT)
+    assert (status.state, status.last.code) == (MaintenanceState.FAULT, Code.CONFLICT)

@@ -41,15 +41,15 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ground.proposals import Action
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.maintenance import AcceptBounds, State
+from robocal_ros.maintenance import AcceptBounds, MaintenanceState
 from robocal_ros.maintenance.hands import DEAF_S
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.tool.config import rows_of
 from robocal_ros.tool.driving import SETTLED_S
 
-BUSY = (State.RUNNING, State.BREAKING_OFF)
+BUSY = (MaintenanceState.RUNNING, MaintenanceState.BREAKING_OFF)
 SERVICES = ("thermal", "arm", "disarm", "cancel", "measure", "sensor")
 STOPS_WITHIN_S = SHORTEST_STOP_S + 0.1  # with a tick and the controller's lag
 # A node that was started anew confirms that nothing moves: it is believed until a stop were over.
@@ -96,7 +96,9 @@ services = st.one_of(
     ),
 )
 gaps = st.one_of(st.just(70.0), st.floats(5.0, 70.0))
-refusals = st.sampled_from([Answer(code, "refused") for code in Code if code is not Code.ACCEPT])
+refusals = st.sampled_from(
+    [DriverAnswer(code, "refused") for code in Code if code is not Code.ACCEPT]
+)
 checks = st.sampled_from([bent(), replace(bent(), answer="cannot tell"), passed()])
 DRIFTS = {level.name: replace(KNOWN, level=level) for level in AccuracyLevel} | {"silent": None}
 flaws = st.sampled_from(["", "", "", "revision", "taught", "EXPIRED", "FAULT", "silent"])
@@ -109,16 +111,16 @@ class Nodes:
         self.kelvin, self.shift_mm, self.flaw = kelvin, shift_mm, flaw
         self.allowed: set[int] = set()
 
-    def thermal(self, cell: Cell, refused: Answer) -> Answer:
+    def thermal(self, cell: Cell, refused: DriverAnswer) -> DriverAnswer:
         """Of a robot that has warmed up; its links of 1.3 m grow by 16 um with each kelvin."""
         if self.kelvin is None:
             return refused
         number = thermal_proposed(cell.history, self.kelvin)
         if self.kelvin * 16e-6 < BOUNDS.thermal_m and self.level(cell) < AccuracyLevel.FAULT:
             self.allowed.add(number)
-        return Answer(Code.ACCEPT, "warm", number)
+        return DriverAnswer(Code.ACCEPT, "warm", number)
 
-    def full(self, cell: Cell) -> Answer:
+    def full(self, cell: Cell) -> DriverAnswer:
         """A tool that is bent sideways."""
         other = {"revision": {"thermal_revision": 7}, "taught": {"taught": rows_of(2.0 * TAUGHT)}}
         shift_m = np.array([0.6, 0.0, 0.8]) * self.shift_mm * 1e-3
@@ -157,7 +159,7 @@ class Watched:
     def step(self) -> None:
         cell, before = self.cell, self.cell.state
         cell.step()
-        if before in BUSY and cell.state is State.IDLE:
+        if before in BUSY and cell.state is MaintenanceState.IDLE:
             near = cell.config.home_near + np.max(np.abs(cell.offset))
             assert np.max(np.abs(cell.q - HOME)) <= near, "handed over away from home"
             assert not cell.tool.armed, "handed over armed"
@@ -220,7 +222,7 @@ class Watched:
                     status = cell.session.status(cell.now_s)
                     assert not status.disarmed or not status.at_home
                 else:
-                    assert cell.session.status(cell.now_s).state is not State.FAULT
+                    assert cell.session.status(cell.now_s).state is not MaintenanceState.FAULT
             case ("restart",):
                 self.killed_s = cell.now_s
                 cell.restart()
@@ -241,7 +243,7 @@ class Watched:
         self.pass_time(1.5)
         if cell.services.get("disarm", OK) not in (SILENT, REFUSED):
             assert not cell.tool.armed, "still armed"
-        assert not cell.tool.armed or cell.state is State.FAULT
+        assert not cell.tool.armed or cell.state is MaintenanceState.FAULT
         count = len(cell.begun)
         for name in cell.begun:
             cell.run(name, 60.0)

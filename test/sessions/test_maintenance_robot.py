@@ -26,9 +26,9 @@ from maintenance_cell import (
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import RobocalError, StorageError
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.hands import Hands
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.maintenance.ways import Ways
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
@@ -49,7 +49,7 @@ def until_measuring(cell: Cell, pose: int) -> None:
 def test_silent_joint_states_stop_the_robot(cell, which):
     until_moving(cell, which)
     cell.silent = True
-    while cell.state is not State.FAULT:
+    while cell.state is not MaintenanceState.FAULT:
         cell.step()
     cell.silent = False
     over(cell, fault=True)
@@ -62,7 +62,7 @@ def test_a_robot_that_was_never_heard_is_not_moved(history):
     cell = Cell(history, silent=True)
     cell.open_gap()
     assert cell.run("c1", LONG_S) is Code.TOO_FEW_SAMPLES
-    assert cell.state is State.IDLE  # nothing has moved: nobody need look
+    assert cell.state is MaintenanceState.IDLE  # nothing has moved: nobody need look
     cell.silent = False
     cell.pass_time(0.5)
     assert cell.run("c1", LONG_S) is Code.ACCEPT
@@ -131,7 +131,7 @@ def test_silent_joint_states_while_the_robot_measures_are_a_fault(cell):
     cell.silent = True
     cell.services["sensor"] = SILENT
     cell.pass_time(0.3)
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert "stands away from home" in cell.session.status(cell.now_s).fault
 
 
@@ -141,7 +141,7 @@ def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     words = f"not at home: {ARM.joint_names[2]} is 5.30 deg off"
     code = refused(lambda: cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns), words)
     assert code is Code.LIMIT_EXCEEDED
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     cell.offset[2] = 0.0
     cell.pass_time(0.5)
     assert cell.run("c1", LONG_S) is Code.CONFLICT  # until it is acknowledged
@@ -165,19 +165,19 @@ def test_a_fault_away_from_home_is_not_acknowledged(cell):
     cell.silent, cell.motion = False, AheadMotion(HOME)
     cell.pass_time(0.5)
     cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE
 
 
 @pytest.mark.parametrize("mode", ["quick", "full"])
 def test_a_robot_that_left_its_plan_in_a_tool_run_is_not_driven_on(cell, mode):
     """It may be held, or have hit something; only a person knows."""
-    held = Answer(Code.LIMIT_EXCEEDED, "away from its plan", left_plan=True)
+    held = DriverAnswer(Code.LIMIT_EXCEEDED, "away from its plan", left_plan=True)
     cell.check, cell.full = (held if mode == "quick" else bent()), lambda _: held
     cell.run("c1", LONG_S)
     assert cell.finish().code is Code.LIMIT_EXCEEDED
     over(cell, fault=True)
     status = cell.session.status(cell.now_s)
-    assert (cell.state, status.fault_code) == (State.FAULT, Code.LIMIT_EXCEEDED)
+    assert (cell.state, status.fault_code) == (MaintenanceState.FAULT, Code.LIMIT_EXCEEDED)
     assert held.message in status.fault
     asked = kinds(cell)
     assert "Move" not in asked[len(asked) - asked[::-1].index("Measure") :]
@@ -230,7 +230,7 @@ def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):
         with pytest.raises(StorageError):
             cell.session.acknowledge("me")
     after = cell.session.status(cell.now_s)
-    assert (after.state, after.fault) == (State.FAULT, before.fault)
+    assert (after.state, after.fault) == (MaintenanceState.FAULT, before.fault)
     assert after.fault_code is Code.LIMIT_EXCEEDED
     assert cell.run("c1", LONG_S) is Code.CONFLICT
 
@@ -247,11 +247,11 @@ def test_a_restart_in_the_middle_of_a_run_is_a_fault(cell):
     until_moving(cell, "thermal")
     cell.restart()
     status = cell.session.status(cell.now_s)
-    assert status.state is State.FAULT
+    assert status.state is MaintenanceState.FAULT
     assert "see where the robot is" in status.fault
     assert status.last.code is Code.CONFLICT
     cell.restart()
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
 
 
 def test_a_robot_that_has_not_come_to_rest_is_not_handed_over(history):
@@ -265,7 +265,7 @@ def test_a_robot_that_has_not_come_to_rest_is_not_handed_over(history):
     cell.session.cancel("by the PLC")
     cell.is_open = False
     cell.finish()
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert "not handed over at home" in cell.session.status(cell.now_s).fault
     over(cell, fault=True)
     cell.session.acknowledge("me")
@@ -286,7 +286,7 @@ def test_the_rest_of_the_way_home_is_driven_where_it_fits(left_s):
 def test_a_fault_ends_after_the_joints_clock_began_anew(cell):
     until_moving(cell, "tool")
     cell.is_open = False
-    while cell.state is not State.FAULT:
+    while cell.state is not MaintenanceState.FAULT:
         cell.step()
     cell.silent = True
     cell.pass_time(5.0)
@@ -294,4 +294,4 @@ def test_a_fault_ends_after_the_joints_clock_began_anew(cell):
     cell.motion = AheadMotion(HOME)
     cell.pass_time(1.0)
     cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE

@@ -20,13 +20,13 @@ from maintenance_tools import decide, level, measured_in_full, modes, until_meas
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.proposals import THERMAL, TOOL
-from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.session.events import ACCEPT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 
 TOO_SHORT_FOR_FULL_S = 33.0
 DAY_NS = 86_400 * 10**9
-WITHOUT_WAY = Answer(Code.LIMIT_EXCEEDED, "the housing would be hit")
+WITHOUT_WAY = DriverAnswer(Code.LIMIT_EXCEEDED, "the housing would be hit")
 OTHER_MODEL = "another thermal model is in force than it was checked with: check it"
 
 
@@ -265,7 +265,7 @@ def test_a_tool_of_another_thermal_model_that_comes_back_is_due(checked):
 def test_a_station_that_moved_degrades_until_a_check_passes(cell):
     words = "the beam station was knocked, or the tool slipped in its mount"
     cell.check = bent()
-    cell.full = lambda _: Answer(Code.STATION_MOVED, words, 7, (), True, "", 0.8, 0.03)
+    cell.full = lambda _: DriverAnswer(Code.STATION_MOVED, words, 7, (), True, "", 0.8, 0.03)
     cell.run("c1", LONG_S)
     result = cell.finish()
     assert (result.tool_found_code, result.tool_code) == (Code.STATION_MOVED, Code.STATION_MOVED)

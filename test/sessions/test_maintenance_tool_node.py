@@ -26,7 +26,7 @@ from maintenance_cell import (
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import ConflictError
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.hands import DEAF_S
 from robocal_ros.motion.robot_watch import VELOCITY_S
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
@@ -50,7 +50,7 @@ def test_a_tool_node_that_never_confirms_is_a_fault(cell):
     cell.services["disarm"] = "ok"
     cell.pass_time(1.0)
     cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE
 
 
 def test_a_tool_node_that_was_never_started_keeps_nothing_but_its_part(history):
@@ -85,7 +85,7 @@ def test_a_tool_node_that_died_at_home_is_a_fault_that_can_be_acknowledged(cell)
         cell.session.acknowledge("me")
     cell.pass_time(GONE_S)
     cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE
 
 
 def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
@@ -101,7 +101,7 @@ def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
     cell.tool = ToolNode()
     cell.pass_time(1.0)
     cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE
 
 
 def test_a_tool_node_is_let_go_only_while_the_robot_stands_at_home(history):
@@ -143,7 +143,7 @@ def test_a_deaf_tool_node_is_stopped_by_what_armed_it(cell, how):
         cell.session.cancel("by the PLC")
     cell.pass_time(3.0)
     assert cell.moved_s <= since_s + 0.2 + DEAF_S + SHORTEST_STOP_S + 0.1
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert "Stop" in kinds(cell)
     with pytest.raises(ConflictError, match="not confirmed"):
         cell.session.acknowledge("me")
@@ -249,7 +249,7 @@ def test_a_node_that_ends_stops_what_the_tool_node_moves_at_once(cell):
     assert cell.shelf.document == before  # a stop does not wait for the disk
     cell.session.close()
     cell.restart()
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert "the node ends" in cell.session.status(cell.now_s).fault
 
 
@@ -258,7 +258,7 @@ def test_a_node_that_ends_just_after_a_fault_stops_what_a_deaf_tool_node_moves(c
     until_moving(cell, "tool")
     cell.services |= {"disarm": SILENT, "cancel": SILENT}
     cell.is_open = False
-    while cell.state is not State.FAULT:
+    while cell.state is not MaintenanceState.FAULT:
         cell.step()
     assert cell.moved_s == cell.now_s
     assert "Stop" not in kinds(cell)
@@ -267,7 +267,7 @@ def test_a_node_that_ends_just_after_a_fault_stops_what_a_deaf_tool_node_moves(c
     assert cell.session.give_up("the node ends", cell.now_s) == []  # sent once
     cell.session.close()
     cell.restart()
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
 
 
 def test_a_tool_node_that_turns_deaf_at_the_station_is_a_fault(cell):
@@ -296,7 +296,7 @@ def test_a_disarm_that_is_not_confirmed_outlives_a_restart(cell):
     cell.services |= {"disarm": SILENT, "cancel": SILENT}
     cell.is_open = False
     cell.pass_time(1.0)
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     cell.restart()
     cell.open_gap()
     assert not cell.session.status(cell.now_s).disarmed
@@ -335,4 +335,4 @@ def test_a_cycle_moves_nothing_before_the_disarm_is_confirmed(cell):
     result = cell.finish()
     assert "does not confirm" in result.message
     assert not {"Move", "BeginCycle", "Arm"} & set(kinds(cell))
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT

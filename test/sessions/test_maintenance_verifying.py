@@ -30,7 +30,7 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import StorageError
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.maintenance import State
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.session.events import ACCEPT, REJECT
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
@@ -104,7 +104,7 @@ def test_a_tool_that_failed_its_check_is_taken_back_by_a_cancelled_run_too(histo
     result = cell.finish()
     assert (result.code, result.accepted) == (Code.CONFLICT, ())
     assert result.message.startswith("by the PLC; the accepted tool failed its check and was taken")
-    assert cell.state is State.IDLE
+    assert cell.state is MaintenanceState.IDLE
     assert cell.history.head(TOOL).calibration_id is None
     assert level(cell) is AccuracyLevel.DEGRADED
 
@@ -126,7 +126,7 @@ def test_a_tool_that_failed_its_check_and_stays_in_force_is_a_fault(history, mon
     result = cell.finish()
     assert (result.code, result.accepted) == (Code.CONFLICT, (number,))
     assert words in result.message
-    assert cell.state is State.FAULT
+    assert cell.state is MaintenanceState.FAULT
     assert words in cell.session.status(cell.now_s).fault
 
 

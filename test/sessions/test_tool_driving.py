@@ -11,7 +11,7 @@ from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import ConflictError
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.session.events import MEASURE_TOOL, Command
-from robocal_ros.tool.driving import Phase
+from robocal_ros.tool.driving import DrivePhase
 from robocal_ros.tool.edge_samples import EdgeSample
 from robocal_ros.tool.judging import KnownTool
 
@@ -32,7 +32,7 @@ def test_a_whole_run_is_driven_and_then_disarmed(robot, history):
     found = KnownTool.of_document(history.model(last.calibration_id))
     away = found.T_flange_tool[:3, 3] - TRUTH[:3, 3]
     assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3  # chi-square, 1e-3
-    assert robot.driver.phase is Phase.IDLE
+    assert robot.driver.phase is DrivePhase.IDLE
     assert robot.driver.told == "the run has ended"
     assert len(robot.sent) == 10  # a way and a motion for each of five steps
 
@@ -71,7 +71,7 @@ def test_no_step_begins_on_a_heartbeat_from_before_a_pause(robot):
     """Readings that waited all through it are taken before anything else."""
     robot.driver.arm(robot.now_s)
     robot.measure()
-    robot.run(1.0, until=lambda: robot.driver.phase is Phase.APPROACH)
+    robot.run(1.0, until=lambda: robot.driver.phase is DrivePhase.APPROACH)
     robot.run(0.1)
     robot.beating = False
     robot.now_s += robot.sent[-1][1].duration_s + 1.0  # the way to the step is over meanwhile
@@ -122,7 +122,7 @@ def driving(robot, phase, for_s=0.4):
     assert robot.driver.phase is phase
 
 
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+@pytest.mark.parametrize("phase", [DrivePhase.APPROACH, DrivePhase.MEASURE])
 def test_silent_joint_states_stop_it(robot, phase):
     driving(robot, phase)
     at_s = robot.now_s
@@ -134,7 +134,7 @@ def test_silent_joint_states_stop_it(robot, phase):
     stopped(robot, "joint states are silent")
 
 
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+@pytest.mark.parametrize("phase", [DrivePhase.APPROACH, DrivePhase.MEASURE])
 def test_a_stop_after_a_suspend_begins_where_the_robot_stands(robot, phase):
     """Host and controller slept in the middle of a motion."""
     driving(robot, phase)
@@ -149,14 +149,14 @@ def test_a_stop_after_a_suspend_begins_where_the_robot_stands(robot, phase):
 
 
 def test_a_break_on_the_way_stops_it(robot):
-    driving(robot, Phase.APPROACH, 0.6)
+    driving(robot, DrivePhase.APPROACH, 0.6)
     robot.edges.insert(0, EdgeSample(robot.ns(robot.now_s), "", "x", True, 1e-4))
     robot.run(0.5)
     stopped(robot, "a beam was broken on the way")
 
 
 def test_a_deviation_from_the_plan_stops_it(robot):
-    driving(robot, Phase.MEASURE)
+    driving(robot, DrivePhase.MEASURE)
     robot.offset[4] = np.radians(1.0)
     robot.run(0.5)
     stopped(robot, "deg away from its plan", follows=False)  # its readings are not where it is
@@ -164,7 +164,7 @@ def test_a_deviation_from_the_plan_stops_it(robot):
 
 @pytest.mark.parametrize("wild_rad", [0.05, -1.0, 1e307])
 def test_one_wild_reading_stops_it_where_it_is(robot, wild_rad):
-    driving(robot, Phase.MEASURE)
+    driving(robot, DrivePhase.MEASURE)
     robot.offset[4] = wild_rad
     robot.step()
     robot.offset[4] = 0.0
@@ -178,14 +178,14 @@ def test_one_wild_reading_stops_it_where_it_is(robot, wild_rad):
 
 
 def test_a_cancel_stops_it(robot):
-    driving(robot, Phase.MEASURE)
+    driving(robot, DrivePhase.MEASURE)
     robot.ask(Command("break_off", {"reason": "cancelled"}))
     robot.run(0.5)
     stopped(robot, "cancelled")
 
 
 def test_disarming_stops_it(robot):
-    driving(robot, Phase.APPROACH, 0.6)
+    driving(robot, DrivePhase.APPROACH, 0.6)
     robot.driver.disarm("disarmed by the operator", robot.now_s)
     robot.run(0.5)
     stopped(robot, "disarmed by the operator")
@@ -206,7 +206,7 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
     assert "housing" in robot.driver.told
 
 
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+@pytest.mark.parametrize("phase", [DrivePhase.APPROACH, DrivePhase.MEASURE])
 def test_a_robot_that_is_held_has_left_its_plan(robot, phase):
     driving(robot, phase)
     robot.motion = AheadMotion(robot.q)
@@ -273,7 +273,7 @@ def test_an_armed_robot_that_falls_silent_is_disarmed(robot):
 
 
 def test_a_clock_that_jumps_back_still_ends_in_a_stop_that_slows_down(robot):
-    driving(robot, Phase.MEASURE)
+    driving(robot, DrivePhase.MEASURE)
     q = robot.q + robot.offset
     robot.driver.reading(robot.now_s - 3600.0, q, robot.now_s)
     robot.driver.disarm("the clock jumped", robot.now_s)

@@ -9,7 +9,7 @@ from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
 from robocal_ros.cell_sim.cell_faults import Fault, Faults, size_of
 from robocal_ros.ground.codes import Code
-from robocal_ros.ground.proposals import TOOL, State
+from robocal_ros.ground.proposals import TOOL, CalibrationState
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.config import rows_of
@@ -70,7 +70,7 @@ def test_a_station_that_was_knocked_sideways_is_named(driver):
     found = driver.measure("full")
     assert found.status is Code.STATION_MOVED
     assert "the beam station was knocked, or the tool slipped in its mount" in found.message
-    assert driver.history.get(found.calibration_id).state is not State.PENDING
+    assert driver.history.get(found.calibration_id).state is not CalibrationState.PENDING
     assert not driver.history.pending(TOOL, 1)
 
 

@@ -16,7 +16,7 @@ from robocal_ros.motion.robot_watch import REST_RAD, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
 from robocal_ros.motion.watched_stop import PAUSED_S, SEEN_S, STANDS_S, WatchedStop
 from robocal_ros.session.events import TOOL_STEP
-from robocal_ros.tool.driving import Phase
+from robocal_ros.tool.driving import DrivePhase
 
 ARM = load_robot("kr150_r3100")
 HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
@@ -29,7 +29,7 @@ def robot(history) -> Robot:
     return made
 
 
-def driven(robot: Robot, phase: Phase, for_s: float) -> None:
+def driven(robot: Robot, phase: DrivePhase, for_s: float) -> None:
     robot.driver.arm(robot.now_s)
     robot.measure("quick")
     robot.run(20.0, until=lambda: robot.driver.phase is phase)
@@ -70,7 +70,7 @@ def test_a_stop_throws_no_joint_back_and_none_ahead(speed, lag_cycles, late_s):
     assert np.max(np.abs(path[-1] - halt.q[-1])) < 1e-6
 
 
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+@pytest.mark.parametrize("phase", [DrivePhase.APPROACH, DrivePhase.MEASURE])
 def test_every_motion_begins_ahead_of_now_with_velocities(robot, phase):
     driven(robot, phase, 0.1)
     for _, plan in robot.sent:
@@ -121,7 +121,7 @@ def test_a_scaled_robot_measures_as_ever(robot, speed, tells):
 
 
 @pytest.mark.parametrize("tells", [True, False])
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+@pytest.mark.parametrize("phase", [DrivePhase.APPROACH, DrivePhase.MEASURE])
 def test_a_pause_of_ten_seconds_is_waited_for(robot, phase, tells):
     robot.tells = tells
     driven(robot, phase, 0.4)
@@ -136,7 +136,7 @@ def test_a_pause_of_ten_seconds_is_waited_for(robot, phase, tells):
 
 def test_a_paused_robot_is_stopped_where_it_is(robot):
     robot.tells = True
-    driven(robot, Phase.MEASURE, 0.4)
+    driven(robot, DrivePhase.MEASURE, 0.4)
     robot.speed = 0.0
     robot.run(1.0)
     here = robot.q
@@ -190,7 +190,7 @@ def test_a_stop_that_is_lost_in_a_pause_does_not_let_the_motion_go_on(lost):
 
 
 @pytest.mark.parametrize("lost", [0, 1, 2])
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+@pytest.mark.parametrize("phase", [DrivePhase.APPROACH, DrivePhase.MEASURE])
 def test_a_lost_stop_is_sent_again_until_the_robot_stands(robot, phase, lost):
     driven(robot, phase, 0.6)
     robot.lost = lost
@@ -207,7 +207,7 @@ def test_a_lost_stop_is_sent_again_until_the_robot_stands(robot, phase, lost):
 def test_a_robot_that_never_stops_is_stopped_by_other_means(robot):
     hard = []
     robot.driver._hard_stop = hard.append
-    driven(robot, Phase.APPROACH, 0.4)
+    driven(robot, DrivePhase.APPROACH, 0.4)
     robot.lost = 1000
     robot.driver.disarm("enough", robot.now_s)
     robot.run(1.0)
@@ -220,7 +220,7 @@ def test_a_robot_that_never_stops_is_stopped_by_other_means(robot):
 
 
 def test_a_rejected_motion_ends_the_run_with_the_controllers_words(robot):
-    driven(robot, Phase.APPROACH, 0.0)
+    driven(robot, DrivePhase.APPROACH, 0.0)
     robot.coming.clear()
     robot.driver.reported(MotionReport(failed=True, words="rejected: no"), robot.now_s)
     robot.run(0.5)
@@ -231,7 +231,7 @@ def test_a_rejected_motion_ends_the_run_with_the_controllers_words(robot):
 
 def test_a_preempted_motion_is_stopped_from_where_the_robot_is(robot):
     """Another trajectory took the controller over, and drives elsewhere."""
-    driven(robot, Phase.APPROACH, 0.6)
+    driven(robot, DrivePhase.APPROACH, 0.6)
     away = robot.q + 0.5
     robot.coming.clear()
     robot.motion.follow(robot.now_s, [robot.now_s + 2.0], away[None], np.zeros((1, 6)))
@@ -246,7 +246,7 @@ def test_a_preempted_motion_is_stopped_from_where_the_robot_is(robot):
 
 def test_an_end_that_is_no_arrival_is_seen(robot):
     """A topic trajectory takes a goal over, and the goal still succeeds."""
-    driven(robot, Phase.APPROACH, 0.6)
+    driven(robot, DrivePhase.APPROACH, 0.6)
     robot.motion = AheadMotion(robot.q)
     robot.driver.reported(MotionReport(ended=True), robot.now_s)
     robot.run(3.0, until=lambda: not robot.driver.armed)

@@ -13,7 +13,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
-from robocal_ros.tool.driving import Phase
+from robocal_ros.tool.driving import DrivePhase
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_gap_that_closes_stops_the_tools_driver(cell):
     plant.listen(plant.now_s + 2.0 * BEAT_S)
     suite.driver.arm(plant.now_s)
     suite.tool_command(Command(events.MEASURE_TOOL, {"mode": "reference", "cycle_id": "one"}))
-    while suite.driver.phase is not Phase.APPROACH:
+    while suite.driver.phase is not DrivePhase.APPROACH:
         plant.step()
     plant.listen(plant.now_s + 0.5)
     assert plant.cell.moving

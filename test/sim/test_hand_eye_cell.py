@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import (
     TrueStairs,
     edge_shots,
@@ -30,7 +30,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(8)
 
 
-def points(cell: HandEyeCell, shots: Shots, i: int) -> np.ndarray:
+def points(cell: HandEyeCell, shots: SimulatedShots, i: int) -> np.ndarray:
     """Points (n, 3) of a shot, base, by the true pose."""
     x, z = shots.profiles[i][np.isfinite(shots.profiles[i]).all(axis=1)].T
     p = np.array([x, 0 * x, z, np.ones_like(x)])
@@ -74,7 +74,7 @@ def test_reported_poses_scatter_as_told():
     assert shots.q is None
 
 
-def edges_seen(cell: HandEyeCell, shots: Shots, i: int) -> np.ndarray:
+def edges_seen(cell: HandEyeCell, shots: SimulatedShots, i: int) -> np.ndarray:
     """Where (k, 3) the true edges of the stairs pierce a shot's laser plane, user frame."""
     T = frames.invert(T_BASE_USER) @ shots.true_T_base_flange[i] @ cell.T_flange_sensor
     k = np.arange(5)

@@ -11,7 +11,7 @@ from history_workers import proposal
 
 from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
-from robocal_ros.ground.proposals import Action, Head, State
+from robocal_ros.ground.proposals import Action, CalibrationState, Head
 from robocal_ros.history.calibrations import CalibrationHistory
 
 
@@ -33,7 +33,7 @@ class TestProposals:
         assert (entry.stamp_ns, entry.created_ns) == (given.stamp_ns, given.created_ns)
         assert (entry.code, entry.reason) == (Code.ACCEPT, given.reason)
         assert (entry.software, entry.method, entry.candidate_rms_mm) == ("0.1.0", "map", 0.11)
-        assert (entry.state, entry.revision, entry.decisions) == (State.PENDING, 0, ())
+        assert (entry.state, entry.revision, entry.decisions) == (CalibrationState.PENDING, 0, ())
 
     def test_equal_contents_are_stored_as_equal_bytes(self, history: CalibrationHistory) -> None:
         first = history.propose(proposal())
@@ -90,7 +90,7 @@ class TestDecisions:
             assert not other.created
             assert other.head() == head
             entry = other.get(number)
-        assert (entry.state, entry.revision) == (State.IN_FORCE, 1)
+        assert (entry.state, entry.revision) == (CalibrationState.IN_FORCE, 1)
         (decision,) = entry.decisions
         assert (decision.action, decision.by, decision.reason) == (Action.ACCEPT, "Ada", "tested")
         assert (decision.head_before, decision.head_after) == (0, 1)
@@ -137,7 +137,7 @@ class TestDecisions:
         assert [e.id for e in history.pending()] == [second, first]
         history.accept(first, **BY)
         assert history.pending() == ()
-        assert history.get(second).state is State.STALE
+        assert history.get(second).state is CalibrationState.STALE
         with pytest.raises(StaleError, match="revision 0, but 1"):
             history.accept(second, **BY)
         with pytest.raises(ConflictError, match="revision 1 is in force, not 0"):
@@ -152,7 +152,7 @@ class TestDecisions:
         with pytest.raises(ConflictError, match="accepted already"):
             history.reject(first, **BY)
         history.reject(second, **BY)
-        assert history.get(second).state is State.REJECTED
+        assert history.get(second).state is CalibrationState.REJECTED
         with pytest.raises(ConflictError, match="rejected by Ada"):
             history.accept(second, **BY)
         with pytest.raises(ConflictError, match="rejected by Ada"):
@@ -161,7 +161,7 @@ class TestDecisions:
     @pytest.mark.parametrize("code", [Code.WORSE_THAN_CURRENT, Code.RESIDUAL_TOO_LARGE])
     def test_verdict_is_obeyed(self, history: CalibrationHistory, code: Code) -> None:
         number = history.propose(proposal(code=code, reason="0.4 mm instead of 0.2 mm"))
-        assert history.get(number).state is State.REFUSED
+        assert history.get(number).state is CalibrationState.REFUSED
         with pytest.raises(RobocalError, match=r"0\.4 mm instead") as caught:
             history.accept(number, **BY)
         assert caught.value.code is code
@@ -182,13 +182,13 @@ class TestDecisions:
             ids.append(history.propose(proposal(based_on=revision, model={"r": revision})))
             history.accept(ids[-1], **BY)
         assert history.rollback(**BY) == Head("thermal", 4, ids[1], {"r": 1})
-        assert history.get(ids[2]).state is State.ROLLED_BACK
+        assert history.get(ids[2]).state is CalibrationState.ROLLED_BACK
         assert history.get(ids[2]).decisions[-1].action is Action.ROLLBACK
         assert history.rollback(**BY).calibration_id == ids[0]
         assert history.rollback(**BY) == Head("thermal", 6, None, None)
         with pytest.raises(ConflictError, match="nothing to roll back"):
             history.rollback(**BY)
-        assert [e.state for e in history.list()] == [State.ROLLED_BACK] * 3
+        assert [e.state for e in history.list()] == [CalibrationState.ROLLED_BACK] * 3
 
     def test_rollback_to_a_chosen_one(self, history: CalibrationHistory) -> None:
         first = history.propose(proposal())
@@ -208,9 +208,9 @@ class TestDecisions:
             history.rollback(0, **BY)
         assert history.rollback(first, expected_head=3, **BY).revision == 4
         assert [e.state for e in history.list()] == [
-            State.STALE,
-            State.ROLLED_BACK,
-            State.IN_FORCE,
+            CalibrationState.STALE,
+            CalibrationState.ROLLED_BACK,
+            CalibrationState.IN_FORCE,
         ]
 
     def test_what_needs_another_kind_beside_it(self, history: CalibrationHistory) -> None:
@@ -220,14 +220,14 @@ class TestDecisions:
         words = f"tool {tool} was measured with thermal revision 0, in force is 1: measure it again"
         with pytest.raises(StaleError, match=words):
             history.accept(tool, with_heads={"thermal": 0}, **BY)
-        assert history.get(tool).state is State.PENDING
+        assert history.get(tool).state is CalibrationState.PENDING
         assert history.accept(tool, with_heads={"thermal": 1}, **BY).revision == 1
 
     def test_kinds_have_revisions_of_their_own(self, history: CalibrationHistory) -> None:
         thermal = history.propose(proposal())
         tool = history.propose(proposal(kind="tool"))
         history.accept(tool, **BY)
-        assert history.get(thermal).state is State.PENDING
+        assert history.get(thermal).state is CalibrationState.PENDING
         assert history.head("tool").revision == 1
         assert history.head().revision == 0
         with pytest.raises(InputError, match="kind tool, not thermal"):
