@@ -39,7 +39,7 @@ class Disarm(DriverRequest):
 
 @dataclass(frozen=True)
 class Measure(DriverRequest):
-    """Measure the tool; ``mode`` of `sessions.tool_results`. Answered when the run has ended."""
+    """Measure the tool; ``mode`` of `tool.results`. Answered when the run has ended."""
 
     mode: str
     cycle_id: str

@@ -13,7 +13,7 @@ from robocal_ros.session.events import Command
 
 
 class History(Protocol):
-    """The part of ``storage.calibrations.CalibrationHistory`` that sessions use."""
+    """The part of ``history.calibrations.CalibrationHistory`` that sessions use."""
 
     serial: str
 
