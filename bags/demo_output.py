@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bench.demo import GOAL_S
 from bench.live.plc import Gap
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 
 @dataclass(frozen=True)

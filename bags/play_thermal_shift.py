@@ -24,7 +24,7 @@ from bench.live.graph import CellController, LiveError
 from bench.startup import ROOT
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.cell_sim.shift import REFERENCE
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ros import qos
 from robocal_ros.ros.session_events import EVENTS
 

@@ -18,10 +18,10 @@ from std_srvs.srv import SetBool
 
 from bench.processes import ENDS_WITH_PARENT, resident_mb
 from bench.startup import EXECUTABLES
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import qos
 from robocal_ros.ros.conversions import time_message

@@ -23,7 +23,7 @@ from bench.live.running import live_cell, validate
 from bench.processes import resident_mb
 from bench.soaking import soak_main
 from bench.tables import Goal, Table
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 COLLISION_MM = 2.0
 EVERY_S = 300.0  # from the begin of a gap to the next one's

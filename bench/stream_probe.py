@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool
 from bench.processes import resident_mb
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import qos
 from robocal_ros.ros.conversions import header, kinematic_model
 

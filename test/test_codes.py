@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from robocal_ros.correction.refusals import Reason
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 ROOT = Path(__file__).parents[1]
 CODES = {code.name: int(code) for code in Code}

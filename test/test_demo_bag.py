@@ -13,10 +13,10 @@ from robocal_ros.bags.replay import feed, replay
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.found_cycles import automatic_commands

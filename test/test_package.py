@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import pytest
 
 import robocal_ros
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 ROOT = Path(__file__).parent.parent
 KINDS = ("msg", "srv", "action")

@@ -13,10 +13,10 @@ from robocal_ros.bags.replay import replay
 from robocal_ros.cell_sim import kr150
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.point_clouds import cloud_points
+from robocal_ros.ground.errors import Code
+from robocal_ros.ground.samples import cloud_points
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome

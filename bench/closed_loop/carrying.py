@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 from bench.closed_loop.words import tool_answer
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.maintenance import MaintenanceSession
 from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.requests import DriverAnswer

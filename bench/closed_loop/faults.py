@@ -8,7 +8,7 @@ from bench.closed_loop.judging import Harm, harm
 from bench.closed_loop.plant import GapReport
 from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord
 from robocal_ros.cell_sim.cell_faults import FAULTS, SIZES, Fault
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 EVERY_S = 160.0  # a gap, then one pass of the programme
 CLEAN, AFTER = 1, 2  # gaps before and after the fault

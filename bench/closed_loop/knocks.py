@@ -17,7 +17,7 @@ from bench.closed_loop.shift import run_shift
 from bench.closed_loop.tables import FAULTY_RMS_M, MM
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.cell_faults import Fault
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 STATION: tuple[Fault, ...] = ("station_knocked", "station_knocked_shift", "station_knocked_turn")
 OTHERS: tuple[Fault, ...] = ("sensor_knocked", "sphere_knocked")

@@ -18,8 +18,7 @@ from robocal_ros.cell_sim.kr150_cell import poses
 from robocal_ros.cell_sim.production import programme
 from robocal_ros.correction.inputs import TrajectoryCommand
 from robocal_ros.correction.refusals import RefusedError
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance import CycleResult

@@ -26,7 +26,7 @@ from bench.live.cell import PROGRAM, ROBOT, TRUTH
 from bench.live.graph import CellController, LiveError
 from robocal_ros.cell_sim.kr150_cell import poses
 from robocal_ros.cell_sim.production import programme
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import qos
 

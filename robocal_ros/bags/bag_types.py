@@ -11,7 +11,7 @@ from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.places import share_folders
+from robocal_ros.ground.files import share_folders
 
 INTERFACES = "robocal_msgs"
 _DTYPES = {"char": "uint8", "octet": "uint8"}

@@ -18,8 +18,7 @@ from robocal_ros.bags.bag_writer import BagWriter, ros_time
 from robocal_ros.bags.bags import BagInfo, BagMessage, BagReader
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.files import draft_beside
-from robocal_ros.ground.point_clouds import cloud_points
-from robocal_ros.ground.samples import joint_sample
+from robocal_ros.ground.samples import cloud_points, joint_sample
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]

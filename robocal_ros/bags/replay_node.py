@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay_topics import CLOCK, ReplayTopics, chosen_topics
 from robocal_ros.ground.errors import ConflictError, InputError, RobocalError
-from robocal_ros.ground.places import share_folders
+from robocal_ros.ground.files import share_folders
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.conversions import time_message

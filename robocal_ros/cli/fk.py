@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     import numpy as np
 
-    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.ground.frames import transform_document
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -155,7 +155,7 @@ def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
     from math import degrees
 
     from robocal_ros.estimation.assessment import verdict_document
-    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.ground.frames import transform_document
 
     sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
     return {

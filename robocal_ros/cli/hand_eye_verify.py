@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
-    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.ground.frames import transform_document
     from robocal_ros.hand_eye.files import read_flange_mount
     from robocal_ros.hand_eye.result import by_shot
     from robocal_ros.hand_eye.verification import verify

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.estimation.assessment import hold_out, pose_groups
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge

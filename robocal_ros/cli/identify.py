@@ -9,8 +9,7 @@ from robocal_ros import __version__
 from robocal_ros.cli.arguments import PARTS, ROBOT_HELP, describe_robot, parts, seed, share, warn
 from robocal_ros.cli.identify_view import headline, show_identification
 from robocal_ros.cli.output import DONE, NO_ANSWER, CliResult, refusal, tell
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 
 if TYPE_CHECKING:
     from robocal_ros.cli.identification import IdentifyAnswer, IdentifyRequest

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RankDeficientError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RankDeficientError, RobocalError
 
 if TYPE_CHECKING:  # rich takes 50 ms, which help and JSON need not wait for
     from rich.console import Console

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, warn
 from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, CliResult, progress_console, tell
 from robocal_ros.cli.replay_view import show_replay
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 
 if TYPE_CHECKING:
     from robocal_ros.bags.bags import BagMessage

@@ -19,7 +19,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.hand_eye.recorded import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome

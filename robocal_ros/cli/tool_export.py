@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.ground.frames import transform_document
     from robocal_ros.tool.exports import exported
 
     T_flange_tool = given_frame(args)

@@ -7,7 +7,7 @@ from robocal_ros.bags.replay import ReplayReport
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import BagOverview
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Outcome

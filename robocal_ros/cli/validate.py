@@ -26,7 +26,7 @@ from robocal_ros.cli.output import (
     tell,
 )
 from robocal_ros.cli.warm_workers import warm_up
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.files import write_text
 
 if TYPE_CHECKING:

@@ -26,8 +26,7 @@ from robocal_ros.cli.validating_parts import (
     tool_runs,
 )
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.hand_eye.recorded import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.replay_parts import seconds
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.session.events import ACCEPT, Command
 
 Array = NDArray[np.float64]

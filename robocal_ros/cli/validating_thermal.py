@@ -16,7 +16,7 @@ from robocal_ros.ground.proposals import THERMAL, Action, Entry
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.report.drift import figures_of
 from robocal_ros.thermal.achieved import measured_errors, true_errors
 from robocal_ros.thermal.in_force import REFERENCE

@@ -39,7 +39,7 @@ from robocal_ros.correction.settings import (
 )
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan

@@ -2,8 +2,7 @@
 
 from enum import StrEnum
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 
 
 class Reason(StrEnum):

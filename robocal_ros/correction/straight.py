@@ -24,7 +24,7 @@ from robocal_ros.correction.straight_kinematics import (
     walk,
 )
 from robocal_ros.ground.compiled import kernel, lean
-from robocal_ros.kinematics.sines import LARGEST_ANGLE
+from robocal_ros.kinematics.kernels import LARGEST_ANGLE
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.compiled import lean
-from robocal_ros.kinematics.sines import reduced_cos_sin
+from robocal_ros.kinematics.kernels import reduced_cos_sin
 
 Array = NDArray[np.float64]
 Six = tuple[float, float, float, float, float, float]

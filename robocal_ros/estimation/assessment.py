@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import TooFewSamplesError
-from robocal_ros.ground.frame_texts import Document
+from robocal_ros.ground.errors import Code, TooFewSamplesError
+from robocal_ros.ground.frames import Document
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

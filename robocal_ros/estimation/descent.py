@@ -1,16 +1,205 @@
 """Damped Gauss-Newton on a manifold, robust or plain, and the test of each sample."""
 
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.freedom import Freedom, require_told
-from robocal_ros.estimation.loss import DescentState, Loss, Problem, information_of
+from robocal_ros.ground.errors import TooFewSamplesError
+
+# ---- what a descent minimises: squared residuals, robust or plain, and a Gaussian prior ---------
+
 
 Array = NDArray[np.float64]
 S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """What a fit under a prior leaves of N residuals, by the noise.
+
+    A direction that the prior holds takes up nothing. With noise of the standard deviation s, data
+    of the information W / s^2 and a prior P the fit takes up trace(W (W + s^2 P)^-1) of the
+    numbers, of those that tell the noise trace(A (W + s^2 P)^-1) (MacKay, Bayesian interpolation,
+    1992: the number of well-determined parameters).
+
+    Attributes
+    ----------
+    count : N numbers tell the noise.
+    told, data : (k,) diagonals of A and W in directions in which W + unit P is one.
+    unit : a variance at which data and prior weigh alike.
+    """
+
+    count: int
+    told: Array
+    data: Array
+    unit: float
+
+    @classmethod
+    def of(cls, count: int, told: Array, data: Array, prior: Array) -> "Freedom":
+        """From A, W and P (k, k); what neither data nor prior determine takes up nothing."""
+        pinned = float(np.trace(prior))
+        unit = float(np.trace(data)) / pinned if pinned else 1.0
+        whole = data + unit * prior
+        size = 1.0 / np.sqrt(np.maximum(np.diag(whole), TINY))
+        weight, axes = np.linalg.eigh(whole * np.outer(size, size))
+        root = size[:, None] * axes / np.sqrt(np.maximum(weight, ROUNDING * weight[-1]))
+        share, turn = np.linalg.eigh(root.T @ data @ root)
+        V = root @ turn
+        shown = np.clip(share, 0.0, 1.0) if pinned else np.ones(len(data))
+        return cls(count, np.sum(V * (told @ V), axis=0), shown, unit)
+
+    @classmethod
+    def flat(cls, count: int, unknowns: int) -> "Freedom":
+        """Without a prior, all numbers telling the noise: each unknown takes up one."""
+        return cls(count, np.ones(unknowns), np.ones(unknowns), 1.0)
+
+    def at(self, squared: float) -> float:
+        """Numbers that are left with a variance of the noise."""
+        return self.count - float(np.sum(self.told / (self.data + self._held(squared))))
+
+    def scale(self, total: float) -> float:
+        """Standard deviation s with s^2 = total / (numbers left at s^2).
+
+        ``total``: sum of the squared residuals. The right side falls where s^2 grows, by a lower
+        power: there is one solution. Newton's method in the logarithms, on log(s^2) less that of
+        the right side, which has a slope between 1 and 2.
+        """
+        squared = max(total, TINY) / self.count
+        for _ in range(MOST_ROUNDS if self.by_prior else 1):
+            left = max(self.at(squared), SMALLEST_SHARE * self.count)
+            held = self._held(squared)
+            slope = 1.0 + float(np.sum(self.told * held / (self.data + held) ** 2)) / left
+            step = float(np.log(max(total, TINY) / left / squared)) / slope
+            squared *= float(np.exp(step))
+            if abs(step) < CLOSE:
+                break
+        return float(np.sqrt(squared))
+
+    @property
+    def by_prior(self) -> bool:
+        """Whether a prior holds anything."""
+        return bool(np.any(self.data < 1.0))
+
+    def _held(self, squared: float) -> Array:
+        return (1.0 - self.data) * (squared / self.unit)
+
+
+def require_told(left: float) -> None:
+    """Refuse noise that too few numbers tell.
+
+    Raises
+    ------
+    TooFewSamplesError
+        With `NO_MEAN` numbers or fewer.
+    """
+    if left <= NO_MEAN:
+        raise TooFewSamplesError(
+            f"the unknowns take up what these samples tell: {NO_MEAN:.0f} numbers or fewer are "
+            "left to find the noise from; measure more poses, or give each sample's sigma (column "
+            "sigma_mm)"
+        )
+
+
+class Problem(Protocol[S]):
+    """Residuals of m samples with c components each, linearised at a state."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names (k) of the increments, for reports."""
+
+    def linearise(self, state: S) -> tuple[Array, Array]:
+        """Residual (m, c), prediction minus measurement over sigma, and Jacobian (m, c, k)."""
+
+    def retract(self, state: S, step: Array) -> S:
+        """Move the state by an increment (k,)."""
+
+    @property
+    def scale_components(self) -> int:
+        """How many of the c components tell the noise when it is unknown (the first ones)."""
+
+    def deviation(self, state: S) -> Array:
+        """Distance (k,) of the state from the prior's mean; zero where the prior is flat."""
+
+
+@dataclass(frozen=True)
+class DescentState(Generic[S]):
+    """Where a descent stands: the state, its residual (m, c) and Jacobian (m, c, k)."""
+
+    state: S
+    residual: Array
+    jacobian: Array
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Loss(Generic[S]):
+    """Of one step of a descent.
+
+    Attributes
+    ----------
+    prior : (k, k) information about the unknowns.
+    keep : (m,) samples in use.
+    scale : standard deviation of a whitened residual.
+    huber : (m,) length of each sample's residual, in scales, from which it counts linearly.
+    """
+
+    problem: Problem[S]
+    prior: Array
+    keep: NDArray[np.bool_]
+    scale: float
+    huber: Array | None
+
+    def at(self, state: S, residual: Array) -> float:
+        """The loss itself."""
+        distance = _lengths(residual[self.keep]) / self.scale
+        near = distance if self.huber is None else np.minimum(distance, self.huber[self.keep])
+        away = self.problem.deviation(state)
+        return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
+
+    def gradient(self, run: DescentState[S]) -> Array:
+        """Half of it, (k,)."""
+        J = run.jacobian.reshape(-1, run.jacobian.shape[2])
+        weighted = (run.residual * self._weight(run.residual)[:, None]).ravel()
+        by_data = J.T @ weighted / self.scale**2
+        return np.asarray(by_data + self.prior @ self.problem.deviation(run.state))
+
+    def information(self, run: DescentState[S]) -> Array:
+        """Half of the second derivative (k, k), without the curvature of the residuals."""
+        weight = self._weight(run.residual)
+        return information_of(run.jacobian, weight) / self.scale**2 + self.prior
+
+    def _weight(self, residual: Array) -> Array:
+        weight = np.where(self.keep, 1.0, 0.0)
+        if self.huber is not None:
+            distance = np.maximum(_lengths(residual), np.finfo(float).tiny)
+            weight *= np.minimum(1.0, self.huber * self.scale / distance)
+        return weight
+
+
+def rows_of(jacobian: Array, keep: NDArray[np.bool_]) -> Array:
+    """Rows (N, k) of the samples to keep, copied only when some are left out."""
+    used = jacobian if np.all(keep) else jacobian[keep]
+    return used.reshape(-1, jacobian.shape[2])
+
+
+def information_of(jacobian: Array, weight: NDArray[np.float64 | np.bool_]) -> Array:
+    """Normal matrix (k, k) of a Jacobian (m, c, k) whose samples have weights (m,)."""
+    used = jacobian
+    if not np.all(weight == 1.0):
+        used = jacobian * np.sqrt(weight)[:, None, None]
+    J = used.reshape(-1, jacobian.shape[2])
+    return np.asarray(J.T @ J)
+
+
+def _lengths(rows: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("mc,mc->m", rows, rows)))
+
+
+# ---- damped Gauss-Newton on a manifold, robust or plain, and the test of each sample ------------
+
 
 FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
 MOST_ITERATIONS = 50
@@ -228,3 +417,21 @@ def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
     scaled = normal * np.outer(scale, scale)
     scaled[np.diag_indices_from(scaled)] += damping
     return np.asarray(np.linalg.solve(scaled, -gradient * scale) * scale)
+
+
+MOST_ROUNDS = 50
+
+
+CLOSE = 1e-12  # relative
+
+
+SMALLEST_SHARE = 1e-9  # of the numbers, so that a fit that takes up all of them is no division by 0
+
+
+TINY = 1e-200
+
+
+ROUNDING = 1e-15
+
+
+NO_MEAN = 2.0  # up to so many numbers a squared error over its reported variance (F) has no mean

@@ -14,9 +14,18 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from robocal_ros.estimation.polyline import places
-from robocal_ros.estimation.profile_noise import SMOOTHED, ordered, smoothed
-from robocal_ros.estimation.surfaces import SurfaceRule, Surfaces, surfaces
+from robocal_ros.estimation.surfaces import (
+    SMOOTHED,
+    SurfaceRule,
+    Surfaces,
+    ordered,
+    smoothed,
+    surfaces,
+)
 from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
+
+# ---- the feature of a straight-line target, an edge or a groove, from one profile ---------------
+
 
 Array = NDArray[np.float64]
 

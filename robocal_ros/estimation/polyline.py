@@ -10,11 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.profile_noise import ordered
-from robocal_ros.estimation.surfaces import SurfaceRule, off_chord, split, surfaces
+from robocal_ros.estimation.surfaces import SurfaceRule, off_chord, ordered, split, surfaces
 from robocal_ros.ground.errors import ResidualError
 
+# ---- profile noise ------------------------------------------------------------------------------
+
+
 Array = NDArray[np.float64]
+
+
+# ---- the corners of a staircase, from one profile -----------------------------------------------
+
+
 Mask = NDArray[np.bool_]
 
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.profile_noise import MAD
+from robocal_ros.estimation.surfaces import MAD
 from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
-from robocal_ros.ground.point_clouds import cloud_points
 from robocal_ros.ground.samples import (
     DEFAULT_TARGET,
     SPHERE_CLOUD,
     PointSample,
+    cloud_points,
     frame_and_target,
     stamp_ns,
 )

@@ -1,12 +1,20 @@
 """Small helpers that the readers and writers of files share."""
 
 import difflib
+import fcntl
+import json
 import os
+import sys
 import threading
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
-from robocal_ros.ground.errors import InputError, StorageError
+from robocal_ros.ground.errors import ConflictError, InputError, StateLostError, StorageError
+
+# ---- small helpers that the readers and writers of files share ----------------------------------
+
 
 MOST_QUOTED = 60
 
@@ -131,3 +139,175 @@ def made_folder_beside(history: Path, name: str) -> Path:
     except OSError as error:
         raise StorageError(f"the folder {folder} cannot be made: {error.strerror}") from error
     return folder
+
+
+# ---- where files that come with the packages are found, with and without ROS --------------------
+
+
+SOURCE_ROOT = Path(__file__).resolve().parents[2]
+
+
+def prefixes() -> list[Path]:
+    """Prefixes that may hold ``share/<package>``: of ROS, of this installation, of Python."""
+    named = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    found = [Path(prefix) for prefix in named if prefix]
+    found += [folder for folder in SOURCE_ROOT.parents if (folder / "share").is_dir()]
+    return [*found, Path(sys.prefix)]
+
+
+def share_folders(package: str, inside: str, source: str) -> list[Path]:
+    """Existing folders ``share/<package>/<inside>`` of all prefixes, the best first.
+
+    ``source`` is the same folder in the source tree; it comes before the installed ones.
+    """
+    installed = (prefix / "share" / package / inside for prefix in prefixes())
+    candidates = dict.fromkeys([SOURCE_ROOT / source, *installed])
+    return [folder for folder in candidates if folder.is_dir()]
+
+
+# ---- state files --------------------------------------------------------------------------------
+
+
+STATE = "state.json"
+
+
+class StateFile:
+    """One JSON document, ``<serial>/<name>/state.json`` beside a history; empty at first.
+
+    Raises
+    ------
+    StorageError
+        When it, or its folder, cannot be made.
+    """
+
+    def __init__(self, history: Path, name: str) -> None:
+        folder = history.with_suffix("") / name
+        self.path = folder / STATE
+        if not folder.exists():  # from then on a file that is missing was lost
+            self._begin(history, folder)
+
+    def _begin(self, history: Path, folder: Path) -> None:
+        """Make the folder with the file in it, unless another does so first."""
+        draft = made_folder_beside(history, draft_beside(folder).name)
+        try:
+            write_text(draft / STATE, "{}", durable=True)
+            draft.rename(folder)
+        except InputError as error:
+            raise StorageError(str(error)) from error
+        except OSError as error:
+            if not folder.exists():
+                raise StorageError(f"{folder} cannot be made: {error.strerror}") from error
+        finally:
+            if draft.exists():
+                (draft / STATE).unlink(missing_ok=True)
+                draft.rmdir()
+        for parent in (folder.parent, history.parent):
+            self._sync(parent)
+
+    def load(self) -> Mapping[str, Any] | None:
+        """The document; None before the first.
+
+        Raises
+        ------
+        StateLostError
+            When it was there once.
+        StorageError
+            When it cannot be read.
+        """
+        if not self.path.exists():
+            raise StateLostError(f"{self.path} is gone: what it told is forgotten")
+        try:
+            document = json.loads(read_text(self.path, "state file"))
+        except (InputError, ValueError) as error:
+            words = f"{self.path} cannot be read: {error}; restore it, or move it away"
+            raise StorageError(words) from error
+        if not isinstance(document, dict):
+            raise StorageError(f"{self.path} holds no document: move it away")
+        return document or None
+
+    def save(self, document: Mapping[str, Any]) -> None:
+        """Put a document in its place.
+
+        Raises
+        ------
+        StorageError
+            When it cannot be written, or a number is not finite; the one before is still there.
+        """
+        try:
+            write_text(self.path, json.dumps(document, allow_nan=False), durable=True)
+        except InputError as error:
+            raise StorageError(str(error)) from error
+        except ValueError as error:
+            raise StorageError(f"{self.path}: {error}") from error
+
+    def _sync(self, folder: Path) -> None:
+        try:
+            sync_folder(folder)
+        except OSError as error:
+            raise StorageError(f"{folder} cannot be brought to the disk: {error}") from error
+
+
+# ---- a part of a cell that one process at a time may play for a robot ---------------------------
+
+
+_POLL_S = 0.01
+
+
+class SoleUser:
+    """Holds ``<serial>/users/<name>`` beside a history; the system lets go of it with the process.
+
+    Two robots that keep one history would bring each other's calibrations into force.
+
+    Parameters
+    ----------
+    name : the part, as the executable is called.
+    timeout_s : longest wait for one that is just ending.
+
+    Raises
+    ------
+    ConflictError
+        Another process holds it.
+    StorageError
+        The file cannot be made.
+    """
+
+    def __init__(self, history: Path, name: str, serial: str, timeout_s: float) -> None:
+        path = made_folder_beside(history, "users") / name
+        try:
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise StorageError(f"{path} cannot be made: {error}") from error
+        try:
+            self._wait_for(name, serial, history, timeout_s)
+        except OSError as error:
+            self.close()
+            raise StorageError(
+                f"{path} cannot be locked: {error}: keep histories on a local disk, not on NFS"
+            ) from error
+        os.ftruncate(self._file, 0)
+        os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
+
+    def _wait_for(self, name: str, serial: str, history: Path, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not self._held():
+            if time.monotonic() > deadline:
+                other = os.pread(self._file, 20, 0).decode(errors="replace").strip()
+                self.close()
+                raise ConflictError(
+                    f"another {name} (process {other or 'unknown'}) keeps the calibrations of "
+                    f"robot '{serial}' in {history}: end it, or give each robot its own serial"
+                )
+            time.sleep(_POLL_S)
+
+    def _held(self) -> bool:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Let go of it; idempotent."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1

@@ -5,8 +5,13 @@ Quaternions are x, y, z, w. scipy's rotations are loaded when they are first use
 second that the start of a node does not need, which is why quaternions do without them.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+# ---- rigid transforms as 4 x 4 arrays, batched in the leading dimensions ------------------------
+
 
 Array = NDArray[np.float64]
 
@@ -138,3 +143,37 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
     U, _, Vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     U[..., -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return np.asarray(U @ Vt)
+
+
+# ---- frames as text: documents (JSON), fixed decimals, URDF -------------------------------------
+
+
+def fixed(values: Array, digits: int) -> list[str]:
+    """Fixed decimals; a zero has no sign."""
+    rounded = np.round(values, digits) + 0.0
+    return [f"{value:.{digits}f}" for value in rounded.tolist()]
+
+
+def urdf_origin(T: Array) -> tuple[str, str]:
+    """``xyz`` (m) and ``rpy`` (rad) of a pose (4, 4) as URDF writes them, 1e-4 mm and 1e-6 deg."""
+    return " ".join(fixed(T[:3, 3], 7)), " ".join(fixed(rpy(T[:3, :3]), 8))
+
+
+def urdf_joint(parent: str, child: str, xyz: str, rpy: str) -> str:
+    """A fixed joint, and the link that it carries."""
+    return (
+        f'<link name="{child}"/>\n'
+        f'<joint name="{parent}-{child}" type="fixed">\n'
+        f'  <parent link="{parent}"/>\n'
+        f'  <child link="{child}"/>\n'
+        f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
+        "</joint>"
+    )
+
+
+Document = dict[str, Any]
+
+
+def transform_document(T: Array) -> Document:
+    """A pose (4, 4) as ``xyz_mm`` and ``quat_xyzw``."""
+    return {"xyz_mm": (T[:3, 3] * 1e3).tolist(), "quat_xyzw": quat_xyzw(T).tolist()}

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import StaleError
+from robocal_ros.ground.errors import Code, StaleError
 
 if TYPE_CHECKING:  # the history is listed without loading NumPy
     from numpy.typing import NDArray

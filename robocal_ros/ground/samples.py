@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError
 
+# ---- typed samples: what sensors and the robot deliver, whatever brought them -------------------
+
+
 Array = NDArray[np.float64]
 
 DEFAULT_TARGET = "tool"
@@ -278,3 +281,96 @@ def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSampl
     if abs(norm - 1.0) > 1e-3:
         raise InputError(f"measured orientation has a quaternion of length {norm:.6g}, not 1")
     return PoseSample(stamp_ns(message.header.stamp), frame, target, transform_from_quat(xyz, quat))
+
+
+# ---- points of a ``sensor_msgs/PointCloud2``, whatever brought the message ----------------------
+
+
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""NumPy's name of each ``sensor_msgs/PointField`` datatype."""
+MOST_POINTS = 5_000_000
+
+
+def cloud_points(message: Any) -> Array:
+    """Points (n, 3), m, of the fields x, y, z; missing points stay not-a-number.
+
+    Raises
+    ------
+    InputError
+        When a field is missing or the data do not have the size that the message tells.
+    """
+    fields = {field.name: field for field in message.fields}
+    missing = [name for name in "xyz" if name not in fields]
+    if missing:
+        raise InputError(
+            f"the cloud has no field {', '.join(missing)}; it has {', '.join(fields) or 'none'}"
+        )
+    width, height = int(message.width), int(message.height)
+    step, row = int(message.point_step), int(message.row_step)
+    count = width * height
+    if not 0 < count <= MOST_POINTS:
+        raise InputError(f"the cloud has {count} points: 1 to {MOST_POINTS} are read")
+    data = np.frombuffer(bytes(message.data), dtype=np.uint8)
+    if step <= 0 or row < width * step or len(data) < row * height:
+        raise InputError(
+            f"the cloud's {len(data)} bytes do not hold {height} rows of {row} bytes with "
+            f"{width} points of {step} bytes"
+        )
+    order = ">" if message.is_bigendian else "<"
+    grid = data[: row * height].reshape(height, row)[:, : width * step].reshape(count, step)
+    points = np.empty((count, 3))
+    for axis, name in enumerate("xyz"):
+        field = fields[name]
+        if field.datatype not in TYPES:
+            raise InputError(f"field {name} of the cloud has the unknown type {field.datatype}")
+        kind = np.dtype(order + TYPES[field.datatype])
+        start = int(field.offset)
+        if not 0 <= start <= step - kind.itemsize:
+            raise InputError(f"field {name} of the cloud lies outside its {step} bytes")
+        column = np.ascontiguousarray(grid[:, start : start + kind.itemsize])
+        points[:, axis] = column.view(kind)[:, 0]
+    return points
+
+
+# ---- pixels of a ``sensor_msgs/Image``, whatever brought the message ----------------------------
+
+
+Image = NDArray[np.uint8]
+
+CHANNELS = {"mono8": 1, "bgr8": 3, "rgb8": 3}
+"""Encodings that are read, and their bytes of a pixel."""
+MOST_PIXELS = 100_000_000
+
+
+def image_array(message: Any) -> Image:
+    """Grey image (h, w), a copy; colours are weighted as ITU-R BT.601 does.
+
+    Raises
+    ------
+    InputError
+        When it is of another encoding, or the data do not have the size that the message tells.
+    """
+    encoding = str(message.encoding)
+    if encoding not in CHANNELS:
+        raise InputError(
+            f"images of encoding '{encoding}' are not read: have the camera publish 8 bits as "
+            f"{', '.join(CHANNELS)}"
+        )
+    channels = CHANNELS[encoding]
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    if not 0 < width * height <= MOST_PIXELS:
+        raise InputError(f"the image has {width}x{height} px: 1 to {MOST_PIXELS} are read")
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    if step < width * channels or len(data) < step * height:
+        raise InputError(
+            f"the image's {len(data)} bytes do not hold {height} rows of {step} bytes with "
+            f"{width} pixels of {channels} bytes"
+        )
+    rows = data[: step * height].reshape(height, step)[:, : width * channels]
+    if channels == 1:
+        return rows.copy()
+    import cv2
+
+    colours = np.ascontiguousarray(rows).reshape(height, width, channels)
+    code = cv2.COLOR_BGR2GRAY if encoding == "bgr8" else cv2.COLOR_RGB2GRAY
+    return np.asarray(cv2.cvtColor(colours, code), dtype=np.uint8)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import errors_document, summarise
 from robocal_ros.ground.errors import InputError, ResidualError
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form, closed_forms
 from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.hand_eye.camera_mistakes import mistake, require_pairs, swapped, wrong_scale

@@ -8,7 +8,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import read_bytes
 from robocal_ros.hand_eye.board import Image, Intrinsics, decode_image
 from robocal_ros.hand_eye.tables import PoseTable
-from robocal_ros.kinematics.made_files import read_fields
+from robocal_ros.kinematics.robots import read_fields
 
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8}  # and how many coefficients they have
 MOST_PX = 100_000  # along a side of an image

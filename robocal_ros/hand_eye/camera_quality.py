@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.camera_closed_forms import closed_form
 from robocal_ros.hand_eye.camera_fit import PairFit
 from robocal_ros.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted

@@ -7,8 +7,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, LimitError
+from robocal_ros.ground.errors import Code, InputError, LimitError
 from robocal_ros.hand_eye.profile import profile_of
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.hand_eye.target_documents import target_of

@@ -10,8 +10,7 @@ from urllib.parse import quote
 from robocal_msgs.srv import HandEyeFile
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.files import made_folder_beside
 from robocal_ros.hand_eye.data import MOST_POINTS, DataSet, data_set_begun
 from robocal_ros.hand_eye.session import HandEyeSession

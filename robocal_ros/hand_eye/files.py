@@ -12,11 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
-from robocal_ros.kinematics.made_files import read_fields
-from robocal_ros.kinematics.pose_fields import read_pose
-from robocal_ros.kinematics.robot_fields import Fields
+from robocal_ros.ground.errors import Code, InputError
+from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
 Array = NDArray[np.float64]
 Parent = Literal["flange", "base"]

@@ -2,7 +2,7 @@
 
 from robocal_ros.ground.proposals import THERMAL, Head, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import History
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.estimation import Estimate, solve
-from robocal_ros.estimation.observability import observability
+from robocal_ros.estimation.estimation import Estimate, observability, solve
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
 from robocal_ros.hand_eye.naming import describe_motion, joined

@@ -13,8 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image, JointState, PointCloud2
 
 from robocal_ros import __version__
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.proposals import Head, hand_eye_kind
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.data_files import HandEyeFiles

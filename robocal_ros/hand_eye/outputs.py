@@ -8,7 +8,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import Head
 from robocal_ros.hand_eye.data import IN_HAND, TO_HAND, Capture
 from robocal_ros.hand_eye.session import HandEyeSession

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import OPEN_M, open_directions
 from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
 from robocal_ros.hand_eye.naming import joined

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import MountFit, noise_numbers
 from robocal_ros.hand_eye.mount_problem import MountProblem, PoseNoise
 from robocal_ros.hand_eye.result import point_jacobian, shots_of

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, summarise, verdict_document
 from robocal_ros.ground import frames
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]

@@ -12,8 +12,7 @@ from robocal_msgs.srv import (
 )
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.hand_eye.data_files import Ask, HandEyeFiles
 from robocal_ros.hand_eye.outputs import MOUNTS, TARGETS
 from robocal_ros.hand_eye.plan import HandEyePlan

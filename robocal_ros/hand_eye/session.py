@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.ground.proposals import hand_eye_kind
 from robocal_ros.ground.samples import JOINTS, JointSample
 from robocal_ros.ground.streams import CLOCK_JUMP_NS, NotStillError

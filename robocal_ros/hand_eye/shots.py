@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.images import image_array
-from robocal_ros.ground.point_clouds import cloud_points
-from robocal_ros.ground.samples import pose_sample, stamp_ns
+from robocal_ros.ground.samples import cloud_points, image_array, pose_sample, stamp_ns
 from robocal_ros.hand_eye.profile import profile_of
 
 Array = NDArray[np.float64]

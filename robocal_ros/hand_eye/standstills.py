@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.samples import JOINTS, joint_sample
 from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.hand_eye.shots import PROFILE, Shot, shot_of

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.polyline import CornerFit, CornerRule, fit_corners
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, ResidualError, RobocalError
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.corner_matching import Match, along, nearest
 from robocal_ros.hand_eye.edge_start import closed_corners, robust_corners
 from robocal_ros.hand_eye.mount_fit import MountFit, first_look, misfit

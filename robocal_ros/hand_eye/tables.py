@@ -17,16 +17,14 @@ from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted, read_bytes
 from robocal_ros.hand_eye.profile import Profile, profile_of
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.flange_units import flange_unit_fault
-from robocal_ros.kinematics.table_columns import (
+from robocal_ros.kinematics.tables import (
     POSITION,
     QUATERNION,
     TableLayout,
     check_plain,
-    read_pose_columns,
-)
-from robocal_ros.kinematics.tables import (
+    flange_unit_fault,
     joint_texts,
+    read_pose_columns,
     read_rotations,
     read_samples,
     read_stamps,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.files import write_text
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.board import FEWEST_CORNERS
 from robocal_ros.hand_eye.targets import (
     MACHINING_M,
@@ -25,9 +25,7 @@ from robocal_ros.hand_eye.targets import (
     Staircase,
     StepTarget,
 )
-from robocal_ros.kinematics.made_files import read_fields
-from robocal_ros.kinematics.pose_fields import read_pose
-from robocal_ros.kinematics.robot_fields import Fields
+from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
 Array = NDArray[np.float64]
 Target = SphereTarget | StepTarget | LineTarget

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.proposals import Head
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.events import Command
 
 Array = NDArray[np.float64]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ResidualError
+from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.hand_eye.quality import HandEyeSettings, apart, field_points, judge_classic
 from robocal_ros.hand_eye.result import HandEyeResult, Method, point_covariance
 from robocal_ros.hand_eye.tracker_classic import Classic, each_without, solve_classic

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.profile_noise import MAD
+from robocal_ros.estimation.surfaces import MAD
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError
 from robocal_ros.hand_eye.tracker_data import FACES

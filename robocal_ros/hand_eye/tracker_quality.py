@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.estimation import Estimate
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.tracker_data import FACES, TrackerData, TrackerTarget
 from robocal_ros.hand_eye.tracker_problem import TrackerProblem
 from robocal_ros.hand_eye.tracker_scan import Scan

@@ -16,10 +16,8 @@ from robocal_ros.ground.files import nearest, quoted, write_text
 from robocal_ros.hand_eye.target_files import LARGEST_MM, SMALLEST_MM
 from robocal_ros.hand_eye.tracker_data import FACES, Arc, TrackerData, TrackerTarget
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.made_files import read_fields
-from robocal_ros.kinematics.robot_fields import Fields
-from robocal_ros.kinematics.table_columns import POSITION, TableLayout, read_layout
-from robocal_ros.kinematics.tables import joint_texts
+from robocal_ros.kinematics.robots import Fields, read_fields
+from robocal_ros.kinematics.tables import POSITION, TableLayout, joint_texts, read_layout
 
 Array = NDArray[np.float64]
 

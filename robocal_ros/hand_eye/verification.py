@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, errors_document, summarise
 from robocal_ros.estimation.estimation import solve
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import distances, without
 from robocal_ros.hand_eye.mount_problem import (
     SENSOR_UNKNOWNS,

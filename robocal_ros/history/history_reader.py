@@ -8,10 +8,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, WrongRobotError
+from robocal_ros.ground.errors import Code, InputError, WrongRobotError
+from robocal_ros.ground.files import SoleUser
 from robocal_ros.ground.proposals import THERMAL, Candidate, Decision, Entry, Head
-from robocal_ros.ground.sole_user import SoleUser
 from robocal_ros.history.correction_record import CorrectionRecord
 from robocal_ros.history.correction_records import read_corrections
 from robocal_ros.history.history_file import HistoryFile, open_file, storage_errors

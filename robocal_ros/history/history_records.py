@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from dataclasses import astuple, fields
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, StorageError
+from robocal_ros.ground.errors import Code, InputError, StorageError
 from robocal_ros.ground.proposals import Action, Candidate, Decision, Proposal
 from robocal_ros.history.history_schema import DamagedError
 

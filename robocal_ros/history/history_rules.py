@@ -6,8 +6,7 @@ The log alone says what is in force: there is no second place that could disagre
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, RobocalError, StaleError
+from robocal_ros.ground.errors import Code, ConflictError, RobocalError, StaleError
 from robocal_ros.ground.proposals import (
     Action,
     CalibrationState,

@@ -3,9 +3,9 @@
 import numpy as np
 
 from robocal_ros.estimation.assessment import judged_errors_document, verdict_document
-from robocal_ros.ground.frame_texts import Document, transform_document
+from robocal_ros.ground.frames import Document, transform_document
 from robocal_ros.identification import CellModel, Identification, JudgedIdentification
-from robocal_ros.kinematics.documents import model_document, parameters_document
+from robocal_ros.kinematics.arm import model_document, parameters_document
 
 
 def identified_model_document(result: Identification) -> Document:

@@ -17,8 +17,7 @@ from robocal_ros.estimation.assessment import (
     summarise,
     too_narrow,
 )
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import log_rotation
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel

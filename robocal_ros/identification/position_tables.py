@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.cells import read_cells
 from robocal_ros.ground.samples import DEFAULT_TARGET
-from robocal_ros.kinematics.table_columns import POSITION, check_plain
+from robocal_ros.kinematics.tables import POSITION, check_plain
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation import estimation
-from robocal_ros.estimation.freedom import require_told
-from robocal_ros.estimation.observability import describe, observability
+from robocal_ros.estimation.descent import require_told
+from robocal_ros.estimation.estimation import describe, observability
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel, CellProblem, UnknownLayout, make_layout

@@ -1,6 +1,5 @@
 """Kinematic model of serial arms: forward kinematics, Jacobians, free parameters."""
 
-from robocal_ros.kinematics.arm import SerialArm
-from robocal_ros.kinematics.parameters import ParameterSet
+from robocal_ros.kinematics.arm import ParameterSet, SerialArm
 
 __all__ = ["ParameterSet", "SerialArm"]

@@ -69,7 +69,7 @@ def follow(
         Where a joint limit is passed, a singularity is near (`SMALLEST_SINGULAR_VALUE`), a pose
         is out of reach, or a joint would have to move by more than `LONGEST_STEP` at once.
     """
-    from robocal_ros.kinematics import following
+    from robocal_ros.kinematics import newton
 
     goals = np.array(T_base_point, dtype=np.float64, order="C")
     near = np.array(q_near, dtype=np.float64)
@@ -80,7 +80,7 @@ def follow(
     ends = np.stack([arm.T_base_root, np.eye(4)])
     ends[1, :3, 3] = p_flange
     path = JointDerivatives(*(np.zeros((len(goals), arm.n)) for _ in range(3)))
-    reached, outcome = following.follow_batch(
+    reached, outcome = newton.follow_batch(
         goals,
         np.array(twist, dtype=np.float64, order="C"),
         np.array(twist_rate, dtype=np.float64, order="C"),
@@ -94,8 +94,8 @@ def follow(
     )
     require_within_limits(arm, path.q[:reached])
     require_regular(arm, path.q[:reached])
-    if outcome != following.REACHED:
-        why = "the arm is singular there" if outcome == following.SINGULAR else _UNREACHED
+    if outcome != newton.REACHED:
+        why = "the arm is singular there" if outcome == newton.SINGULAR else _UNREACHED
         raise LimitError(f"{_pose(goals, reached)}: {why}. {_WHAT_TO_DO}")
     return path
 

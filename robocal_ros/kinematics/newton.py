@@ -7,7 +7,11 @@ A packed pose holds x, y, z, w of its quaternion, then the translation.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.compiled import inlined, lean
+from robocal_ros.ground.compiled import inlined, kernel, lean
+from robocal_ros.kinematics.kernels import turns_size, walk
+
+# ---- compiled parts of Newton's method on poses: residual, geometric Jacobian, solution ---------
+
 
 Array = NDArray[np.float64]
 
@@ -237,3 +241,82 @@ def bias(links: Array, frames: Array, T: Array, qd: Array, rate: Array, out: Arr
             b0, b1, b2 = b0 + d0, b1 + d1, b2 + d2
     rate[0], rate[1], rate[2], rate[3], rate[4], rate[5] = v0, v1, v2, w0, w1, w2
     out[0], out[1], out[2], out[3], out[4], out[5] = a0, a1, a2, b0, b1, b2
+
+
+# ---- compiled inverse kinematics along a path of poses, with the rates of the joints ------------
+
+
+MOST_ITERATIONS = 15
+# A residual (m, rad) that is the rounding floor, and a step after which the next one is below it.
+SMALL_RESIDUAL = 1e-12
+SMALL_STEP = 1e-9
+
+REACHED, SINGULAR, MISSED = range(3)
+
+
+@kernel
+def _reach(
+    goal: Array, links: Array, poses: Array, turns: Array, frames: Array, J: Array, L: Array,
+    near: Array, longest: float, q: Array,
+) -> int:  # fmt: skip
+    """Newton's steps in ``q`` from ``near`` to ``goal``; ``poses``: root, tool, pose at q."""
+    n = q.shape[0]
+    e, x, step = np.empty(6), np.zeros(n), np.empty(n)
+    for i in range(n):
+        q[i] = near[i]
+    small = False
+    for _ in range(MOST_ITERATIONS):
+        walk(q, links, poses[0], turns, frames, poses[2])
+        at_tool(poses[2], poses[1])
+        columns(links, frames, poses[2], J)
+        if not factor(J, L):
+            return SINGULAR
+        if residual(goal, poses[2], e) <= SMALL_RESIDUAL or small:
+            return REACHED
+        solve(J, L, e, x, step)
+        for i in range(n):
+            x[i] += step[i]
+            q[i] = near[i] + x[i]
+        if not largest_of(x) <= longest:
+            return MISSED
+        small = largest_of(step) <= SMALL_STEP
+    return MISSED
+
+
+@kernel
+def follow_batch(
+    goals: Array,
+    twist: Array,
+    rate: Array,
+    near: Array,
+    links: Array,
+    root_and_tool: Array,
+    longest: float,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+) -> tuple[int, int]:
+    """Joints (m, n) at goals (m, 4, 4), each from the one before, and their rates.
+
+    ``root_and_tool`` (2, 4, 4): T_base_root and where on the flange the goals are; ``twist`` and
+    its derivative ``rate`` (m, 6) of the goals; ``longest``: no joint moves further from one goal
+    to the next. Gives how many were reached and what became of the next.
+    """
+    n = links.shape[0]
+    poses, frames = np.empty((3, 4, 4)), np.empty((n, 2, 3))
+    turns = np.empty(turns_size(n))
+    J, L, zero = np.empty((n, 6)), np.empty((n, n)), np.zeros(n)
+    v, a = np.empty(6), np.empty(6)
+    copy(root_and_tool[0], poses[0])
+    copy(root_and_tool[1], poses[1])
+    for i in range(goals.shape[0]):
+        start = near if i == 0 else q[i - 1]
+        outcome = _reach(goals[i], links, poses, turns, frames, J, L, start, longest, q[i])
+        if outcome != REACHED:
+            return i, outcome
+        solve(J, L, twist[i], zero, qd[i])
+        bias(links, frames, poses[2], qd[i], v, a)
+        for r in range(6):
+            a[r] = rate[i, r] - a[r]
+        solve(J, L, a, zero, qdd[i])
+    return goals.shape[0], REACHED

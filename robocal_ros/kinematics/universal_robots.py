@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.kinematics.arm import SerialArm
-from robocal_ros.kinematics.parameters import ALPHA, NEARLY_PARALLEL, THETA, A, D
+from robocal_ros.kinematics.arm import ALPHA, NEARLY_PARALLEL, THETA, A, D, SerialArm
 
 Array = NDArray[np.float64]
 

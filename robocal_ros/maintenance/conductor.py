@@ -4,8 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from traceback import extract_tb
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.maintenance.asking import Script
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import Memory

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.ground.proposals import (
     THERMAL,
     TOOL,
@@ -19,7 +18,7 @@ from robocal_ros.ground.proposals import (
     require_measured_with,
 )
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.session.decisions import decide, measured_with
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome

@@ -10,7 +10,7 @@ from robocal_msgs.action import MeasureTool
 from robocal_msgs.srv import BeginCycle, EndCycle
 from std_srvs.srv import SetBool
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.maintenance import requests as asked
 from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.motion.driver import MotionDriver, guarded

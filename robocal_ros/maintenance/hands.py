@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import LimitError
+from robocal_ros.ground.errors import Code, LimitError
 from robocal_ros.maintenance import requests as asked
 from robocal_ros.maintenance.asking import Asking, Script
 from robocal_ros.maintenance.config import MaintenanceConfig

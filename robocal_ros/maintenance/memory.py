@@ -7,8 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import StateLostError, StorageError
+from robocal_ros.ground.errors import Code, StateLostError, StorageError
 
 REMEMBERED = 200  # ended cycles
 VERSION = 2  # of the document; one without a version is the first, which knew no runs and stamps

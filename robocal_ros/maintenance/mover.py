@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import LimitError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, LimitError, RobocalError, TooFewSamplesError
 from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.ways import HOME, STATION, Line, Route, Ways
 from robocal_ros.motion.limits import start_near

@@ -10,6 +10,7 @@ from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.files import StateFile
 from robocal_ros.ground.samples import (
     JOINTS,
     MEASURED_POINT,
@@ -19,7 +20,6 @@ from robocal_ros.ground.samples import (
     joint_sample,
     stamp_ns,
 )
-from robocal_ros.ground.state_files import StateFile
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import MaintenanceSession, MaintenanceState

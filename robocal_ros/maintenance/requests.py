@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.motion.plan import JointPlan
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.asking import Script, SilentError

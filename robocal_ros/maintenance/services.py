@@ -10,8 +10,7 @@ from robocal_msgs.action import RunMaintenance
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.maintenance import CycleResult, MaintenanceSession, Status
 from robocal_ros.maintenance.outputs import MaintenanceOutputs, result_message
 from robocal_ros.ros.decision_services import TWIN

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.correction.status import ToldCorrection
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, LimitError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import Accuracy, Drift, accuracy_of

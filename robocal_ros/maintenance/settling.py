@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import StorageError
+from robocal_ros.ground.errors import Code, StorageError
 from robocal_ros.maintenance.asking import Script
 from robocal_ros.maintenance.deciding import BY, Decider, withholding
 from robocal_ros.maintenance.hands import Hands

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from enum import IntEnum
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.hands import Hands

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.maintenance.asking import Script, SilentError
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.requests import BeginCycle, DriverAnswer, EndCycle

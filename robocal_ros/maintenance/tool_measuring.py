@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.maintenance.asking import Script, SilentError
 from robocal_ros.maintenance.deciding import Decider

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.maintenance.asking import Script
 from robocal_ros.maintenance.deciding import BY, Decider

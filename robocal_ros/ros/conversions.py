@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.proposals import Entry
-from robocal_ros.kinematics.parameters import COLUMNS
+from robocal_ros.kinematics.arm import COLUMNS
 
 if TYPE_CHECKING:  # most nodes have no thermal session
     from robocal_ros.session.events import Outcome

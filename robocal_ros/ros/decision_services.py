@@ -7,8 +7,7 @@ from typing import Any
 from robocal_msgs.srv import Decide, ListCalibrations
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.ros.conversions import summary_message
 from robocal_ros.ros.endpoints import trigger_text

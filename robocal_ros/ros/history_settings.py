@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros.ground.errors import WrongRobotError
-from robocal_ros.ground.state_files import StateFile
+from robocal_ros.ground.files import StateFile
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_damage import acknowledge, damage_notice
 from robocal_ros.history.history_paths import history_path, state_folder

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from robocal_ros import __version__
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, Head
 from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample
 from robocal_ros.ground.streams import JointStream

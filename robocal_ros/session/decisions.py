@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.proposals import BEFORE_ANY, THERMAL, TOOL, Decision, Entry
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.session import events

@@ -4,8 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, JUMPS
 
 CONFIGURE = "configure"

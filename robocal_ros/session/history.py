@@ -5,8 +5,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import WrongRobotError
+from robocal_ros.ground.errors import Code, WrongRobotError
 from robocal_ros.ground.proposals import Decision, Entry, Head, Proposal
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Command

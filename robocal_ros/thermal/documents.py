@@ -14,10 +14,10 @@ from robocal_ros.estimation.assessment import (
     verdict_document,
 )
 from robocal_ros.ground import frames
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.identification.documents import cell_document
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import parameters_document
+from robocal_ros.kinematics.arm import parameters_document
 from robocal_ros.thermal.flange_identification import JudgedFlangeSensor
 from robocal_ros.thermal.identification import CycleDrift
 from robocal_ros.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict

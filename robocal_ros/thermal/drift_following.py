@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, Entry
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm

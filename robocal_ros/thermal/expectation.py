@@ -5,8 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import THERMAL, CalibrationState, Entry
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm

@@ -16,7 +16,7 @@ from robocal_ros.estimation.assessment import (
     summarise,
     too_narrow,
 )
-from robocal_ros.estimation.observability import describe
+from robocal_ros.estimation.estimation import describe
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.priors import default_prior, fitted_prior

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.observability import Observability, describe, observability
+from robocal_ros.estimation.estimation import Observability, describe, observability
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm

@@ -3,7 +3,7 @@
 from robocal_ros.ground.errors import ConflictError
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import History
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of

@@ -20,7 +20,7 @@ from robocal_ros.ground.samples import (
     TEMPERATURES,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.motion.source_guard import SourceGuard
 from robocal_ros.ros import qos

@@ -13,7 +13,7 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import Method, identify_and_hold_out
 from robocal_ros.identification.documents import identification_document, identified_model_document
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.config import METHODS, ThermalConfig
 from robocal_ros.thermal.cycle_verdict import judge_cycle

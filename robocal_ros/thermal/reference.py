@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import LARGEST_RMS_M, summarise
 from robocal_ros.ground.errors import ResidualError
-from robocal_ros.ground.frame_texts import Document
+from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel
 from robocal_ros.identification.mismatch import require_match

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import LARGEST_RMS_M, Verdict
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RankDeficientError, ResidualError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, RankDeficientError, ResidualError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel
 from robocal_ros.identification.mismatch import require_match

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.made_files import read_made, write_made
+from robocal_ros.kinematics.robots import read_made, write_made
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, RobocalError, StorageError
+from robocal_ros.ground.errors import Code, ConflictError, RobocalError, StorageError
 from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.samples import (
     JOINTS,

@@ -10,8 +10,7 @@ from robocal_msgs.srv import CalibrateSensor, PlanPoses
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, LimitError
+from robocal_ros.ground.errors import Code, ConflictError, LimitError
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.estimation.assessment import Verdict, summarise
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Command, Outcome

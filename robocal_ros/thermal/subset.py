@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.observability import describe, observability
+from robocal_ros.estimation.estimation import describe, observability
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 
 Array = NDArray[np.float64]

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Judgement, Verdict
-from robocal_ros.estimation.observability import describe, observability
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.estimation.estimation import describe, observability
+from robocal_ros.ground.errors import Code, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.cycle_verdict import conclude

@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 
 Array = NDArray[np.float64]
 Beam = Literal["x", "y"]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.tool.crossed_beams import CircleFit
 from robocal_ros.tool.crossed_run import ToolEstimate
 from robocal_ros.tool.judging import KnownTool

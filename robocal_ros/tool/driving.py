@@ -9,8 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, RobocalError
+from robocal_ros.ground.errors import Code, ConflictError, RobocalError
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.plan import JointPlan

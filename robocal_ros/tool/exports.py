@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.frame_texts import fixed, urdf_joint, urdf_origin
+from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
 
 Array = NDArray[np.float64]
 Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]

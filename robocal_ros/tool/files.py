@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.kinematics.made_files import read_fields
+from robocal_ros.kinematics.robots import read_fields
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.followed import HistoryFollower
 from robocal_ros.session.history import History
 from robocal_ros.tool.config import ToolConfig, made_with

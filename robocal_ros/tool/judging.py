@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.tool.crossed_run import ToolEstimate
 from robocal_ros.tool.tool_axis import minimal_rotation
 from robocal_ros.tool.witness import BendRule, Witness, bend_or_station

@@ -8,7 +8,7 @@ import numpy as np
 
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.made_files import read_fields, require_made_for, write_made
+from robocal_ros.kinematics.robots import read_fields, require_made_for, write_made
 from robocal_ros.tool.beam_edges import BEAMS
 from robocal_ros.tool.laser_frame import POINTS, LaserFrame
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.estimation.descent import chi2_quantile
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.tool.judging import KnownTool, change_between, difference
 from robocal_ros.tool.witness import SMALL_M, Witness
 

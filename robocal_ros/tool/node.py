@@ -9,8 +9,7 @@ from robocal_msgs.msg import BeamEvent, ToolFrame
 from sensor_msgs.msg import JointState
 
 from robocal_ros import __version__
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, RobocalError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash

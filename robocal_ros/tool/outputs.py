@@ -8,7 +8,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, ToolFrame, ToolStep
 
-from robocal_ros.ground.frame_texts import Document
+from robocal_ros.ground.frames import Document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros import conversions, qos
 from robocal_ros.ros.session_events import SessionEvents

@@ -2,8 +2,7 @@
 
 from enum import Enum
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import ToolBody

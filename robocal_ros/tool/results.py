@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError
+from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, TOOL, Proposal
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Command, Outcome

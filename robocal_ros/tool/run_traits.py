@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, RobocalError, TooFewSamplesError
 from robocal_ros.tool.beam_edges import BEAMS, BeamError
 from robocal_ros.tool.crossed_run import ToolEstimate
 

@@ -10,8 +10,7 @@ from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import ToolFrame, ToolStep
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.ros.decision_services import DecisionServices

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, RobocalError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.ground.samples import JOINTS, JointSample
 from robocal_ros.kinematics import SerialArm

@@ -10,13 +10,14 @@ from robocal_ros.ground.cells import Cells, read_cells
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.table_columns import (
+from robocal_ros.kinematics.tables import (
     ORIENTATIONS,
     check_plain,
     orientation_columns,
     read_joint_columns,
+    read_rotations,
+    read_stamps,
 )
-from robocal_ros.kinematics.tables import read_rotations, read_stamps
 from robocal_ros.tool.beam_edges import BEAMS, Beam, BeamEdge
 from robocal_ros.tool.flange_path import JointPath
 from robocal_ros.tool.named_steps import STEP_NAMES, step_kind

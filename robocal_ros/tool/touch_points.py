@@ -7,12 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.estimation.assessment import Verdict
-from robocal_ros.estimation.estimation import Estimate, solve
-from robocal_ros.estimation.loss import Problem
-from robocal_ros.estimation.observability import observability
+from robocal_ros.estimation.descent import Problem
+from robocal_ros.estimation.estimation import Estimate, observability, solve
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
 
 Array = NDArray[np.float64]
 EulerConvention = Literal["zxz", "zyx", "zyz"]

@@ -14,8 +14,8 @@ from jsonschema import Draft202012Validator
 from robocal_ros import __version__
 from robocal_ros.cli import main as frame
 from robocal_ros.cli.output import CliResult, exit_status, failure
-from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import (
+    Code,
     ConflictError,
     InputError,
     RankDeficientError,

@@ -15,7 +15,7 @@ from bench.closed_loop import setting
 from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord, run_shift
 from robocal_ros.bags.bags import BagReader, bag_info
 from robocal_ros.bags.replay import NOT_BITS
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.thermal.accuracy import AccuracyLevel

@@ -13,7 +13,7 @@ import pytest
 from command import conforms, environment, robocal, robocal_json
 from jsonschema import ValidationError
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import CalibrationState, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.correction_record import CorrectionRecord

@@ -12,7 +12,7 @@ from hand_eye_driver import FRAME, sphere_set
 
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 SCHEMA = "replay.hand_eye.json"
 

@@ -7,7 +7,7 @@ from command import ROOT, robocal, robocal_json
 
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.bags.replay import needed_inputs
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.session.events import IDENTIFY, Command
 
 BAGS = ROOT / "bags"

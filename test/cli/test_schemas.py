@@ -17,7 +17,7 @@ from tracker_files import SCAN, tracker_files
 
 from robocal_ros.cell_sim.tracker_cells import prp_cell
 from robocal_ros.cli.main import COMMANDS
-from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics.robots import load_description
 
 UR_NOMINAL = """[DH]

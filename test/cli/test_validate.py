@@ -42,8 +42,7 @@ from robocal_ros.cli.main import main
 from robocal_ros.cli.validating import Job
 from robocal_ros.cli.validating_many import validated
 from robocal_ros.cli.validating_parts import require_finite
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.session.records import arguments_text, outcome_text
 

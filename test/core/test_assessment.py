@@ -16,8 +16,7 @@ from robocal_ros.estimation.assessment import (
     summarise,
     too_narrow,
 )
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.ground.errors import Code, TooFewSamplesError
 
 
 def apart(count: int) -> np.ndarray:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from robocal_ros.estimation.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent
-from robocal_ros.estimation.loss import DescentState
+from robocal_ros.estimation.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent, DescentState
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.cycle_verdict import judge_cycle

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.estimation.descent import chi2_quantile
-from robocal_ros.estimation.estimation import solve
-from robocal_ros.estimation.observability import describe, observability
+from robocal_ros.estimation.estimation import describe, observability, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 

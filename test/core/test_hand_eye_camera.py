@@ -10,8 +10,7 @@ from scipy.stats import chi2
 
 from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TruePose
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ResidualError
+from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
 from robocal_ros.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form, closed_form_of_all
 from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs

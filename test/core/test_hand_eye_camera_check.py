@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from camera_pairs import MOUNTS, measured
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
 from robocal_ros.hand_eye.camera_closed_forms import closed_form
 

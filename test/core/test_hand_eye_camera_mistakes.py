@@ -8,8 +8,8 @@ from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured
 
 from robocal_ros.cell_sim.board_camera import BoardCell, TruePose
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import (
+    Code,
     InputError,
     RankDeficientError,
     ResidualError,

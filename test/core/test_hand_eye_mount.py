@@ -8,7 +8,7 @@ import pytest
 from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_target
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import SETTLED, fit_mount
 from robocal_ros.hand_eye.mount_problem import (
     MountProblem,

@@ -19,7 +19,7 @@ from robocal_ros.cell_sim.hand_eye_cell import SimulatedShots
 from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
 from robocal_ros.cell_sim.profile_targets import ball_on_table
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_problem import PoseNoise
 from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
 from robocal_ros.hand_eye.planning import SensorRange, check_plan

@@ -30,8 +30,8 @@ from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.profile_targets import Scene, ball_on_table
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import (
+    Code,
     InputError,
     RankDeficientError,
     ResidualError,

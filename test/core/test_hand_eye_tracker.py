@@ -11,8 +11,8 @@ from robocal_ros.cell_sim.profile_targets import Prism, Stem
 from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
 from robocal_ros.cell_sim.ur10_station import Q_NEAR
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import (
+    Code,
     InputError,
     RankDeficientError,
     ResidualError,

@@ -7,8 +7,7 @@ import pytest
 
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.identification import CellModel, identify, identify_and_judge
 from robocal_ros.identification.cell import CellProblem, make_layout
 from robocal_ros.identification.start import linear_start

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.images import CHANNELS, image_array
+from robocal_ros.ground.samples import CHANNELS, image_array
 
 RGB = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
 LUMA = [0.299, 0.587, 0.114]  # of red, green and blue, ITU-R BT.601

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import ParameterSet, SerialArm, kernels
-from robocal_ros.kinematics.parameters import ALPHA, BETA
+from robocal_ros.kinematics.arm import ALPHA, BETA
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.universal_robots import (
     factory_arm,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.point_clouds import cloud_points
+from robocal_ros.ground.samples import cloud_points
 
 POINTS = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 3))
 

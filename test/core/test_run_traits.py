@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, RobocalError, TooFewSamplesError
 from robocal_ros.tool.beam_edges import BeamError
 from robocal_ros.tool.run_traits import (
     ClockError,

@@ -7,8 +7,7 @@ import pytest
 
 from robocal_ros.estimation.assessment import Judgement
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, ResidualError
+from robocal_ros.ground.errors import Code, InputError, ResidualError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

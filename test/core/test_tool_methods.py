@@ -6,8 +6,8 @@ import pytest
 from robocal_ros.cell_sim.beam_moves import Sweep
 from robocal_ros.cell_sim.beams import RoundTool, TrueBeam, bent, crossings
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
 from robocal_ros.ground.errors import (
+    Code,
     InputError,
     RankDeficientError,
     ResidualError,

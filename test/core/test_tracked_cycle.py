@@ -7,8 +7,7 @@ import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.ground.errors import Code, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

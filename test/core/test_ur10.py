@@ -7,7 +7,7 @@ import pytest
 
 from bench.ur10_campaigns import halves, load_campaign
 from robocal_ros.estimation.assessment import pose_groups
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.identification import identify_and_judge
 from robocal_ros.kinematics.robots import load_robot
 

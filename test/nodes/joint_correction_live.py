@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import conversions, qos
 from robocal_ros.tool.judging import KnownTool

@@ -14,7 +14,7 @@ from bench.closed_loop.faults import RIGHT, WELL
 from bench.live.cell import set_fault
 from bench.live.plc import GAP_S, Plc
 from bench.live.running import live_cell
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 KNOCKS = [fault for fault, code in RIGHT.items() if code is Code.SENSOR_OR_ROBOT_MOVED]
 

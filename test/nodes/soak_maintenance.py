@@ -20,7 +20,7 @@ from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenance
 from std_srvs.srv import Trigger
 from test_maintenance_calls import HOME_DEG, Plc, process, proposed
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 

@@ -15,8 +15,7 @@ from robocal_msgs.srv import Decide
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, StaleError
+from robocal_ros.ground.errors import Code, InputError, StaleError
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.diagnostics import WARN, Health

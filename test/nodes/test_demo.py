@@ -15,7 +15,7 @@ from bench.live.cell import TRUTH
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.cell_sim.joint_motion import ROOM
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 pytestmark = pytest.mark.cell
 

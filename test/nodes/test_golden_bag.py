@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from history_content import content
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 
 ROOT = Path(__file__).parents[2]

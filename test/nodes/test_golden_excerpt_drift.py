@@ -31,7 +31,7 @@ from robocal_ros.bags import replay
 from robocal_ros.bags.bag_writer import BagWriter
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.recording import BagOverview, open_recording
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

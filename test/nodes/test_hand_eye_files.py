@@ -8,7 +8,7 @@ from hand_eye_live import NAME, SHOTS, LiveSensor
 from robocal_msgs.srv import Decide, HandEyeFile
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 
 @pytest.fixture

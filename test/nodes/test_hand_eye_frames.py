@@ -13,7 +13,7 @@ from robocal_msgs.srv import Decide
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ros import qos
 from robocal_ros.ros.diagnostics import ERROR
 from robocal_ros.ros.frame_watch import FRESH_S

@@ -26,7 +26,7 @@ from tf2_msgs.msg import TFMessage
 
 from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.data import Capture
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.hand_eye.outputs import HandEyeOutputs

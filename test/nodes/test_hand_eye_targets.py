@@ -19,7 +19,7 @@ from robocal_ros.bags.hand_eye_bags import write_data_set
 from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, step_shots
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.quality import HandEyeSettings
 from robocal_ros.hand_eye.target_files import write_target
 from robocal_ros.hand_eye.targets import Staircase, StepTarget

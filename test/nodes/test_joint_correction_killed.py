@@ -17,7 +17,7 @@ from trajectory_controllers import ARM, CONTROLLERS, HOME, NODE, Controlled, tra
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.ground.samples import CORRECTED
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import robot_file_hash
 from robocal_ros.ros import conversions, qos
 

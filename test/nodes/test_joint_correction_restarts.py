@@ -25,7 +25,7 @@ from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import qos
 from robocal_ros.session.history import bring_into_force
 from robocal_ros.tool.judging import KnownTool

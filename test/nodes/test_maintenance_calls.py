@@ -20,10 +20,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode

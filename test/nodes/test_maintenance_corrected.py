@@ -12,7 +12,7 @@ from test_maintenance_calls import HOME_DEG, proposed
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import ACCURACY, CORRECTION, MaintenanceNode
 from robocal_ros.ros import conversions, qos

@@ -10,7 +10,7 @@ from robocal_msgs.msg import AccuracyState, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 GAP_S = 150.0
 

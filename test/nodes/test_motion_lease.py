@@ -16,7 +16,7 @@ from test_maintenance_calls import HOME_DEG as STANDING_DEG
 from test_maintenance_calls import Plc, process
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ros import qos
 
 PROGRAM = "/program/joint_trajectory"

@@ -18,7 +18,7 @@ from test_tool_cell import Cell
 from trajectory_controllers import HOME, NODE, Controlled, simulated, trajectory
 
 from bench.live.cell import set_fault
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ros import qos
 
 pytestmark = pytest.mark.cell

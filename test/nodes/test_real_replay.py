@@ -16,7 +16,7 @@ from std_msgs.msg import String
 
 from bench import ur10_campaigns
 from robocal_ros.bags.bags import BagReader, BagWriter
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import qos

@@ -16,7 +16,7 @@ from tool_driver import TRUTH
 from robocal_ros.bags.recorder_node import LOOK_S
 from robocal_ros.bags.recording_folders import recordings
 from robocal_ros.cli.main import main
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.session_events import EVENTS
 

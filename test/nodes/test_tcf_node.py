@@ -16,7 +16,7 @@ from tool_driver import TAUGHT, TRUTH
 
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.ros import qos
 

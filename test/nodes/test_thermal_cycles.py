@@ -10,7 +10,7 @@ from robocal_msgs.msg import AccuracyState
 from sensor_msgs.msg import JointState, Temperature
 from shift import NS, Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.conversions import time_message

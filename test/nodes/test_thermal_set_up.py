@@ -8,7 +8,7 @@ from sensor_msgs.msg import JointState
 from shift import BALL, T_SENSOR_BASE, Shift, built, postures
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import qos
 

@@ -14,7 +14,7 @@ from maintenance_cell import (
     thermal_proposed,
 )
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.maintenance import requests as ask

@@ -9,7 +9,7 @@ from scipy.stats import chi2, norm
 from shift import BALL, NOISE_M, Shift, built, postures, warmed
 
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

@@ -9,7 +9,7 @@ import pytest
 from shift import Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JOINTS, JointSample, PointSample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

@@ -20,11 +20,11 @@ from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.ground import frames
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, hand_eye_kind
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.quality import HandEyeSettings
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
 from robocal_ros.session.history import bring_into_force
 from robocal_ros.session.records import digest

@@ -21,8 +21,7 @@ from scipy.stats import chi2
 
 from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
 from robocal_ros.bags.replay import replay
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.hand_eye import shots as hand_eye_shots
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import data_set_begun, data_set_of

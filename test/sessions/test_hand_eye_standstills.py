@@ -15,7 +15,7 @@ from hand_eye_driver import (
     sphere_shots_of,
 )
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession

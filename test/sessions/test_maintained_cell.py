@@ -13,8 +13,7 @@ from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim import kr150_cell
 from robocal_ros.cell_sim.beams import RoundTool, bent
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

@@ -29,8 +29,7 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError, StorageError
+from robocal_ros.ground.errors import Code, InputError, StorageError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.accuracy import Drift

@@ -33,8 +33,7 @@ from maintenance_tools import (
 )
 from tool_driver import TAUGHT
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import StaleError
+from robocal_ros.ground.errors import Code, StaleError
 from robocal_ros.ground.proposals import THERMAL, TOOL, Action, Decision, Head
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import insert_decision

@@ -28,8 +28,7 @@ from maintenance_tools import (
     until_verified,
 )
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, StorageError
+from robocal_ros.ground.errors import Code, ConflictError, StorageError
 from robocal_ros.ground.proposals import THERMAL, TOOL, Action
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.maintenance import MaintenanceState

@@ -6,7 +6,7 @@ import pytest
 from maintenance_cell import bent, passed
 from maintenance_tools import automatic, measured_in_full, until_verified
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 
 UNSURE = replace(bent(), code=Code.TOO_FEW_SAMPLES, answer="cannot tell")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from maintenance_cell import LONG_S, POSES, REFUSED, SILENT, Cell, config_of, kinds, opened
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.requests import DriverAnswer

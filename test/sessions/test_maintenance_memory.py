@@ -3,8 +3,7 @@
 import pytest
 from maintenance_cell import LONG_S, Cell, opened
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import StorageError
+from robocal_ros.ground.errors import Code, StorageError
 from robocal_ros.maintenance.memory import VERSION
 
 SPOILT = {

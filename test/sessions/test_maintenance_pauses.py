@@ -23,7 +23,7 @@ from maintenance_cell import (
     proposed,
 )
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.maintenance import AcceptBounds, MaintenanceState
 from robocal_ros.maintenance.conductor import UNSAVED_S
 from robocal_ros.maintenance.hands import DEAF_S

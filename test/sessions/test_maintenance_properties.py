@@ -37,8 +37,7 @@ from maintenance_cell import (
 )
 from tool_driver import TAUGHT
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import Action
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.maintenance import AcceptBounds, MaintenanceState

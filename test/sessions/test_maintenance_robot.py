@@ -24,8 +24,7 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError, StorageError
+from robocal_ros.ground.errors import Code, RobocalError, StorageError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.requests import DriverAnswer

@@ -18,7 +18,7 @@ from maintenance_cell import (
 )
 from maintenance_tools import decide, level, measured_in_full, modes, until_measuring
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.session.events import ACCEPT, ROLLBACK

@@ -24,8 +24,7 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError
+from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.hands import DEAF_S
 from robocal_ros.motion.robot_watch import VELOCITY_S

@@ -26,8 +26,7 @@ from maintenance_tools import (
     until_verified,
 )
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import StorageError
+from robocal_ros.ground.errors import Code, StorageError
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.maintenance import MaintenanceState

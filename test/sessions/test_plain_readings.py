@@ -10,7 +10,7 @@ from joint_blocks import in_blocks
 from tool_driver import config_of, noisy_cell
 
 from robocal_ros.bags.replay import replay
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,

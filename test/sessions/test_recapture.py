@@ -7,7 +7,7 @@ import pytest
 from maintenance_cell import config_of
 from shift import BALL, KNOCK, NOISE_M, Shift, built, knocked, postures, warmed
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.deciding import Decider

@@ -15,7 +15,7 @@ from robocal_ros.ground.samples import JOINTS, JUMPS
 from robocal_ros.hand_eye import recorded as hand_eye_recorded
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import records
 from robocal_ros.session.events import Command
 from robocal_ros.thermal import seeding

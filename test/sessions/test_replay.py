@@ -12,8 +12,7 @@ from joint_blocks import in_blocks
 from shift import Shift, built, postures, warmed
 
 from robocal_ros.bags.replay import NOT_BITS, feed, input_topics, read_events, replay
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.proposals import Proposal
 from robocal_ros.ground.samples import (
     JOINTS,

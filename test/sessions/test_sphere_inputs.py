@@ -8,7 +8,7 @@ import pytest
 from shift import Shift, built, postures, warmed
 
 from robocal_ros.cell_sim.sphere_cloud import CloudScene, sphere_cloud
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import (
     JOINTS,
     MEASURED_POINT,

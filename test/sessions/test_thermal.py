@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shift import Shift, built, of_kind, postures, warmed
 
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JOINTS, MEASURED_POINT, JointSample, PointSample
 from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.history.calibrations import CalibrationHistory

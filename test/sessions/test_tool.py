@@ -8,11 +8,10 @@ import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import RoundTool, bent
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
 from robocal_ros.session.history import bring_into_force
 from robocal_ros.tool.beam_edges import BeamEdge

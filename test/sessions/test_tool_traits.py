@@ -6,7 +6,7 @@ import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import RoundTool
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.tool.session import ToolSession

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robocal_ros.cell_sim.joint_motion import JointMotion
-from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.limits import MotionLimits

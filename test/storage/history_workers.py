@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 

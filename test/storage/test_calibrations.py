@@ -9,8 +9,7 @@ import pytest
 from histories import BY, reopened
 from history_workers import proposal
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.ground.proposals import Action, CalibrationState, Head
 from robocal_ros.history.calibrations import CalibrationHistory
 

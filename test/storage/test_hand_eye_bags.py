@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from robocal_ros.bags.bags import read_bag
 from robocal_ros.bags.hand_eye_bags import PROFILE, read_data_set, write_data_set
 from robocal_ros.ground.errors import InputError, WrongRobotError
-from robocal_ros.ground.point_clouds import cloud_points
+from robocal_ros.ground.samples import cloud_points
 from robocal_ros.kinematics.robots import load_robot
 
 ARM = load_robot("ur10")

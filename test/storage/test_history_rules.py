@@ -9,8 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from robocal_ros.ground.codes import Code
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 
 KINDS = ("thermal", "tool")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from robocal_ros.ground.errors import StateLostError, StorageError
-from robocal_ros.ground.state_files import StateFile
+from robocal_ros.ground.files import StateFile
 
 
 @pytest.fixture
