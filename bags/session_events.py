@@ -5,8 +5,7 @@ from typing import Any
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.records import arguments_text, outcome_text
+from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text
 
 
 class EventLog:

@@ -23,15 +23,19 @@ from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.cycle_verdict import judge_cycle
-from robocal_ros.thermal.drift_history import DriftHistory, share_within
-from robocal_ros.thermal.identification import identify_cycle
-from robocal_ros.thermal.learning import learn_drift
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.process_learning import EarlierShift, LearnedProcess, learn_process
+from robocal_ros.thermal.documents import judge_cycle
+from robocal_ros.thermal.identification import identify_cycle, subset_drift
+from robocal_ros.thermal.learning import (
+    DriftHistory,
+    EarlierShift,
+    LearnedProcess,
+    learn_drift,
+    learn_process,
+    share_within,
+)
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.screening import screen
-from robocal_ros.thermal.spots import ColdSpots
-from robocal_ros.thermal.subset import subset_drift
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from robocal_ros.estimation.assessment import summarise
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import Identification, identify
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.process import STEADY_TIME_S
+from robocal_ros.thermal.process import STEADY_TIME_S, drift_prior
 
 FIRST_H = 10.0
 BLOCK = 300  # poses, 1.1 hours of measuring

@@ -15,8 +15,7 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.reference import capture_reference
-from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.reference import ColdSpots, capture_reference
 
 Array = NDArray[np.float64]
 

@@ -19,10 +19,10 @@ from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.identification import identify_cycle
-from robocal_ros.thermal.learning import learn_drift
-from robocal_ros.thermal.process_learning import (
+from robocal_ros.thermal.learning import (
     EarlierShift,
     LearnedProcess,
+    learn_drift,
     learn_gains,
     learn_process,
     visit_noise,

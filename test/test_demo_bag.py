@@ -19,9 +19,8 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.found_cycles import automatic_commands
-from robocal_ros.thermal.inputs import take_message
-from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal.seeding import automatic_commands
+from robocal_ros.thermal.session import ThermalSession, take_message
 
 BAGS = Path(__file__).parent.parent / "bags"
 BAG = BAGS / "demo_shift.mcap"

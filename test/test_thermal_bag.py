@@ -21,8 +21,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.inputs import take_message
-from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal.session import ThermalSession, take_message
 
 BAGS = Path(__file__).parent.parent / "bags"
 BAG = BAGS / "thermal_shift.mcap"

@@ -18,7 +18,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.accuracy import AccuracyForecast, Work
 from robocal_ros.thermal.drift_following import default_process
-from robocal_ros.thermal.process_learning import LearnedProcess
+from robocal_ros.thermal.learning import LearnedProcess
 from robocal_ros.thermal.tracking import DriftTracker
 
 Array = NDArray[np.float64]

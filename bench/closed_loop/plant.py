@@ -27,7 +27,7 @@ from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.travel import joint_way
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.process_learning import LearnedProcess
+from robocal_ros.thermal.learning import LearnedProcess
 from robocal_ros.tool.results import REFERENCE
 
 Array = NDArray[np.float64]

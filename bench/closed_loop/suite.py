@@ -33,8 +33,7 @@ from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.drift_following import EXPECTED
-from robocal_ros.thermal.process_documents import process_document
-from robocal_ros.thermal.process_learning import LearnedProcess
+from robocal_ros.thermal.learning import LearnedProcess, process_document
 from robocal_ros.thermal.session import ThermalSession
 from robocal_ros.tool.driving import ToolDriver
 from robocal_ros.tool.edge_log import EDGES

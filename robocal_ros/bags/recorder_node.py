@@ -12,7 +12,7 @@ from robocal_ros.bags.bag_recording import BagRecording
 from robocal_ros.bags.recorded_topics import DIAGNOSTICS, TOPICS, RecordedTopic, RecordedTopics
 from robocal_ros.bags.recording_folders import MB, Maker, keep, make_room, new_folder, size_bytes
 from robocal_ros.ground.errors import Code, ConflictError, StorageError
-from robocal_ros.history.history_paths import state_folder
+from robocal_ros.history.history_file import state_folder
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.diagnostics import ERROR, WARN, Health
 from robocal_ros.ros.endpoints import trigger_text

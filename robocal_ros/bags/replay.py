@@ -16,8 +16,7 @@ from robocal_ros.ground.samples import (
     stamp_ns,
 )
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.records import digest, read_command
+from robocal_ros.session.events import Command, Outcome, digest, read_command
 
 EVENTS = "session_events"
 NOT_BITS = "not to the last bit"

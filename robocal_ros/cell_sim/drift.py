@@ -19,7 +19,7 @@ from robocal_ros.cell_sim.robot import TrueRobot
 from robocal_ros.cell_sim.sensor import SphereSensor
 from robocal_ros.cell_sim.shift import SERVO_RAD
 from robocal_ros.cell_sim.thermal import Warmth
-from robocal_ros.thermal.drift_history import share_within
+from robocal_ros.thermal.learning import share_within
 
 Array = NDArray[np.float64]
 

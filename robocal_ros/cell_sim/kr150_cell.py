@@ -28,7 +28,7 @@ from robocal_ros.cell_sim.sphere_station import SphereStation
 from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.drift_history import THRESHOLD_M
+from robocal_ros.thermal.learning import THRESHOLD_M
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD
 from robocal_ros.hand_eye.shots import PROFILE
 from robocal_ros.ros import qos
 from robocal_ros.ros.conversions import NS, header, transform_message
-from robocal_ros.thermal.drift_history import THRESHOLD_M
+from robocal_ros.thermal.learning import THRESHOLD_M
 
 Array = NDArray[np.float64]
 

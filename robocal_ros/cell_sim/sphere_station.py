@@ -9,7 +9,7 @@ from robocal_ros.cell_sim.cell_faults import Faults
 from robocal_ros.cell_sim.draws import Draws, Stream
 from robocal_ros.cell_sim.sensor import SphereSensor
 from robocal_ros.cell_sim.sphere_cloud import sphere_cloud
-from robocal_ros.thermal.pose_planning import SensorField
+from robocal_ros.thermal.planning import SensorField
 
 Array = NDArray[np.float64]
 

@@ -72,8 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.history.calibrations import CalibrationHistory
-    from robocal_ros.history.history_damage import damaged_files
-    from robocal_ros.history.history_paths import known_serials, state_folder
+    from robocal_ros.history.history_file import damaged_files, known_serials, state_folder
 
     folder = state_folder() if args.state is None else args.state.absolute()
     serial = args.robot_serial
@@ -144,7 +143,7 @@ def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Ans
 
 
 def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    from robocal_ros.history.history_damage import acknowledge
+    from robocal_ros.history.history_file import acknowledge
 
     files = acknowledge(history.path, _by(args), time.time_ns())
     return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_acknowledged

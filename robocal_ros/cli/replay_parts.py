@@ -11,7 +11,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.streams import JointStream
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.session.commanded import Commanded
+from robocal_ros.session.base import Commanded
 from robocal_ros.session.events import Command, Outcome
 
 S = TypeVar("S", bound=Commanded)

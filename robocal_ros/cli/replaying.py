@@ -24,10 +24,14 @@ from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.found_cycles import accepting, automatic_commands, window_commands
-from robocal_ros.thermal.inputs import take_message
-from robocal_ros.thermal.seeding import is_thermal_session, session_as_recorded
-from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal.seeding import (
+    accepting,
+    automatic_commands,
+    is_thermal_session,
+    session_as_recorded,
+    window_commands,
+)
+from robocal_ros.thermal.session import ThermalSession, take_message
 from robocal_ros.tool.recorded import is_tool_session
 
 Window = tuple[float, float]

@@ -13,16 +13,19 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.identification.cell import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import read_measurements
-from robocal_ros.thermal.cycle_verdict import judge_cycle
-from robocal_ros.thermal.documents import cycle_document, flange_sensor_document
-from robocal_ros.thermal.flange_identification import identify_and_judge_flange_sensor
+from robocal_ros.thermal.documents import cycle_document, flange_sensor_document, judge_cycle
+from robocal_ros.thermal.flange_sensor import identify_and_judge_flange_sensor
 from robocal_ros.thermal.identification import CycleDrift, identify_cycle, identify_subset
-from robocal_ros.thermal.prior_files import read_prior
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.sensor_files import PlacedSensor, read_sensor
-from robocal_ros.thermal.spots import ColdSpots
-from robocal_ros.thermal.visit_tables import read_visits
-from robocal_ros.thermal.visits import ONLY_CYCLE, Visits, require_cold_counterparts
+from robocal_ros.thermal.learning import read_prior
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.reference import (
+    ONLY_CYCLE,
+    ColdSpots,
+    Visits,
+    read_visits,
+    require_cold_counterparts,
+)
+from robocal_ros.thermal.sensor_calibration import PlacedSensor, read_sensor
 
 
 @dataclass(frozen=True)

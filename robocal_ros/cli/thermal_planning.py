@@ -12,11 +12,10 @@ from robocal_ros.cli.output import Document
 from robocal_ros.ground.files import write_text
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import read_measurements
-from robocal_ros.thermal.cycle_planning import plan_cycle
-from robocal_ros.thermal.pose_planning import PosePlan, SensorField
-from robocal_ros.thermal.prior_files import read_prior
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.sensor_files import read_sensor
+from robocal_ros.thermal.learning import read_prior
+from robocal_ros.thermal.planning import PosePlan, SensorField, plan_cycle
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.sensor_calibration import read_sensor
 
 Array = NDArray[np.float64]
 

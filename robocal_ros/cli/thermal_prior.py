@@ -47,9 +47,8 @@ def run(args: argparse.Namespace) -> CliResult:
     import numpy as np
 
     from robocal_ros.cli.thermal_identification import cold_spots, warm_visits
-    from robocal_ros.thermal.learning import learn_drift
-    from robocal_ros.thermal.prior_files import write_prior
-    from robocal_ros.thermal.sensor_files import read_sensor
+    from robocal_ros.thermal.learning import learn_drift, write_prior
+    from robocal_ros.thermal.sensor_calibration import read_sensor
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from robocal_ros.kinematics import SerialArm
-    from robocal_ros.thermal.drift_history import DriftHistory
+    from robocal_ros.thermal.learning import DriftHistory
 
 NAME = "screen"
 HELP = "find which parameters a drift needs, by what is left at check poses"
@@ -93,8 +93,8 @@ def run(args: argparse.Namespace) -> CliResult:
 
 def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
     from robocal_ros.cli.thermal_identification import check_visits, cold_spots, warm_visits
-    from robocal_ros.thermal.drift_history import DriftHistory
-    from robocal_ros.thermal.sensor_files import read_sensor
+    from robocal_ros.thermal.learning import DriftHistory
+    from robocal_ros.thermal.sensor_calibration import read_sensor
 
     cold, spots = cold_spots(arm, read_sensor(args.sensor, arm), args.cold)
     warm = warm_visits(args.warm, arm, cold)
@@ -116,8 +116,8 @@ def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
 def _best_subset(args: argparse.Namespace, history: "DriftHistory") -> Document | None:
     if not args.best_subset:
         return None
-    from robocal_ros.thermal.best_subset import best_subset
-    from robocal_ros.thermal.drift_history import share_within
+    from robocal_ros.thermal.learning import share_within
+    from robocal_ros.thermal.screening import best_subset
 
     found = best_subset(history, args.wanted)
     chosen = [history.names.index(name) for name in found.names]

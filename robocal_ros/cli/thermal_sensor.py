@@ -36,8 +36,7 @@ def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.kinematics.tables import read_measurements
     from robocal_ros.thermal.documents import sensor_document
-    from robocal_ros.thermal.sensor_calibration import calibrate_sensor
-    from robocal_ros.thermal.sensor_files import write_sensor
+    from robocal_ros.thermal.sensor_calibration import calibrate_sensor, write_sensor
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

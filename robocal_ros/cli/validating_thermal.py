@@ -12,14 +12,13 @@ from robocal_ros.bags.bags import BagMessage
 from robocal_ros.cli.bag_truth import CheckPoints
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import BagOverview
-from robocal_ros.ground.proposals import THERMAL, Action, Entry
+from robocal_ros.ground.proposals import REFERENCE, THERMAL, Action, Entry
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.report.drift import figures_of
-from robocal_ros.thermal.achieved import measured_errors, true_errors
-from robocal_ros.thermal.in_force import REFERENCE
+from robocal_ros.thermal.identification import measured_errors, true_errors
 from robocal_ros.thermal.reference import ColdReference, holds_drift, reference_of
 from robocal_ros.thermal.session import ThermalSession
 

@@ -22,7 +22,7 @@ from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.correction.status import CorrectionStatus
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.history.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
+from robocal_ros.history.history_records import CALIBRATED, NOMINAL, CorrectionRecord
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros.base import NO_SERIAL
 from robocal_ros.ros.conversions import header, transform_message

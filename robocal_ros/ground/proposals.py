@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # the history is listed without loading NumPy
 
 THERMAL = "thermal"
 TOOL = "tool"
+REFERENCE = "reference"  # the cold reference
 HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
 MANDREL = "mandrel_reference"  # how the mandrel measures while the beam station stands right
 HAND_EYE = "hand_eye"  # where a sensor sits; see `hand_eye_kind`

@@ -15,7 +15,7 @@ from robocal_ros.ground.files import made_folder_beside
 from robocal_ros.hand_eye.data import MOST_POINTS, DataSet, data_set_begun
 from robocal_ros.hand_eye.session import HandEyeSession
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_paths import unused
+from robocal_ros.history.history_file import unused
 from robocal_ros.ros.decision_services import answer
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
 from robocal_ros.session.events import LOAD, Command, Outcome

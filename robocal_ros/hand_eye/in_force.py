@@ -3,8 +3,8 @@
 from robocal_ros.ground.proposals import THERMAL, Head, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.session.followed import HistoryFollower
-from robocal_ros.session.history import History
+from robocal_ros.session.base import HistoryFollower
+from robocal_ros.session.decisions import History
 
 
 class HandEyeInForce(HistoryFollower):

@@ -6,9 +6,9 @@ from robocal_ros.ground.proposals import THERMAL, hand_eye_kind
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.base import configured_with, recorded_arguments
+from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command
-from robocal_ros.session.history import History, seeded
-from robocal_ros.session.recorded import configured_with, recorded_arguments
 
 OWN = "sensor"  # only a hand-eye session's configuration has it
 

@@ -14,8 +14,8 @@ from robocal_ros.hand_eye.result import HandEyeResult, hand_eye_document
 from robocal_ros.hand_eye.solving import solved
 from robocal_ros.hand_eye.thermal import flange_poses
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.history import History
 
 
 class HandEyeResults:

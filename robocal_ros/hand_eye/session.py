@@ -26,9 +26,9 @@ from robocal_ros.hand_eye.solving import require_known
 from robocal_ros.hand_eye.thermal import PoseModels
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.commanded import Commanded, Handler
+from robocal_ros.session.base import Commanded, Handler
+from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.history import History
 
 _NO_SET = "no data set is open: call start, or load one"
 

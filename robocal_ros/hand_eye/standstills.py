@@ -13,9 +13,8 @@ from robocal_ros.ground.samples import JOINTS, joint_sample
 from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.hand_eye.shots import PROFILE, Shot, shot_of
 from robocal_ros.session import events
-from robocal_ros.session.commanded import GAP_NS
+from robocal_ros.session.base import GAP_NS, Ignored
 from robocal_ros.session.events import Command
-from robocal_ros.session.ignored import Ignored
 
 Array = NDArray[np.float64]
 

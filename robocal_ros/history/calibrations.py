@@ -12,10 +12,10 @@ from contextlib import contextmanager
 
 from robocal_ros.ground.errors import InputError, StaleError, WrongRobotError
 from robocal_ros.ground.proposals import THERMAL, Action, Candidate, Decision, Head, Proposal
-from robocal_ros.history.correction_record import CorrectionRecord
-from robocal_ros.history.correction_records import insert_correction
 from robocal_ros.history.history_reader import HistoryReader
 from robocal_ros.history.history_records import (
+    CorrectionRecord,
+    insert_correction,
     insert_decision,
     insert_proposal,
     packed,

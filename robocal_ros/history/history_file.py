@@ -4,26 +4,199 @@ A damaged file is never repaired and never deleted: it is set aside under anothe
 done only by an owner (see `history_damage`), and only while no other process has the file open, so
 that two of them cannot go on with two different histories; a lock file beside it (shared while
 open, exclusive to set aside) sees to it.
+
+Calibrations, their payloads, the decisions about them and what commands were corrected with are
+only ever added to; triggers refuse changes by any program.
+
+A history that begins anew forgets what was in force, so every node that reads it says so, also
+after a restart, until ``robocal history acknowledge`` has written who knows of it into
+``<serial>/damage/acknowledged.json``. A file that was moved away needs no acknowledgement.
 """
 
 import errno
 import fcntl
+import glob
+import itertools
+import json
 import os
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import quote
+from typing import Any
+from urllib.parse import quote, unquote
 
-from robocal_ros.ground.errors import StorageError, WrongRobotError
-from robocal_ros.history.history_damage import set_aside
-from robocal_ros.history.history_schema import (
-    APPLICATION_ID,
-    MIGRATIONS,
-    SCHEMA_VERSION,
-    DamagedError,
+from robocal_ros.ground.errors import InputError, StorageError, WrongRobotError
+from robocal_ros.ground.files import made_folder_beside, write_text
+
+# ---- history schema -----------------------------------------------------------------------------
+
+
+APPLICATION_ID = 0x52434C48
+"""Marks the file as ours ("RCLH"), so that no other program's database is ever migrated."""
+
+
+def _append_only(*tables: str) -> tuple[str, ...]:
+    return tuple(
+        f"CREATE TRIGGER {table}_{verb.lower()} BEFORE {verb} ON {table} "
+        f"BEGIN SELECT RAISE(ABORT, '{table} are never changed'); END"
+        for table in tables
+        for verb in ("UPDATE", "DELETE")
+    )
+
+
+MIGRATIONS: tuple[tuple[str, ...], ...] = (
+    (
+        "CREATE TABLE history (serial TEXT NOT NULL)",
+        """CREATE TABLE calibrations (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            kind TEXT NOT NULL,
+            model_hash TEXT NOT NULL,
+            based_on INTEGER NOT NULL CHECK (based_on >= 0),
+            cycle_id TEXT NOT NULL,
+            stamp_ns INTEGER NOT NULL,
+            created_ns INTEGER NOT NULL,
+            software TEXT NOT NULL,
+            method TEXT NOT NULL,
+            code INTEGER NOT NULL,
+            reason TEXT NOT NULL,
+            candidate_rms_mm REAL,
+            UNIQUE (id, kind))""",
+        # Apart from the small tables, so that opening and listing never read through them.
+        """CREATE TABLE payloads (
+            calibration_id INTEGER NOT NULL REFERENCES calibrations (id),
+            name TEXT NOT NULL CHECK (name IN ('document', 'model', 'inputs')),
+            data BLOB NOT NULL,
+            sha256 BLOB NOT NULL,
+            PRIMARY KEY (calibration_id, name))""",
+        """CREATE TABLE decisions (
+            seq INTEGER PRIMARY KEY AUTOINCREMENT,
+            kind TEXT NOT NULL,
+            action TEXT NOT NULL CHECK (action IN ('accept', 'reject', 'rollback')),
+            calibration_id INTEGER,
+            by TEXT NOT NULL,
+            reason TEXT NOT NULL,
+            wall_ns INTEGER NOT NULL,
+            head_before INTEGER NOT NULL CHECK (head_before >= 0),
+            head_after INTEGER NOT NULL,
+            CHECK (head_after = head_before + (action <> 'reject')),
+            CHECK (calibration_id IS NOT NULL OR action = 'rollback'),
+            FOREIGN KEY (calibration_id, kind) REFERENCES calibrations (id, kind))""",
+        # The last line of defence for compare-and-set: no revision can be given twice.
+        "CREATE UNIQUE INDEX one_revision ON decisions (kind, head_after) WHERE action <> 'reject'",
+        "CREATE UNIQUE INDEX one_decision ON decisions (calibration_id) WHERE action <> 'rollback'",
+        *_append_only("calibrations", "payloads", "decisions"),
+    ),
+    (
+        """CREATE TABLE corrections (
+            seq INTEGER PRIMARY KEY AUTOINCREMENT,
+            wall_ns INTEGER NOT NULL,
+            software TEXT NOT NULL,
+            model_hash TEXT NOT NULL,
+            enabled INTEGER NOT NULL CHECK (enabled IN (0, 1)),
+            shadow INTEGER NOT NULL CHECK (shadow IN (0, 1)),
+            model_revision INTEGER NOT NULL CHECK (model_revision >= 0),
+            tool_revision INTEGER NOT NULL CHECK (tool_revision >= 0),
+            reference TEXT NOT NULL CHECK (reference IN ('nominal', 'calibrated')),
+            reference_source TEXT NOT NULL,
+            reference_name TEXT NOT NULL,
+            reference_hash TEXT NOT NULL,
+            taught_tool TEXT NOT NULL)""",
+        *_append_only("corrections"),
+    ),
+    # What waits is asked for all the time, and must not take longer with each year.
+    ("CREATE INDEX of_a_revision ON calibrations (kind, based_on, code)",),
 )
+"""Script ``n`` brings schema version ``n`` to ``n + 1``; shipped ones are never edited."""
+
+SCHEMA_VERSION = len(MIGRATIONS)
+
+
+class DamagedError(Exception):
+    """The file, or something in it, cannot be trusted."""
+
+
+# ---- damaged histories that were set aside, until a person has taken notice ---------------------
+
+
+COMPANIONS = ("", "-wal", "-shm")
+_FILE = "acknowledged.json"
+
+
+def set_aside(history: Path) -> Path:
+    """Rename a history and its companions, the file first; the name that it has now.
+
+    A kill in between leaves a log without its file, which the next opening sets aside too;
+    the other way round it would leave an older state that looks healthy.
+    """
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    aside = Path(f"{history}.damaged-{stamp}")
+    number = 1
+    while any(Path(f"{aside}{end}").exists() for end in COMPANIONS):
+        number += 1
+        aside = Path(f"{history}.damaged-{stamp}-{number}")
+    for end in COMPANIONS:
+        part = Path(f"{history}{end}")
+        if part.exists():
+            part.rename(f"{aside}{end}")
+    return aside
+
+
+def damaged_files(history: Path) -> tuple[Path, ...]:
+    """Histories that were set aside and that nobody has acknowledged, the oldest first."""
+    found = set()
+    for path in history.parent.glob(f"{glob.escape(history.name)}.damaged-*"):
+        name = path.name
+        for end in COMPANIONS[1:]:
+            name = name.removesuffix(end)
+        found.add(name)
+    return tuple(history.with_name(name) for name in sorted(found - _acknowledged(history).keys()))
+
+
+def damage_notice(history: Path) -> str:
+    """What a node says of them; empty where there are none."""
+    files = damaged_files(history)
+    if not files:
+        return ""
+    return (
+        f"a damaged history was set aside as {files[-1]}, and the calibrations began anew: restore "
+        "a backup, or acknowledge it with 'robocal history acknowledge'"
+    )
+
+
+def acknowledge(history: Path, by: str, wall_ns: int) -> tuple[Path, ...]:
+    """Write down who knows of the damage; returns what was not acknowledged before.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be written.
+    """
+    files = damaged_files(history)
+    if files:
+        known = _acknowledged(history) | {
+            path.name: {"by": by, "wall_ns": wall_ns} for path in files
+        }
+        try:
+            folder = made_folder_beside(history, "damage")
+            write_text(folder / _FILE, json.dumps(known) + "\n", durable=True)
+        except InputError as error:
+            raise StorageError(str(error)) from error
+    return files
+
+
+def _acknowledged(history: Path) -> dict[str, Any]:
+    """By the names of files; empty where it cannot be read: then the nodes say it again."""
+    try:
+        known = json.loads((history.with_suffix("") / "damage" / _FILE).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+# ---- the SQLite file behind a calibration history: place, schema, locks, damage -----------------
+
 
 _FULL_CHECK_BYTES = 2_000_000
 _NOT_READABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
@@ -291,3 +464,57 @@ def open_file(
             file.close()
             raise
     return file
+
+
+# ---- history paths ------------------------------------------------------------------------------
+
+
+_SUFFIX = ".sqlite"
+_LONGEST_NAME = 200  # bytes; file systems allow 255, the names of files set aside are longer
+
+
+def state_folder() -> Path:
+    """Folder of the histories: $ROBOCAL_STATE, else ``robocal`` in the XDG state folder.
+
+    Raises
+    ------
+    StorageError
+        There is no home folder to put it in.
+    """
+    if chosen := os.environ.get("ROBOCAL_STATE"):
+        return Path(chosen).absolute()
+    base = Path(os.environ.get("XDG_STATE_HOME", ""))
+    if not base.is_absolute():  # XDG: unset, empty or relative means the default
+        try:
+            base = Path.home() / ".local" / "state"
+        except RuntimeError as error:
+            raise StorageError(f"no home folder: {error}; set ROBOCAL_STATE") from error
+    return base / "robocal"
+
+
+def history_path(serial: str, folder: Path) -> Path:
+    """File of a robot serial; any serial gives a safe name, and the serial can be read back.
+
+    Raises
+    ------
+    InputError
+        Empty or too long serial.
+    """
+    name = quote(serial, safe=" ")
+    if name.startswith("."):
+        name = "%2E" + name[1:]
+    if not serial.strip() or len(name) > _LONGEST_NAME:
+        raise InputError(f"robot serial {serial!r}: must have 1 to {_LONGEST_NAME} characters")
+    return folder / (name + _SUFFIX)
+
+
+def unused(folder: Path, stem: str, suffix: str) -> Path:
+    """A file that is not there yet: named by its stem, else with a number behind it."""
+    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+    paths = (folder / (name + suffix) for name in names)
+    return next(path for path in paths if not path.exists())
+
+
+def known_serials(folder: Path) -> list[str]:
+    """Robot serials that have a history in the folder."""
+    return sorted(unquote(path.name.removesuffix(_SUFFIX)) for path in folder.glob(f"*{_SUFFIX}"))

@@ -9,15 +9,19 @@ import io
 import json
 import sqlite3
 from collections.abc import Iterator
-from dataclasses import astuple, fields
+from dataclasses import astuple, dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.ground.errors import Code, InputError, StorageError
 from robocal_ros.ground.proposals import Action, Candidate, Decision, Proposal
-from robocal_ros.history.history_schema import DamagedError
+from robocal_ros.history.history_file import DamagedError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+
+# ---- history records ----------------------------------------------------------------------------
+
 
 _COLUMNS = tuple(column.name for column in fields(Candidate))
 _SELECT = f"SELECT id, {', '.join(_COLUMNS)} FROM calibrations "
@@ -150,3 +154,68 @@ def _read(connection: sqlite3.Connection, calibration_id: int, name: str) -> byt
     if row is None or hashlib.sha256(row[0]).digest() != row[1]:
         raise DamagedError(f"the {name} of calibration {calibration_id} is damaged")
     return bytes(row[0])
+
+
+# ---- what a robot's commands were corrected with, from when on: records that never change -------
+
+
+NOMINAL, CALIBRATED = "nominal", "calibrated"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionRecord:
+    """What the joint correction did from an instant on.
+
+    Attributes
+    ----------
+    wall_ns : when this began.
+    software : version of this software.
+    model_hash : of the nominal model.
+    enabled : whether the correction was asked for.
+    shadow : whether it was only shown.
+    model_revision, tool_revision : in force for it; 0 for none, and for the taught tool.
+    reference : NOMINAL or CALIBRATED: which model the program was made with, as it was chosen.
+    reference_source : where that came from: a robot type, or the path of a robot file.
+    reference_name, reference_hash : of that model.
+    taught_tool : the tool that the program was made with: x, y, z in m, qx, qy, qz, qw.
+    """
+
+    wall_ns: int
+    software: str
+    model_hash: str
+    enabled: bool
+    shadow: bool
+    model_revision: int
+    tool_revision: int
+    reference: str
+    reference_source: str
+    reference_name: str
+    reference_hash: str
+    taught_tool: tuple[float, ...]
+
+
+# ---- rows of the history file that tell what a robot's commands were corrected with -------------
+
+
+_CORRECTION_COLUMNS = tuple(column.name for column in fields(CorrectionRecord))
+
+
+def insert_correction(connection: sqlite3.Connection, record: CorrectionRecord) -> None:
+    """Add a record."""
+    *row, tool = astuple(record)
+    marks = ", ".join("?" * len(_CORRECTION_COLUMNS))
+    connection.execute(
+        f"INSERT INTO corrections ({', '.join(_CORRECTION_COLUMNS)}) VALUES ({marks})",
+        (*row, json.dumps(tool, allow_nan=False)),
+    )
+
+
+def read_corrections(connection: sqlite3.Connection, limit: int) -> Iterator[CorrectionRecord]:
+    """The latest records, newest first."""
+    chosen = f"SELECT {', '.join(_CORRECTION_COLUMNS)} FROM corrections ORDER BY seq DESC LIMIT ?"
+    for row in connection.execute(chosen, (max(limit, 0),)):
+        values = dict(zip(_CORRECTION_COLUMNS, row, strict=True))
+        for name in ("enabled", "shadow"):
+            values[name] = bool(values[name])
+        values["taught_tool"] = tuple(json.loads(values["taught_tool"]))
+        yield CorrectionRecord(**values)

@@ -7,9 +7,8 @@ import numpy as np
 from robocal_ros.ground.proposals import Head
 from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.memory import Memory, ToolRecord
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError, both_errors, offset_error
 from robocal_ros.thermal.accuracy_state import Accuracy
-from robocal_ros.thermal.combined_error import both_errors, offset_error
 
 __all__ = ["Accuracy", "Drift", "accuracy_of"]
 

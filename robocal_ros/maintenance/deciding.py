@@ -8,6 +8,7 @@ import numpy as np
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.ground.proposals import (
+    REFERENCE,
     THERMAL,
     TOOL,
     Action,
@@ -20,10 +21,8 @@ from robocal_ros.ground.proposals import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.maintenance.config import MaintenanceConfig
-from robocal_ros.session.decisions import decide, measured_with
+from robocal_ros.session.decisions import History, decide, measured_with
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
-from robocal_ros.session.history import History
-from robocal_ros.thermal.in_force import REFERENCE
 from robocal_ros.thermal.reference import commissioned_of
 from robocal_ros.tool.judging import KnownTool, change_between
 from robocal_ros.tool.laser_frame import LaserFrame

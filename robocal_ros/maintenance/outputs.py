@@ -10,7 +10,7 @@ from robocal_ros.maintenance import CycleResult, Status
 from robocal_ros.ros import conversions, qos
 from robocal_ros.ros.session_events import SessionEvents
 from robocal_ros.thermal.accuracy_state import Accuracy
-from robocal_ros.thermal.outputs import accuracy_message
+from robocal_ros.thermal.services import accuracy_message
 from robocal_ros.tool.services import ANSWERS
 
 AddOutput = Callable[[type, str, QoSProfile], Any]

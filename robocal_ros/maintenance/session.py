@@ -28,8 +28,8 @@ from robocal_ros.maintenance.run import CycleRun
 from robocal_ros.maintenance.status import MaintenanceState, Status, status_of
 from robocal_ros.maintenance.thermal_part import ThermalCycle, ThermalPart
 from robocal_ros.maintenance.ways import Ways
+from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.history import History
 from robocal_ros.tool.results import FULL, QUICK
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ros import qos
-from robocal_ros.session.ignored import MOST_REASONS, kind_of
+from robocal_ros.session.base import MOST_REASONS, kind_of
 
 LOG_EVERY_S = 5.0
 MOST_WAITING = 10_000  # messages of an input that are taken at once

@@ -8,8 +8,7 @@ from typing import Any
 from robocal_ros.ground.errors import WrongRobotError
 from robocal_ros.ground.files import StateFile
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_damage import acknowledge, damage_notice
-from robocal_ros.history.history_paths import history_path, state_folder
+from robocal_ros.history.history_file import acknowledge, damage_notice, history_path, state_folder
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_file_hash
 from robocal_ros.ros.base import NO_SERIAL

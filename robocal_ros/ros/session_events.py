@@ -7,8 +7,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from robocal_msgs.msg import SessionEvent
 
 from robocal_ros.ros.conversions import time_message
-from robocal_ros.session.events import CONFIGURE, Command, Outcome
-from robocal_ros.session.records import arguments_text, outcome_text
+from robocal_ros.session.events import CONFIGURE, Command, Outcome, arguments_text, outcome_text
 
 # A recorder that comes later still gets the events.
 EVENTS = QoSProfile(

@@ -4,32 +4,189 @@ So it survives a restart: the history holds each cycle's measurements, and every
 tracker's state, from which the later cycles are taken again.
 """
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import THERMAL, Entry
+from robocal_ros.ground.errors import Code, ConflictError, InputError
+from robocal_ros.ground.proposals import REFERENCE, THERMAL, Entry
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.session.history import History
+from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.session.base import HistoryFollower
+from robocal_ros.session.decisions import History
 from robocal_ros.thermal.accuracy import AccuracyForecast, Work
-from robocal_ros.thermal.follower_state import HEAT, STATE, TIMES, FollowerState
-from robocal_ros.thermal.heat import Heat
-from robocal_ros.thermal.in_force import InForce
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.process import DriftProcess
-from robocal_ros.thermal.process_documents import process_of
-from robocal_ros.thermal.process_learning import LearnedProcess
-from robocal_ros.thermal.reference import ColdReference
-from robocal_ros.thermal.steps import FixedSphere
-from robocal_ros.thermal.tracked_cycle import TrackedCycle, track_cycle
+from robocal_ros.thermal.identification import FixedSphere
+from robocal_ros.thermal.learning import LearnedProcess, process_of
+from robocal_ros.thermal.process import DriftProcess, Heat, drift_prior
+from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
+from robocal_ros.thermal.tracking import DriftState, TrackedCycle, track_cycle
+
+# ---- where a follower of the drift stands, in forms that are kept: bit for bit ------------------
+
 
 Array = NDArray[np.float64]
+
+HEAT = "tracker_heat"
+TIMES = "tracker_times"  # of a kept cycle: the tracker's, and that of the first refused one
+STATE = ("tracker_mean", "tracker_covariance", "tracker_clock")
+
+
+@dataclass(frozen=True, eq=False)
+class FollowerState:
+    """Where a follower stands.
+
+    Attributes
+    ----------
+    tracker : state of the tracker; its time counts from the cold visit.
+    heat : motor temperatures as last read, where they are in use.
+    anchor_ns : stamp that the tracker's time is at; that of the last cycle until the clock jumps.
+    stamp_ns : of the last cycle that was taken, of the cold visit before the first.
+    cycles : kept since the cold visit, refused ones among them.
+    moved, moved_s : why the last cycle was refused, empty where it was not; and the tracker's
+        time of the first of those that were refused in a row.
+    """
+
+    tracker: DriftState
+    heat: Heat | None
+    stamp_ns: int
+    cycles: int
+    anchor_ns: int
+    moved: str = ""
+    moved_s: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """In plain values, bit for bit."""
+        mean, covariance, clock = (self.arrays()[name] for name in STATE)
+        return {
+            "mean": _text(mean),
+            "covariance": _text(covariance),
+            "time_s": self.tracker.time_s,
+            "clock": clock.tolist(),
+            "moved": self.moved,
+            "moved_s": self.moved_s,
+            "heat": None if self.heat is None else _text(self.heat.array()),
+        }
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "FollowerState":
+        """Read it back.
+
+        Raises
+        ------
+        InputError
+            When it is no such document.
+        """
+        try:
+            arrays = {
+                STATE[0]: _array(document["mean"]),
+                STATE[1]: _array(document["covariance"]),
+                STATE[2]: np.array(document["clock"], dtype=np.int64),
+            }
+            if document["heat"] is not None:
+                arrays[HEAT] = _array(document["heat"])
+            times = float(document["time_s"]), document["moved_s"]
+            return cls.of_arrays(arrays, times, str(document["moved"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"the recorded state of the tracker cannot be read: {error}"
+            ) from error
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """In arrays; the covariance is symmetric to the last bit, one half of it is kept."""
+        P = self.tracker.covariance
+        clock = np.array([self.stamp_ns, self.cycles, self.anchor_ns], dtype=np.int64)
+        return dict(zip(STATE, (self.tracker.mean, P[np.triu_indices(len(P))], clock), strict=True))
+
+    @classmethod
+    def of_arrays(
+        cls, arrays: Mapping[str, NDArray[Any]], times: tuple[float, float | None], moved: str
+    ) -> "FollowerState":
+        """Read it back; ``times`` are the tracker's and `moved_s`."""
+        mean, half, clock = (arrays[name] for name in STATE)
+        P = np.zeros((len(mean),) * 2)
+        rows, columns = np.triu_indices(len(mean))
+        P[rows, columns] = P[columns, rows] = half
+        heat = Heat.of_array(arrays[HEAT]) if HEAT in arrays else None
+        tracker = DriftState(times[0], mean, P)
+        stamp_ns, cycles, anchor_ns = (int(value) for value in clock)
+        return cls(tracker, heat, stamp_ns, cycles, anchor_ns, moved, times[1])
+
+
+def _text(array: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, dtype="<f8").tobytes()).decode()
+
+
+def _array(text: str) -> Array:
+    return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(np.float64)
+
+
+# ---- what the history has in force, followed while other processes decide in it too -------------
+
+
+class InForce(HistoryFollower):
+    """The thermal model and the cold reference in force, as of the last look.
+
+    Attributes
+    ----------
+    head : head of the thermal models.
+    reference, reference_id, reference_model : the cold reference, its calibration, and what is
+        kept of it; or None.
+    """
+
+    def __init__(self, history: History, nominal: SerialArm) -> None:
+        self._nominal = nominal
+        super().__init__(history, THERMAL)
+
+    def _read(self) -> None:
+        super()._read()
+        head = self._history.head(REFERENCE)
+        reference = None if head.model is None else reference_of(head.model, self._nominal)
+        self.reference: ColdReference | None = reference
+        self.reference_id, self.reference_model = head.calibration_id, head.model
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the model in force."""
+        model = self.head.model
+        return self._nominal if model is None else arm_of(model, self._nominal)
+
+    @property
+    def drifted(self) -> bool:
+        """Whether the model in force holds a drift since a cold reference."""
+        return holds_drift(self.head.model)
+
+    @property
+    def commissioned(self) -> SerialArm:
+        """The arm without any drift: what is in force while none is, else what the reference keeps.
+
+        Raises
+        ------
+        ConflictError
+            When a drift is in force and no cold reference.
+        """
+        if not self.drifted:
+            return self.arm
+        if self.reference_model is None:
+            raise ConflictError(
+                "the model in force holds a drift, but there is no cold reference any more: roll "
+                "the thermal model back to the one without it"
+            )
+        return commissioned_of(self.reference_model, self._nominal)
+
+    @property
+    def nominal(self) -> SerialArm:
+        """The arm without any calibration."""
+        return self._nominal
+
+
+# ---- drift following ----------------------------------------------------------------------------
+
 
 CHECKPOINT_EVERY = 32  # cycles between two kept states: a restart takes at most so many again
 LOOK_BACK = 100

@@ -3,6 +3,14 @@
 Drifts are so small that the model is linear in them (0.1 mrad over 3 m: the second order is
 30 nm). With y the displacement of the targets since the cold visit, ``y = A x + B s - b + v``:
 x the parameters' drift, s the set-up's shift, b the cold visit's noise and v the warm one's.
+
+Many cycles at once: all visit the same poses, so that one decomposition serves them all.
+
+With ``y ~ N(0, S)`` the error of forecasting part i from the rest is ``(S^-1)_ii^-1 (S^-1 y)_i``,
+and its covariance is ``(S^-1)_ii^-1`` (Rasmussen and Williams 2006, section 5.4.2).
+
+A step that the drift cannot explain is compared with few simple causes, each a linear model of the
+displacement; generalised least squares tells which of them leave no more than noise.
 """
 
 from collections.abc import Sequence
@@ -11,16 +19,161 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.estimation.estimation import Observability, describe, observability
-from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.agreement import agreeing, left_out
-from robocal_ros.thermal.process import SETUP_SIGMA_M
-from robocal_ros.thermal.spots import ColdSpots
-from robocal_ros.thermal.subset import subset_drift
+from robocal_ros.thermal.reference import ColdReference, ColdSpots
+
+# ---- some of the parameters by least squares, the others held: the classic identification -------
+
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_VISIBLE = 1e-6  # share of an undetermined direction that counts as being in it
+SETUP_SIGMA_M = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class SubsetDrift:
+    """Drift of p chosen parameters in t cycles.
+
+    Attributes
+    ----------
+    chosen : (p,) columns of the parameters.
+    drift : (t, p) since the cold visit, SI.
+    basis : (3m, p) orthonormal, of the displacements that the chosen parameters can cause.
+    inverse : (p, p) from coordinates in that basis to parameters.
+    """
+
+    chosen: Index
+    drift: Array
+    basis: Array
+    inverse: Array
+
+    @property
+    def gain(self) -> Array:
+        """(p,) standard deviation of each per unit of noise in a coordinate of a displacement."""
+        return np.asarray(np.linalg.norm(self.inverse, axis=1))
+
+    @property
+    def size(self) -> Array:
+        """(p,) rms drift per standard deviation that a unit of noise would give it."""
+        return np.asarray(np.sqrt(np.mean(self.drift**2, axis=0)) / self.gain)
+
+
+def subset_drift(
+    displacement: Array, rows: Array, chosen: Sequence[int], names: tuple[str, ...]
+) -> SubsetDrift:
+    """Solve Y = A X for some columns of A by singular values (thesis eq. 3-8 to 3-10).
+
+    Parameters
+    ----------
+    displacement : (t, 3m) of the spots since the cold visit, m, measuring axes.
+    rows : (3m, k) the same by each parameter, measuring axes.
+    chosen : columns that may drift; the others are held.
+    names : (k,) of all parameters.
+
+    Raises
+    ------
+    TooFewSamplesError
+        With fewer equations than chosen parameters.
+    RankDeficientError
+        When the poses do not tell the chosen parameters apart.
+    """
+    columns = np.array(chosen, dtype=np.int64)
+    A = rows[:, columns]
+    if A.shape[0] < A.shape[1]:
+        raise TooFewSamplesError(
+            f"{A.shape[0] // 3} poses give {A.shape[0]} equations for {A.shape[1]} parameters: "
+            "measure more"
+        )
+    words = open_directions(rows, chosen, names)
+    if words:
+        raise RankDeficientError(f"not determined by these poses: {'; '.join(words)}", words)
+    length = np.linalg.norm(A, axis=0)
+    U, s, Vt = np.linalg.svd(A / length, full_matrices=False)
+    inverse = (Vt.T / s) / length[:, None]
+    return SubsetDrift(columns, displacement @ U @ inverse.T, U, inverse)
+
+
+def open_directions(rows: Array, chosen: Sequence[int], names: tuple[str, ...]) -> tuple[str, ...]:
+    """What (n, k) rows leave open among chosen columns, in words; weights as they displace."""
+    null, own = _null(rows, chosen), tuple(names[i] for i in chosen)
+    return tuple(describe(direction, own) for direction in null.T)
+
+
+def entangled(rows: Array, chosen: Sequence[int]) -> tuple[int, ...]:
+    """Those chosen columns of (n, k) rows that the others reproduce; none where all are determined.
+
+    Leaving one of them out takes nothing from what the rest can explain.
+    """
+    null = np.abs(_null(rows, chosen))
+    inside = np.any(null > _VISIBLE * null.max(axis=0, initial=0.0), axis=1)
+    return tuple(column for column, member in zip(chosen, inside, strict=True) if member)
+
+
+def _null(rows: Array, chosen: Sequence[int]) -> Array:
+    """Open directions (p, r) of chosen columns, in units of what each column displaces."""
+    A = rows[:, list(chosen)]
+    length = np.linalg.norm(A, axis=0)
+    return observability(A).null * np.where(length > 0.0, length, 1.0)[:, None]
+
+
+# ---- agreement ----------------------------------------------------------------------------------
+
+
+FALSE_SAMPLE = 0.001  # chance that a sound cycle loses a sample
+
+
+def agreeing(y: Array, S: Array, count: int) -> NDArray[np.bool_]:
+    """Which of ``count`` samples of three coordinates fit what all others say of them.
+
+    The worst is left out until all fit. ``y`` (3 count,), ``S`` (3 count, 3 count).
+    """
+    keep = np.ones(count, dtype=np.bool_)
+    limit = chi2_quantile(1.0 - FALSE_SAMPLE / count, 3)
+    while np.sum(keep) > 1:
+        rows = np.repeat(keep, 3)
+        pull, own = _parts(y[rows], S[np.ix_(rows, rows)])
+        squared = np.einsum("mi,mi->m", pull, np.linalg.solve(own, pull[..., None])[..., 0])
+        worst = int(np.argmax(squared))
+        if squared[worst] <= limit:
+            break
+        keep[np.flatnonzero(keep)[worst]] = False
+    return keep
+
+
+def left_out(y: Array, S: Array, keep: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Error (m, 3) at each sample of the forecast from the others, and its rms length (m,)."""
+    rows, count = np.repeat(keep, 3), len(keep)
+    error, spread = np.empty((count, 3)), np.empty(count)
+    pull, own = _parts(y[rows], S[np.ix_(rows, rows)])
+    covariance = np.linalg.inv(own)
+    error[keep] = (covariance @ pull[..., None])[..., 0]
+    spread[keep] = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    if not np.all(keep):  # those left out are forecast from all that are kept
+        gain = np.linalg.solve(S[np.ix_(rows, rows)], S[np.ix_(rows, ~rows)]).T
+        error[~keep] = (y[~rows] - gain @ y[rows]).reshape(-1, 3)
+        rest = S[np.ix_(~rows, ~rows)] - gain @ S[np.ix_(rows, ~rows)]
+        spread[~keep] = np.sqrt(np.diag(rest).reshape(-1, 3).sum(axis=1))
+    return error, spread
+
+
+def _parts(y: Array, S: Array) -> tuple[Array, Array]:
+    """Parts (m, 3) of S^-1 y and diagonal blocks (m, 3, 3) of S^-1."""
+    inverse = np.linalg.inv(S)
+    count = len(y) // 3
+    blocks = inverse.reshape(count, 3, count, 3)
+    each = np.arange(count)
+    return np.asarray((inverse @ y).reshape(count, 3)), np.asarray(blocks[each, :, each])
+
+
+# ---- the drift that one measuring cycle shows: maximum a posteriori, closed form ----------------
+
 
 FEWEST_POSES = 2
 
@@ -188,3 +341,167 @@ def visit_variance(
     """Variance (m,), m^2, of one coordinate of a displacement: warm and cold noise."""
     sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
     return np.asarray(sigma**2 + sigma_m**2 / spots.visits[spot])
+
+
+# ---- steps --------------------------------------------------------------------------------------
+
+
+SENSOR = "sensor"
+CHANCE = 0.01  # a cause is ruled out where it would leave so much in fewer cases than this
+FIXED_FALSE_ALARM = 0.001
+SENSOR_WANDER_M = 1e-5  # a sensor that warms up moves by so much without a knock
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something that may have moved.
+
+    Attributes
+    ----------
+    name : ``sensor`` (or the robot's base, which looks the same), ``sphere``, or a joint's name.
+    words : what moved and by how much.
+    """
+
+    name: str
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class FixedSphere:
+    """How a sphere that is fixed in the cell has moved since the cold visit.
+
+    Attributes
+    ----------
+    shift_m : (3,) in the measuring frame.
+    moved : whether by more than noise and the sensor's own wander allow.
+    """
+
+    shift_m: Array
+    moved: bool
+
+
+def fixed_sphere(cold: Array, now: Array, sigma_m: float) -> FixedSphere:
+    """Compare measured centres (n, 3) of a fixed sphere; ``sigma_m`` of one coordinate of one.
+
+    Medians: a wrong one among three or more does no harm.
+    """
+    shift = np.median(now, axis=0) - np.median(cold, axis=0)
+    each = [(1.0 if len(p) < 3 else np.pi / 2.0) / len(p) for p in (cold, now)]
+    variance = sigma_m**2 * sum(each) + SENSOR_WANDER_M**2
+    limit = chi2_quantile(1.0 - FIXED_FALSE_ALARM, 3)
+    return FixedSphere(shift, bool(shift @ shift > limit * variance))
+
+
+def possible_causes(
+    spots: ColdSpots, warm: Measurements, deviation: Array, covariance: Array
+) -> tuple[Cause, ...]:
+    """Single causes that explain a deviation (3m,) of covariance (3m, 3m), measuring axes.
+
+    Few poses leave many causes possible.
+    """
+    target = spots.target[spots.match(warm)]
+    parameters, setup = spots.rows(warm.q, target)
+    lever = warm.position - warm.position.mean(axis=0)
+    unit = np.broadcast_to(np.eye(3), (len(warm), 3, 3))
+    rigid = np.concatenate([unit, -frames.skew(lever)], axis=2)
+    found = []
+    if (moved := _explains(rigid, deviation, covariance)) is not None:
+        turned = float(np.degrees(np.linalg.norm(moved[3:])))
+        by = f"{np.linalg.norm(moved[:3]) * 1e3:.2f} mm and {turned:.3f} deg"
+        found.append(Cause(SENSOR, f"sensor and robot base moved against each other by {by}"))
+    if (moved := _explains(setup[:, :, 3:], deviation, covariance)) is not None:
+        by = f"{np.linalg.norm(moved) * 1e3:.2f} mm"
+        found.append(Cause("sphere", f"the sphere moved on the flange by {by}"))
+    for name, column in _joint_zeros(spots.cell.arm):
+        if (moved := _explains(parameters[:, :, [column]], deviation, covariance)) is not None:
+            by = f"{np.degrees(moved[0]):.4f} deg"
+            found.append(Cause(name, f"the zero of {name} changed by {by}"))
+    return tuple(found)
+
+
+def step_words(causes: Sequence[Cause], fixed: FixedSphere | None) -> str:
+    """Say what moved, what cannot be told, and what would decide."""
+    if fixed is not None and fixed.moved:
+        by = f"{np.linalg.norm(fixed.shift_m) * 1e3:.2f} mm"
+        return (
+            f"the fixed sphere seems to have moved by {by}, so the sensor did: fasten it, then "
+            "capture a new cold reference"
+        )
+    said = "" if fixed is None else "the fixed sphere stands where it was, so the sensor too; "
+    if causes:
+        said += "or ".join(f"{cause.words}; " for cause in causes)
+        said += "the data cannot tell these apart; " if len(causes) > 1 else ""
+    else:
+        said += "no single cause explains it; "
+    if fixed is None and any(cause.name == SENSOR for cause in causes):
+        said += (
+            "a second sphere, fixed to the floor or the base and measured as "
+            "reference_sphere_center, would decide; "
+        )
+    return f"{said}look at sensor, sphere and robot, then calibrate or capture a new cold reference"
+
+
+def _joint_zeros(arm: SerialArm) -> list[tuple[str, int]]:
+    names = arm.parameters.names
+    wanted = [
+        (joint, f"d{i}_mm" if arm.prismatic[i - 1] else f"theta{i}_deg")
+        for i, joint in enumerate(arm.joint_names, start=1)
+    ]
+    return [(joint, names.index(name)) for joint, name in wanted if name in names]
+
+
+def _explains(rows: Array, deviation: Array, covariance: Array) -> Array | None:
+    """Size (h,) of a cause with rows (m, 3, h) that leaves only noise; None where it leaves more.
+
+    Generalised least squares; what is left over is chi-square of 3m - h where the cause is true.
+    """
+    G = rows.reshape(len(deviation), -1)
+    freedom = len(deviation) - G.shape[1]
+    L = np.linalg.cholesky(covariance)
+    whitened = np.linalg.solve(L, np.column_stack([G, deviation]))
+    size, *_ = np.linalg.lstsq(whitened[:, :-1], whitened[:, -1], rcond=None)
+    left = whitened[:, -1] - whitened[:, :-1] @ size
+    if freedom > 0 and left @ left > chi2_quantile(1.0 - CHANCE, freedom):
+        return None
+    return np.asarray(size)
+
+
+# ---- what models of a drifting arm leave of its errors: as measured, and in truth ---------------
+
+
+def measured_errors(
+    reference: ColdReference,
+    warm: Measurements,
+    models: Sequence[SerialArm],
+    *,
+    left_out: Sequence[str] = (),
+    sigma_m: float,
+) -> list[Array]:
+    """Errors (m, 3), m, in measuring axes, that each model leaves at the poses of a warm visit.
+
+    Against the cold visit: the cold model itself leaves the whole drift. Visits of one pose are
+    averaged; the noise of both visits is in it. ``left_out``: names of averaged visits that no
+    model can fit. ``sigma_m``: of a coordinate of one visit.
+
+    Raises
+    ------
+    InputError
+        When a measurement has no cold counterpart.
+    """
+    spots, cold = reference.spots, reference.cell.arm
+    data = spots.average(warm, sigma_m)
+    data = data.take(~np.isin(data.sample, left_out))
+    moved = spots.drift(data)
+    rows = spots.rows(data.q, spots.target[spots.match(data)])[0]
+    return [moved - rows @ cold.parameters.read(model.mdh - cold.mdh) for model in models]
+
+
+def true_errors(cold: SerialArm, model: SerialArm, q: Array, tool: Array, moved: Array) -> Array:
+    """Errors (m, 3), m, base, that a model leaves where the tool truly moved by ``moved`` (m, 3).
+
+    What joints corrected by the model miss: its own displacement of the tool (3,), flange, at the
+    joints (m, n) is corrected away. The second order, drift times correction, is left out.
+    """
+    point = np.append(tool, 1.0)
+    told = (model.fk(q) - cold.fk(q)) @ point
+    return np.asarray(moved - told[:, :3])

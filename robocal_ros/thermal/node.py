@@ -35,13 +35,10 @@ from robocal_ros.ros.stamp_watch import StampWatch
 from robocal_ros.session.events import CYCLE, Outcome
 from robocal_ros.thermal.documents import placed_of
 from robocal_ros.thermal.identification import require_parameters
-from robocal_ros.thermal.inputs import take_message
-from robocal_ros.thermal.outputs import ThermalOutputs
+from robocal_ros.thermal.proposing import SENSOR
 from robocal_ros.thermal.seeding import configuration
-from robocal_ros.thermal.services import ThermalServices
-from robocal_ros.thermal.session import ThermalSession
-from robocal_ros.thermal.set_up_services import SetUpServices
-from robocal_ros.thermal.setting_up import SENSOR
+from robocal_ros.thermal.services import SetUpServices, ThermalOutputs, ThermalServices
+from robocal_ros.thermal.session import ThermalSession, take_message
 from robocal_ros.thermal.settings import SETTINGS, session_config
 
 Array = NDArray[np.float64]

@@ -2,13 +2,14 @@
 
 from bisect import bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import ConflictError, InputError, TooFewSamplesError
+from robocal_ros.ground.proposals import THERMAL, Entry
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -17,14 +18,102 @@ from robocal_ros.ground.samples import (
     REFERENCE_SPHERE,
     JointBlock,
     JointSample,
+    Measurements,
     PointSample,
     PoseSample,
 )
 from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
-from robocal_ros.session.ignored import Ignored
-from robocal_ros.thermal.observation import Observation
+from robocal_ros.session import events
+from robocal_ros.session.base import Ignored
+from robocal_ros.session.decisions import History
+from robocal_ros.session.events import Command
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.drift_following import InForce
+
+# ---- one measured target with its joints, and many of them as arrays ----------------------------
+
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A measured target with the joints at that instant.
+
+    ``ready_ns``: stamp of the joint reading that completed it; ``rotation`` None for a point.
+    """
+
+    stamp_ns: int
+    ready_ns: int
+    topic: str
+    frame: str
+    target: str
+    q: Array
+    position: Array
+    rotation: Array | None
+    source: PointSample | PoseSample
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of a coordinate from the measurement itself; 0 where not known."""
+        return self.source.sigma_m if isinstance(self.source, PointSample) else 0.0
+
+
+def one_per_visit(observations: Sequence[Observation], same_rad: float) -> list[Observation]:
+    """Average what was measured of a target while the robot stood at one posture.
+
+    However often it was measured there, a visit shows the robot's repeatability once.
+    ``observations`` in order of their stamps; ``same_rad``: joints that move less stand still.
+    """
+    visits: list[dict[str, list[Observation]]] = []
+    first: Observation | None = None
+    for one in observations:
+        if first is None or np.max(np.abs(one.q - first.q)) > same_rad:
+            first = one
+            visits.append({})
+        visits[-1].setdefault(one.target, []).append(one)
+    return [_averaged(several) for visit in visits for several in visit.values()]
+
+
+def _averaged(several: Sequence[Observation]) -> Observation:
+    last = several[-1]
+    if len(several) == 1:
+        return last
+    position = np.mean([o.position for o in several], axis=0)
+    sigma_m = float(np.sqrt(np.mean([o.sigma_m**2 for o in several]) / len(several)))
+    return replace(
+        last,
+        q=np.mean([o.q for o in several], axis=0),
+        position=position,
+        source=PointSample(last.stamp_ns, last.frame, last.target, position, last.topic, sigma_m),
+    )
+
+
+def as_measurements(
+    observations: Sequence[Observation], sigma_m: float | None = None
+) -> Measurements:
+    """Arrays of observations; orientations only where all have one.
+
+    ``sigma_m``: standard deviation of a coordinate of one visit, to which each measurement's own
+    is added; None where the noise is to be found.
+    """
+    rotations = [o.rotation for o in observations if o.rotation is not None]
+    complete = bool(observations) and len(rotations) == len(observations)
+    several = len({o.target for o in observations}) > 1
+    return Measurements(
+        q=np.array([o.q for o in observations]),
+        position=np.array([o.position for o in observations]),
+        target=tuple(o.target for o in observations),
+        sample=tuple(
+            f"{o.stamp_ns}/{o.target}" if several else str(o.stamp_ns) for o in observations
+        ),
+        rotation=np.array(rotations) if complete else None,
+        sigma=None if sigma_m is None else np.hypot(sigma_m, [o.sigma_m for o in observations]),
+        stamp_ns=np.array([o.stamp_ns for o in observations], dtype=np.int64),
+    )
+
+
+# ---- observations -------------------------------------------------------------------------------
 
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
@@ -290,3 +379,161 @@ class ObservationDesk:
         """Drop observations up to a stamp: they were used."""
         self.used_ns = max(self.used_ns, until_ns)
         self._observed = [o for o in self._observed if o.stamp_ns > until_ns]
+
+
+# ---- which measuring cycle is open, and when it ends by itself ----------------------------------
+
+
+TIME_OUT = "time-out"
+REMEMBERED = 200  # calibrations back to which a cycle's id is known
+
+
+@dataclass
+class OpenCycle:
+    """The open cycle.
+
+    Attributes
+    ----------
+    id : its name; empty while none is open.
+    begun_ns : stamp at which it began.
+    postponed_ns : stamp at which it could not be kept; its time-out begins anew there.
+    """
+
+    id: str = ""
+    begun_ns: int = 0
+    postponed_ns: int = 0
+
+    def begin(self, cycle_id: str, stamp_ns: int, history: History) -> str:
+        """Open a cycle and say so; one that is open already goes on, another one is broken off.
+
+        Raises
+        ------
+        ConflictError
+            When a cycle of this id has ended.
+        """
+        if self.id == cycle_id:
+            return f"cycle '{cycle_id}' is open already"
+        if ended(cycle_id, history) is not None:
+            raise ConflictError(
+                f"cycle '{cycle_id}' has ended already: give each cycle an id of its own"
+            )
+        broken = f"; cycle '{self.id}' is broken off" if self.id else ""
+        self.id, self.begun_ns = cycle_id, stamp_ns
+        return f"cycle '{cycle_id}' is open{broken}"
+
+    def close(self) -> None:
+        """No cycle is open any more."""
+        self.id = ""
+
+
+def ended(cycle_id: str, history: History) -> Entry | None:
+    """The calibration that a cycle of this id gave, the latest of them; None without."""
+    entries = (e for e in history.list(REMEMBERED) if e.kind == THERMAL and e.cycle_id == cycle_id)
+    return next(entries, None)
+
+
+# ---- which measurements belong to a command, and when a cycle ends by itself --------------------
+
+
+OTHER_POSE = "measured at a pose that the cold reference lacks"
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What was measured beside the targets.
+
+    ``fixed`` (n, 3): centres of a sphere fixed in the cell, m; ``temperatures``: stamps and
+    temperatures (n,) of all motors since the last cycle, degrees Celsius; ``temperature`` (n,):
+    those of that time, None where they are not known.
+    """
+
+    fixed: Array
+    temperatures: Sequence[tuple[int, Array]]
+    temperature: Array | None
+
+
+class Windows:
+    """Takes the observations of a command from the desk."""
+
+    def __init__(
+        self, desk: ObservationDesk, cycle: OpenCycle, current: InForce, config: ThermalConfig
+    ) -> None:
+        self._desk, self._cycle, self._current, self._config = desk, cycle, current, config
+        self._pause_ns = int(config.cycle_timeout_s * 1e9)
+
+    def from_ns(self, command: Command) -> int:
+        """Stamp of the first measurement that counts: a cycle holds no pause of its time-out."""
+        calibrates = self._current.reference is None or command.name in events.SET_UP
+        if calibrates or self._cycle.id:
+            return self._desk.from_ns
+        return self._desk.last_run_ns(self._pause_ns)
+
+    def of(self, command: Command) -> tuple[Measurements, Array]:
+        """Targets on the flange, and centres (n, 3) of a sphere fixed in the cell.
+
+        Raises
+        ------
+        TooFewSamplesError
+            When nothing was measured.
+        InputError
+            When a cycle holds no pose of the cold reference.
+        """
+        desk, sets_up = self._desk, command.name in events.SET_UP
+        desk.drop_far_ahead()
+        after = int(command.arguments.get("from_ns", desk.from_ns)) - 1
+        observed = desk.window(after, command.stamp_ns or 0, command.marks or {})
+        fixed = [o.position for o in observed if o.topic == REFERENCE_SPHERE]
+        found = [o for o in observed if o.topic != REFERENCE_SPHERE]
+        if not found:
+            raise TooFewSamplesError(desk.why_nothing())
+        drift = self._current.reference is not None and not sets_up
+        if drift or sets_up:
+            found = one_per_visit(found, self._config.standstill.tolerance_rad)
+        if drift:
+            found = self._at_cold_poses(found)
+        last = int(command.arguments.get("samples", 0))
+        sigma_m = self._config.sigma_m if drift else None  # a calibration finds its noise itself
+        data = as_measurements(found[-last:] if last else found, sigma_m)
+        return data, np.array(fixed).reshape(-1, 3)
+
+    def overdue(self) -> Command | None:
+        """The command that ends a cycle in which nothing came for its time-out, or None.
+
+        Without ``begin_cycle`` a cycle is what follows each other without such a pause, at half
+        of the cold reference's poses or more.
+        """
+        desk, cycle = self._desk, self._cycle
+        last_ns = max(desk.latest_ns, cycle.begun_ns if cycle.id else 0)
+        due_ns = max(last_ns, cycle.postponed_ns) + self._pause_ns
+        if not last_ns or desk.newest_ns.get(JOINTS, 0) <= due_ns:
+            return None
+        if not cycle.id and not self._half_visited():
+            return None
+        return Command(events.END_CYCLE, {"by": TIME_OUT}, due_ns)
+
+    def progress(self) -> tuple[int, int]:
+        """How many poses of the cold reference were visited in this cycle, and of how many."""
+        reference, desk = self._current.reference, self._desk
+        if reference is None:
+            return 0, 0
+        start = desk.from_ns if self._cycle.id else desk.last_run_ns(self._pause_ns)
+        q = [o.q for o in desk.unused(start)]
+        return len(reference.spots.visited(np.array(q))), reference.spots.poses
+
+    def _half_visited(self) -> bool:
+        visited, poses = self.progress()
+        return poses > 0 and 2 * visited >= poses
+
+    def _at_cold_poses(self, found: list[Observation]) -> list[Observation]:
+        """Those at a pose of the cold reference; that of another pose shows no drift."""
+        if self._current.reference is None:
+            return found
+        known = self._current.reference.spots.knows(np.array([o.q for o in found]))
+        for other in (o for o, at_one in zip(found, known, strict=True) if not at_one):
+            self._desk.ignored.add(other.topic, OTHER_POSE)
+        if not np.any(known):
+            raise InputError(
+                f"none of the {len(found)} measured poses was measured in the cold reference: "
+                "visit the reference poses, or capture a new reference"
+            )
+        return [o for o, at_one in zip(found, known, strict=True) if at_one]

@@ -1,6 +1,6 @@
 """The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -8,10 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.sphere import cloud_sample
 from robocal_ros.ground.errors import Code, ConflictError, RobocalError, StorageError
 from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.samples import (
     JOINTS,
+    JUMPS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    REFERENCE_SPHERE,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
     TEMPERATURES,
     JointBlock,
     JointSample,
@@ -19,25 +26,87 @@ from robocal_ros.ground.samples import (
     PointSample,
     PoseSample,
     TemperatureSample,
+    joint_sample,
+    point_sample,
+    pose_sample,
+    temperature_sample,
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.decisions import decide, outside_decision
-from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.history import History
-from robocal_ros.thermal.accuracy_state import Accuracy, accuracy_of
-from robocal_ros.thermal.bounds import Bounds
+from robocal_ros.session.decisions import History, decide, outside_decision
+from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
+from robocal_ros.thermal.accuracy_state import Accuracy, MotorTemperatures, accuracy_of
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.cycles import TIME_OUT, OpenCycle, ended
-from robocal_ros.thermal.drift_following import DriftFollower, Following
-from robocal_ros.thermal.in_force import InForce
-from robocal_ros.thermal.keeping import CandidateStore
-from robocal_ros.thermal.observations import ObservationDesk
-from robocal_ros.thermal.proposing import Proposer
+from robocal_ros.thermal.drift_following import DriftFollower, Following, InForce
+from robocal_ros.thermal.observations import (
+    TIME_OUT,
+    Beside,
+    ObservationDesk,
+    OpenCycle,
+    Windows,
+    ended,
+)
+from robocal_ros.thermal.proposing import CandidateStore, Proposer, SetUp
 from robocal_ros.thermal.reference import ColdReference
-from robocal_ros.thermal.setting_up import SetUp
-from robocal_ros.thermal.temperatures import MotorTemperatures
-from robocal_ros.thermal.windows import Beside, Windows
+
+# ---- bounds -------------------------------------------------------------------------------------
+
+
+SAME_CLOCK_NS = 1_000_000_000
+
+
+class Bounds:
+    """Gives commands what replay needs to find the same samples."""
+
+    def __init__(
+        self, desk: ObservationDesk, cycle: OpenCycle, windows: Windows, config: ThermalConfig
+    ) -> None:
+        self._desk, self._cycle, self._windows, self._config = desk, cycle, windows, config
+
+    def stamped(self, command: Command, clock_ns: int | None) -> Command:
+        """Return the command with a stamp: its own, the clock's, or the newest known."""
+        if command.stamp_ns is None:
+            newest = self._desk.clock_ns
+            near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
+            command = replace(command, stamp_ns=clock_ns if near else newest)
+        return command
+
+    def named(self, command: Command) -> Command:
+        """Name a cycle: as the open one, else by its time."""
+        begins = command.name == events.BEGIN_CYCLE
+        if command.arguments.get("cycle_id") or not (begins or command.name in events.CYCLE):
+            return command
+        by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
+        name = by_time if begins else self._cycle.id or by_time
+        return replace(command, arguments={**command.arguments, "cycle_id": name})
+
+    def marked(self, command: Command) -> Command:
+        """Return the command with the bounds of its samples, for the record."""
+        marks, arguments = self._desk.marks, dict(command.arguments)
+        if command.name in events.MEASURED:
+            arguments.setdefault("from_ns", self._windows.from_ns(command))
+        return replace(command, marks=marks, arguments=arguments)
+
+    def ready(self, command: Command) -> bool:
+        """Whether its samples are complete."""
+        return reached(self._wanted(command), self._desk.newest_ns, self._desk.jumps)
+
+    def joints_awaited_ns(self, command: Command) -> int | None:
+        """Stamp of the joint reading that it waits for; None when it waits for none."""
+        return joints_awaited_ns(self._wanted(command), self._desk.newest_ns)
+
+    def _wanted(self, command: Command) -> Mapping[str, int]:
+        """Marks up to which samples must have come."""
+        if command.marks is not None:
+            return command.marks
+        marks = {JUMPS: self._desk.jumps}
+        if command.name in events.MEASURED:
+            marks[JOINTS] = (command.stamp_ns or 0) + int(self._config.lateness_s * 1e9)
+        return marks
+
+
+# ---- the thermal session: samples and commands in, judged proposals out. No clock, no ROS -------
+
 
 __all__ = ["ThermalConfig", "ThermalSession"]
 
@@ -288,3 +357,26 @@ class ThermalSession:
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""
         return [outside_decision(decision, self.desk.marks) for decision in self._current.look()]
+
+
+# ---- messages into the thermal session: the same for live topics and for recorded ones ----------
+
+
+def take_message(session: ThermalSession, kind: str, message: Any) -> None:
+    """Give a message to the session; one that cannot be used is counted with its reason.
+
+    ``kind`` is the input that the message belongs to; other kinds are left alone.
+    """
+    try:
+        if kind == JOINTS:
+            session.add(joint_sample(message))
+        elif kind in (MEASURED_POINT, SPHERE_CENTER, REFERENCE_SPHERE):
+            session.add(point_sample(message, session.config.target, kind))
+        elif kind == SPHERE_CLOUD:
+            session.add(cloud_sample(message, session.config.sphere, session.config.target))
+        elif kind == TEMPERATURES:
+            session.add(temperature_sample(message))
+        elif kind == MEASURED_POSE:
+            session.add(pose_sample(message, session.config.target))
+    except RobocalError as error:
+        session.desk.ignored.add(kind, str(error))

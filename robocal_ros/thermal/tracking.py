@@ -7,19 +7,39 @@ against the cold model, whatever is in force. A cycle that the process cannot ex
 applied.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.assessment import Judgement, Verdict
 from robocal_ros.estimation.descent import chi2_quantile
-from robocal_ros.ground.errors import InputError, StaleError
+from robocal_ros.estimation.estimation import describe, observability
+from robocal_ros.ground.errors import Code, InputError, StaleError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.thermal.agreement import agreeing
-from robocal_ros.thermal.heat import SOURCES, Heat, HeatGains, joints_of, swing_k
-from robocal_ros.thermal.priors import PLAUSIBLE_WARMING_K
-from robocal_ros.thermal.process import DriftProcess
-from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.thermal.documents import conclude
+from robocal_ros.thermal.identification import (
+    FEWEST_POSES,
+    CycleDrift,
+    FixedSphere,
+    agreeing,
+    possible_causes,
+    step_words,
+)
+from robocal_ros.thermal.process import (
+    PLAUSIBLE_WARMING_K,
+    SOURCES,
+    DriftProcess,
+    Heat,
+    HeatGains,
+    joints_of,
+    swing_k,
+)
+from robocal_ros.thermal.reference import ColdSpots
+
+# ---- the model between measuring cycles: a Kalman filter over the parameters' drift -------------
+
 
 Array = NDArray[np.float64]
 
@@ -273,3 +293,233 @@ class DriftTracker:
         A = parameters.reshape(3 * m, -1)
         noise = np.diag(np.repeat(sigma**2, 3)) + A @ self._swing(time_s) @ A.T
         return spots.drift(cycle).ravel(), H.reshape(3 * m, -1), noise
+
+
+# ---- tracked cycle ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedCycle:
+    """A cycle that the tracker took or refused.
+
+    Attributes
+    ----------
+    found : the drift after the cycle; before it where the cycle was refused.
+    judged : figures and verdict; each pose is forecast from all earlier cycles and the other poses.
+    innovation : what the cycle brought against what was expected.
+    """
+
+    found: CycleDrift
+    judged: Judgement
+    innovation: Innovation
+
+
+def track_cycle(
+    tracker: DriftTracker,
+    warm: Measurements,
+    time_s: float,
+    *,
+    in_force: SerialArm,
+    fixed: FixedSphere | None = None,
+    doubt_s: float | None = None,
+) -> TrackedCycle:
+    """Update the tracker with a cycle and judge the model that follows from it.
+
+    A cycle that the drift since the last one cannot explain, or during which a sphere that is
+    fixed in the cell (``fixed``) moved, leaves the tracker as it was, and is refused as
+    SENSOR_OR_ROBOT_MOVED with what it may be. ``doubt_s``: see `DriftTracker.take`.
+
+    Raises
+    ------
+    InputError
+        When a sample has no cold counterpart.
+    TooFewSamplesError
+        With fewer than two poses.
+    StaleError
+        When the cycle is older than the last one.
+    """
+    spots = tracker.spots
+    warm = spots.average(warm, tracker.sigma_m)
+    if len(warm) < FEWEST_POSES:
+        raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
+    last = tracker.state
+    innovation = tracker.take(warm, time_s, doubt_s)
+    taken, tracker.state = tracker.state, last
+    before = tracker.at(innovation.time_s)
+    moved = not innovation.applied or (fixed is not None and fixed.moved)
+    if not moved:
+        tracker.state = taken
+    miss, spread, drifts = _left_out(tracker, before, warm, innovation)
+    found = _found(tracker, warm, time_s, innovation, miss, spread)
+    arm = spots.cell.arm
+    A = spots.rows(warm.q, spots.target[spots.match(warm)])[0]
+    own = drifts - arm.parameters.read(in_force.mdh - arm.mdh)
+    judged = conclude(
+        found,
+        spots,
+        warm,
+        in_force,
+        current=np.linalg.norm(miss + np.einsum("mik,mk->mi", A, own), axis=1),
+        after=np.linalg.norm(miss, axis=1),
+        spread=spread,
+        usable=innovation.kept,
+    )
+    if moved:
+        judged = replace(judged, verdict=_refusal(tracker, warm, innovation, fixed))
+    return TrackedCycle(found, judged, innovation)
+
+
+def _found(
+    tracker: DriftTracker,
+    warm: Measurements,
+    time_s: float,
+    innovation: Innovation,
+    miss: Array,
+    spread: Array,
+) -> CycleDrift:
+    spots, k = tracker.spots, tracker.count
+    arm, (drift, covariance) = spots.cell.arm, tracker.drift(time_s)
+    kept = warm.take(innovation.kept)
+    rows = spots.rows(kept.q, spots.target[spots.match(kept)])[0]
+    seen = observability(rows.reshape(-1, k))
+    chosen = arm.parameters
+    sigma = np.full(len(warm), tracker.sigma_m) if warm.sigma is None else warm.sigma
+    return CycleDrift(
+        drift=drift,
+        covariance=covariance,
+        prior_covariance=tracker.expected_drift(),
+        arm=arm.with_mdh(chosen.add(arm.mdh, drift)),
+        warm=warm,
+        left_out=miss,
+        left_out_sigma=spread,
+        rejected=~innovation.kept,
+        noise_m=float(np.sqrt(np.mean(sigma**2))),
+        seen=seen,
+        unobservable=tuple(describe(c, chosen.names, chosen.to_display) for c in seen.null.T),
+    )
+
+
+def _left_out(
+    tracker: DriftTracker, before: DriftState, warm: Measurements, innovation: Innovation
+) -> tuple[Array, Array, Array]:
+    """Error (m, 3) at each pose of what all else says, its rms length (m,), and drifts (m, k).
+
+    All else: the earlier cycles and the other poses of this one that agree. Cold visit and set-up
+    are estimated along, so that model in force and candidate differ by the drift alone.
+    """
+    _, H, _ = tracker.observation(warm, before.time_s)
+    D = tracker.drift_rows(before.time_s)
+    v, S, k, count = innovation.deviation, innovation.covariance, tracker.count, len(warm)
+    forecast, PH = D @ before.mean, D @ before.covariance @ H.T
+    kept = np.repeat(innovation.kept, 3)
+    miss, spread, drifts = np.empty((count, 3)), np.empty(count), np.empty((count, k))
+    for i in range(count):
+        own, others = slice(3 * i, 3 * i + 3), kept.copy()
+        others[own] = False
+        across = S[others, own]
+        gain = np.linalg.solve(S[np.ix_(others, others)], np.column_stack([v[others], across]))
+        miss[i] = v[own] - across.T @ gain[:, 0]
+        spread[i] = np.sqrt(np.trace(S[own, own] - across.T @ gain[:, 1:]))
+        drifts[i] = forecast + PH[:, others] @ gain[:, 0]
+    return miss, spread, drifts
+
+
+def _refusal(
+    tracker: DriftTracker, warm: Measurements, innovation: Innovation, fixed: FixedSphere | None
+) -> Verdict:
+    rms_mm, expected_mm = (
+        1e3 * float(np.sqrt(3.0 * np.mean(square)))
+        for square in (innovation.deviation**2, np.diag(innovation.covariance))
+    )
+    causes = possible_causes(tracker.spots, warm, innovation.deviation, innovation.covariance)
+    return Verdict(
+        Code.SENSOR_OR_ROBOT_MOVED,
+        f"the measured positions are {rms_mm:.2f} mm rms off, where drift and noise explain "
+        f"{expected_mm:.2f} mm; the model stays as it was; {step_words(causes, fixed)}",
+    )
+
+
+# ---- whether a parameter fluctuates about a level or drifts: tests of its autocorrelation -------
+
+
+LEVEL = 0.05  # chance that white noise passes for a drift
+LAGS = 7  # a drift shows in the first lags; with 7 the count's own chance is 4.4 %, next to LEVEL
+BOUND = 1.96  # of a white series' autocorrelation, times the root of its length
+FEWEST = 3 * LAGS
+
+
+@dataclass(frozen=True, eq=False)
+class Stationarity:
+    """Tests of k series, each against white noise about a level.
+
+    Attributes
+    ----------
+    autocorrelation : (LAGS, k) at lags 1 ... LAGS.
+    bound : half width of the interval that holds 95 % of a white series' autocorrelations.
+    outside : (k,) how many lags lie outside it; ``allowed`` of them is what chance allows.
+    p_value : (k,) of Ljung and Box's test.
+    """
+
+    autocorrelation: Array
+    bound: float
+    outside: NDArray[np.int64]
+    allowed: int
+    p_value: Array
+
+    @property
+    def by_count(self) -> NDArray[np.bool_]:
+        """(k,) stationary, because no more lags lie outside than chance allows."""
+        return np.asarray(self.outside <= self.allowed)
+
+    @property
+    def by_ljung_box(self) -> NDArray[np.bool_]:
+        """(k,) stationary, because white noise has such autocorrelations often enough."""
+        return np.asarray(self.p_value >= LEVEL)
+
+
+def stationarity(series: Array) -> Stationarity:
+    """Test the columns of equally spaced series (t, k), in whatever unit.
+
+    The lags of a white series are nearly independent and each is outside with chance 5 %, so
+    that their number is binomial. Ljung and Box (1978) sum their squares instead, which is
+    chi-square with as many degrees of freedom as there are lags. Either finds a white series
+    drifting in about 5 % of cases (the count, being whole, in a little less).
+
+    Raises
+    ------
+    TooFewSamplesError
+        With fewer than 21 times.
+    """
+    from scipy.special import gammaincc
+
+    n = len(series)
+    if n < FEWEST:
+        raise TooFewSamplesError(
+            f"{n} cycles are too few to tell a drift from chance: at least {FEWEST}"
+        )
+    r = autocorrelation(series)
+    bound = BOUND / float(np.sqrt(n))
+    left = n - np.arange(1, LAGS + 1)
+    squared = n * (n + 2.0) * np.sum(r**2 / left[:, None], axis=0)
+    return Stationarity(
+        autocorrelation=r,
+        bound=bound,
+        outside=np.sum(np.abs(r) > bound, axis=0),
+        allowed=_allowed(),
+        p_value=np.asarray(gammaincc(0.5 * LAGS, 0.5 * squared)),
+    )
+
+
+def autocorrelation(series: Array) -> Array:
+    """Sample autocorrelation (LAGS, k) of the columns of (t, k); zero for a constant column."""
+    x = series - series.mean(axis=0)
+    power = np.sum(x**2, axis=0)
+    power = np.where(power > 0.0, power, 1.0)
+    return np.array([np.sum(x[lag:] * x[:-lag], axis=0) / power for lag in range(1, LAGS + 1)])
+
+
+def _allowed() -> int:
+    """Most lags outside that chance exceeds in no more than 5 % of white series."""
+    from scipy.special import bdtrc
+
+    return next(count for count in range(LAGS + 1) if bdtrc(count, LAGS, LEVEL) <= LEVEL)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.session.followed import HistoryFollower
-from robocal_ros.session.history import History
+from robocal_ros.session.base import HistoryFollower
+from robocal_ros.session.decisions import History
 from robocal_ros.tool.config import ToolConfig, made_with
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.run_traits import RunTraits

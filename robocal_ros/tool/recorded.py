@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.base import configured_with, recorded_arguments
+from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command
-from robocal_ros.session.history import History, seeded
-from robocal_ros.session.recorded import configured_with, recorded_arguments
 from robocal_ros.tool.config import ToolConfig
 from robocal_ros.tool.session import ToolSession
 

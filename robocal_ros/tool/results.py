@@ -12,8 +12,8 @@ from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, TOOL, Proposal
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.history import History
 from robocal_ros.tool.change_documents import change_document, check_document
 from robocal_ros.tool.config import ToolConfig, made_with
 from robocal_ros.tool.crossed_model import Held

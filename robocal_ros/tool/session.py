@@ -10,9 +10,9 @@ from robocal_ros.ground.proposals import TOOL
 from robocal_ros.ground.samples import JOINTS, JointSample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.commanded import Commanded, Handler
+from robocal_ros.session.base import Commanded, Handler
+from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.history import History
 from robocal_ros.tool.beam_edges import BeamError
 from robocal_ros.tool.config import ToolConfig
 from robocal_ros.tool.edge_log import AHEAD_NS, EDGES, MOST_EDGES, EdgeLog

@@ -15,8 +15,7 @@ from robocal_ros.hand_eye.recorded import configuration
 from robocal_ros.hand_eye.session import HandEyeSession
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.records import arguments_text, outcome_text
+from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text
 
 EVENTS = "/hand_eye_node/session_events"
 

@@ -15,8 +15,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import Command
-from robocal_ros.session.records import arguments_text, outcome_text
+from robocal_ros.session.events import Command, arguments_text, outcome_text
 from robocal_ros.thermal.seeding import configuration
 from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 

@@ -43,8 +43,7 @@ from robocal_ros.cli.validating import Job
 from robocal_ros.cli.validating_many import validated
 from robocal_ros.cli.validating_parts import require_finite
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.records import arguments_text, outcome_text
+from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text
 
 TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
 EXCERPT = ROOT / "bags/golden_excerpt.mcap"

@@ -8,7 +8,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.achieved import measured_errors, true_errors
+from robocal_ros.thermal.identification import measured_errors, true_errors
 from robocal_ros.thermal.reference import ColdReference, capture_reference
 
 TOOL = np.array([0.1, 0.05, 0.2])

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.thermal.accuracy import ToolError
-from robocal_ros.thermal.combined_error import both_errors, offset_error
+from robocal_ros.thermal.accuracy import ToolError, both_errors, offset_error
 
 DRAWS = 200_000
 

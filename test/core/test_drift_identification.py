@@ -9,10 +9,10 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground.errors import Code, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.cycle_verdict import judge_cycle
+from robocal_ros.thermal.documents import judge_cycle
 from robocal_ros.thermal.identification import identify_cycle, identify_subset
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.reference import ColdSpots
 
 
 @pytest.fixture(scope="module")

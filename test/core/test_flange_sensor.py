@@ -10,14 +10,12 @@ from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooF
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.flange_identification import (
-    identify_and_judge_flange_sensor,
-    identify_flange_sensor,
-)
 from robocal_ros.thermal.flange_sensor import (
     FlangeSensorProblem,
     MeasuringRobot,
     hand_eye_start,
+    identify_and_judge_flange_sensor,
+    identify_flange_sensor,
     in_sessions,
 )
 

@@ -7,8 +7,8 @@ from robocal_ros.cell_sim import kr150
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import identify_cycle
 from robocal_ros.thermal.learning import learn_drift
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.reference import ColdSpots
 
 
 def test_a_learned_prior_does_better_than_the_default():

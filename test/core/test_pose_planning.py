@@ -12,8 +12,8 @@ from robocal_ros.ground.errors import LimitError, TooFewSamplesError
 from robocal_ros.identification.cell import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.identification import identify_cycle
-from robocal_ros.thermal.pose_planning import (
+from robocal_ros.thermal.identification import SETUP_SIGMA_M, identify_cycle
+from robocal_ros.thermal.planning import (
     Design,
     SensorField,
     candidate_poses,
@@ -21,9 +21,8 @@ from robocal_ros.thermal.pose_planning import (
     plan_poses,
     shortest_way,
 )
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.process import SETUP_SIGMA_M
-from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.reference import ColdSpots
 
 FIELD = SensorField()
 

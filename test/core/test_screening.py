@@ -11,11 +11,10 @@ import pytest
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.best_subset import best_subset
-from robocal_ros.thermal.drift_history import DriftHistory, share_within
-from robocal_ros.thermal.screening import Screening, screen
-from robocal_ros.thermal.spots import ColdSpots
-from robocal_ros.thermal.subset import entangled, subset_drift
+from robocal_ros.thermal.identification import entangled, subset_drift
+from robocal_ros.thermal.learning import DriftHistory, share_within
+from robocal_ros.thermal.reference import ColdSpots
+from robocal_ros.thermal.screening import Screening, best_subset, screen
 
 ARM = load_robot("kr150_r3100")
 NAMES = ARM.parameters.names

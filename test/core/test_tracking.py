@@ -13,10 +13,8 @@ from robocal_ros.ground.errors import InputError, StaleError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.heat import Heat, HeatGains, joints_of
-from robocal_ros.thermal.priors import drift_prior
-from robocal_ros.thermal.process import DriftProcess
-from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.process import DriftProcess, Heat, HeatGains, drift_prior, joints_of
+from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.tracking import DriftTracker
 
 PERIOD_S = 300.0

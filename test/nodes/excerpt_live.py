@@ -9,8 +9,7 @@ from robocal_msgs.msg import SessionEvent
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import Outcome
-from robocal_ros.session.records import digest
+from robocal_ros.session.events import Outcome, digest
 
 BAG = Path(__file__).parents[2] / "bags" / "golden_excerpt.mcap"
 ROBOT = "kr150_r3100"

@@ -21,7 +21,7 @@ from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.diagnostics import WARN, Health
 from robocal_ros.ros.endpoints import LOG_EVERY_S, LogLimit
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.session.ignored import MOST_REASONS
+from robocal_ros.session.base import MOST_REASONS
 
 BUG = 5e5  # of this number the callback has a defect
 

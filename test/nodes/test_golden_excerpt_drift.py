@@ -39,8 +39,8 @@ from robocal_ros.ros import qos
 from robocal_ros.ros.session_events import EVENTS
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
-from robocal_ros.thermal.inputs import take_message
 from robocal_ros.thermal.seeding import session_as_recorded
+from robocal_ros.thermal.session import take_message
 
 
 @pytest.fixture

@@ -24,8 +24,8 @@ from robocal_ros import __version__
 from robocal_ros.correction import report as correction_log
 from robocal_ros.ground import frames
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.correction_record import CALIBRATED, CorrectionRecord
-from robocal_ros.history.correction_record import NOMINAL as AS_NOMINAL
+from robocal_ros.history.history_records import CALIBRATED, CorrectionRecord
+from robocal_ros.history.history_records import NOMINAL as AS_NOMINAL
 from robocal_ros.kinematics.robots import load_description, save_robot
 from robocal_ros.ros.history_settings import history_notice
 

@@ -31,7 +31,7 @@ from robocal_ros.ground.proposals import CalibrationState, Head, Proposal
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_damage import acknowledge
+from robocal_ros.history.history_file import acknowledge
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
@@ -40,10 +40,9 @@ from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.diagnostics import Health
 from robocal_ros.ros.history_settings import history_notice
 from robocal_ros.ros.session_events import EVENTS
-from robocal_ros.thermal.inputs import take_message
 from robocal_ros.thermal.node import ThermalNode
 from robocal_ros.thermal.seeding import config_of
-from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal.session import ThermalSession, take_message
 
 POSES = 8
 NS = 1_000_000_000

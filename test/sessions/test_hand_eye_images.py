@@ -33,7 +33,7 @@ from robocal_ros.hand_eye.target_documents import target_document
 from robocal_ros.hand_eye.target_files import read_target
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
-from robocal_ros.session.records import arguments_text, digest, outcome_text, read_command
+from robocal_ros.session.events import arguments_text, digest, outcome_text, read_command
 
 CONFIG = HandEyeConfig(sensor_frame=FRAME, limit_m=2e-3)  # as `robocal hand-eye camera`
 CORNERS = COLUMNS * ROWS

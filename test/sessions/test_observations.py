@@ -13,9 +13,8 @@ from robocal_ros.ground.samples import (
     PoseSample,
 )
 from robocal_ros.ground.streams import JointStream, Reading, StandstillRule
-from robocal_ros.session.ignored import MOST_REASONS
-from robocal_ros.thermal.observation import as_measurements
-from robocal_ros.thermal.observations import MOST_WAITING, ObservationDesk
+from robocal_ros.session.base import MOST_REASONS
+from robocal_ros.thermal.observations import MOST_WAITING, ObservationDesk, as_measurements
 
 MS = 1_000_000
 NAMES = ("a", "b")

@@ -16,7 +16,7 @@ from robocal_ros.hand_eye import recorded as hand_eye_recorded
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.session import records
+from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.thermal import seeding
 from robocal_ros.thermal.config import ThermalConfig
@@ -64,7 +64,7 @@ def test_a_recording_that_cannot_be_read_leaves_the_history_empty(history, kind,
 def event(command: Command, outcome: str = "{}") -> SimpleNamespace:
     """As a bag gives it."""
     stamp = SimpleNamespace(sec=(command.stamp_ns or 0) // 10**9, nanosec=0)
-    arguments = records.arguments_text(command)
+    arguments = events.arguments_text(command)
     message = SimpleNamespace(
         command=command.name, stamp=stamp, arguments=arguments, outcome=outcome
     )

@@ -24,12 +24,21 @@ from robocal_ros.ground.samples import (
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import CONFIGURE, Command
-from robocal_ros.session.records import arguments_text, digest, outcome_text, read_command
-from robocal_ros.thermal.found_cycles import automatic_commands, window_commands
-from robocal_ros.thermal.inputs import take_message
-from robocal_ros.thermal.seeding import config_of, configuration
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.session.events import (
+    CONFIGURE,
+    Command,
+    arguments_text,
+    digest,
+    outcome_text,
+    read_command,
+)
+from robocal_ros.thermal.seeding import (
+    automatic_commands,
+    config_of,
+    configuration,
+    window_commands,
+)
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession, take_message
 
 NS = 1_000_000_000
 POSES = 8

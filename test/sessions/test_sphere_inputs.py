@@ -20,8 +20,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
-from robocal_ros.thermal.inputs import take_message
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession, take_message
 
 NS = 1_000_000_000
 POSES = 8

@@ -19,8 +19,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.decisions import NEWEST, ONLY
-from robocal_ros.session.events import Command, Outcome
-from robocal_ros.session.records import digest
+from robocal_ros.session.events import Command, Outcome, digest
 from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 NS = 1_000_000_000

@@ -39,7 +39,7 @@ from robocal_ros.cell_sim.production import programme
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
-from robocal_ros.thermal.drift_history import share_within
+from robocal_ros.thermal.learning import share_within
 from robocal_ros.tool.crossed_model import RobotNoise
 
 SILENT = replace(Effects(), noise=False, outliers=False)

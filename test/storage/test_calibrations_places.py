@@ -13,7 +13,7 @@ from history_workers import SERIAL, proposal
 
 from robocal_ros.ground.errors import InputError, StorageError, WrongRobotError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_paths import history_path, known_serials, state_folder
+from robocal_ros.history.history_file import history_path, known_serials, state_folder
 
 
 class TestWrongRobot:

@@ -15,8 +15,13 @@ from history_workers import SERIAL, proposal
 
 from robocal_ros.ground.errors import StorageError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_damage import acknowledge, damage_notice, damaged_files
-from robocal_ros.history.history_paths import history_path, known_serials
+from robocal_ros.history.history_file import (
+    acknowledge,
+    damage_notice,
+    damaged_files,
+    history_path,
+    known_serials,
+)
 
 
 class TestTrouble:

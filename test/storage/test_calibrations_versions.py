@@ -12,8 +12,13 @@ from history_workers import SERIAL, proposal
 from robocal_ros.ground.errors import StorageError
 from robocal_ros.ground.files import made_folder_beside
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_paths import history_path, known_serials, unused
-from robocal_ros.history.history_schema import MIGRATIONS, SCHEMA_VERSION
+from robocal_ros.history.history_file import (
+    MIGRATIONS,
+    SCHEMA_VERSION,
+    history_path,
+    known_serials,
+    unused,
+)
 
 
 class TestFolderBeside:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.history import history_file, history_schema
+from robocal_ros.history import history_file
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
-from robocal_ros.history.history_paths import history_path
+from robocal_ros.history.history_file import history_path
+from robocal_ros.history.history_records import CALIBRATED, NOMINAL, CorrectionRecord
 
 SERIAL = "K7"
 RECORD = CorrectionRecord(
@@ -68,7 +68,7 @@ def test_they_are_never_changed(tmp_path: Path) -> None:
 
 def test_an_older_history_is_brought_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(history_file, "MIGRATIONS", history_schema.MIGRATIONS[:1])
+        patch.setattr(history_file, "MIGRATIONS", history_file.MIGRATIONS[:1])
         patch.setattr(history_file, "SCHEMA_VERSION", 1)
         opened(tmp_path).close()
     with opened(tmp_path) as history:

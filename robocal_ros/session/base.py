@@ -1,21 +1,122 @@
 """A session's commands in their turn, and the joint readings whose stamps they go by."""
 
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from robocal_ros import __version__
-from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import THERMAL, Head
+from robocal_ros.ground.errors import Code, InputError, RobocalError
+from robocal_ros.ground.proposals import THERMAL, Decision, Head
 from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample
 from robocal_ros.ground.streams import JointStream
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.decisions import decide, outside_decision
-from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
-from robocal_ros.session.followed import HistoryFollower
-from robocal_ros.session.history import BY, History, bring_into_force
-from robocal_ros.session.ignored import Ignored
+from robocal_ros.session.decisions import (
+    BY,
+    History,
+    bring_into_force,
+    decide,
+    outside_decision,
+    require_robot,
+)
+from robocal_ros.session.events import CONFIGURE, Command, Outcome, joints_awaited_ns, reached
+
+# ---- followed -----------------------------------------------------------------------------------
+
+
+class HistoryFollower:
+    """Heads of a history as of the last look; a subclass reads those that it is about.
+
+    Parameters
+    ----------
+    kind : whose decisions are told.
+
+    Attributes
+    ----------
+    head : of that kind.
+    fault : why the history could not be read at the last look; empty when it could.
+    """
+
+    def __init__(self, history: History, kind: str) -> None:
+        self._history, self._kind = history, kind
+        self._version = history.data_version()
+        decided = history.decisions(newest=1)
+        self._seen = decided[-1].seq if decided else 0
+        self.fault = ""
+        self._read()
+
+    def _read(self) -> None:
+        self.head: Head = self._history.head(self._kind)
+
+    def look(self, own_wall_ns: int | None = None) -> list[Decision]:
+        """Take over what was decided since the last look.
+
+        Returns others' decisions about the kind, oldest first; those stamped ``own_wall_ns`` are
+        the caller's own. Never raises for the history's sake: see ``fault``.
+        """
+        try:
+            version = self._history.data_version()
+            self.fault = ""
+            if version == self._version:
+                return []
+            decided = self._history.decisions(self._seen)
+            self._read()
+        except RobocalError as error:
+            self.fault = str(error)
+            return []
+        self._version = version
+        self._seen = decided[-1].seq if decided else self._seen
+        return [d for d in decided if d.kind == self._kind and d.wall_ns != own_wall_ns]
+
+
+# ---- what a session did not use, by topic and reason --------------------------------------------
+
+
+MOST_REASONS = 30
+_NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
+
+
+def kind_of(reason: str) -> str:
+    """The reason with '#' for its numbers, which do not tell reasons apart."""
+    return _NUMBER.sub("#", reason)
+
+
+class Ignored(dict[str, Counter[str]]):
+    """Counts by topic and reason; numbers (put as '#') do not tell reasons apart."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: dict[tuple[str, str], str] = {}
+
+    def add(self, topic: str, reason: str, count: int = 1) -> None:
+        """Count samples that are not used."""
+        counter = self.setdefault(topic, Counter())
+        key = kind_of(reason)
+        key = key if key in counter or len(counter) < MOST_REASONS else "other"
+        counter[key] += count
+        self._last[topic, key] = reason
+
+    def listed(self) -> dict[str, str]:
+        """All reasons with their counts and the latest words, as nodes show them."""
+        return {
+            f"{topic} ignored: {key}": f"{count}, last: {self._last[topic, key]}"
+            for topic, counter in self.items()
+            for key, count in counter.items()
+        }
+
+    def words(self) -> str:
+        """Tell the most frequent reason of each topic; empty when nothing was ignored."""
+        parts = [
+            f"{counter.total()} of {topic} ({self._last[topic, counter.most_common(1)[0][0]]})"
+            for topic, counter in self.items()
+        ]
+        return f"ignored: {', '.join(parts)}" if parts else ""
+
+
+# ---- a session's commands in their turn, and the joint readings whose stamps they go by ---------
+
 
 WHILE = "in force while this was recorded"
 GAP_NS = 250_000_000
@@ -152,3 +253,44 @@ class Commanded:
         else:
             bring_into_force(self._history, THERMAL, self.nominal, model, __version__, WHILE)
         return Outcome(command, Code.ACCEPT, f"thermal model {WHILE}")
+
+
+# ---- what the configuration records of all commanded sessions have in common --------------------
+
+
+Document = Mapping[str, Any]
+
+
+def configured_with(
+    session: Commanded, topics: Mapping[str, str], config: Document, in_force: Document
+) -> Command:
+    """Settings and what is in force, so that a replay can start from the same.
+
+    ``topics``: name of each input's topic.
+    """
+    arguments = {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "topics": dict(topics),
+        "config": dict(config),
+        **in_force,
+    }
+    return Command(CONFIGURE, arguments, session.newest_joints_ns, session.marks)
+
+
+def recorded_arguments(nominal: SerialArm, configured: Command, names: Sequence[str]) -> Document:
+    """Arguments of a configuration with ``config`` and these names.
+
+    Raises
+    ------
+    WrongRobotError
+        The recording was made with another nominal model.
+    InputError
+        One is missing.
+    """
+    require_robot(nominal, configured)
+    arguments = configured.arguments
+    missing = [name for name in ("config", *names) if name not in arguments]
+    if missing:
+        raise InputError(f"the recorded configuration lacks {', '.join(missing)}")
+    return arguments
