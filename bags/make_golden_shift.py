@@ -48,9 +48,13 @@ from robocal_ros.ground.samples import (  # noqa: E402
 )
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
 from robocal_ros.thermal import seeding  # noqa: E402
-from robocal_ros.tool import recorded as tool_recorded  # noqa: E402
-from robocal_ros.tool.edge_log import EDGES  # noqa: E402
-from robocal_ros.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noqa: E402
+from robocal_ros.tool import recorded  # noqa: E402
+from robocal_ros.tool.edges import (  # noqa: E402
+    BREAK,
+    EDGES,
+    RESTORE,
+    EdgeSample,
+)
 
 FULL = ROOT / "out" / "golden_shift.mcap"
 EXCERPT = Path(__file__).with_name("golden_excerpt.mcap")
@@ -136,7 +140,7 @@ class Recorder:
         }
         made = {
             "thermal": lambda: seeding.configuration(thermal, THERMAL),
-            "tool": lambda: tool_recorded.configuration(tool, TOOL),
+            "tool": lambda: recorded.configuration(tool, TOOL),
         }
         for node, state in shown.items():
             if self._shown.get(node) != state:

@@ -37,13 +37,11 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.tool.beam_edges import BeamEdge, InputRule
-from robocal_ros.tool.config import ToolConfig, rows_of
-from robocal_ros.tool.edge_log import EDGES
-from robocal_ros.tool.edge_samples import BREAK, RESTORE
+from robocal_ros.tool.edges import BREAK, EDGES, RESTORE, BeamEdge, InputRule
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.measuring_plan import PlannedStep
 from robocal_ros.tool.recorded import configuration
+from robocal_ros.tool.run import ToolConfig, rows_of
 from robocal_ros.tool.session import ToolSession
 
 BAG = Path(__file__).with_name("tool_runs.mcap")

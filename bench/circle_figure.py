@@ -10,7 +10,7 @@ from robocal_ros.cell_sim.beam_moves import Circle
 from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
 from robocal_ros.ground import frames
 from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE
-from robocal_ros.tool.beam_edges import BeamEdge
+from robocal_ros.tool.edges import BeamEdge
 
 RADIUS_M, TOOL_M = 0.012, 0.0025
 CENTRE_M = np.array([0.003, -0.004])  # the bent tool's axis at the circle's centre

@@ -28,11 +28,9 @@ from robocal_ros.cell_sim.tool_cell import MeasuredRun, RunPlan, ToolCell
 from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.tool.beam_edges import BeamEdge
-from robocal_ros.tool.circle_edges import CircleMotion, label_edges
-from robocal_ros.tool.classic_run import classic_tool
-from robocal_ros.tool.crossed_beams import closed_form, fit_circle
-from robocal_ros.tool.crossed_model import Held
+from robocal_ros.tool.crossed_model import Held, closed_form, fit_circle
+from robocal_ros.tool.crossed_run import classic_tool
+from robocal_ros.tool.edges import BeamEdge, CircleMotion, label_edges
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.tool.quick_check import CheckRule, quick_check

@@ -10,8 +10,8 @@ from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.tool.config import ToolConfig, rows_of
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.tool.run import ToolConfig, rows_of
 
 SERIAL = "SIM-KR150"
 STATION, FRAME, TARGET = "station", "sensor", "ball"

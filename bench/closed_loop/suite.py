@@ -36,8 +36,7 @@ from robocal_ros.thermal.drift_following import EXPECTED
 from robocal_ros.thermal.learning import LearnedProcess, process_document
 from robocal_ros.thermal.session import ThermalSession
 from robocal_ros.tool.driving import ToolDriver
-from robocal_ros.tool.edge_log import EDGES
-from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.edges import EDGES, EdgeSample
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.session import ToolSession
 

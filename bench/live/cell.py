@@ -26,7 +26,7 @@ from robocal_ros.cell_sim.cell_samples import CellSamples
 from robocal_ros.cell_sim.kr150_cell import kr150_cell
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, save_robot
-from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.laser_frame import LaserFile, write_laser
 
 ROBOT, SERIAL = "kr150_r3100", setting.SERIAL
 PARAMETERS = ROOT / "config" / "cells" / "kr150_shift.yaml"

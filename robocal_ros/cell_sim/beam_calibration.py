@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.beam_moves import Sweep
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool
 from robocal_ros.ground import frames
-from robocal_ros.tool.beam_edges import BEAMS
+from robocal_ros.tool.edges import BEAMS
 
 Array = NDArray[np.float64]
 

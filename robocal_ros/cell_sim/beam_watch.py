@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.beams import BeamStation, Poses, RoundTool
 from robocal_ros.cell_sim.draws import Draws, Stream
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.tool.beam_edges import BeamEdge
+from robocal_ros.tool.edges import BeamEdge
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.tool.beam_edges import BEAMS, Beam, BeamEdge
+from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge
 
 Array = NDArray[np.float64]
 Poses = Callable[[Array], Array]

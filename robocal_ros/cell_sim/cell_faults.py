@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
 from robocal_ros.ground import frames
-from robocal_ros.tool.beam_edges import Beam, BeamEdge
+from robocal_ros.tool.edges import Beam, BeamEdge
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.heating import Temperatures
 from robocal_ros.cell_sim.profile_station import ProfileShot
 from robocal_ros.cell_sim.sphere_station import SphereShot
-from robocal_ros.tool.beam_edges import BeamEdge
+from robocal_ros.tool.edges import BeamEdge
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from robocal_ros.ground.samples import (
     PointSample,
     TemperatureSample,
 )
-from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.edges import EdgeSample
 
 Sample = JointSample | PointSample | TemperatureSample | EdgeSample
 

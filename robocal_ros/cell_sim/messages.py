@@ -17,8 +17,8 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.ros.conversions import header
-from robocal_ros.tool.beam_edges import BeamEdge
 from robocal_ros.tool.crossed_model import StepKind
+from robocal_ros.tool.edges import BeamEdge
 from robocal_ros.tool.measuring_plan import PlannedStep
 
 Array = NDArray[np.float64]

@@ -9,8 +9,7 @@ from robocal_ros.cell_sim.beam_program import step_move
 from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.cell_sim.tool_cell import ToolCell, joints_at
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.tool.beam_edges import BeamEdge
-from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.edges import BeamEdge, EdgeSample
 from robocal_ros.tool.measuring_plan import PlannedStep
 
 Array = NDArray[np.float64]

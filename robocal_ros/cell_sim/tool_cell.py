@@ -13,14 +13,11 @@ from robocal_ros.cell_sim.beam_moves import Circle, Plunge
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.tool.circle_edges import CircleMotion
-from robocal_ros.tool.classic_run import CommandedCircle
-from robocal_ros.tool.crossed_beams import CircleMethod, fit_circle
-from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise
-from robocal_ros.tool.crossed_run import ToolEstimate, estimate_tool
-from robocal_ros.tool.flange_path import JointPath
+from robocal_ros.tool.crossed_model import BeamStep, CircleMethod, Held, RobotNoise, fit_circle
+from robocal_ros.tool.crossed_run import CommandedCircle, ToolEstimate, estimate_tool
+from robocal_ros.tool.edges import CircleMotion
+from robocal_ros.tool.flange_path import JointPath, axis_from_centres, upright_pose
 from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.tool_axis import axis_from_centres, upright_pose
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
 from robocal_ros.hand_eye.shots import SHOTS
 from robocal_ros.session.events import Command
-from robocal_ros.tool.edge_log import EDGES
+from robocal_ros.tool.edges import EDGES
 
 MEASURED = (*MEASURING, EDGES, *SHOTS)
 UNASKED = "while this was recorded nobody gave its node a command"

@@ -50,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.tool.documents import laser_document
+    from robocal_ros.tool.files import read_beam_points
     from robocal_ros.tool.laser_frame import calibrate_laser
-    from robocal_ros.tool.tables import read_beam_points
+    from robocal_ros.tool.quick_check import laser_document
 
     _require_together(args)
     radius_m = None if args.radius_mm is None else args.radius_mm * 1e-3
@@ -80,7 +80,7 @@ def _require_together(args: argparse.Namespace) -> None:
 
 
 def _write(args: argparse.Namespace, laser: "LaserFrame") -> None:
-    from robocal_ros.tool.laser_files import LaserFile, write_laser
+    from robocal_ros.tool.laser_frame import LaserFile, write_laser
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -16,7 +16,7 @@ from robocal_ros.ground.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.tool.beam_edges import InputRule
+    from robocal_ros.tool.edges import InputRule
 
 NAME = "crossed"
 HELP = "find a tool from the edges of a whole run, or its axis from one circle at constant speed"
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from math import isfinite
 
-    from robocal_ros.tool.beam_edges import InputRule
+    from robocal_ros.tool.edges import InputRule
 
     if not isfinite(args.sample_period_s) or args.sample_period_s < 0.0:
         raise InputError("--sample-period-s must be a finite number, not below 0")
@@ -101,11 +101,10 @@ def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
 def _circle(args: argparse.Namespace, rule: "InputRule") -> Document:
     from math import isfinite, radians
 
-    from robocal_ros.tool.beam_edges import debounced
-    from robocal_ros.tool.circle_edges import CircleMotion
-    from robocal_ros.tool.crossed_beams import fit_circle
-    from robocal_ros.tool.documents import circle_document
-    from robocal_ros.tool.tables import read_edges
+    from robocal_ros.tool.crossed_model import fit_circle
+    from robocal_ros.tool.edges import CircleMotion, debounced
+    from robocal_ros.tool.files import read_edges
+    from robocal_ros.tool.quick_check import circle_document
 
     start_deg = args.start_deg or 0.0
     beam_angle_deg = 90.0 if args.beam_angle_deg is None else args.beam_angle_deg

@@ -13,7 +13,7 @@ from robocal_ros.ground.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.tool.beam_edges import InputRule
+    from robocal_ros.tool.edges import InputRule
 
 NEEDED = ("joints", "robot", "laser")
 
@@ -36,12 +36,12 @@ def add_run_options(parser: "argparse._ActionsContainer") -> None:
 def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.tool.crossed_run import estimate_tool
-    from robocal_ros.tool.documents import classic_run_document, run_document
     from robocal_ros.tool.driven_circle import classic_from_path
+    from robocal_ros.tool.files import read_joint_path, read_step_edges
     from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
-    from robocal_ros.tool.laser_files import read_laser_for
-    from robocal_ros.tool.named_steps import named_steps
-    from robocal_ros.tool.tables import read_joint_path, read_step_edges
+    from robocal_ros.tool.laser_frame import read_laser_for
+    from robocal_ros.tool.measuring_plan import named_steps
+    from robocal_ros.tool.quick_check import classic_run_document, run_document
 
     missing = [f"--{name}" for name in NEEDED if getattr(args, name) is None]
     if missing:

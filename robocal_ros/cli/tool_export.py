@@ -12,7 +12,7 @@ from robocal_ros.ground.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.tool.exports import Load
+    from robocal_ros.tool.files import Load
 
 NAME = "export"
 HELP = "print a tool's frame for a controller, or for URDF"
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.ground.frames import transform_document
-    from robocal_ros.tool.exports import exported
+    from robocal_ros.tool.files import exported
 
     T_flange_tool = given_frame(args)
     if T_flange_tool is None:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> CliResult:
 
 
 def _load(args: argparse.Namespace) -> "Load | None":
-    from robocal_ros.tool.exports import Load
+    from robocal_ros.tool.files import Load
 
     if args.mass_kg is None and args.cog_mm is None:
         return None

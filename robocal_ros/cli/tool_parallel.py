@@ -45,10 +45,9 @@ def run(args: argparse.Namespace) -> CliResult:
     from math import isfinite
 
     from robocal_ros.ground.errors import InputError
-    from robocal_ros.tool.documents import parallel_document
-    from robocal_ros.tool.parallel_beams import ParallelBeams
-    from robocal_ros.tool.parallel_sweeps import fit_parallel
-    from robocal_ros.tool.tables import read_sweeps
+    from robocal_ros.tool.files import read_sweeps
+    from robocal_ros.tool.parallel_beams import ParallelBeams, fit_parallel
+    from robocal_ros.tool.quick_check import parallel_document
 
     if not all(map(isfinite, (args.up_mm, args.down_mm, args.x_mm or 0.0))):
         raise InputError("--up-mm, --down-mm and --x-mm must be finite numbers")

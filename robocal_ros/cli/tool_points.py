@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.tool.documents import touch_document
-    from robocal_ros.tool.tables import read_flange_poses
+    from robocal_ros.tool.files import read_flange_poses
+    from robocal_ros.tool.quick_check import touch_document
     from robocal_ros.tool.touch_points import fit_four, fit_seven
 
     fit = {"four": fit_four, "seven": fit_seven}[args.method]

@@ -11,8 +11,7 @@ from robocal_ros.ground.frames import transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Outcome
-from robocal_ros.tool.inputs import take_tool_message
-from robocal_ros.tool.recorded import tool_session_as_recorded
+from robocal_ros.tool.recorded import take_tool_message, tool_session_as_recorded
 from robocal_ros.tool.session import ToolSession
 
 

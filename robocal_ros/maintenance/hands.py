@@ -12,7 +12,7 @@ from robocal_ros.maintenance.mover import FaultError, Mover
 from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.maintenance.ways import HOME, STATION, Route, Ways
 from robocal_ros.motion.gap import Gap
-from robocal_ros.tool.phases import SETTLED_S, STANDS_S
+from robocal_ros.tool.driving import SETTLED_S, STANDS_S
 from robocal_ros.tool.results import QUICK
 
 DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot

@@ -16,7 +16,7 @@ from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.joint_poses import MM, joint_poses, joints_of
 from robocal_ros.ros.parameters import Setting, length
 from robocal_ros.ros.pose_settings import given_pose, pose_settings
-from robocal_ros.tool.laser_files import read_laser_for
+from robocal_ros.tool.laser_frame import read_laser_for
 
 SHORTEST_SILENCE_S = 2.0
 

@@ -11,7 +11,7 @@ from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.requests import BeginCycle, DriverAnswer, EndCycle
 from robocal_ros.maintenance.ways import HOME
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
-from robocal_ros.tool.phases import STANDS_S
+from robocal_ros.tool.driving import STANDS_S
 
 Array = NDArray[np.float64]
 

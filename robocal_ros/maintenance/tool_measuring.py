@@ -12,7 +12,7 @@ from robocal_ros.maintenance.memory import Memory, ToolRecord
 from robocal_ros.maintenance.mover import FaultError
 from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.thermal.accuracy import ToolError
-from robocal_ros.tool.phases import STANDS_S
+from robocal_ros.tool.driving import STANDS_S
 from robocal_ros.tool.results import FULL, QUICK
 
 FAILED = (  # without a result they say that something is wrong with the tool, or its measurement

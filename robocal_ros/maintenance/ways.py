@@ -18,7 +18,7 @@ from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import ToolBody
 from robocal_ros.motion.plan import JointPlan, joined
 from robocal_ros.motion.travel import along, departure, joint_way, raised_way
-from robocal_ros.tool.measuring_motion import least_s
+from robocal_ros.tool.driving import least_s
 
 Array = NDArray[np.float64]
 

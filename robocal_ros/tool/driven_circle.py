@@ -7,11 +7,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError
-from robocal_ros.tool.beam_edges import BEAMS, BeamEdge, BeamError, edges_of
-from robocal_ros.tool.circle_edges import FEWEST_EDGES, CircleMotion
-from robocal_ros.tool.classic_run import CommandedCircle, classic_tool
 from robocal_ros.tool.crossed_model import BeamStep
-from robocal_ros.tool.crossed_run import LARGEST_MISFIT_M
+from robocal_ros.tool.crossed_run import LARGEST_MISFIT_M, CommandedCircle, classic_tool
+from robocal_ros.tool.edges import BEAMS, FEWEST_EDGES, BeamEdge, BeamError, CircleMotion, edges_of
 from robocal_ros.tool.flange_path import FlangePath
 from robocal_ros.tool.laser_frame import LaserFrame
 

@@ -1,12 +1,40 @@
-"""Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
+"""Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print.
 
+Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
+W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB a
+unit quaternion, real part first; Universal Robots a rotation vector.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
+from robocal_ros.ground.cells import Cells, read_cells
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
+from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields
+from robocal_ros.kinematics.tables import (
+    ORIENTATIONS,
+    check_plain,
+    orientation_columns,
+    read_joint_columns,
+    read_rotations,
+    read_stamps,
+)
+from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge
+from robocal_ros.tool.flange_path import JointPath
+from robocal_ros.tool.measuring_plan import STEP_NAMES, step_kind
+from robocal_ros.tool.parallel_beams import HEIGHTS, SWEEPS, Height
+
+# ---- files --------------------------------------------------------------------------------------
+
 
 Array = NDArray[np.float64]
 
@@ -46,3 +74,248 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     if rotation is None:
         top.fail("is missing or null: give the tool's roll, pitch and yaw too", "quat_xyzw")
     return frames.transform(rotation, xyz)
+
+
+# ---- a tool frame in the words of a robot's controller ------------------------------------------
+
+
+Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]
+
+ABB_UNKNOWN = "1,[0,0,1]"  # ABB takes no load without mass or with its centre in the flange
+ABB_REMARK = "! mass and centre of gravity are placeholders: enter this tool's, in kg and mm\n"
+
+
+@dataclass(frozen=True)
+class Load:
+    """What ABB's tooldata holds beside the frame.
+
+    Attributes
+    ----------
+    mass_kg : of the tool, above 0.
+    centre : (x, y, z) of gravity in the flange frame, m.
+    """
+
+    mass_kg: float
+    centre: tuple[float, float, float]
+
+
+def exported(T_flange_tool: Array, format: Format, load: Load | None = None) -> str:
+    """Text for a controller, with 1e-4 mm and 1e-5 deg; ``load`` is for ABB."""
+    if format == "abb":
+        return _abb(T_flange_tool, load)
+    return _FORMATS[format](T_flange_tool)
+
+
+def _place_mm(T: Array) -> list[str]:
+    return fixed(T[:3, 3] * 1e3, 4)
+
+
+def _rpy_deg(T: Array) -> list[str]:
+    return fixed(np.degrees(frames.rpy(T[:3, :3])), 5)
+
+
+def _urdf(T: Array) -> str:
+    return urdf_joint("tool0", "tcp", *urdf_origin(T))
+
+
+def _kuka(T: Array) -> str:
+    x, y, z = _place_mm(T)
+    c, b, a = _rpy_deg(T)
+    return f"$TOOL={{X {x},Y {y},Z {z},A {a},B {b},C {c}}}"
+
+
+def _fanuc(T: Array) -> str:
+    x, y, z = _place_mm(T)
+    w, p, r = _rpy_deg(T)
+    return f"X {x}  Y {y}  Z {z}\nW {w}  P {p}  R {r}"
+
+
+def _ur(T: Array) -> str:
+    pose = fixed(T[:3, 3], 7) + fixed(frames.log_rotation(T[:3, :3]), 8)
+    return f"set_tcp(p[{','.join(pose)}])"
+
+
+def _abb(T: Array, load: Load | None) -> str:
+    x, y, z, w = fixed(frames.quat_xyzw(T), 9)
+    place, turn = ",".join(_place_mm(T)), ",".join((w, x, y, z))
+    weight, remark = ABB_UNKNOWN, ABB_REMARK
+    if load is not None:
+        centre = ",".join(fixed(np.array(load.centre) * 1e3, 3))
+        weight, remark = f"{load.mass_kg:.3f},[{centre}]", ""
+    frame = f"[[{place}],[{turn}]]"
+    return f"{remark}PERS tooldata tcp:=[TRUE,{frame},[{weight},[1,0,0,0],0,0,0]];"
+
+
+_FORMATS: Mapping[str, Callable[[Array], str]] = {
+    "urdf": _urdf,
+    "kuka": _kuka,
+    "fanuc": _fanuc,
+    "ur": _ur,
+}
+
+
+# ---- tables about tools: points of light beams, edges, flange poses (docs/tool.md) --------------
+
+
+POSITION = ("x_mm", "y_mm", "z_mm")
+STATES = {"1": True, "true": True, "0": False, "false": False}
+
+
+def read_beam_points(path: Path) -> dict[str, Array]:
+    """Flange positions (3,), base, m, by the name of their edge; of one measured often the mean.
+
+    Raises
+    ------
+    InputError
+        With file, row and column, when the table is not as docs/tool.md says.
+    """
+    table = read_cells(path, lambda header, file: check_plain(header, file, ("point", *POSITION)))
+    positions = _positions(table)
+    names = np.array(table.words("point"))
+    return {str(name): positions[names == name].mean(axis=0) for name in dict.fromkeys(names)}
+
+
+def read_edges(path: Path, sigma_s: float) -> list[BeamEdge]:
+    """Edges of one motion, with ``sigma_s`` where the table has none of its own.
+
+    Raises
+    ------
+    InputError
+        As `read_beam_points`; when the table names several steps.
+    """
+    table = _edge_table(path)
+    steps = dict.fromkeys(table.words("step"))
+    if len(steps) > 1:
+        raise InputError(
+            f"holds the steps {', '.join(steps)}: give --joints, --robot and --laser for a whole "
+            "run, or one circle alone",
+            file=table.file,
+            column="step",
+        )
+    return _edges(table, sigma_s, 0)
+
+
+def read_step_edges(
+    path: Path, sigma_s: float, origin_ns: int
+) -> tuple[list[BeamEdge], tuple[str, ...]]:
+    """Edges of a whole run, their times counted from ``origin_ns``, and the step of each.
+
+    Raises
+    ------
+    InputError
+        As `read_beam_points`; when a name says neither circle nor plunge.
+    """
+    table = _edge_table(path)
+    steps = table.words("step")
+    if not steps:
+        raise InputError(
+            f"column step is missing: it names the motion of each edge; {STEP_NAMES}",
+            file=table.file,
+            row=1,
+        )
+    for index, step in enumerate(steps):
+        if step_kind(step) is None:
+            table.fail(f"{quoted(step)} is no step; {STEP_NAMES}", index, "step")
+    return _edges(table, sigma_s, origin_ns), steps
+
+
+def _edge_table(path: Path) -> Cells:
+    required, optional = ("stamp_s", "beam", "blocked"), ("sigma_s", "step")
+    return read_cells(path, lambda header, file: check_plain(header, file, required, optional))
+
+
+def _edges(table: Cells, sigma_s: float, origin_ns: int) -> list[BeamEdge]:
+    beams, states = table.words("beam"), table.words("blocked")
+    for index, (beam, state) in enumerate(zip(beams, states, strict=True)):
+        if beam not in BEAMS:
+            table.fail(f"'{beam}' is not one of {', '.join(BEAMS)}", index, "beam")
+        if state.lower() not in STATES:
+            table.fail(f"'{state}' is neither 1 (blocked) nor 0", index, "blocked")
+    names: dict[str, Beam] = {name: name for name in BEAMS}
+    times = (read_stamps(table) - origin_ns) * 1e-9
+    sigma = np.full(len(times), sigma_s)
+    if "sigma_s" in table.columns:
+        sigma = table.numbers("sigma_s")
+        if np.any(sigma <= 0.0):
+            table.fail("no stamp is exact", int(np.argmax(sigma <= 0.0)), "sigma_s")
+    return [
+        BeamEdge(names[beam], STATES[state.lower()], time, spread)
+        for beam, state, time, spread in zip(
+            beams, states, times.tolist(), sigma.tolist(), strict=True
+        )
+    ]
+
+
+def read_joint_path(path: Path, arm: SerialArm) -> tuple[JointPath, int]:
+    """The flange over time from a table of joint readings, and the origin of its times, ns.
+
+    Raises
+    ------
+    InputError
+        As `read_beam_points`; when stamps do not increase.
+    TooFewSamplesError
+        Fewer than four readings.
+    """
+    found: list[tuple[tuple[str, ...], Array]] = []
+    table = read_cells(
+        path, lambda header, file: found.append(read_joint_columns(header, arm, file))
+    )
+    columns, factors = found[0]
+    q = np.column_stack([table.numbers(name) for name in columns]) * factors
+    stamps = read_stamps(table)
+    late = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(late):
+        table.fail("is not after the row before it", int(late[0]) + 1, "stamp_s")
+    origin_ns = int(stamps[0])
+    return JointPath(arm, np.asarray((stamps - origin_ns) * 1e-9, dtype=np.float64), q), origin_ns
+
+
+def read_flange_poses(path: Path) -> Array:
+    """T_base_flange (m, 4, 4).
+
+    Raises
+    ------
+    InputError
+        As `read_beam_points`; without an orientation.
+    """
+    return _poses(path)[1]
+
+
+def read_sweeps(path: Path) -> dict[tuple[str, Height], Array]:
+    """T_base_flange (m, 4, 4) at the edges of parallel beams, by sweep and beam.
+
+    Raises
+    ------
+    InputError
+        As `read_flange_poses`; when a sweep or a beam has another name than docs/tool.md says.
+    """
+    table, T = _poses(path, ("sweep", "beam"))
+    sweeps, beams = table.words("sweep"), table.words("beam")
+    found: dict[tuple[str, Height], list[int]] = {}
+    heights: dict[str, Height] = {name: name for name in HEIGHTS}
+    for index, (sweep, beam) in enumerate(zip(sweeps, beams, strict=True)):
+        for column, name, known in (("sweep", sweep, SWEEPS), ("beam", beam, HEIGHTS)):
+            if name not in known:
+                table.fail(f"{quoted(name)} is not one of {', '.join(known)}", index, column)
+        found.setdefault((sweep, heights[beam]), []).append(index)
+    return {key: T[rows] for key, rows in found.items()}
+
+
+def _poses(path: Path, words: tuple[str, ...] = ()) -> tuple[Cells, Array]:
+    """A table of flange poses with further columns of words, and T_base_flange (m, 4, 4)."""
+    every = [name for names in ORIENTATIONS for name in names]
+    required = (*words, *POSITION)
+
+    def check(header: list[str], file: str) -> None:
+        check_plain(header, file, required, every)
+        if orientation_columns([name.strip() for name in header], file) is None:
+            check_plain(header, file, (*required, *ORIENTATIONS[-1]), every)
+
+    table = read_cells(path, check)
+    kind = orientation_columns(list(table.columns), table.file)
+    R = read_rotations(table, kind or ORIENTATIONS[-1])
+    return table, frames.transform(R, _positions(table))
+
+
+def _positions(table: Cells) -> Array:
+    return 1e-3 * np.column_stack([table.numbers(name) for name in POSITION])

@@ -11,7 +11,7 @@ from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.tool.crossed_run import ToolEstimate
-from robocal_ros.tool.tool_axis import minimal_rotation
+from robocal_ros.tool.flange_path import minimal_rotation
 from robocal_ros.tool.witness import BendRule, Witness, bend_or_station
 
 Array = NDArray[np.float64]

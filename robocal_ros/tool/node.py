@@ -25,17 +25,14 @@ from robocal_ros.ros.run import run
 from robocal_ros.ros.stamp_watch import StampWatch
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool import node_motion
-from robocal_ros.tool.edge_log import EDGES
-from robocal_ros.tool.in_force import ToolInForce
-from robocal_ros.tool.inputs import take_tool_message
-from robocal_ros.tool.laser_files import read_laser_for
-from robocal_ros.tool.measuring_motion import load_measuring
+from robocal_ros.tool.driving import load_measuring
+from robocal_ros.tool.edges import EDGES
+from robocal_ros.tool.laser_frame import read_laser_for
 from robocal_ros.tool.measuring_plan import PlannedStep
 from robocal_ros.tool.node_motion import TcfMotion
-from robocal_ros.tool.outputs import TcfOutputs
-from robocal_ros.tool.recorded import configuration
-from robocal_ros.tool.results import WITNESS, WITNESS_REFERENCE
-from robocal_ros.tool.services import Runner, TcfServices
+from robocal_ros.tool.recorded import configuration, take_tool_message
+from robocal_ros.tool.results import WITNESS, WITNESS_REFERENCE, ToolInForce
+from robocal_ros.tool.services import Runner, TcfOutputs, TcfServices
 from robocal_ros.tool.session import ToolSession
 from robocal_ros.tool.settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 

@@ -23,7 +23,7 @@ from robocal_ros.ros.parameters import Setting, length
 from robocal_ros.ros.steady_clock import SteadyClock
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver
-from robocal_ros.tool.edge_samples import RESTORE
+from robocal_ros.tool.edges import RESTORE
 from robocal_ros.tool.session import ToolSession
 
 TICK_S = 0.01

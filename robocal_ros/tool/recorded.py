@@ -1,14 +1,21 @@
 """A tool session's settings for the record, and a session that starts where a recorded one did."""
 
 from collections.abc import Mapping
+from typing import Any
 
+from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL
+from robocal_ros.ground.samples import JOINTS, joint_sample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.base import configured_with, recorded_arguments
 from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command
-from robocal_ros.tool.config import ToolConfig
+from robocal_ros.tool.edges import EDGES, edge_sample
+from robocal_ros.tool.run import ToolConfig
 from robocal_ros.tool.session import ToolSession
+
+# ---- recorded -----------------------------------------------------------------------------------
+
 
 IN_FORCE = {"model": THERMAL, "tool": TOOL, "healthy": HEALTHY_TOOL}
 OWN = "healthy"  # only a tool session's configuration has it
@@ -52,3 +59,17 @@ def tool_session_as_recorded(
     in_force[MANDREL] = configured.arguments.get("mandrel")  # older recordings have none
     seeded(history, nominal, in_force, software)
     return ToolSession(nominal, history, config, software)
+
+
+# ---- messages into the tool session: the same for live topics and for recorded ones -------------
+
+
+def take_tool_message(session: ToolSession, kind: str, message: Any) -> None:
+    """Give a message to the session; one that cannot be used is counted with its reason."""
+    try:
+        if kind == JOINTS:
+            session.add(joint_sample(message))
+        elif kind == EDGES:
+            session.add(edge_sample(message, session.config.beams))
+    except RobocalError as error:
+        session.ignored.add(kind, str(error))

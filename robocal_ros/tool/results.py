@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.errors import Code, ConflictError
-from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, TOOL, Proposal
+from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head, Proposal
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.session.base import HistoryFollower
 from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.tool.change_documents import change_document, check_document
-from robocal_ros.tool.config import ToolConfig, made_with
 from robocal_ros.tool.crossed_model import Held
-from robocal_ros.tool.documents import run_document
-from robocal_ros.tool.in_force import ToolInForce
+from robocal_ros.tool.crossed_run import RunTraits
 from robocal_ros.tool.judging import (
     KnownTool,
     change_between,
@@ -30,11 +29,93 @@ from robocal_ros.tool.judging import (
     witness_of,
 )
 from robocal_ros.tool.mandrel import StationFinding, station_finding, with_mandrel
-from robocal_ros.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
-from robocal_ros.tool.run import ToolRun
+from robocal_ros.tool.quick_check import (
+    Answer,
+    QuickCheck,
+    change_document,
+    check_document,
+    quick_check,
+    run_document,
+    sideways_check,
+)
+from robocal_ros.tool.run import ToolConfig, ToolRun, made_with
 from robocal_ros.tool.witness import SMALL_M, Witness
 
+# ---- the tool in force and the thermal model that its flange poses come from --------------------
+
+
 Array = NDArray[np.float64]
+
+
+class ToolInForce(HistoryFollower):
+    """What the history has in force for a tool, as of the last look.
+
+    Attributes
+    ----------
+    head, thermal, healthy, mandrel : heads of the tools, of the thermal models and of the
+        measurements of the healthy tool and of the mandrel.
+    """
+
+    def __init__(self, history: History, nominal: SerialArm, config: ToolConfig) -> None:
+        self._nominal = nominal
+        self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
+        self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
+        super().__init__(history, TOOL)
+
+    def _read(self) -> None:
+        super()._read()
+        self.thermal: Head = self._history.head(THERMAL)
+        self.healthy: Head = self._history.head(HEALTHY_TOOL)
+        self.mandrel: Head = self._history.head(MANDREL)
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the thermal model in force."""
+        model = self.thermal.model
+        return self._nominal if model is None else arm_of(model, self._nominal)
+
+    @property
+    def tool(self) -> KnownTool:
+        """The tool in force; without one the taught one."""
+        model = self.head.model
+        return self._taught if model is None else KnownTool.of_document(model)
+
+    @property
+    def anchor(self) -> Array:
+        """Tip (3,) of the last tool whose cause was known: in force, or before small changes."""
+        known = (self.head.model or {}).get("anchor")
+        return self.tool.T_flange_tool[:3, 3] if known is None else np.array(known)
+
+    @property
+    def measured_healthy(self) -> KnownTool | None:
+        """How the healthy tool was measured; None without, or with another tool or station."""
+        model = self._healthy_model
+        return None if model is None else KnownTool.of_document(model)
+
+    @property
+    def healthy_traits(self) -> RunTraits | None:
+        """What its run showed beside the tool; None where that is not known."""
+        model = self._healthy_model
+        traits = None if model is None else model.get("traits")
+        return None if traits is None else RunTraits.of_document(traits)
+
+    @property
+    def measured_mandrel(self) -> KnownTool | None:
+        """How the mandrel was measured; None without, or with another one or another station."""
+        model = self.mandrel.model
+        if model is None or model["made_with"] != self._made_with:
+            return None
+        return KnownTool.of_document(model) if model["mandrel"] == self._mandrel else None
+
+    @property
+    def _healthy_model(self) -> dict[str, Any] | None:
+        model = self.healthy.model
+        return None if model is None or model["made_with"] != self._made_with else model
+
+
+# ---- results ------------------------------------------------------------------------------------
+
+
 Document = dict[str, Any]
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"

@@ -4,19 +4,34 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import Quaternion, TransformStamped
+from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.qos import QoSProfile
 from robocal_msgs.action import MeasureTool
-from robocal_msgs.msg import ToolFrame, ToolStep
+from robocal_msgs.msg import CalibrationQuality, ToolFrame, ToolStep
 from std_srvs.srv import Trigger
 
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, RobocalError
+from robocal_ros.ground.frames import Document
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.ros import conversions, qos
+from robocal_ros.ros.conversions import header, pose_message, transform_message
 from robocal_ros.ros.decision_services import DecisionServices
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
+from robocal_ros.ros.session_events import SessionEvents
+from robocal_ros.ros.static_tf import StaticTf
 from robocal_ros.session.events import Outcome
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.measuring_plan import PlannedStep
 from robocal_ros.tool.results import FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE
+
+# ---- services -----------------------------------------------------------------------------------
+
 
 MODES = {
     MeasureTool.Goal.FULL: FULL,
@@ -188,3 +203,170 @@ def _fill(result: Any, document: Any) -> None:
     result.deviation_mm = float(change.get("tip_mm", 0.0))
     result.deviation_deg = float(change.get("axis_deg", 0.0))
     result.sigma_mm = float(np.max(sigma))
+
+
+# ---- steps and tools as messages: pure mapping --------------------------------------------------
+
+
+Array = NDArray[np.float64]
+
+KINDS = {"circle": ToolStep.CIRCLE, "plunge": ToolStep.PLUNGE}
+
+
+def step_message(step: PlannedStep, run: int, stamp_ns: int, frame: str) -> ToolStep:
+    """A step that is awaited."""
+    turn = frames.quat_xyzw(frames.transform(step.R_base_laser, np.zeros(3))).tolist()
+    return ToolStep(
+        header=header(stamp_ns, frame),
+        run=run,
+        number=step.number,
+        of=step.of,
+        kind=KINDS[step.kind],
+        name=step.name,
+        flange=pose_message(step.T_base_flange),
+        laser=Quaternion(**dict(zip("xyzw", turn, strict=True))),
+        radius=step.radius_m,
+        speed=step.speed_m_s,
+        direction=step.direction,
+        start_angle=step.start_rad,
+        depth=step.depth_m,
+        text=step_words(step),
+    )
+
+
+def step_words(step: PlannedStep) -> str:
+    """A step for a person who drives the robot."""
+    where = ", ".join(f"{1e3 * x:.2f}" for x in step.T_base_flange[:3, 3])
+    place = f"step {step.number} of {step.of}, {step.name}: flange at ({where}) mm"
+    speed = f"{step.speed_m_s * 1e3:.0f} mm/s"
+    if step.kind == "plunge":
+        return f"{place}, down by {step.depth_m * 1e3:.1f} mm and up again at {speed}"
+    way = "counter-clockwise" if step.direction > 0 else "clockwise"
+    return f"{place}, once round it {way} at {step.radius_m * 1e3:.1f} mm and {speed}"
+
+
+class ToolMessages:
+    """Tools of one robot as messages.
+
+    Parameters
+    ----------
+    flange, tool : names of the frames.
+    """
+
+    def __init__(
+        self, nominal: SerialArm, serial: str, robot_file_hash: str, flange: str, tool: str
+    ) -> None:
+        self._nominal, self._serial = nominal, serial
+        self._robot_file_hash = robot_file_hash
+        self._flange, self._tool = flange, tool
+
+    def frame(
+        self, known: KnownTool, revision: int, thermal_revision: int, state: int, stamp_ns: int
+    ) -> ToolFrame:
+        """A tool with where it comes from."""
+        flat = np.zeros(0) if known.covariance is None else known.covariance.ravel()
+        return ToolFrame(
+            header=header(stamp_ns, self._flange),
+            child_frame_id=self._tool,
+            robot=self._nominal.name,
+            serial=self._serial,
+            model_hash=self._nominal.model_hash,
+            robot_file_hash=self._robot_file_hash,
+            revision=revision,
+            thermal_revision=thermal_revision,
+            tool=transform_message(known.T_flange_tool),
+            covariance=flat.tolist(),
+            state=state,
+        )
+
+    def transform(self, known: KnownTool, stamp_ns: int) -> TransformStamped:
+        """A tool as a transform below the flange."""
+        return TransformStamped(
+            header=header(stamp_ns, self._flange),
+            child_frame_id=self._tool,
+            transform=transform_message(known.T_flange_tool),
+        )
+
+
+# ---- what the tool node says: its topics, and how results get onto them -------------------------
+
+
+AddOutput = Callable[[type, str, QoSProfile], Any]
+
+
+class TcfOutputs:
+    """Publishers of one tool's results.
+
+    Parameters
+    ----------
+    add : creates a publisher.
+    base : name of the base frame.
+
+    Attributes
+    ----------
+    missing : what cannot be published on this machine; empty when everything can.
+    """
+
+    def __init__(
+        self,
+        add: AddOutput,
+        nominal: SerialArm,
+        serial: str,
+        robot_file_hash: str,
+        frames: tuple[str, str, str],
+    ) -> None:
+        self._base, flange, tool = frames
+        self._nominal, self._serial = nominal, serial
+        self._messages = ToolMessages(nominal, serial, robot_file_hash, flange, tool)
+        self._step = add(ToolStep, "~/next_step", qos.LATCHED)
+        self._candidate = add(ToolFrame, "~/candidate", qos.LATCHED)
+        self._tool = add(ToolFrame, "~/tool", qos.LATCHED)
+        self._frame = add(TransformStamped, "~/tool_frame", qos.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self.events = SessionEvents(add)
+        self._tf = StaticTf(add)
+        self.missing = self._tf.missing
+
+    def step(self, step: PlannedStep | None, run: int, stamp_ns: int) -> ToolStep:
+        """Say what is awaited; None: nothing is."""
+        stamp = conversions.header(stamp_ns, self._base)
+        message = (
+            ToolStep(header=stamp, run=run)
+            if step is None
+            else step_message(step, run, stamp_ns, self._base)
+        )
+        self._step.publish(message)
+        return message
+
+    def tool(self, known: KnownTool, revision: int, thermal: int, stamp_ns: int) -> None:
+        """Say what is in force."""
+        state = ToolFrame.ACCEPTED if revision else ToolFrame.NONE
+        self._tool.publish(self._messages.frame(known, revision, thermal, state, stamp_ns))
+        transform = self._messages.transform(known, stamp_ns)
+        self._frame.publish(transform)
+        self._tf.publish([transform])
+
+    def frame(self, model: Document, stamp_ns: int) -> ToolFrame:
+        """A measured tool."""
+        known, thermal = KnownTool.of_document(model), int(model["thermal_revision"])
+        return self._messages.frame(known, 0, thermal, ToolFrame.CANDIDATE, stamp_ns)
+
+    def candidate(self, model: Document, stamp_ns: int) -> None:
+        """Show what was measured."""
+        self._candidate.publish(self.frame(model, stamp_ns))
+
+    def quality(self, outcome: Outcome) -> None:
+        """Show the verdict on a run."""
+        document = outcome.document or {}
+        message = conversions.verdict_message(
+            outcome,
+            robot=self._nominal.name,
+            serial=self._serial,
+            stamp=conversions.header(outcome.command.stamp_ns or 0, self._base),
+            cycle_id=str(document.get("cycle_id", "")),
+        )
+        if "misfit_mm" in document:
+            message.candidate_rms_mm = float(document["misfit_mm"])
+        if "sigma_mm" in document:
+            message.predicted_rms_mm = float(np.max(document["sigma_mm"]))
+        self._quality.publish(message)

@@ -13,14 +13,10 @@ from robocal_ros.session import events
 from robocal_ros.session.base import Commanded, Handler
 from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.tool.beam_edges import BeamError
-from robocal_ros.tool.config import ToolConfig
-from robocal_ros.tool.edge_log import AHEAD_NS, EDGES, MOST_EDGES, EdgeLog
-from robocal_ros.tool.edge_samples import EdgeSample
-from robocal_ros.tool.in_force import ToolInForce
+from robocal_ros.tool.edges import AHEAD_NS, EDGES, MOST_EDGES, BeamError, EdgeLog, EdgeSample
 from robocal_ros.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
-from robocal_ros.tool.results import FULL, MODES, QUICK, ToolResults
-from robocal_ros.tool.run import ToolRun
+from robocal_ros.tool.results import FULL, MODES, QUICK, ToolInForce, ToolResults
+from robocal_ros.tool.run import ToolConfig, ToolRun
 
 AHEAD_S = AHEAD_NS * 1e-9
 BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges themselves show

@@ -10,14 +10,14 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import Setting, length
 from robocal_ros.ros.pose_settings import given_pose, pose_settings
-from robocal_ros.tool.beam_edges import InputRule
-from robocal_ros.tool.config import ToolConfig, rows_of
 from robocal_ros.tool.crossed_model import RobotNoise
+from robocal_ros.tool.crossed_run import TraitLimits
+from robocal_ros.tool.edges import InputRule
 from robocal_ros.tool.judging import ToolLimits
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.measuring_plan import MeasuringMotion
 from robocal_ros.tool.quick_check import CheckRule
-from robocal_ros.tool.run_traits import TraitLimits
+from robocal_ros.tool.run import ToolConfig, rows_of
 
 PROGRAM, TRAJECTORY = "program", "trajectory"
 

@@ -22,8 +22,7 @@ from robocal_ros.cell_sim.tool_cell import MeasuredRun, ToolCell
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, RobotNoise
-from robocal_ros.tool.laser_files import LaserFile, write_laser
-from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.tool.laser_frame import LaserFile, LaserFrame, calibrate_laser, write_laser
 
 Q_NEAR = np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618])
 T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.04, 0.01]), [0.7994, -0.1263, 0.1945])

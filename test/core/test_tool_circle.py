@@ -9,15 +9,14 @@ from robocal_ros.cell_sim.beam_moves import Circle
 from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ResidualError
-from robocal_ros.tool.beam_edges import BeamEdge, BeamError
-from robocal_ros.tool.circle_edges import CircleMotion, label_edges
-from robocal_ros.tool.crossed_beams import (
+from robocal_ros.tool.crossed_model import (
     CircleProblem,
     CircleState,
     classic_distances,
     closed_form,
     fit_circle,
 )
+from robocal_ros.tool.edges import BeamEdge, BeamError, CircleMotion, label_edges
 
 RADIUS, PERIOD, START = 0.012, 2.0, np.radians(45.0)
 BETA = np.radians(92.2)

@@ -7,7 +7,7 @@ from beam_cell import make_cell
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.cell_sim.ur10_station import TAUGHT
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
-from robocal_ros.tool.beam_edges import BeamEdge, BeamError, InputRule, debounced, edges_of
+from robocal_ros.tool.edges import BeamEdge, BeamError, InputRule, debounced, edges_of
 from robocal_ros.tool.flange_path import JointPath
 
 SIGMA = 2e-5

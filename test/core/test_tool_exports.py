@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground import frames
-from robocal_ros.tool.exports import Load, exported
+from robocal_ros.tool.files import Load, exported
 
 NUMBER = r"-?\d+(?:\.\d+)?"
 TURNS = [

@@ -18,14 +18,14 @@ from robocal_ros.cell_sim.beams import (
 from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, T_BASE_LASER, laser_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError
-from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.tool.tool_axis import (
+from robocal_ros.tool.flange_path import (
     axis_from_centres,
     first_rotation,
     minimal_rotation,
     retaught,
     upright_pose,
 )
+from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
 
 PUBLISHED_MM = {  # thesis table 5-3
     "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),

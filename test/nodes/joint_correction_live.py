@@ -20,7 +20,7 @@ from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import conversions, qos
 from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.messages import ToolMessages
+from robocal_ros.tool.services import ToolMessages
 
 NOMINAL = load_robot("kr150_r3100")
 NAMES = list(NOMINAL.joint_names)

@@ -24,9 +24,9 @@ from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground import frames
 from robocal_ros.ros import qos
 from robocal_ros.ros.conversions import header, transform_message
+from robocal_ros.tool.files import read_beam_points
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.tool.measuring_plan import MeasuringMotion, MeasuringPlan
-from robocal_ros.tool.tables import read_beam_points
 
 DEFAULTS = {setting.name: setting.default for setting in SETTINGS}
 ARM = straight_arm("ur10")

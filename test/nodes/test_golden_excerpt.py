@@ -31,10 +31,9 @@ from robocal_ros.ros.session_events import EVENTS
 from robocal_ros.session import events
 from robocal_ros.session.decisions import ONLY
 from robocal_ros.session.events import Command
-from robocal_ros.tool.inputs import take_tool_message
-from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
-from robocal_ros.tool.recorded import tool_session_as_recorded
+from robocal_ros.tool.recorded import take_tool_message, tool_session_as_recorded
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.session_events import EVENTS
 from robocal_ros.session.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
-from robocal_ros.tool.config import ToolConfig
-from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
+from robocal_ros.tool.run import ToolConfig
 
 BAGS = Path(__file__).parents[2] / "bags"
 EVENT_TOPIC = "/tcf_node/session_events"

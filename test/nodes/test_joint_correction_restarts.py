@@ -29,7 +29,7 @@ from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import qos
 from robocal_ros.session.decisions import bring_into_force
 from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.laser_frame import LaserFile, write_laser
 
 PERIOD_S = 0.02
 SPEED_RAD_S, SWING_RAD = 0.05, 0.1

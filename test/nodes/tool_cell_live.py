@@ -17,7 +17,7 @@ from robocal_ros.cell_sim.messages import planned_step
 from robocal_ros.cell_sim.tool_cell import ToolCell
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.ros import qos
-from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
 
 STATION = "north"

@@ -15,7 +15,7 @@ from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session.events import MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.tool.driving import DrivePhase, ToolDriver
-from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.edges import EdgeSample
 from robocal_ros.tool.session import ToolSession
 
 PERIOD_S = 0.008

@@ -25,8 +25,8 @@ from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.tool.config import made_with
 from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.run import made_with
 
 TICK_S = 0.02
 LAG_S = 0.02  # of the controller

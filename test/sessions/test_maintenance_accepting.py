@@ -43,7 +43,7 @@ from robocal_ros.motion.gap import STALL_S
 from robocal_ros.session.decisions import decide
 from robocal_ros.session.events import ACCEPT, WITHHOLD, Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.tool.config import rows_of
+from robocal_ros.tool.run import rows_of
 
 UNSOUND = (AccuracyLevel.FAULT, None)  # None: silent
 BESIDE = np.eye(4) + 1e-5 * np.eye(4, k=3)  # a hundredth of a millimetre

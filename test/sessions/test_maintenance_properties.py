@@ -45,8 +45,8 @@ from robocal_ros.maintenance.hands import DEAF_S
 from robocal_ros.maintenance.requests import DriverAnswer
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.tool.config import rows_of
 from robocal_ros.tool.driving import SETTLED_S
+from robocal_ros.tool.run import rows_of
 
 BUSY = (MaintenanceState.RUNNING, MaintenanceState.BREAKING_OFF)
 SERVICES = ("thermal", "arm", "disarm", "cancel", "measure", "sensor")

@@ -22,7 +22,7 @@ from robocal_ros.thermal import seeding
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import session_as_recorded
 from robocal_ros.thermal.session import ThermalSession
-from robocal_ros.tool import recorded as tool_recorded
+from robocal_ros.tool import recorded
 from robocal_ros.tool.session import ToolSession
 
 NS = 1_000_000_000
@@ -34,8 +34,8 @@ KINDS = {
     ),
     "tool": (
         lambda history: ToolSession(ARM, history, config_of(noisy_cell()), "test"),
-        tool_recorded.configuration,
-        tool_recorded.tool_session_as_recorded,
+        recorded.configuration,
+        recorded.tool_session_as_recorded,
     ),
     "hand-eye": (
         lambda history: HandEyeSession(ARM, history, HandEyeConfig(), "test"),

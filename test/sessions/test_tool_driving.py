@@ -11,7 +11,7 @@ from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.session.events import MEASURE_TOOL, Command
 from robocal_ros.tool.driving import DrivePhase
-from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.edges import EdgeSample
 from robocal_ros.tool.judging import KnownTool
 
 

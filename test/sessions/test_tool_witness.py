@@ -12,7 +12,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import TOOL, CalibrationState
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
-from robocal_ros.tool.config import rows_of
+from robocal_ros.tool.run import rows_of
 from robocal_ros.tool.session import ToolSession
 
 HARM_M = 1e-4  # more than this nobody may take for the tool's who has not proven it

@@ -14,9 +14,9 @@ from robocal_ros.cell_sim.robot_program import RobotProgram, Sample
 from robocal_ros.cell_sim.tool_cell import ToolCell
 from robocal_ros.cell_sim.ur10_station import TAUGHT
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
-from robocal_ros.tool.beam_edges import InputRule
-from robocal_ros.tool.config import ToolConfig, rows_of
 from robocal_ros.tool.crossed_model import RobotNoise
+from robocal_ros.tool.edges import InputRule
+from robocal_ros.tool.run import ToolConfig, rows_of
 from robocal_ros.tool.session import ToolSession
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.001], [0.025, 0.0375, 0.0])  # 80 mm above its tip

@@ -15,8 +15,8 @@ from robocal_ros.cell_sim.joint_motion import CYCLE_S
 from robocal_ros.cell_sim.standing import TICK_S
 from robocal_ros.cell_sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
 from robocal_ros.ground.errors import LimitError
-from robocal_ros.tool.beam_edges import BeamError, debounced
 from robocal_ros.tool.crossed_model import RobotNoise
+from robocal_ros.tool.edges import BeamError, debounced
 from robocal_ros.tool.laser_frame import calibrate_laser
 from robocal_ros.tool.measuring_plan import MeasuringPlan, PlannedStep
 

@@ -12,7 +12,7 @@ from robocal_ros.cell_sim.robot import shift, turn
 from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import Housing, ToolBody
-from robocal_ros.tool.measuring_motion import approach, measuring
+from robocal_ros.tool.driving import approach, measuring
 from robocal_ros.tool.measuring_plan import MeasuringPlan
 
 CROSSING = T_BASE_LASER[:3, 3]

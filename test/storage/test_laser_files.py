@@ -9,8 +9,13 @@ import yaml
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.files import read_tool
-from robocal_ros.tool.laser_files import LaserFile, read_laser, read_laser_for, write_laser
-from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.laser_frame import (
+    LaserFile,
+    LaserFrame,
+    read_laser,
+    read_laser_for,
+    write_laser,
+)
 
 POINTS = np.array(
     [[0.79367, -0.12861, 0.2], [0.80558, -0.12896, 0.2], [0.797, -0.1324, 0.2], [0.797, -0.12, 0.2]]
