@@ -31,8 +31,14 @@ from bench.tables import Goal, Table
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.hand_eye.mount_problem import PoseNoise
-from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
-from robocal_ros.hand_eye.planning import PlannedTarget, SensorRange, check_plan
+from robocal_ros.hand_eye.planning import (
+    PlannedLine,
+    PlannedSphere,
+    PlannedStairs,
+    PlannedTarget,
+    SensorRange,
+    check_plan,
+)
 from robocal_ros.hand_eye.quality import expected_error_m
 from robocal_ros.hand_eye.result import at_origin, increment
 from robocal_ros.hand_eye.targets import StepTarget

@@ -23,16 +23,16 @@ from bench.hand_eye_sets import (
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.hand_eye.board import boards_of_corners, see_boards
-from robocal_ros.hand_eye.camera_closed_forms import (
+from robocal_ros.hand_eye.camera import distances, rms
+from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
+from robocal_ros.hand_eye.camera_model import (
     CLOSED_FORMS,
     HAND_EYE,
+    PosePairs,
     closed_form,
     closed_form_of_all,
+    linearised,
 )
-from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
-from robocal_ros.hand_eye.camera_model import linearised
-from robocal_ros.hand_eye.camera_quality import distances, rms
-from robocal_ros.hand_eye.pose_pairs import PosePairs
 from robocal_ros.hand_eye.streams import pair_streams, pairs_at
 
 Array = NDArray[np.float64]

@@ -29,11 +29,10 @@ from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.ur10_station import Q_NEAR
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.hand_eye.joint import solve_joint
 from robocal_ros.hand_eye.mount_problem import pivot_of
 from robocal_ros.hand_eye.quality import expected_error_m
 from robocal_ros.hand_eye.result import HandEyeResult, at_origin, increment
-from robocal_ros.hand_eye.solve import field_of
+from robocal_ros.hand_eye.solve import field_of, solve_joint
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]

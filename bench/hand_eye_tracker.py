@@ -18,7 +18,7 @@ from robocal_ros.ground import frames
 from robocal_ros.hand_eye.tracker import solve_best, spread
 from robocal_ros.hand_eye.tracker_classic import solve_classic
 from robocal_ros.hand_eye.tracker_data import TrackerNoise
-from robocal_ros.hand_eye.tracker_state import SENSOR
+from robocal_ros.hand_eye.tracker_problem import SENSOR
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]

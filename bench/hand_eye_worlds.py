@@ -24,7 +24,6 @@ from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.profile_targets import Scene
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.diagnosis import look
 from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen
 from robocal_ros.hand_eye.mount_problem import (
     MountProblem,
@@ -34,11 +33,9 @@ from robocal_ros.hand_eye.mount_problem import (
     pivot_of,
 )
 from robocal_ros.hand_eye.result import increment
-from robocal_ros.hand_eye.sightings import Index, Sightings, TargetModel
-from robocal_ros.hand_eye.step_task import StepTask
-from robocal_ros.hand_eye.target_models import LineModel, SphereModel
+from robocal_ros.hand_eye.target_models import Index, LineModel, Sightings, SphereModel, TargetModel
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.hand_eye.tasks import LineTask, SphereTask, Task
+from robocal_ros.hand_eye.tasks import LineTask, SphereTask, StepTask, Task, look
 
 Array = NDArray[np.float64]
 

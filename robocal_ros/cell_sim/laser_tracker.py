@@ -14,7 +14,7 @@ from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.profile_targets import Ball, ScannedBody, Scene, block
 from robocal_ros.cell_sim.robot import shift, turn
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.profile import profile_of
+from robocal_ros.hand_eye.shots import profile_of
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.kinematics import SerialArm
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.laser_tracker import FEWEST_LIT, Sizes, TrackerCell, true_flange
 from robocal_ros.cell_sim.profile_targets import Ball, Scene
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.profile import Profile, profile_of
+from robocal_ros.hand_eye.shots import Profile, profile_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.inverse import inverse
 

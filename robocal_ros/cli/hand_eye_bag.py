@@ -13,19 +13,18 @@ from robocal_ros.bags.replay import topic_kind
 from robocal_ros.cli.recording import open_recording
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.streams import StandstillRule
-from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.config import HandEyeConfig, flange_poses
 from robocal_ros.hand_eye.data import data_set_of
-from robocal_ros.hand_eye.profile import Profile
 from robocal_ros.hand_eye.recorded import is_hand_eye_session
-from robocal_ros.hand_eye.shots import PROFILE
-from robocal_ros.hand_eye.standstills import (
+from robocal_ros.hand_eye.shots import (
+    PROFILE,
+    Profile,
     StandingShot,
     Standstills,
     captured_marks,
     first_of_each,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData
-from robocal_ros.hand_eye.thermal import flange_poses
 from robocal_ros.kinematics import SerialArm
 
 if TYPE_CHECKING:

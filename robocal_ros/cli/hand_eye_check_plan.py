@@ -128,7 +128,7 @@ def _planned(
 ) -> "PlannedTarget":
     import numpy as np
 
-    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
+    from robocal_ros.hand_eye.planning import PlannedLine, PlannedSphere, PlannedStairs
     from robocal_ros.hand_eye.targets import SphereTarget, StepTarget
 
     if isinstance(target, SphereTarget):
@@ -146,7 +146,7 @@ def _planned(
 
 def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[str] | None:
     """Marks of the stairs on which proposed poses lay the light."""
-    from robocal_ros.hand_eye.planned_targets import PlannedStairs
+    from robocal_ros.hand_eye.planning import PlannedStairs
 
     return list(target.lit(T_base_sensor)) if isinstance(target, PlannedStairs) else None
 

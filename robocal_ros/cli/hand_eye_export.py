@@ -38,8 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.ground.frames import transform_document
-    from robocal_ros.hand_eye.exports import exported
-    from robocal_ros.hand_eye.files import read_mount
+    from robocal_ros.hand_eye.files import exported, read_mount
 
     mount = read_mount(args.result, accepted=True)
     T, parent = mount.T_parent_sensor, args.parent or PARENTS[mount.parent]

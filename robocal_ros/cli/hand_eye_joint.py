@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.hand_eye.joint import solve_joint
     from robocal_ros.hand_eye.result import hand_eye_document
+    from robocal_ros.hand_eye.solve import solve_joint
 
     arm, settings = arm_of(args), settings_of(args)
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}

@@ -11,7 +11,7 @@ from robocal_ros.ground.files import quoted
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.board import Chessboard, Intrinsics, SeenBoards
     from robocal_ros.hand_eye.camera import CameraSettings
-    from robocal_ros.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.hand_eye.camera_model import PosePairs
     from robocal_ros.hand_eye.result import HandEyeResult
     from robocal_ros.hand_eye.streams import PoseStream
     from robocal_ros.hand_eye.tables import PoseTable
@@ -66,10 +66,8 @@ def _tables(
 
 
 def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
-    from robocal_ros.hand_eye.board import Chessboard
-    from robocal_ros.hand_eye.board_pairs import intrinsics_document
+    from robocal_ros.hand_eye.board import Chessboard, intrinsics_document, read_intrinsics
     from robocal_ros.hand_eye.camera import CheckPairs, calibrate_camera
-    from robocal_ros.hand_eye.camera_files import read_intrinsics
 
     columns, rows = args.board
     board = Chessboard(columns, rows, args.square_mm * 1e-3)
@@ -93,9 +91,7 @@ def _pairs_of_images(
     table: "PoseTable", args: argparse.Namespace, board: "Chessboard",
     intrinsics: "Intrinsics | None",
 ) -> "tuple[PosePairs, SeenBoards]":  # fmt: skip
-    from robocal_ros.hand_eye.board import see_boards
-    from robocal_ros.hand_eye.board_pairs import board_pairs
-    from robocal_ros.hand_eye.camera_files import read_images
+    from robocal_ros.hand_eye.board import board_pairs, read_images, see_boards
 
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
@@ -155,7 +151,7 @@ def _paired(
     robot: "PoseTable", camera: "PoseTable", mount: Any
 ) -> "tuple[PosePairs, dict[str, str]]":
     """Pairs of the same sample, or row; and the samples that only one table has."""
-    from robocal_ros.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.hand_eye.camera_model import PosePairs
 
     if not robot.named and not camera.named and len(robot) != len(camera):
         raise InputError(

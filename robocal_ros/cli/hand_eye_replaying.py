@@ -10,8 +10,8 @@ from robocal_ros.cli.recording import BagOverview
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.ground.proposals import Head
-from robocal_ros.hand_eye.inputs import take_hand_eye_message
 from robocal_ros.hand_eye.recorded import hand_eye_session_as_recorded
+from robocal_ros.hand_eye.session import take_hand_eye_message
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 

@@ -234,9 +234,8 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Ta
 
 def read_target_of(kind: str, path: Path) -> "Target":
     """Read a target file of this kind. Raises as `given_target`."""
-    from robocal_ros.hand_eye.target_documents import KIND_OF
     from robocal_ros.hand_eye.target_files import read_target
-    from robocal_ros.hand_eye.targets import BoardTarget
+    from robocal_ros.hand_eye.targets import KIND_OF, BoardTarget
 
     target = read_target(path)
     found = KIND_OF[type(target)]
@@ -252,9 +251,8 @@ def task_of(target: "Target | None", feature: str | None, classic: bool = False)
     """
     from robocal_ros.estimation.edge import EdgeRule
     from robocal_ros.estimation.polyline import CornerRule
-    from robocal_ros.hand_eye.step_task import StepTask
     from robocal_ros.hand_eye.targets import SphereTarget, StepTarget
-    from robocal_ros.hand_eye.tasks import LineTask, SphereTask
+    from robocal_ros.hand_eye.tasks import LineTask, SphereTask, StepTask
 
     if isinstance(target, SphereTarget):
         return SphereTask(target)

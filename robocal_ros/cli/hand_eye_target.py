@@ -40,8 +40,7 @@ def add_target_action(parser: argparse.ArgumentParser) -> None:
 def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = None) -> CliResult:
     """Place the sensor. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.result import hand_eye_document
-    from robocal_ros.hand_eye.solve import solve_task
-    from robocal_ros.hand_eye.verification import held_out, judged
+    from robocal_ros.hand_eye.solve import held_out, judged, solve_task
 
     arm, settings = arm_of(args), settings_of(args)
     target = given_target(kind, args.target, radius_mm)

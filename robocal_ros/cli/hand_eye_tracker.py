@@ -72,9 +72,9 @@ def _add_limits(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> CliResult:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.hand_eye.result import hand_eye_document
+    from robocal_ros.hand_eye.target_files import read_tracker_target
     from robocal_ros.hand_eye.tracker import solve_tracker
     from robocal_ros.hand_eye.tracker_data import TrackerTarget
-    from robocal_ros.hand_eye.tracker_tables import read_tracker_target
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm
@@ -109,10 +109,10 @@ def _noise(args: argparse.Namespace) -> "TrackerNoise":
 def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", dict[str, str]]:
     """All measurements, and the profiles that show next to nothing, with why."""
     from robocal_ros.ground.errors import TooFewSamplesError
-    from robocal_ros.hand_eye.profile import Profile
+    from robocal_ros.hand_eye.shots import Profile
     from robocal_ros.hand_eye.tables import read_pose_table, read_profiles
+    from robocal_ros.hand_eye.target_files import read_tracker_points
     from robocal_ros.hand_eye.tracker_data import TrackerData
-    from robocal_ros.hand_eye.tracker_tables import read_tracker_points
 
     points = read_tracker_points(args.points, arm)
     table = read_pose_table(args.poses, arm)

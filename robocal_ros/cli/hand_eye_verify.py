@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> CliResult:
     from robocal_ros.ground.frames import transform_document
     from robocal_ros.hand_eye.files import read_flange_mount
     from robocal_ros.hand_eye.result import by_shot
-    from robocal_ros.hand_eye.verification import verify
+    from robocal_ros.hand_eye.solve import verify
 
     settings = settings_of(args)
     T_flange_sensor = read_flange_mount(args.result)

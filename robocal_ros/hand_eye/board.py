@@ -2,13 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.hand_eye.pose_pairs import Shared
+from robocal_ros.ground.files import read_bytes
+from robocal_ros.hand_eye.camera_model import Mount, PosePairs, Shared
+from robocal_ros.hand_eye.tables import PoseTable
+from robocal_ros.kinematics.robots import read_fields
+
+# ---- a chessboard in images: its corners, the camera's intrinsics, and where the board is -------
+
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -292,3 +300,87 @@ def _pose(corners: Array, board: Chessboard, camera: Intrinsics) -> tuple[Array,
     by_turn = J[:, :3] @ frames.left_jacobian_inverse(w)
     rows = np.concatenate([J[:, 3:6], by_turn, J[:, 6:]], axis=1)
     return T, np.asarray(seen, dtype=np.float64).reshape(-1) - corners.ravel(), rows
+
+
+# ---- boards that a camera saw, paired with the robot's poses ------------------------------------
+
+
+def board_pairs(
+    seen: SeenBoards, names: tuple[str, ...], T_base_flange: Array, mount: Mount
+) -> PosePairs:
+    """Pairs of the boards with the flange poses (m, 4, 4) of the samples ``names`` (m,)."""
+    row = {name: index for index, name in enumerate(names)}
+    return PosePairs(
+        T_base_flange=T_base_flange[[row[name] for name in seen.names]],
+        T_camera_board=seen.T_camera_board,
+        names=seen.names,
+        mount=mount,
+        covariance=seen.covariance,
+        shared=seen.shared,
+    )
+
+
+def intrinsics_document(seen: SeenBoards, from_images: bool) -> dict[str, Any]:
+    """The camera of a result, px; ``from_images``: solved from the same images."""
+    camera = seen.intrinsics
+    return {
+        "from_images": from_images,
+        "fx_px": float(camera.matrix[0, 0]),
+        "fy_px": float(camera.matrix[1, 1]),
+        "cx_px": float(camera.matrix[0, 2]),
+        "cy_px": float(camera.matrix[1, 2]),
+        "distortion": camera.distortion.tolist(),
+        "width_px": camera.size[0],
+        "height_px": camera.size[1],
+        "sigma": None
+        if camera.covariance is None
+        else [float(variance) ** 0.5 for variance in camera.covariance.diagonal()],
+        "noise_px": seen.noise_px,
+    }
+
+
+# ---- images of a camera, and its intrinsics as ROS writes them (camera_info YAML) ---------------
+
+
+MODELS = {"plumb_bob": 5, "rational_polynomial": 8}  # and how many coefficients they have
+MOST_PX = 100_000  # along a side of an image
+NOT_NEEDED = ("camera_name", "rectification_matrix", "projection_matrix")
+
+
+def read_images(folder: Path, table: PoseTable) -> tuple[list[tuple[str, Image]], dict[str, str]]:
+    """Named grey images of the shots that a table names, and why any of them cannot be read.
+
+    Raises
+    ------
+    InputError
+        When a file is missing.
+    """
+    images, rejected = [], {}
+    for path, name in zip(table.files_in(folder), table.names, strict=True):
+        try:
+            images.append((name, decode_image(read_bytes(path, "image"), path.name)))
+        except InputError as error:
+            rejected[name] = str(error)
+    return images, rejected
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Read intrinsics, which are taken as exact.
+
+    Raises
+    ------
+    InputError
+        Naming file and key, when it is not as docs/hand_eye_camera.md says.
+    """
+    top = read_fields(path, "file of intrinsics")
+    needed = ("image_width", "image_height", "camera_matrix", "distortion_model",
+              "distortion_coefficients")  # fmt: skip
+    top.only(*needed, *NOT_NEEDED)
+    model = top.choice("distortion_model", tuple(MODELS))
+    width, height = (top.whole(key, 1, MOST_PX) for key in needed[:2])
+    matrix, distortion = top.below("camera_matrix"), top.below("distortion_coefficients")
+    K = np.array(matrix.numbers("data", 9)).reshape(3, 3)
+    if not (K[0, 0] > 0.0 and K[1, 1] > 0.0 and np.allclose(K[2], [0.0, 0.0, 1.0])):
+        matrix.fail("must be fx 0 cx, 0 fy cy, 0 0 1 by rows, in px", "data")
+    coefficients = np.array(distortion.numbers("data", MODELS[model]))
+    return Intrinsics(K, coefficients, (width, height))

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError
-from robocal_ros.hand_eye.profile import profile_of
-from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.hand_eye.target_documents import target_of
-from robocal_ros.hand_eye.thermal import PoseModel, models_used, pose_model_of
+from robocal_ros.hand_eye.board import find_corners
+from robocal_ros.hand_eye.config import PoseModel, models_used, pose_model_of
+from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE, Shot, profile_of
+from robocal_ros.hand_eye.targets import BoardTarget, target_of
 from robocal_ros.kinematics import SerialArm
+
+# ---- the data set of a hand-eye calibration: its target, and what was captured of it ------------
+
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -265,3 +268,39 @@ def _sample_of(
     if type(thermal) is not int or not 0 <= thermal < len(models):
         raise InputError(f"sample {handle} of the data set is of thermal model {thermal}: no such")
     return HandEyeSample(handle, str(row["mark"]), at_ns, q, values, models[thermal])
+
+
+# ---- images of a board: what a sample keeps of them ---------------------------------------------
+
+
+def seen_corners(target: Mapping[str, Any], shot: Shot) -> Array:
+    """Width and height of an image, then the corners of the board in it: (1 + n, 2), px.
+
+    Raises
+    ------
+    InputError
+        When the image does not show the board.
+    """
+    board = board_of(target).board
+    image = shot.read()
+    corners = find_corners(image, board)
+    if corners is None:
+        raise InputError(
+            f"no board of {board.columns}x{board.rows} inner corners in the image of "
+            f"{shot.stamp_ns} ns: look for light, focus, and that all of the board is in sight"
+        )
+    return np.vstack([image.shape[::-1], corners])
+
+
+def board_of(target: Mapping[str, Any]) -> BoardTarget:
+    """The board that a document of a target describes.
+
+    Raises
+    ------
+    InputError
+        When it describes none.
+    """
+    found = target_of(target)
+    if not isinstance(found, BoardTarget):
+        raise InputError(f"a {target['kind']} without a board shows no corners")
+    return found

@@ -1,19 +1,105 @@
 """Maximum likelihood of a mount: robust, with the robot's own error found where none is given."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.estimation import Estimate, observability, solve
-from robocal_ros.ground.errors import RankDeficientError
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
-from robocal_ros.hand_eye.naming import describe_motion, joined
-from robocal_ros.hand_eye.restricted_noise import FIRST_NOISE, averaged_covariance, restricted_noise
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RankDeficientError, ResidualError, RobocalError
+from robocal_ros.hand_eye.mount_problem import (
+    FIRST_NOISE,
+    MountProblem,
+    MountState,
+    PoseNoise,
+    TargetView,
+    averaged_covariance,
+    restricted_noise,
+)
 from robocal_ros.hand_eye.result import at_origin, increment, moved_origin
+from robocal_ros.hand_eye.target_models import SphereModel
+
+# ---- directions that poses leave open, in words, with the motion that would show them -----------
+
 
 Array = NDArray[np.float64]
+
+AXES = ("the laser line (x)", "the laser plane's normal (y)", "the beam (z)")
+ALONG = 0.9  # cosine from which a direction is named after an axis
+SMALL_TURN_RAD = float(np.radians(1.0))  # turns below this show nothing
+FARTHEST_AXIS_M = 100.0  # a turn about an axis beyond it is a translation
+ENOUGH = "by 20 deg or more"
+
+
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """About how many axes poses turn; ``axis`` (3,), base, where it is one."""
+
+    count: int
+    axis: Array
+
+
+def turns_of(T_base_flange: Array) -> Turns:
+    """Turning axes of poses (m, 4, 4): of the rotations against the first one."""
+    R = T_base_flange[:, :3, :3]
+    turn = frames.log_rotation(R @ R[0].T)
+    _, s, Vt = np.linalg.svd(turn, full_matrices=False)
+    spread = s / np.sqrt(len(turn))
+    return Turns(int(np.sum(spread > SMALL_TURN_RAD)), Vt[0])
+
+
+def describe_motion(direction: Array, T_base_flange: Array) -> str:
+    """Words for an open direction (v, w) (6,) of the sensor, sensor axes, and what to do."""
+    return f"{_words(direction)}: {_remedy(turns_of(T_base_flange))}"
+
+
+def joined(words: Sequence[str]) -> str:
+    """Several `describe_motion` in one sentence, a remedy that they share said once."""
+    parts = [each.partition(": ") for each in words]
+    what = "; ".join(first for first, _, _ in parts)
+    remedies = dict.fromkeys(remedy for _, _, remedy in parts if remedy)
+    return ": ".join(filter(None, (what, "; ".join(remedies))))
+
+
+def _words(direction: Array) -> str:
+    v, w = direction[:3], direction[3:]
+    if np.linalg.norm(w) * FARTHEST_AXIS_M < max(float(np.linalg.norm(v)), 1e-300):
+        return f"translation along {_axis(v)}"
+    turn = float(np.linalg.norm(w))
+    centre = np.cross(w, v) / turn**2  # the point of the axis next to the origin
+    pitch = float(v @ w) / turn**2
+    words = f"rotation about {_axis(w)}"
+    if np.linalg.norm(centre) > 1e-3:
+        place = ", ".join(f"{1e3 * value:.0f}" for value in centre)
+        words += f" through ({place}) mm of the sensor"
+    if abs(pitch) > 1e-3:
+        words += ", with a translation along it"
+    return words
+
+
+def _axis(direction: Array) -> str:
+    unit = direction / np.linalg.norm(direction)
+    place = int(np.argmax(np.abs(unit)))
+    if abs(unit[place]) > ALONG:
+        return AXES[place]
+    return f"({', '.join(f'{value:.2f}' for value in unit)}) of the sensor"
+
+
+def _remedy(turns: Turns) -> str:
+    if turns.count == 0:
+        return f"the poses do not turn; turn the flange about two axes, {ENOUGH}"
+    if turns.count == 1:
+        axis = ", ".join(f"{value:.2f}" for value in turns.axis)
+        found = f"all poses turn about ({axis}) of the base"
+        return f"{found}; tilt the flange about another axis, {ENOUGH}"
+    return "show the target at other places of the profile, at other distances and tilts"
+
+
+# ---- mount fit ----------------------------------------------------------------------------------
+
 
 LOOKS = 3
 ROUNDS = 8
@@ -257,3 +343,185 @@ def without(
         }
         kept.append(view.take(~out))
     return tuple(kept)
+
+
+# ---- how far each sighting is from what is found without its pose -------------------------------
+
+
+def solved_again(fit: MountFit) -> Callable[[tuple[TargetView, ...]], MountState]:
+    """How the mount is found from part of the views of a fit: nothing is rejected any more."""
+
+    def again(views: tuple[TargetView, ...]) -> MountState:
+        part = MountProblem(views, fit.noise, fit.state)
+        return solve(
+            part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
+        ).settled()
+
+    return again
+
+
+def leave_one_out(
+    views: tuple[TargetView, ...], solved: Callable[[tuple[TargetView, ...]], MountState]
+) -> Array | None:
+    """Distance of each sighting from what is ``solved`` without its pose, m.
+
+    None where the rest does not suffice.
+    """
+    sample = np.concatenate([view.sightings.pose for view in views])
+    own = np.zeros(len(sample))
+    for pose in np.unique(sample):
+        out = sample == pose
+        rest = without(views, out, {})
+        if any(len(view.sightings.names) == 0 for view in rest):
+            return None  # a target that only this pose saw
+        try:
+            own[out] = distances(views, solved(rest))[out]
+        except RobocalError:
+            return None
+    return own
+
+
+# ---- common mistakes in the data, recognised because undoing them makes everything fit ----------
+
+
+CLEARLY = 0.4  # of the misfit as given: below it the undone data may be the right ones
+FITS_M = 5e-4  # misfit of data that are right
+FITS = 5.0  # times the rms of the others
+FARTHEST_M, NEAREST_M = 20.0, 0.02  # of a flange from its base
+
+LEFT_HANDED = "they come from a left-handed frame: turn one axis round"
+
+_FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def _mirrored(T: Array) -> Array:
+    return np.asarray(_FLIP @ T @ _FLIP)
+
+
+def _mirrored_place(T: Array, axis: int) -> Array:
+    mirrored = T.copy()
+    mirrored[:, axis, 3] *= -1.0
+    return mirrored
+
+
+def _real_first(T: Array) -> Array:
+    """Rotations as they are if the four numbers were w, x, y, z."""
+    return frames.transform_from_quat(T[:, :3, 3], np.roll(frames.quat_xyzw(T), -1, axis=1))
+
+
+def _scaled(T: Array, factor: float) -> Array:
+    return frames.transform(T[:, :3, :3], factor * T[:, :3, 3])
+
+
+MISTAKES: tuple[tuple[str, Callable[[Array], Array]], ...] = (
+    (
+        "each profile fits the pose after its own: the two lists are shifted by one",
+        partial(np.roll, shift=-1, axis=0),
+    ),
+    (
+        "each profile fits the pose before its own: the two lists are shifted by one",
+        partial(np.roll, shift=1, axis=0),
+    ),
+    ("the poses fit when inverted: give the flange in the base, not the base in it", frames.invert),
+    ("the poses fit when their quaternions are read as w, x, y, z: reorder them", _real_first),
+    (f"the poses fit when mirrored as a whole: {LEFT_HANDED}", _mirrored),
+    *(
+        (
+            f"the poses fit with {axis} of their positions negated: {LEFT_HANDED}",
+            partial(_mirrored_place, axis=number),
+        )
+        for number, axis in enumerate("xyz")
+    ),
+)
+"""What is wrong, in words, and what undoes it: poses (m, 4, 4) as they should have been."""
+
+
+def undone(T_base_flange: Array) -> Iterator[tuple[str, Array]]:
+    """Each mistake that may be in poses (m, 4, 4), in words, and the poses without it."""
+    for words, undo in MISTAKES:
+        yield words, undo(T_base_flange)
+    far = float(np.linalg.norm(T_base_flange[:, :3, 3], axis=1).max())
+    if far < NEAREST_M:
+        words = "the poses fit when 1000 times larger: their positions are in m where mm are meant"
+        yield words, _scaled(T_base_flange, 1e3)
+    if far > FARTHEST_M:
+        words = "the poses fit when 1000 times smaller: their positions are in mm where m are meant"
+        yield words, _scaled(T_base_flange, 1e-3)
+
+
+def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: float) -> str | None:
+    """The words of the suspect with the smallest misfit, m; None where none fits."""
+    best, least = None, min(CLEARLY * as_given_m, FITS_M)
+    for words, misfit in suspects:
+        try:
+            found = misfit()
+        except RobocalError:
+            continue
+        if found < least:
+            best, least = words, found
+    return best
+
+
+def swapped(fit: MountFit, lost: TargetView, place: Array, shots: Sequence[str]) -> dict[str, str]:
+    """Which rejected sightings fit the pose of another rejected shot: names and reasons.
+
+    ``lost`` holds the rejected sightings; ``shots``: the name of each.
+    """
+    limit = FITS * float(np.sqrt(np.mean(fit.distances() ** 2)))
+    s = lost.sightings
+    found: dict[str, str] = {}
+    for shot in np.unique(s.shot):
+        rows = np.flatnonzero(s.shot == shot)
+        for other in np.unique(s.shot[s.shot != shot]):
+            T = s.T_base_flange[[np.flatnonzero(s.shot == other)[0]]] @ fit.state.T_flange_sensor
+            own = lost.take(rows)
+            far = own.model.distance(np.repeat(T, len(rows), axis=0), place, own.sightings.value)
+            if np.median(far) < limit:
+                words = f"fits the pose of {shots[other]}, not its own: swapped?"
+                found |= {s.names[row]: words for row in rows}
+    return found
+
+
+# ---- a wrong radius of the sphere, seen where profiles at several heights of it disagree --------
+
+
+CONDITION = 1e5
+SURE = 5.0  # standard deviations
+TOLERANCE_M = 5e-5  # of a sphere that is sold as a reference
+
+
+def require_radius(fit: MountFit) -> None:
+    """Refuse a fit that would be clearly better with another radius (a score test).
+
+    Raises
+    ------
+    ResidualError
+        Naming the radius that fits.
+    """
+    problem = MountProblem(fit.views, fit.noise, fit.state)
+    linear = problem.linear(fit.state)
+    radius = np.concatenate(
+        [
+            view.model.radius_m / np.maximum(view.sightings.value[:, 2], 1e-6)
+            if isinstance(view.model, SphereModel)
+            else np.zeros(len(view.sightings.names))
+            for view in fit.views
+        ]
+    )
+    if not np.any(radius):
+        return
+    column = np.zeros_like(linear.jacobian[:, :, :1])
+    column[:, 2, 0] = radius  # dr / dR at a given height of the laser plane
+    residual, jacobian = problem.whitened(linear, column)
+    unit = np.linalg.norm(jacobian, axis=0)
+    if np.any(unit == 0.0) or np.linalg.cond(jacobian / unit) > CONDITION:
+        return  # the radius looks like another unknown
+    normal = jacobian.T @ jacobian
+    change = np.linalg.solve(normal, -jacobian.T @ residual)[-1]
+    sigma = fit.scale * float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
+    if abs(change) > max(SURE * sigma, TOLERANCE_M):
+        model = next(view.model for view in fit.views if isinstance(view.model, SphereModel))
+        raise ResidualError(
+            f"the profiles fit a sphere of radius {(model.radius_m + change) * 1e3:.2f} mm, not "
+            f"{model.radius_m * 1e3:.2f} mm: check which sphere is mounted"
+        )

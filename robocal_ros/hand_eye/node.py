@@ -16,12 +16,9 @@ from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.proposals import Head, hand_eye_kind
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.data_files import HandEyeFiles
-from robocal_ros.hand_eye.inputs import take_hand_eye_message
-from robocal_ros.hand_eye.outputs import HandEyeOutputs
 from robocal_ros.hand_eye.recorded import configuration
-from robocal_ros.hand_eye.services import HandEyeServices
-from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
+from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.settings import SETTINGS, session_config
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory

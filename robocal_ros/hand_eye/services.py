@@ -1,28 +1,391 @@
 """The services of the hand-eye node: each call becomes a command to the session."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
+from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
+from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import (
     CalibrateHandEye,
     CaptureHandEye,
+    CheckHandEyePlan,
+    HandEyeFile,
     RemoveHandEye,
     StartHandEye,
 )
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, InputError, RobocalError
-from robocal_ros.hand_eye.data_files import Ask, HandEyeFiles
-from robocal_ros.hand_eye.outputs import MOUNTS, TARGETS
-from robocal_ros.hand_eye.plan import HandEyePlan
+from robocal_ros.ground.files import made_folder_beside
+from robocal_ros.ground.proposals import Head
+from robocal_ros.ground.samples import joint_sample
+from robocal_ros.hand_eye.data import (
+    IN_HAND,
+    MOST_POINTS,
+    TO_HAND,
+    Capture,
+    DataSet,
+    data_set_begun,
+)
 from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.session_planning import (
+    judged_plan,
+    pose_of,
+    poses_of_flange,
+    poses_of_joints,
+    require_count,
+    require_near,
+    require_target,
+    rough_mount,
+    sphere_centre,
+)
 from robocal_ros.hand_eye.settings import start_arguments
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.ros.conversions import transform_message
+from robocal_ros.history.history_file import unused
+from robocal_ros.ros import conversions, qos
+from robocal_ros.ros.conversions import pose_message, transform_message
 from robocal_ros.ros.decision_services import answer, twin
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
-from robocal_ros.session.events import CALIBRATE, CAPTURE, REMOVE, START, Command, Outcome
+from robocal_ros.ros.pose_settings import given_pose
+from robocal_ros.ros.session_events import SessionEvents
+from robocal_ros.ros.static_tf import StaticTf
+from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.planning import PlanReport
+
+
+# ---- what the hand-eye node says: its topics, and how results get onto them ---------------------
+
+
+AddOutput = Callable[[type, str, QoSProfile], Any]
+
+TARGETS = {
+    HandEyeStatus.SPHERE: "sphere",
+    HandEyeStatus.STEP: "step",
+    HandEyeStatus.LINE: "line",
+    HandEyeStatus.CAMERA: "camera",
+}
+MOUNTS = {HandEyeStatus.ON_FLANGE: IN_HAND, HandEyeStatus.FIXED: TO_HAND}
+NUMBER_OF = {name: number for number, name in TARGETS.items()}
+MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
+
+
+class HandEyeOutputs:
+    """Publishers of one sensor's results.
+
+    Parameters
+    ----------
+    add : creates a publisher.
+    robot, serial : as messages carry them.
+
+    Attributes
+    ----------
+    transforms : all that were put onto tf.
+    missing : what cannot be published on this machine; empty when everything can.
+    """
+
+    def __init__(self, add: AddOutput, robot: str, serial: str) -> None:
+        self._robot, self._serial = robot, serial
+        self._status = add(HandEyeStatus, "~/status", qos.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self.events = SessionEvents(add)
+        self.transforms: list[TransformStamped] = []
+        self._tf = StaticTf(add)
+        self.missing = self._tf.missing
+
+    def status(self, session: HandEyeSession, last: Outcome | None, *, ended: bool = False) -> None:
+        """Say how far the data set is, and what came of the last command.
+
+        ``ended``: the session is over; its captures are told once more, as they ended.
+        """
+        message = status_message(session, last)
+        if ended:
+            message.state = HandEyeStatus.IDLE
+        self._status.publish(message)
+
+    def transform(self, head: Head, stamp_ns: int) -> None:
+        """Put what is in force onto tf; nothing in force: late subscribers get no transform."""
+        transforms = [] if head.model is None else [calibration_transform(head.model, stamp_ns)]
+        self.transforms += transforms
+        self._tf.publish(transforms)
+
+    def quality(self, outcome: Outcome, frame: str) -> None:
+        """Show the verdict on a calibration, or why there is none."""
+        stamp = conversions.header(outcome.command.stamp_ns or 0, frame)
+        message = conversions.verdict_message(
+            outcome, robot=self._robot, serial=self._serial, stamp=stamp
+        )
+        document = outcome.document or {}
+        message.unobservable = list(document.get("unobservable", ()))
+        message.rejected = list(document.get("rejected", ()))
+        if (error_mm := document.get("working_error_mm")) is not None:
+            message.predicted_rms_mm = float(error_mm)
+        if (left_out := document.get("leave_one_out_mm")) is not None:
+            message.held_out = outcome.samples
+            errors = {f"{name}_mm": value for name, value in left_out.items()}
+            conversions.set_errors(message, "candidate", errors)
+        self._quality.publish(message)
+
+
+def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStatus:
+    """The state of a session."""
+    data, config = session.data, session.config
+    fixed = data is not None and data.mount == TO_HAND
+    message = HandEyeStatus(
+        header=conversions.header(
+            session.newest_joints_ns, config.base_frame if fixed else config.flange_frame
+        ),
+        child_frame_id=config.sensor_frame,
+        state=HandEyeStatus.IDLE,
+        revision=session.in_force.revision,
+    )
+    if data is not None:
+        waits = data.waiting is not None
+        message.state = HandEyeStatus.CAPTURING if waits else HandEyeStatus.COLLECTING
+        message.target, message.method = NUMBER_OF[data.kind], data.method
+        message.mount, message.candidate_id = MOUNT_NUMBER_OF[data.mount], data.candidate
+        message.samples = [_sample(one) for _, one in sorted(data.captures.items())]
+    if last is not None:
+        message.last_command, message.last_message = last.command.name, last.message
+        message.last_status = int(last.status)
+    return message
+
+
+def _sample(capture: Capture) -> HandEyeSample:
+    states = {Code.NONE: HandEyeSample.WAITING, Code.ACCEPT: HandEyeSample.CAPTURED}
+    return HandEyeSample(
+        handle=capture.handle,
+        mark=capture.mark,
+        state=states.get(capture.code, HandEyeSample.FAILED),
+        reason=capture.reason,
+        status=int(capture.code),
+        stamp=conversions.time_message(capture.stamp_ns),
+    )
+
+
+def calibration_transform(model: dict[str, Any], stamp_ns: int) -> TransformStamped:
+    """A calibration as a transform."""
+    return TransformStamped(
+        header=conversions.header(stamp_ns, model["parent"]),
+        child_frame_id=model["child"],
+        transform=conversions.transform_message(np.array(model["T_parent_sensor"])),
+    )
+
+
+# ---- data files ---------------------------------------------------------------------------------
+
+
+Ask = Callable[[Command], Awaitable[Outcome]]
+
+KEPT, SUFFIX = "hand_eye", ".mcap"
+
+
+class HandEyeFiles:
+    """``~/load``, ``~/save`` and its Trigger twin; the data set of each calibration is kept.
+
+    Parameters
+    ----------
+    ask : gives a command to the session and awaits its outcome.
+    session : the one that runs; raises while the node is inactive.
+    history : beside its file data sets are kept.
+    """
+
+    def __init__(
+        self,
+        node: EndpointNode,
+        ask: Ask,
+        session: Callable[[], HandEyeSession],
+        history: CalibrationHistory,
+    ) -> None:
+        self._node, self._ask, self._session, self._history = node, ask, session, history
+        self._saved: tuple[DataSet | None, frozenset[int]] = None, frozenset()
+        self._fault: tuple[int, str] = 0, ""  # of the last calibration
+        node.add_service(HandEyeFile, "~/load", self._load)
+        node.add_service(HandEyeFile, "~/save", self._save)
+        node.add_service(Trigger, "~/save_trigger", self._save_twin)
+
+    async def begin(self, command: Command) -> Outcome:
+        """Give a command that opens a data set; the answer tells of what was dropped unsaved."""
+        before = self._session().data
+        outcome = await self._ask(command)
+        if not outcome.done or not (lost := self._unsaved(before)):
+            return outcome
+        words = f"{outcome.message}; {lost} samples were dropped that were not saved"
+        return replace(outcome, message=words)
+
+    async def calibrate(self, command: Command) -> Outcome:
+        """Give a command that calibrates; the answer tells when its data set could not be kept."""
+        outcome = await self._ask(command)
+        number, fault = self._fault
+        if not fault or number != outcome.calibration_id:
+            return outcome
+        return replace(outcome, message=f"{outcome.message}; {fault}")
+
+    def keep(self, outcome: Outcome) -> None:
+        """Keep the data set of a calibration under its id; one that cannot be kept is told of."""
+        number = outcome.calibration_id
+        self._fault = number, ""
+        if not number:
+            return
+        try:
+            self._write(unused(self._folder(), str(number), SUFFIX))
+        except RobocalError as error:
+            self._fault = number, f"its samples were not kept, call save: {error}"
+            self._node.get_logger().error(f"calibration {number}: {self._fault[1]}")
+
+    def _folder(self) -> Path:
+        return made_folder_beside(self._history.path, KEPT)
+
+    def _unsaved(self, data: DataSet | None) -> int:
+        of, handles = self._saved
+        samples = () if data is None else data.samples
+        return len(set(samples) - (handles if data is of else set()))
+
+    def _mark_saved(self) -> None:
+        data = self._session().data
+        self._saved = data, frozenset(() if data is None else data.samples)
+
+    async def _load(self, request: Any, response: Any) -> Any:
+        from robocal_ros.bags.hand_eye_bags import read_data_set
+
+        path = _path(request)
+        document = read_data_set(path, self._session().nominal)
+        outcome = await self.begin(Command(LOAD, {"path": str(path), "set": document}))
+        if outcome.done:
+            self._mark_saved()
+        response.samples = outcome.samples
+        return answer(response, outcome)
+
+    def _save(self, request: Any, response: Any) -> Any:
+        response.samples, response.message = self._write(_path(request))
+        response.success, response.status = True, int(Code.ACCEPT)
+        return response
+
+    def _save_twin(self, request: Any, response: Any) -> Any:
+        try:
+            _, words = self._write(unused(self._folder(), self._stem(), SUFFIX))
+        except RobocalError as error:
+            response.message = trigger_text(0, error.code, str(error))
+            return response
+        response.success, response.message = True, trigger_text(0, Code.ACCEPT, words)
+        return response
+
+    def _stem(self) -> str:
+        """Sensor and time (UTC)."""
+        frame = quote(self._session().config.sensor_frame, safe="")
+        return f"{frame}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+
+    def _write(self, path: Path) -> tuple[int, str]:
+        """Write the open data set; how many samples it has, and what to say."""
+        from robocal_ros.bags.hand_eye_bags import write_data_set
+
+        session = self._session()
+        document = session.document()
+        topic = data_set_begun(document).topic
+        write_data_set(path, document, topic, session.config.sensor_frame, session.nominal)
+        self._mark_saved()
+        rows = document["samples"]
+        words = f"{len(rows)} samples saved in {path}"
+        points = sum(len(row["values"]) for row in rows)
+        if points > MOST_POINTS:
+            words += f"; {points} points are too many to load (at most {MOST_POINTS})"
+        return len(rows), words
+
+
+def _path(request: Any) -> Path:
+    """The whole path: the caller does not see the node's working folder."""
+    if not request.path:
+        raise InputError("path is empty: name the file")
+    try:
+        return Path(request.path).expanduser().absolute()
+    except RuntimeError as error:
+        raise InputError(f"{error}: name the whole path", file=request.path) from error
+
+
+# ---- the service of the hand-eye node that judges planned poses ---------------------------------
+
+
+Array = NDArray[np.float64]
+
+ROUGH = "rough"  # the parameters that say about where the sensor sits
+
+
+class HandEyePlan:
+    """``~/check_plan``.
+
+    Parameters
+    ----------
+    session : the one that runs.
+    """
+
+    def __init__(
+        self,
+        node: EndpointNode,
+        settings: Mapping[str, Any],
+        session: Callable[[], HandEyeSession],
+        history: CalibrationHistory,
+    ) -> None:
+        self._settings, self._session, self._history = settings, session, history
+        node.add_service(CheckHandEyePlan, "~/check_plan", self._check)
+
+    def _check(self, request: Any, response: Any) -> Any:
+        from robocal_ros.hand_eye.planning import SensorRange
+
+        session = self._session()
+        data = require_target(session)
+        poses = _poses(request, session)
+        near, far, width = (1e-3 * x for x in self._settings["sensor_range_mm"])
+        sensor = SensorRange(near, far, width, noise_m=self._settings["sensor_noise_mm"] * 1e-3)
+        given = [pose_of(*_parts(pose), "sensor") for pose in request.sensor]
+        configured = given_pose(self._settings, ROUGH)
+        mount, who = rough_mount(session, self._history, next(iter(given), None), configured)
+        if request.center:
+            centre: Array | None = require_near(_point(request.center[0]), "center")
+        else:
+            centre = sphere_centre(data, self._history, session.current.arm, mount)
+        config = session.config
+        found = judged_plan(data, poses, list(request.marks), mount, sensor, config, centre)
+        return _answered(response, found, who)
+
+
+def _poses(request: Any, session: HandEyeSession) -> Array:
+    require_count(len(request.joints), len(request.flange))
+    if len(request.joints):
+        return poses_of_joints(session.current.arm, [joint_sample(one) for one in request.joints])
+    position, quat = zip(*(_parts(pose) for pose in request.flange), strict=True)
+    return poses_of_flange(np.array(position), np.array(quat))
+
+
+def _parts(pose: Any) -> tuple[list[float], list[float]]:
+    o = pose.orientation
+    return _point(pose.position), [o.x, o.y, o.z, o.w]
+
+
+def _point(point: Any) -> list[float]:
+    return [point.x, point.y, point.z]
+
+
+def _answered(response: Any, found: "PlanReport", who: str) -> Any:
+    response.success, response.status = found.verdict.accept, int(found.verdict.code)
+    response.message = f"{found.verdict.reason} (the sensor's place is that of {who})"
+    response.rank, response.unknowns = found.rank, found.unknowns
+    error_m = found.working_error_m
+    response.expected_error_mm = -1.0 if error_m is None else error_m * 1e3
+    response.unobservable = list(found.unobservable)
+    response.unseen = [f"pose {i + 1}: {why}" for i, why in sorted(found.unseen.items())]
+    response.proposed = [pose_message(T) for T in found.proposed]
+    return response
+
+
+# ---- the services of the hand-eye node: each call becomes a command to the session --------------
 
 
 class HandEyeServices:

@@ -6,9 +6,9 @@ from typing import Any
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.ground.proposals import hand_eye_kind
-from robocal_ros.ground.samples import JOINTS, JointSample
+from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
 from robocal_ros.ground.streams import CLOCK_JUMP_NS, NotStillError
-from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.config import HandEyeConfig, HandEyeInForce, PoseModels
 from robocal_ros.hand_eye.data import (
     MOST_CAPTURES,
     MOST_HANDLE,
@@ -17,18 +17,18 @@ from robocal_ros.hand_eye.data import (
     HandEyeSample,
     data_set_begun,
     data_set_of,
+    seen_corners,
 )
-from robocal_ros.hand_eye.images import seen_corners
-from robocal_ros.hand_eye.in_force import HandEyeInForce
-from robocal_ros.hand_eye.results import HandEyeResults
-from robocal_ros.hand_eye.shots import IMAGE, Shot, ShotLog
-from robocal_ros.hand_eye.solving import require_known
-from robocal_ros.hand_eye.thermal import PoseModels
+from robocal_ros.hand_eye.results import HandEyeResults, require_known
+from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Shot, ShotLog, shot_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.base import Commanded, Handler
 from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
+
+# ---- session ------------------------------------------------------------------------------------
+
 
 _NO_SET = "no data set is open: call start, or load one"
 
@@ -294,3 +294,17 @@ class HandEyeSession(Commanded):
             told = ", ".join(map(str, taken))
             words += f"; their flange poses are those of thermal revision {told}"
         return Outcome(command, Code.ACCEPT, words, samples=count)
+
+
+# ---- messages into the hand-eye session: the same for live topics and for recorded ones ---------
+
+
+def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> None:
+    """Give a message to the session; one that cannot be used is counted with its reason."""
+    try:
+        if kind == JOINTS:
+            session.add(joint_sample(message))
+        elif kind in SHOTS:
+            session.add(shot_of(kind, message))
+    except RobocalError as error:
+        session.refuse(kind, error)

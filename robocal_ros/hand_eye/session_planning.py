@@ -12,10 +12,9 @@ from robocal_ros.ground.proposals import CalibrationState
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import DataSet
-from robocal_ros.hand_eye.profile import Profile
 from robocal_ros.hand_eye.session import HandEyeSession
-from robocal_ros.hand_eye.target_documents import target_of
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.hand_eye.shots import Profile
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget, target_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
 from robocal_ros.session.decisions import History
@@ -242,7 +241,7 @@ def judged_plan(
 def _planned(
     data: DataSet, marks: Sequence[str], sensor: "SensorRange", centre: Array | None
 ) -> "PlannedTarget":
-    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
+    from robocal_ros.hand_eye.planning import PlannedLine, PlannedSphere, PlannedStairs
 
     target = target_of(data.target)
     if isinstance(target, SphereTarget):

@@ -9,10 +9,10 @@ import numpy as np
 from robocal_ros.ground.errors import InputError
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import FEATURES, TOPIC_OF
-from robocal_ros.hand_eye.solving import METHODS, MOUNTS, WITHOUT_FILE
-from robocal_ros.hand_eye.target_documents import KIND_OF, Document, target_document
+from robocal_ros.hand_eye.results import METHODS, MOUNTS, WITHOUT_FILE
 from robocal_ros.hand_eye.target_files import KINDS as DESCRIBED
 from robocal_ros.hand_eye.target_files import read_target
+from robocal_ros.hand_eye.targets import KIND_OF, Document, target_document
 from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import Setting, length
 from robocal_ros.ros.pose_settings import pose_settings

@@ -5,20 +5,85 @@ next to nothing while nobody asks.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.samples import cloud_points, image_array, pose_sample, stamp_ns
-from robocal_ros.hand_eye.profile import profile_of
+from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.samples import (
+    JOINTS,
+    cloud_points,
+    image_array,
+    joint_sample,
+    pose_sample,
+    stamp_ns,
+)
+from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
+from robocal_ros.session import events
+from robocal_ros.session.base import GAP_NS, Ignored
+from robocal_ros.session.events import Command
+
+# ---- a profile: what a line-laser sensor sees in one shot, in its own x-z plane -----------------
+
 
 Array = NDArray[np.float64]
+
+FEWEST_POINTS = 10
+NARROWEST_M, WIDEST_M = 1e-3, 20.0  # no line laser's field of view is outside of this
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Points of one profile.
+
+    Attributes
+    ----------
+    points : (n, 2) x along the laser line and z along the beam, sensor frame, m, in the order of
+        the sensor's columns; its plane is y = 0. Finite: what the sensor did not see is left out.
+    name : of the shot, for reports.
+    """
+
+    points: Array
+    name: str
+
+
+def profile_of(points: ArrayLike, name: str) -> Profile:
+    """Check and wrap points (n, 2), m; columns without a return (not-a-number) are left out.
+
+    Raises
+    ------
+    InputError
+        When the points are not (n, 2), or their extent is that of another unit.
+    TooFewSamplesError
+        When nearly nothing was seen.
+    """
+    rows = np.asarray(points, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 2:
+        raise InputError(f"profile {name} has shape {rows.shape}, not (points, 2)")
+    rows = rows[np.all(np.isfinite(rows), axis=1)]
+    if len(rows) < FEWEST_POINTS:
+        raise TooFewSamplesError(
+            f"profile {name} has {len(rows)} points (at least {FEWEST_POINTS}): check the exposure "
+            "and that the target is in range"
+        )
+    extent = float(np.ptp(rows, axis=0).max())
+    if not NARROWEST_M <= extent <= WIDEST_M:
+        small = extent < NARROWEST_M
+        width = f"{extent * 1e3:.4g} mm" if small else f"{extent:.4g} m"
+        raise InputError(
+            f"profile {name} comes out {width} wide: is it a thousand times too "
+            f"{'small' if small else 'large'}? A table's x_mm and z_mm hold mm, a message m"
+        )
+    return Profile(rows, name)
+
+
+# ---- shots --------------------------------------------------------------------------------------
+
 
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
 SHOTS = (PROFILE, TARGET_POSE, IMAGE)
@@ -155,3 +220,127 @@ class ShotLog:
         """Forget all."""
         self._shots.clear()
         self._bytes = 0
+
+
+# ---- shots of a recording: profiles that were taken while the robot stood still -----------------
+
+
+@dataclass(frozen=True, eq=False)
+class StandingShot:
+    """A profile, named by its number in the recording, and the mean joints (n,) of its standstill.
+
+    ``mark``: of a staircase, where the recording tells it; else empty.
+    """
+
+    name: str
+    shot: Shot
+    q: Array
+    mark: str = ""
+
+
+class Standstills:
+    """Pairs profiles with standstills, as a session does for a capture.
+
+    Attributes
+    ----------
+    found : shots in the order of the recording.
+    rejected : name of each other profile, and why it is none.
+    ignored : joint readings that were not used.
+    """
+
+    def __init__(self, joint_names: tuple[str, ...], rule: StandstillRule) -> None:
+        self._stream, self._rule = JointStream(joint_names), rule
+        self._waiting: deque[tuple[str, Shot]] = deque()
+        self._count, self._frame = 0, ""
+        self.found: list[StandingShot] = []
+        self.rejected: dict[str, str] = {}
+        self.ignored = Ignored()
+
+    def take(self, kind: str, message: Any) -> None:
+        """Take a message of an input; one that cannot be used is counted, or named."""
+        if kind == PROFILE:
+            self._take_profile(message)
+        elif kind == JOINTS:
+            try:
+                self._stream.add(joint_sample(message), GAP_NS)
+            except RobocalError as error:
+                self.ignored.add(kind, str(error))
+        while self._waiting and self._settled(*self._waiting[0]):
+            self._waiting.popleft()
+
+    def close(self) -> None:
+        """No more messages come."""
+        for name, shot in self._waiting:
+            told = self.ignored.words() or "the recording ends, or its clocks differ"
+            self.rejected[name] = f"no joint readings about {shot.stamp_ns} ns: {told}"
+        self._waiting.clear()
+
+    def _take_profile(self, message: Any) -> None:
+        self._count += 1
+        name = f"shot_{self._count:02d}"
+        try:
+            shot = shot_of(PROFILE, message)
+            shot.read()
+        except RobocalError as error:
+            self.rejected[name] = str(error)
+            return
+        self._frame = self._frame or shot.frame
+        if shot.frame == self._frame:
+            self._waiting.append((name, shot))
+        else:
+            told = f"in frame '{shot.frame}', those before it in '{self._frame}'"
+            self.rejected[name] = f"of another sensor: {told}"
+
+    def _settled(self, name: str, shot: Shot) -> bool:
+        try:
+            q = self._stream.resting(shot.stamp_ns, self._rule)
+        except NotStillError as error:
+            self.rejected[name] = f"not at standstill: {error}"
+            return True
+        if q is None:
+            return False
+        self.found.append(StandingShot(name, shot, q))
+        return True
+
+
+def captured_marks(
+    commands: Sequence[tuple[Command, Mapping[str, Any]]],
+) -> dict[int, str] | None:
+    """Stamp and mark of the shots that a recorded session holds in the end.
+
+    ``commands``: each with its recorded outcome. None: they tell of no data set.
+    """
+    begun = False
+    asked: dict[int, str] = {}
+    stamps: dict[int, int] = {}
+    for command, outcome in commands:
+        name, arguments = command.name, command.arguments
+        if outcome["status"] != Code.ACCEPT:
+            continue
+        begun |= name in (events.START, events.LOAD, events.SAMPLE)
+        if name in (events.START, events.LOAD):
+            asked, stamps = {}, {}
+        elif name == events.CAPTURE:
+            asked[int(arguments["handle"])] = str(arguments.get("mark", ""))
+        elif name == events.SAMPLE:
+            stamps[int(arguments["handle"])] = int(arguments["shot_ns"])
+        elif name == events.REMOVE:
+            stamps.pop(int(arguments["handle"]), None)
+    return {at: asked.get(handle, "") for handle, at in stamps.items()} if begun else None
+
+
+def first_of_each(
+    found: Sequence[StandingShot], tolerance_rad: float
+) -> tuple[list[StandingShot], dict[str, str]]:
+    """The first shot of each standstill, and why the others are left out.
+
+    What errs in a pose is common to all shots from it: they are not measurements of their own.
+    """
+    kept: list[StandingShot] = []
+    rejected: dict[str, str] = {}
+    for one in found:
+        if kept and float(np.max(np.abs(one.q - kept[-1].q))) <= tolerance_rad:
+            rejected[one.name] = f"taken at the same standstill as {kept[-1].name}"
+        else:
+            kept.append(one)
+    return kept, rejected

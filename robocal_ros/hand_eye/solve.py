@@ -1,18 +1,42 @@
 """Where a line-laser sensor sits: profiles of a target and flange poses in, its pose out."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.assessment import Verdict, errors_document, summarise
 from robocal_ros.estimation.edge import EdgeRule
-from robocal_ros.hand_eye.diagnosis import features, looked
-from robocal_ros.hand_eye.leave_one_out import leave_one_out, solved_again
-from robocal_ros.hand_eye.mistakes import swapped
-from robocal_ros.hand_eye.mount_fit import MountFit, distances, fit_mount, require_seen
-from robocal_ros.hand_eye.mount_problem import TargetView, pivot_of
-from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.estimation.estimation import solve
+from robocal_ros.ground.errors import (
+    Code,
+    InputError,
+    RankDeficientError,
+    RobocalError,
+    TooFewSamplesError,
+)
+from robocal_ros.hand_eye.mount_fit import (
+    MountFit,
+    distances,
+    fit_mount,
+    leave_one_out,
+    require_radius,
+    require_seen,
+    solved_again,
+    swapped,
+    without,
+)
+from robocal_ros.hand_eye.mount_problem import (
+    FIRST_NOISE,
+    SENSOR_UNKNOWNS,
+    MountProblem,
+    MountState,
+    PoseNoise,
+    TargetView,
+    pivot_of,
+)
 from robocal_ros.hand_eye.quality import (
     HandEyeSettings,
     apart,
@@ -22,11 +46,22 @@ from robocal_ros.hand_eye.quality import (
     judge_classic,
     judge_residuals,
 )
-from robocal_ros.hand_eye.result import HandEyeResult, Method
-from robocal_ros.hand_eye.sphere_radius import require_radius
-from robocal_ros.hand_eye.step_task import StepTask
+from robocal_ros.hand_eye.result import HandEyeResult, Method, TargetKind
+from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, Read, SphereTask, Task
+from robocal_ros.hand_eye.tasks import (
+    HandEyeData,
+    LineTask,
+    Read,
+    SphereTask,
+    StepTask,
+    Task,
+    features,
+    looked,
+)
+
+# ---- solve --------------------------------------------------------------------------------------
+
 
 Array = NDArray[np.float64]
 
@@ -167,4 +202,283 @@ def _classic(
         place=state.places[0],
         working_error_m=error_m,
         verdict=refused or judge_classic(apart_m, error_m, settings),
+    )
+
+
+# ---- verification -------------------------------------------------------------------------------
+
+
+Document = dict[str, Any]
+
+HELD = len(SENSOR_UNKNOWNS)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Distances (n,) of ``samples`` from a target, m; ``rejected``: shots without a feature."""
+
+    samples: tuple[str, ...]
+    distance_m: Array
+    rejected: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """What other data say of a mount.
+
+    Attributes
+    ----------
+    samples, distance_m : (n,) distance of each from the target, m.
+    target : what was found of the target with the mount held.
+    rejected : shots and features that were not used, and why.
+    """
+
+    samples: tuple[str, ...]
+    distance_m: Array
+    target: Document
+    rejected: Mapping[str, str]
+    verdict: Verdict
+
+
+def held_out(task: Task, data: HandEyeData, T_flange_sensor: Array, place: Array) -> HeldOut:
+    """How far other shots of the same target, which has not moved, are off.
+
+    Parameters
+    ----------
+    place : of the target, as `HandEyeResult` holds it.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When no shot shows the target.
+    """
+    read = task.read(data, T_flange_sensor)
+    state = MountState(T_flange_sensor, (place,))
+    return HeldOut(read.view.sightings.names, distances((read.view,), state), read.rejected)
+
+
+def judged(
+    result: HandEyeResult,
+    seen: HeldOut,
+    shots: int,
+    settings: HandEyeSettings,
+    left_out: Mapping[str, str] | None = None,
+) -> HandEyeResult:
+    """A result with what ``shots`` that were not used say of it; they may refuse it.
+
+    ``left_out``: what was no shot from the first, with the reason.
+    """
+    rejected = {**(left_out or {}), **seen.rejected}
+    document = errors_document(summarise(seen.distance_m)) | {
+        "rejected": list(rejected),
+        "rejected_because": rejected,
+    }
+    refused = judge_residuals(seen.distance_m, shots, len(seen.rejected), settings)
+    verdict = result.verdict
+    if refused is not None and verdict.accept:
+        words = f"shots that were not used to solve: {refused.reason}"
+        verdict = Verdict(refused.code, words)
+    return replace(result, verdict=verdict, more={**result.more, "held_out": document})
+
+
+def verify(
+    task: Task, data: HandEyeData, T_flange_sensor: Array, settings: HandEyeSettings
+) -> Verification:
+    """Hold a mount, find the target with it, and see how far each sighting is off.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When too few shots show the target.
+    RankDeficientError
+        When they do not tell where it is.
+    """
+    read = task.read(data)
+    start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
+    rejected = dict(read.rejected)
+    view, state = fit_place(read.view, start, settings.noise() or FIRST_NOISE, rejected)
+    far = distances((view,), state)
+    return Verification(
+        view.sightings.names,
+        far,
+        task.found(state.places[0]),
+        rejected,
+        _verdict(far, len(rejected), settings),
+    )
+
+
+def _verdict(far: Array, lost: int, settings: HandEyeSettings) -> Verdict:
+    rms = float(np.sqrt(np.mean(far**2)))
+    words = f"{len(far)} samples are off by {rms * 1e3:.3f} mm rms"
+    if lost > len(far):
+        return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}, but {lost} do not fit at all")
+    if rms > settings.limit_m:
+        words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): the mount is not this one"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    return Verdict(Code.ACCEPT, words)
+
+
+def fit_place(
+    view: TargetView, start: MountState, noise: PoseNoise, rejected: dict[str, str]
+) -> tuple[TargetView, MountState]:
+    """The target's most likely place with the sensor held; outliers are named in ``rejected``.
+
+    Raises
+    ------
+    RankDeficientError
+        When the sightings do not tell it.
+    """
+    if not view.model.names:
+        return view, start
+    problem = MountProblem((view,), noise, start)
+    estimate = solve(
+        _PlaceProblem(problem),
+        start,
+        prior_information=view.model.prior,
+        sizes=problem.sizes,
+    )
+    kept = without((view,), estimate.rejected[problem.sample], rejected)
+    return kept[0], estimate.settled()
+
+
+class _PlaceProblem:
+    """`MountProblem` whose sensor is held."""
+
+    scale_components = 0
+
+    def __init__(self, problem: MountProblem) -> None:
+        self._problem = problem
+        self.names = problem.names[HELD:]
+
+    def linearise(self, state: MountState) -> tuple[Array, Array]:
+        residual, jacobian = self._problem.linearise(state)
+        return residual, jacobian[..., HELD:]
+
+    def retract(self, state: MountState, step: Array) -> MountState:
+        return self._problem.retract(state, np.concatenate([np.zeros(HELD), step]))
+
+    def deviation(self, state: MountState) -> Array:
+        return self._problem.deviation(state)[HELD:]
+
+
+# ---- one mount from several targets at once: what one leaves open, another shows ----------------
+
+
+Part = tuple[Task, HandEyeData]
+
+
+def solve_joint(
+    parts: Sequence[Part],
+    settings: HandEyeSettings,
+    checks: Mapping[TargetKind, HandEyeData] | None = None,
+) -> HandEyeResult:
+    """Calibrate with all shots of several targets; names of samples begin with their target's kind.
+
+    At least one target must suffice for a first pose of the sensor. ``checks``: by kind, other
+    shots of targets, which have not moved; they judge the result.
+
+    Raises
+    ------
+    InputError
+        Fewer than two targets, or two of one kind.
+    ResidualError
+        One target's samples contradict each other; the mistake is named as in `solve_task`.
+    TooFewSamplesError, RankDeficientError
+        When no target gives a first pose, the first one's reason; as `solve_task` otherwise.
+    """
+    kinds = [task.kind for task, _ in parts]
+    if len(kinds) < 2 or len(set(kinds)) < len(kinds):
+        raise InputError(f"several targets of different kinds are needed, not: {', '.join(kinds)}")
+    alone = [_alone(*part) for part in parts]
+    X = _first(alone, settings)
+    reads = _named(parts, [read for read, _ in alone])
+    views = tuple(read.view for read in reads)
+    places = [
+        task.placed(view, X.T_flange_sensor) for (task, _), view in zip(parts, views, strict=True)
+    ]
+    fit = fit_mount(views, MountState(X.T_flange_sensor, tuple(places)), settings.noise())
+    require_radius(fit)
+    require_seen(fit)
+    tasks = [task for task, _ in parts]
+    result = result_of(tasks, fit, reads, _data(parts), settings)
+    if not checks:
+        return result
+    shots = sum(len(data.names) for data in checks.values())
+    return judged(result, _held_out(tasks, fit.state, checks), shots, settings)
+
+
+def _held_out(
+    tasks: Sequence[Task], state: MountState, checks: Mapping[TargetKind, HandEyeData]
+) -> HeldOut:
+    """How far all other shots are off."""
+    found = {
+        task.kind: held_out(task, checks[task.kind], state.T_flange_sensor, place)
+        for task, place in zip(tasks, state.places, strict=True)
+        if task.kind in checks
+    }
+    return HeldOut(
+        tuple(f"{kind}/{name}" for kind, one in found.items() for name in one.samples),
+        np.concatenate([one.distance_m for one in found.values()]),
+        {
+            f"{kind}/{name}": why
+            for kind, one in found.items()
+            for name, why in one.rejected.items()
+        },
+    )
+
+
+def _alone(task: Task, data: HandEyeData) -> tuple[Read, MountState | RobocalError]:
+    """Features of one target, and where they lead alone, or why nowhere: others may show more."""
+    read = features(task, data)
+    try:
+        return read, looked(task, data, read)
+    except (TooFewSamplesError, RankDeficientError) as error:
+        return read, error
+
+
+def _first(
+    alone: Sequence[tuple[Read, MountState | RobocalError]], settings: HandEyeSettings
+) -> MountState:
+    """The pose of the sensor from the target that shows it best alone."""
+    failures = [near for _, near in alone if isinstance(near, RobocalError)]
+    fits = []
+    for read, near in alone:
+        if isinstance(near, MountState):
+            try:
+                fits.append(fit_mount((read.view,), near, settings.noise()))
+            except (TooFewSamplesError, RankDeficientError) as error:
+                failures.append(error)
+    if not fits:
+        raise failures[0]
+    return min(fits, key=lambda fit: float(np.trace(fit.covariance[:3, :3]))).state
+
+
+def _named(parts: Sequence[Part], reads: Sequence[Read]) -> list[Read]:
+    """Samples called after their target; shots of all are numbered through."""
+    named, first = [], 0
+    for (task, data), read in zip(parts, reads, strict=True):
+        s = read.view.sightings
+        s = replace(
+            s,
+            names=tuple(f"{task.kind}/{name}" for name in s.names),
+            shot=s.shot + first,
+            pose=s.pose + first,
+        )
+        named.append(
+            Read(
+                replace(read.view, sightings=s),
+                {f"{task.kind}/{name}": why for name, why in read.rejected.items()},
+                {f"{task.kind}/{name}": points for name, points in read.points.items()},
+            )
+        )
+        first += len(data.names)
+    return named
+
+
+def _data(parts: Sequence[Part]) -> HandEyeData:
+    """All shots together."""
+    return HandEyeData(
+        tuple(f"{task.kind}/{name}" for task, data in parts for name in data.names),
+        np.concatenate([data.T_base_flange for _, data in parts]),
+        [profile for _, data in parts for profile in data.profiles],
     )

@@ -14,7 +14,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera, require_sound
 from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
-from robocal_ros.hand_eye.pose_pairs import Mount, PosePairs, Shared, differences, predicted
+from robocal_ros.hand_eye.camera_model import Mount, PosePairs, Shared, differences, predicted
 from robocal_ros.hand_eye.result import HandEyeResult
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.cells import Cells, read_cells, texts, write_cells
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted, read_bytes
-from robocal_ros.hand_eye.profile import Profile, profile_of
+from robocal_ros.hand_eye.shots import Profile, profile_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import (
     POSITION,

@@ -15,14 +15,20 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError, RobocalError
-from robocal_ros.hand_eye.increments import tangents
-from robocal_ros.hand_eye.tracker_cube import PARALLEL_FACES, Cube, fit_plane, outward, tracked_cube
-from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
-from robocal_ros.hand_eye.tracker_flange import (
+from robocal_ros.hand_eye.target_models import tangents
+from robocal_ros.hand_eye.tracker_data import (
+    PARALLEL_FACES,
     Axis,
+    Cube,
+    TrackerData,
+    TrackerNoise,
+    TrackerTarget,
     fit_axes,
+    fit_plane,
     flange_pose,
+    outward,
     reflector_in_flange,
+    tracked_cube,
     two_axis_frame,
 )
 from robocal_ros.hand_eye.tracker_scan import Scan, find_planes, parts_of

@@ -2,6 +2,9 @@
 
 Rows are whitened one by one, so that each is a sample of its own; the errors of the joints at a
 profile are common to all that it shows, and at a point of an arc they move it along its path.
+
+Both are taken to miss the model by half of it: they turn about their common perpendicular, and
+shift along it, in opposite directions. What the flange is then lies midway, as in the closed form.
 """
 
 from collections.abc import Sequence
@@ -12,32 +15,168 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.increments import tangents
+from robocal_ros.hand_eye.target_models import moved, tangents
 from robocal_ros.hand_eye.tracker_data import (
     FACES,
     MOVED,
     Arc,
+    Axis,
     TrackerData,
     TrackerNoise,
     TrackerTarget,
+    nominal_axis,
 )
-from robocal_ros.hand_eye.tracker_features import Caps, Lines
-from robocal_ros.hand_eye.tracker_skew import AxisPair
-from robocal_ros.hand_eye.tracker_state import (
-    CENTRE,
-    FLANGE,
-    MISMATCH,
-    NAMES,
-    NORMALS,
-    OFFSETS,
-    REFLECTOR,
-    SENSOR,
-    UNKNOWNS,
-    TrackerUnknowns,
-    adjoint,
-)
+from robocal_ros.hand_eye.tracker_scan import Caps, Lines
+
+# ---- tracker state ------------------------------------------------------------------------------
+
 
 Array = NDArray[np.float64]
+
+FLANGE, SENSOR = slice(0, 6), slice(6, 12)
+REFLECTOR, CENTRE = slice(12, 15), slice(15, 18)
+NORMALS = (slice(18, 20), slice(20, 22))
+OFFSETS, MISMATCH = slice(22, 24), slice(24, 26)
+UNKNOWNS = 26
+NAMES = tuple(
+    f"{what} {axis}"
+    for what, axes in (
+        ("flange in tracker", ("x", "y", "z", "turn x", "turn y", "turn z")),
+        ("sensor in flange", ("x", "y", "z", "turn x", "turn y", "turn z")),
+        ("reflector", ("x", "y", "z")),
+        ("sphere", ("x", "y", "z")),
+        *((face, ("tilt", "turn")) for face in FACES),
+        ("face offset", ("1", "2")),
+        ("axes", ("angle", "gap")),
+    )
+    for axis in axes
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerUnknowns:
+    """All unknowns, SI.
+
+    Attributes
+    ----------
+    T_tracker_flange : (4, 4) at the first profile; T_flange_sensor (4, 4).
+    reflector : (3,) in the flange; ``centre`` (3,) of the sphere, tracker.
+    normals, offsets : (2, 3) and (2,) of the faces, outward, tracker.
+    mismatch : (2,) of the axes' angle and gap, real minus nominal.
+    """
+
+    T_tracker_flange: Array
+    T_flange_sensor: Array
+    reflector: Array
+    centre: Array
+    normals: Array
+    offsets: Array
+    mismatch: Array
+
+    def moved(self, step: Array) -> "TrackerUnknowns":
+        """The state after an increment (26,)."""
+        tilts = np.array(
+            [tangents(n) @ step[part] for n, part in zip(self.normals, NORMALS, strict=True)]
+        )
+        normals = self.normals + tilts
+        return TrackerUnknowns(
+            T_tracker_flange=moved(self.T_tracker_flange, step[FLANGE]),
+            T_flange_sensor=moved(self.T_flange_sensor, step[SENSOR]),
+            reflector=self.reflector + step[REFLECTOR],
+            centre=self.centre + step[CENTRE],
+            normals=normals / np.linalg.norm(normals, axis=1)[:, None],
+            offsets=self.offsets + step[OFFSETS],
+            mismatch=self.mismatch + step[MISMATCH],
+        )
+
+    def sensor_poses(self, motion: Array) -> Array:
+        """T_tracker_sensor (m, 4, 4) of the profiles, from their T_flange0_flange (m, 4, 4)."""
+        return np.asarray(self.T_tracker_flange @ motion @ self.T_flange_sensor)
+
+
+def adjoint(T: Array) -> Array:
+    """(..., 6, 6): twists (v, w) given on the right of a frame, on the left of T (..., 4, 4).
+
+    ``exp(adjoint(T) x) T = T exp(x)``.
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    found = np.zeros((*T.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = R
+    found[..., :3, 3:] = frames.skew(t) @ R
+    return found
+
+
+# ---- axes of a real arm that stand to each other a little otherwise than its model says ---------
+
+
+ANGLE_SIGMA, GAP_SIGMA_M = float(np.radians(0.5)), 1e-3  # of real arms: hardly a restraint
+HELD_M = 1e-9  # the gap from a joint that slides has no meaning
+
+
+@dataclass(frozen=True, eq=False)
+class AxisPair:
+    """The axes of both arcs in the flange of the first profile, by the nominal geometry.
+
+    Attributes
+    ----------
+    joints : of the arcs.
+    screws : (6, 2) twists that turn about the common perpendicular, and shift along it.
+    sigma : (2,) of the mismatch, rad and m.
+    height_axis : (3,) direction of the last one that turns.
+    """
+
+    joints: tuple[int, int]
+    screws: Array
+    sigma: Array
+    height_axis: Array
+
+    @classmethod
+    def of(cls, data: TrackerData, axes: Sequence[Axis]) -> "AxisPair":
+        """The axes of the arcs of ``data``."""
+        first, second = (
+            nominal_axis(data, arc, axis.joint) for arc, axis in zip(data.arcs, axes, strict=True)
+        )
+        across = np.cross(first[0], second[0])
+        across /= np.linalg.norm(across)
+        turning = [i for i in (0, 1) if not axes[i].slides]
+        last = max(turning, key=lambda i: axes[i].joint)
+        foot = (first, second)[last][1]
+        if len(turning) == 2:  # where the common perpendicular starts from the first axis
+            rows = np.column_stack([first[0], -second[0], across])
+            foot = first[1] + first[0] * np.linalg.solve(rows, second[1] - first[1])[0]
+        screws = np.zeros((6, 2))
+        screws[:3, 0], screws[3:, 0], screws[:3, 1] = np.cross(foot, across), across, across
+        return cls(
+            joints=(axes[0].joint, axes[1].joint),
+            screws=screws,
+            sigma=np.array([ANGLE_SIGMA, GAP_SIGMA_M if len(turning) == 2 else HELD_M]),
+            height_axis=(first, second)[last][0],
+        )
+
+    def share_of(self, q: Array) -> float:
+        """Share of the mismatch, -1/2 or 1/2, of the one joint that moves; 0 where several do."""
+        moved = np.flatnonzero(np.ptp(q, axis=0) > MOVED)
+        if len(moved) != 1 or moved[0] not in self.joints:
+            return 0.0
+        return self.joints.index(int(moved[0])) - 0.5
+
+    def carried(self, motion: Array, mismatch: Array, share: float) -> Array:
+        """Motions (n, 4, 4) about the real axis instead of the nominal one."""
+        turn, gap = share * mismatch
+        across = self.screws[3:, 0]
+        R = frames.exp_rotation(turn * across)
+        foot = np.cross(across, self.screws[:3, 0])
+        C = frames.transform(R, foot - R @ foot + gap * across)
+        return np.asarray(C @ motion @ frames.invert(C))
+
+    def twists(self, carried: Array, share: float) -> Array:
+        """Left twists (n, 6, 2) of carried motions by the mismatch."""
+        return np.asarray(share * (self.screws - adjoint(carried) @ self.screws))
+
+
+# ---- tracker problem ----------------------------------------------------------------------------
+
+
 OF_FACE = 2  # rows of a profile for each face; then come those of the sphere
 
 

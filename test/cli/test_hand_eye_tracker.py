@@ -12,8 +12,8 @@ from robocal_ros.cell_sim.laser_tracker import TrackerCell
 from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
 from robocal_ros.cell_sim.ur10_station import Q_NEAR
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye.target_files import read_tracker_points, read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
-from robocal_ros.hand_eye.tracker_tables import read_tracker_points, read_tracker_target
 from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")

@@ -7,7 +7,7 @@ from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, T
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.board import Chessboard
 from robocal_ros.hand_eye.camera_fit import GivenNoise
-from robocal_ros.hand_eye.pose_pairs import PosePairs
+from robocal_ros.hand_eye.camera_model import PosePairs
 
 MOUNTS = ("in-hand", "to-hand")
 EXACT = BoardNoise(0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

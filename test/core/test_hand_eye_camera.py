@@ -12,14 +12,27 @@ from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
-from robocal_ros.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form, closed_form_of_all
-from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
+from robocal_ros.hand_eye.camera_fit import (
+    Evidence,
+    GivenNoise,
+    PairNoise,
+    Parts,
+    estimate,
+    fit_pairs,
+)
 from robocal_ros.hand_eye.camera_kernels import weigh
-from robocal_ros.hand_eye.camera_model import PairState, linearised
-from robocal_ros.hand_eye.camera_noise import Evidence, PairNoise, Parts, estimate
-from robocal_ros.hand_eye.camera_start import robust_start
-from robocal_ros.hand_eye.increments import moved
-from robocal_ros.hand_eye.pose_pairs import Placement, PosePairs, Shared
+from robocal_ros.hand_eye.camera_model import (
+    CLOSED_FORMS,
+    PairState,
+    Placement,
+    PosePairs,
+    Shared,
+    closed_form,
+    closed_form_of_all,
+    linearised,
+    robust_start,
+)
+from robocal_ros.hand_eye.target_models import moved
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -19,7 +19,7 @@ from robocal_ros.hand_eye.board import (
 )
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
 from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
-from robocal_ros.hand_eye.pose_pairs import PosePairs
+from robocal_ros.hand_eye.camera_model import PosePairs
 
 
 def pixels(cell: BoardCell, count: int, seed: int, noise_px: float = 0.2):

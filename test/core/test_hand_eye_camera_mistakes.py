@@ -15,11 +15,9 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera, left_out, unsettled
 from robocal_ros.hand_eye.camera_fit import fit_pairs
-from robocal_ros.hand_eye.camera_model import PairState, linearised
-from robocal_ros.hand_eye.camera_quality import left_out, unsettled
-from robocal_ros.hand_eye.pose_pairs import PosePairs
+from robocal_ros.hand_eye.camera_model import PairState, PosePairs, linearised
 
 
 def scaled(T: np.ndarray, factor: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.hand_eye.exports import exported
+from robocal_ros.hand_eye.files import exported
 
 TURNS = [
     *Rotation.random(20, random_state=7).as_matrix(),

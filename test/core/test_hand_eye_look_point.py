@@ -6,8 +6,7 @@ from hand_eye_sets import CELL, CENTRE, RADIUS_M
 from scipy.optimize import minimize
 
 from robocal_ros.cell_sim.hand_eye_sets import sphere_shots
-from robocal_ros.hand_eye.look_point import BEHIND, OFF_EQUATOR, looked_at
-from robocal_ros.hand_eye.planning import SensorRange
+from robocal_ros.hand_eye.planning import BEHIND, OFF_EQUATOR, SensorRange, looked_at
 
 SENSOR = SensorRange(width_m=0.09)
 

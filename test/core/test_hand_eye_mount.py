@@ -14,15 +14,14 @@ from robocal_ros.hand_eye.mount_problem import (
     MountProblem,
     MountState,
     PoseNoise,
+    RestrictedLikelihood,
     TargetView,
     pivot_of,
 )
 from robocal_ros.hand_eye.quality import HandEyeSettings, judge
-from robocal_ros.hand_eye.restricted_noise import RestrictedLikelihood
 from robocal_ros.hand_eye.result import increment
-from robocal_ros.hand_eye.sightings import Sightings
-from robocal_ros.hand_eye.step_task import StepTask
-from robocal_ros.hand_eye.target_models import LineModel, SphereModel
+from robocal_ros.hand_eye.target_models import LineModel, Sightings, SphereModel
+from robocal_ros.hand_eye.tasks import StepTask
 
 X = CELL.T_flange_sensor
 FEATURE_M = 5e-6

@@ -21,8 +21,13 @@ from robocal_ros.cell_sim.profile_targets import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_problem import PoseNoise
-from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStairs
-from robocal_ros.hand_eye.planning import SensorRange, check_plan
+from robocal_ros.hand_eye.planning import (
+    PlannedLine,
+    PlannedSphere,
+    PlannedStairs,
+    SensorRange,
+    check_plan,
+)
 from robocal_ros.hand_eye.quality import HandEyeSettings, apart, expected_error_m
 from robocal_ros.hand_eye.result import at_origin
 from robocal_ros.hand_eye.solve import solve_sphere

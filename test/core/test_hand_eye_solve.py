@@ -38,14 +38,19 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.hand_eye.joint import solve_joint
-from robocal_ros.hand_eye.profile import profile_of
 from robocal_ros.hand_eye.quality import HandEyeSettings
 from robocal_ros.hand_eye.result import hand_eye_document, point_covariance
-from robocal_ros.hand_eye.solve import solve_line, solve_sphere, solve_step
+from robocal_ros.hand_eye.shots import profile_of
+from robocal_ros.hand_eye.solve import (
+    held_out,
+    solve_joint,
+    solve_line,
+    solve_sphere,
+    solve_step,
+    verify,
+)
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
-from robocal_ros.hand_eye.verification import held_out, verify
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor

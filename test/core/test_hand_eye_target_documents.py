@@ -8,13 +8,14 @@ import pytest
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.hand_eye.target_documents import target_document, target_of
 from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LineTarget,
     SphereTarget,
     Staircase,
     StepTarget,
+    target_document,
+    target_of,
 )
 
 T = frames.transform(frames.exp_rotation([0.1, 0.2, 0.3]), [0.7, 0.1, 1 / 3])

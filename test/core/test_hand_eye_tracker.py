@@ -19,14 +19,12 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.hand_eye import tracker
-from robocal_ros.hand_eye.profile import Profile
-from robocal_ros.hand_eye.tracker import solve_best, solve_tracker, spread
+from robocal_ros.hand_eye.shots import Profile
+from robocal_ros.hand_eye.tracker import solve_best, solve_tracker, spread, states_without
 from robocal_ros.hand_eye.tracker_classic import solve_classic
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData
-from robocal_ros.hand_eye.tracker_features import fit_caps
-from robocal_ros.hand_eye.tracker_quality import states_without
-from robocal_ros.hand_eye.tracker_scan import Scan
-from robocal_ros.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
+from robocal_ros.hand_eye.tracker_problem import SENSOR, UNKNOWNS, adjoint
+from robocal_ros.hand_eye.tracker_scan import Scan, fit_caps
 from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")

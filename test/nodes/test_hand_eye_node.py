@@ -29,7 +29,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.data import Capture
 from robocal_ros.hand_eye.node import HandEyeNode
-from robocal_ros.hand_eye.outputs import HandEyeOutputs
+from robocal_ros.hand_eye.services import HandEyeOutputs
 from robocal_ros.hand_eye.target_files import write_target
 from robocal_ros.hand_eye.targets import LineTarget
 from robocal_ros.ros import qos

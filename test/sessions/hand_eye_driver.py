@@ -17,11 +17,9 @@ from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.inputs import take_hand_eye_message
-from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.hand_eye.target_documents import target_document
-from robocal_ros.hand_eye.targets import SphereTarget
+from robocal_ros.hand_eye.targets import SphereTarget, target_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome

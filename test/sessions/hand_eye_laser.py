@@ -13,8 +13,7 @@ from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, groove_sh
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession
-from robocal_ros.hand_eye.target_documents import target_document
-from robocal_ros.hand_eye.targets import Staircase, StepTarget
+from robocal_ros.hand_eye.targets import Staircase, StepTarget, target_document
 from robocal_ros.session import events
 
 SHOTS = list(sphere_shots_of(14))

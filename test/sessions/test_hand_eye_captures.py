@@ -16,7 +16,7 @@ from hand_eye_laser import SHOTS, STEP, begun, driver_of
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye import shots as hand_eye_shots
 from robocal_ros.hand_eye.shots import MOST_BYTES, MOST_KEPT, Shot, ShotLog
-from robocal_ros.hand_eye.target_documents import target_document
+from robocal_ros.hand_eye.targets import target_document
 from robocal_ros.session import events
 
 # ---- captures that fail -------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
-from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.tables import (
     PoseTable,
     read_pose_table,
