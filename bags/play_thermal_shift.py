@@ -26,7 +26,7 @@ from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.cell_sim.shift import REFERENCE
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import qos
-from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.ros.decision_services import EVENTS
 
 SERIAL = "SIM-KR150-2"
 INPUTS = ("joint_states", "sphere_cloud", "reference_sphere_center", "motor_temperatures")

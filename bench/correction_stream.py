@@ -160,8 +160,7 @@ def _correct(probe: "Probe", stream: "Stream", arm: Any) -> None:
     from robocal_msgs.msg import KinematicModel
 
     from bench.stream_probe import drifted, offered, path
-    from robocal_ros.correction.bounds import CorrectionConfig
-    from robocal_ros.correction.clamping import correction_between
+    from robocal_ros.correction.bounds import CorrectionConfig, correction_between
     from robocal_ros.correction.joint_correction import pack_model
 
     actual = drifted(arm, DRIFT_M)

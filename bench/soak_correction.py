@@ -19,8 +19,7 @@ from bench.soaking import soak_main
 from bench.startup import EXECUTABLES
 from bench.stream_probe import STATES, TARGETS, Probe, Stream, Subject, drifted, offered
 from bench.tables import Goal, Table
-from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.clamping import correction_between
+from robocal_ros.correction.bounds import CorrectionConfig, correction_between
 from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

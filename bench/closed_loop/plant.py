@@ -16,15 +16,14 @@ from robocal_ros.cell_sim.cell_outputs import Happened
 from robocal_ros.cell_sim.cell_samples import CellSamples, Sample
 from robocal_ros.cell_sim.kr150_cell import poses
 from robocal_ros.cell_sim.production import programme
-from robocal_ros.correction.inputs import TrajectoryCommand
-from robocal_ros.correction.refusals import RefusedError
+from robocal_ros.correction.inputs import RefusedError, TrajectoryCommand
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance import CycleResult
-from robocal_ros.maintenance.ways import STATION
+from robocal_ros.maintenance.mover import STATION
+from robocal_ros.motion.cell import joint_way
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.travel import joint_way
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.learning import LearnedProcess

@@ -6,8 +6,7 @@ from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, point_sigma
 from robocal_ros.cell_sim.cell_plan import CellPlan, known_laser
 from robocal_ros.cell_sim.kr150_cell import SPIN_RAD, T_BASE_LASER, TAUGHT, poses
 from robocal_ros.maintenance import AcceptBounds, MaintenanceConfig, Times
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.housing import DrivingConfig, Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser

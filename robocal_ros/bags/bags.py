@@ -17,12 +17,18 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from robocal_ros.bags import bag_types
+from robocal_ros.bags.bag_types import graph_name
 from robocal_ros.bags.bag_writer import BagWriter
-from robocal_ros.bags.mcap_files import Block, Lost, McapFile, open_file, read_block
-from robocal_ros.bags.merging import in_order
-from robocal_ros.bags.message_readers import message_reader
-from robocal_ros.bags.messages import Messages
-from robocal_ros.bags.recorded_names import graph_name
+from robocal_ros.bags.mcap_files import (
+    Block,
+    Lost,
+    McapFile,
+    Messages,
+    in_order,
+    message_reader,
+    open_file,
+    read_block,
+)
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import read_text
 

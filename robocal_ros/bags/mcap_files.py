@@ -2,15 +2,18 @@
 
 A file without an index is what a recorder that was killed leaves behind. Everything up to the
 first incomplete record is read. A damaged chunk is left out. What was found wrong is told.
+
+A reader takes messages and a range of them, and gives contents with the place of each.
 """
 
+import heapq
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -19,11 +22,66 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema, Statistics
 from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from numpy.typing import NDArray
+from rosbags.serde.errors import SerdeError
+from rosbags.typesys.store import Typestore
 from zstandard import ZstdError
 
-from robocal_ros.bags.bag_types import full_name
-from robocal_ros.bags.messages import Messages
+from robocal_ros.bags.bag_types import full_name, ros_types
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import JointBlock, joint_sample
+
+if TYPE_CHECKING:
+    from robocal_ros.ground.serialized_joints import JointLayout
+
+
+# ---- messages as they lie in the bytes of a bag -------------------------------------------------
+
+
+Places = NDArray[np.int64]
+
+
+class Messages(NamedTuple):
+    """Messages (k,) in the bytes that they came from.
+
+    Attributes
+    ----------
+    content : the bytes.
+    log_time_ns : when each was recorded.
+    channel : its number.
+    begin, end : where its data lies.
+    """
+
+    content: memoryview
+    log_time_ns: Places
+    channel: Places
+    begin: Places
+    end: Places
+
+    def data(self, place: int) -> memoryview:
+        """A message's data."""
+        return self.content[self.begin[place] : self.end[place]]
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Messages":
+        """Return those at ``rows``."""
+        return Messages(self.content, *(column[rows] for column in self[1:]))
+
+    @classmethod
+    def among(cls, content: memoryview) -> "Messages":
+        """Messages among MCAP records, as they are stored.
+
+        Raises
+        ------
+        ValueError
+            When the bytes are not whole records.
+        """
+        from robocal_ros.ground.mcap_records import find_messages
+
+        return cls(content, *find_messages(content))
+
+
+# ---- one MCAP file as blocks of messages, found by its index or, without one, by a scan ---------
+
 
 MAGIC = b"\x89MCAP0\r\n"
 OTHER_FORMATS = {
@@ -280,3 +338,155 @@ def _definitions(content: memoryview, file: McapFile) -> None:
                 channel = Channel.read(body)
                 file.channels[channel.id] = channel
         at += HEAD.size + length
+
+
+# ---- messages of many blocks in one order: by log time, ties as they were recorded --------------
+
+
+class Stretch(NamedTuple):
+    """Messages ``start`` to ``stop`` of a block of a file: none of another block lies between."""
+
+    file: int
+    messages: Messages
+    start: int
+    stop: int
+
+
+# time of the next message, file, block's offset, place in the block, the block's messages
+_Entry = tuple[int, int, int, int, Messages]
+
+
+def in_order(
+    blocks: Iterable[tuple[int, Block]], read: Callable[[int, Block], Messages | None]
+) -> Iterator[Stretch]:
+    """Merge blocks, each with the number of its file; one is in memory only while it is needed.
+
+    ``read`` gives a block's messages in order of log time.
+    """
+    heap: list[_Entry] = []
+    for start_ns, index, block in sorted((block.start_ns, index, block) for index, block in blocks):
+        yield from _earlier(heap, start_ns)
+        messages = read(index, block)
+        if messages is not None and len(messages.log_time_ns):
+            first_ns = int(messages.log_time_ns[0])
+            heapq.heappush(heap, (first_ns, index, block.offset, 0, messages))
+    yield from _earlier(heap, None)
+
+
+def _earlier(heap: list[_Entry], before_ns: int | None) -> Iterator[Stretch]:
+    """Take the messages before ``before_ns`` (None: all) off the heap, in order."""
+    while heap and (before_ns is None or heap[0][0] < before_ns):
+        _, index, offset, start, messages = heapq.heappop(heap)
+        times = messages.log_time_ns
+        stop = len(times)
+        if before_ns is not None:
+            stop = int(np.searchsorted(times, before_ns))
+        if heap:
+            other_ns, *other = heap[0][:3]
+            ours_first = [index, offset] < other  # of equal times
+            stop = min(stop, int(np.searchsorted(times, other_ns + ours_first)))
+        if stop < len(times):
+            heapq.heappush(heap, (int(times[stop]), index, offset, stop, messages))
+        yield Stretch(index, messages, start, stop)
+
+
+# ---- message readers ----------------------------------------------------------------------------
+
+
+Decode = Callable[[Messages, int], Any]
+Reader = Callable[[Messages, int, int], Iterator[tuple[int, Any]]]
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+MOST_LAYOUTS = 8  # of a topic: a gripper and an arm may take turns
+MOST_TOGETHER = 1024  # readings: where all are odd, each is looked for among so many
+
+
+def message_reader(
+    file: McapFile, channel: int, types: Typestore | None, blocks: Collection[str]
+) -> Reader:
+    """Reader of a channel.
+
+    ``types`` decode its messages; None: they stay bytes. ``blocks``: topics whose joint states
+    come in blocks.
+    """
+    topic, msgtype = file.channels[channel].topic, file.msgtype(channel)
+    if types is None:
+        return _OneByOne(lambda found, place: bytes(found.data(place)))
+
+    def decode(found: Messages, place: int) -> Any:
+        try:
+            return types.deserialize_cdr(found.data(place), msgtype)
+        except (SerdeError, KeyError) as error:
+            raise InputError(
+                f"a message of {topic} at {found.log_time_ns[place]} ns is not a {msgtype}: "
+                f"{error}",
+                file=str(file.path),
+            ) from error
+
+    as_defined = types.fielddefs.get(msgtype) == ros_types().fielddefs[JOINT_STATE]
+    gathered = topic in blocks and msgtype == JOINT_STATE and as_defined
+    return _JointReader(decode) if gathered else _OneByOne(decode)
+
+
+class _OneByOne:
+    """Reader of any topic."""
+
+    def __init__(self, decode: Decode) -> None:
+        self._decode = decode
+
+    def __call__(self, found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:
+        for place in range(start, stop):
+            yield place, self._decode(found, place)
+
+
+class _JointReader(_OneByOne):
+    """Reader of a topic of joint states: as decoded one by one, many times faster.
+
+    What can be used comes in blocks (`JointBlock`), what is odd as messages.
+    """
+
+    def __init__(self, decode: Decode) -> None:
+        super().__init__(decode)
+        self._layouts: list[tuple[JointLayout, tuple[str, ...]]] = []
+
+    def __call__(self, found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:
+        while start < stop:
+            until = min(stop, start + MOST_TOGETHER)
+            block = self._block(found, start, until)
+            if block is None and self._learn(found, start):
+                block = self._block(found, start, until)
+            if block is None:
+                yield start, self._decode(found, start)
+                start += 1
+            else:
+                yield start, block
+                start += len(block)
+
+    def _block(self, found: Messages, start: int, stop: int) -> JointBlock | None:
+        """The readings from ``start`` on that are laid out alike and finite; None without."""
+        begin, end = found.begin[start:stop], found.end[start:stop]
+        content = np.frombuffer(found.content, dtype=np.uint8)
+        for layout, names in self._layouts:
+            if len(layout.pattern) != end[0] - begin[0]:
+                continue
+            stamps, position = layout.gather(content, begin, end)
+            finite = np.isfinite(position).all(axis=1)
+            count = len(stamps) if finite.all() else int(np.argmin(finite))
+            if count:
+                return JointBlock(stamps[:count], names, position[:count])
+        return None
+
+    def _learn(self, found: Messages, place: int) -> bool:
+        """Take the layout of a message, if it is one that can be used."""
+        from robocal_ros.ground.serialized_joints import JointLayout
+
+        layout = JointLayout.of(bytes(found.data(place)))
+        if layout is None:
+            return False
+        try:
+            sample = joint_sample(self._decode(found, place))
+        except InputError:  # said where the message is taken
+            return False
+        self._layouts.insert(0, (layout, sample.names))
+        del self._layouts[MOST_LAYOUTS:]
+        return True

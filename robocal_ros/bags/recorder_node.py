@@ -8,9 +8,16 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
-from robocal_ros.bags.bag_recording import BagRecording
-from robocal_ros.bags.recorded_topics import DIAGNOSTICS, TOPICS, RecordedTopic, RecordedTopics
-from robocal_ros.bags.recording_folders import MB, Maker, keep, make_room, new_folder, size_bytes
+from robocal_ros.bags.bag_recording import (
+    MB,
+    BagRecording,
+    Maker,
+    keep,
+    make_room,
+    new_folder,
+    size_bytes,
+)
+from robocal_ros.bags.replay_topics import DIAGNOSTICS, TOPICS, RecordedTopic, RecordedTopics
 from robocal_ros.ground.errors import Code, ConflictError, StorageError
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.ros.base import HouseNode

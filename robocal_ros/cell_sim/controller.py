@@ -22,7 +22,7 @@ from robocal_ros.cell_sim.trajectory_goal import GoalState, TrajectoryGoal
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ros import qos
 from robocal_ros.ros.conversions import header
-from robocal_ros.ros.deferred_action import DeferredActionServer
+from robocal_ros.ros.decision_services import DeferredActionServer
 from robocal_ros.ros.endpoints import EndpointNode
 
 MONITOR_S = 0.05  # action_monitor_rate: goals' ends and feedback are told so often

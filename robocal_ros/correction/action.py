@@ -22,12 +22,12 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 
+from robocal_ros.correction.inputs import Reason, RefusedError
 from robocal_ros.correction.output import SentPath
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.samples import TAUGHT
-from robocal_ros.ros.deferred_action import DeferredActionServer
+from robocal_ros.ros.decision_services import DeferredActionServer
 from robocal_ros.ros.endpoints import EndpointNode
 
 Result = FollowJointTrajectory.Result

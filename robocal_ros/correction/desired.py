@@ -5,13 +5,27 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.bounds import CorrectionConfig, Policy, require_solved, require_within
-from robocal_ros.correction.clamping import ClampedResult, correction_between
+from robocal_ros.correction.bounds import (
+    ClampedResult,
+    CorrectionConfig,
+    Policy,
+    correction_between,
+    require_solved,
+    require_within,
+)
+from robocal_ros.correction.inputs import Reason
 from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.correction.limiter import OffsetLimiter, put_out
-from robocal_ros.correction.refusals import Reason
-from robocal_ros.correction.staged import StagedCorrection, StagedResult
-from robocal_ros.correction.stepping import FIGURES, LARGEST, NOT_WITHIN, REDUCED, REMAINING, SHIFT
+from robocal_ros.correction.staged import (
+    FIGURES,
+    LARGEST,
+    NOT_WITHIN,
+    REDUCED,
+    REMAINING,
+    SHIFT,
+    StagedCorrection,
+    StagedResult,
+)
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]

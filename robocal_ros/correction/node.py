@@ -23,10 +23,15 @@ from robocal_ros.correction.graph import (
     JointSources,
     Leases,
 )
-from robocal_ros.correction.inputs import TrajectoryCommand, offered_model, offered_tool
+from robocal_ros.correction.inputs import (
+    Reason,
+    RefusedError,
+    TrajectoryCommand,
+    offered_model,
+    offered_tool,
+)
 from robocal_ros.correction.messages import ArrayMessage, JointMessage, PathMessage, tail_message
 from robocal_ros.correction.output import SentPath
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.correction.session import CorrectionSession, load_kernels
@@ -41,9 +46,9 @@ from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
-from robocal_ros.motion.source_guard import SourceGuard
 from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode

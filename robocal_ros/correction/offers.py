@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from robocal_ros.correction.bounds import ROUNDING, CorrectionConfig, Survey, survey
-from robocal_ros.correction.inputs import Array, OfferedModel, OfferedTool
+from robocal_ros.correction.inputs import Array, OfferedModel, OfferedTool, Reason, RefusedError
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 

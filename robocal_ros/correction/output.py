@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import Array, Index
+from robocal_ros.correction.inputs import Array, Index, Reason, RefusedError
 from robocal_ros.correction.limiter import (
     DESIRED,
     DESIRED_RATE,
@@ -19,7 +19,6 @@ from robocal_ros.correction.limiter import (
     TAUGHT,
     OffsetLimiter,
 )
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.kinematics import SerialArm

@@ -5,10 +5,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.inputs import JointCommand, require_finite
-from robocal_ros.correction.joint_correction import plain
-from robocal_ros.correction.rates import ordinary
-from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, require_finite
+from robocal_ros.correction.joint_correction import ordinary, plain
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.correction import kernels as k
 from robocal_ros.correction import straight, straight_damped
-from robocal_ros.correction import straight_kinematics as six
-from robocal_ros.correction.room import (
+from robocal_ros.correction import straight as six
+from robocal_ros.correction.straight import (
     IS_STRAIGHT,
     PER_ERROR,
     STEEPNESS,

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
-from robocal_ros.correction.inputs import Array
-from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.inputs import Array, Reason
 from robocal_ros.ground.proposals import Head
 
 if TYPE_CHECKING:  # who hears a status needs no compiled code

@@ -9,29 +9,27 @@ from numpy.typing import NDArray
 
 from robocal_ros.correction.kernels import WINDOW, lambda_square
 from robocal_ros.correction.straight import (
+    ACTUAL,
     AT_GOAL,
+    DAMPING,
     FAR,
     LANES,
     NEAR,
     SHORT,
-    dot,
-    more,
-    turns_little,
-    weighed,
-    within,
-    write,
-)
-from robocal_ros.correction.straight_kinematics import (
-    ACTUAL,
-    DAMPING,
     Frame,
     Frames,
     N,
     Six,
     column,
+    dot,
     goal,
+    more,
     residual,
+    turns_little,
     walk,
+    weighed,
+    within,
+    write,
 )
 from robocal_ros.ground.compiled import kernel, lean
 

@@ -8,10 +8,9 @@ from itertools import accumulate
 
 import numpy as np
 
-from robocal_ros.correction.bounds import CorrectionConfig, require_limits
-from robocal_ros.correction.clamping import ClampedCorrection
+from robocal_ros.correction.bounds import ClampedCorrection, CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import Array, Index, JointCommand
+from robocal_ros.correction.inputs import Array, Index, JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
     DESIRED,
     LONGEST_STEP_S,
@@ -21,9 +20,8 @@ from robocal_ros.correction.limiter import (
     VELOCITY,
 )
 from robocal_ros.correction.output import Output, hold_speeds
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.stepping import ADDS, TOO_FAST
+from robocal_ros.correction.staged import ADDS, TOO_FAST
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 

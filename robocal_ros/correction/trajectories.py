@@ -10,6 +10,8 @@ from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import (
     Array,
     Index,
+    Reason,
+    RefusedError,
     TrajectoryCommand,
     require_few,
     require_finite,
@@ -26,7 +28,6 @@ from robocal_ros.correction.limiter import (
     STILL,
 )
 from robocal_ros.correction.output import Output, SentPath, hold_speeds, spline, spline_terms
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
 from robocal_ros.ground.samples import CORRECTED

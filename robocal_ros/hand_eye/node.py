@@ -23,18 +23,17 @@ from robocal_ros.hand_eye.settings import SETTINGS, session_config
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.motion.silence import Silence
-from robocal_ros.motion.source_guard import SourceGuard
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.command_desk import CommandDesk
-from robocal_ros.ros.decision_services import DecisionServices
+from robocal_ros.ros.clocks import StampWatch
+from robocal_ros.ros.decision_services import CommandDesk, DecisionServices
 from robocal_ros.ros.diagnostics import ERROR, WARN, Health
 from robocal_ros.ros.endpoints import NotActiveError
 from robocal_ros.ros.frame_watch import FrameWatch
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
-from robocal_ros.ros.stamp_watch import StampWatch
 from robocal_ros.session.decisions import named
 from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome
 

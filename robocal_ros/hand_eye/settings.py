@@ -14,9 +14,7 @@ from robocal_ros.hand_eye.target_files import KINDS as DESCRIBED
 from robocal_ros.hand_eye.target_files import read_target
 from robocal_ros.hand_eye.targets import KIND_OF, Document, target_document
 from robocal_ros.ros.history_settings import STATE_DIR
-from robocal_ros.ros.parameters import Setting, length
-from robocal_ros.ros.pose_settings import pose_settings
-from robocal_ros.ros.standstill_settings import STANDSTILL, standstill_rule
+from robocal_ros.ros.parameters import STANDSTILL, Setting, length, pose_settings, standstill_rule
 
 
 def _range_fault(values: list[float]) -> str | None:

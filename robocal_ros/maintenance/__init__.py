@@ -23,8 +23,7 @@ status          what is said
 
 from robocal_ros.maintenance.config import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.maintenance.memory import CycleResult
-from robocal_ros.maintenance.session import MaintenanceSession
-from robocal_ros.maintenance.status import MaintenanceState, Status
+from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState, Status
 
 __all__ = [
     "AcceptBounds",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import DrivingConfig
 
 Array = NDArray[np.float64]
 

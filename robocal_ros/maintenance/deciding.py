@@ -1,12 +1,19 @@
 """Decisions about thermal models and tools, and what may be accepted without a person."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    RobocalError,
+    StaleError,
+    StorageError,
+)
 from robocal_ros.ground.proposals import (
     REFERENCE,
     THERMAL,
@@ -21,11 +28,16 @@ from robocal_ros.ground.proposals import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.maintenance.config import MaintenanceConfig
+from robocal_ros.maintenance.hands import Hands
+from robocal_ros.maintenance.requests import Script
 from robocal_ros.session.decisions import History, decide, measured_with
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
 from robocal_ros.thermal.reference import commissioned_of
 from robocal_ros.tool.judging import KnownTool, change_between
 from robocal_ros.tool.laser_frame import LaserFrame
+
+# ---- decisions about thermal models and tools, and what may be accepted without a person --------
+
 
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
@@ -285,3 +297,59 @@ def withholding(kind: str, calibration_id: int, why: str) -> Outcome:
     """A candidate is left to a person, for the record."""
     words = f"{kind} candidate {calibration_id} waits for a decision: {why}"
     return Outcome(Command(WITHHOLD, {"id": calibration_id, "kind": kind}), Code.ACCEPT, words)
+
+
+# ---- settling -----------------------------------------------------------------------------------
+
+
+HELD_S = 2.0  # another process's change is a matter of milliseconds
+WITHIN = "within the configured bounds"
+
+
+def patiently(hands: Hands, act: Callable[[], Outcome]) -> Script[Outcome]:
+    """What ``act`` gives; where the storage refuses, at the next ticks again while time allows.
+
+    Raises
+    ------
+    StorageError
+        The last refusal, where it raised.
+    """
+    until_s = hands.now_s + HELD_S
+    while True:
+        last = hands.now_s >= until_s or not hands.fits(0.0)
+        try:
+            outcome = act()
+        except StorageError:
+            if last:
+                raise
+        else:
+            if last or outcome.status is not Code.STORAGE_FAILED:
+                return outcome
+        yield
+
+
+def settled(
+    hands: Hands,
+    decider: Decider,
+    kind: str,
+    calibration_id: int,
+    unsure: Callable[[], str],
+    wall_ns: int,
+) -> Script[Outcome]:
+    """Accept a candidate that lies inside the bounds, or leave it to a person.
+
+    ``unsure`` says why it waits although it lies inside them; empty: it need not.
+    """
+
+    def act() -> Outcome:
+        mine = decider.accepted_here(calibration_id)  # by a try whose answer was lost
+        if not mine and (why := decider.withheld(calibration_id) or unsure()):
+            return withholding(kind, calibration_id, why)
+        return decider.decide(ACCEPT, calibration_id, BY, WITHIN, wall_ns)
+
+    return (yield from patiently(hands, act))
+
+
+def is_accepted(outcome: Outcome) -> bool:
+    """Whether what was settled is in force now."""
+    return outcome.done and outcome.command.name == ACCEPT

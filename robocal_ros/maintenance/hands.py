@@ -5,12 +5,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, LimitError
 from robocal_ros.maintenance import requests as asked
-from robocal_ros.maintenance.asking import Asking, Script
 from robocal_ros.maintenance.config import MaintenanceConfig
-from robocal_ros.maintenance.disarming import SENT, Disarming
-from robocal_ros.maintenance.mover import FaultError, Mover
-from robocal_ros.maintenance.requests import DriverAnswer
-from robocal_ros.maintenance.ways import HOME, STATION, Route, Ways
+from robocal_ros.maintenance.mover import HOME, STATION, FaultError, Mover, Route, Ways
+from robocal_ros.maintenance.requests import SENT, Asking, Disarming, DriverAnswer, Script
 from robocal_ros.motion.gap import Gap
 from robocal_ros.tool.driving import SETTLED_S, STANDS_S
 from robocal_ros.tool.results import QUICK

@@ -24,25 +24,29 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import MaintenanceSession, MaintenanceState
 from robocal_ros.maintenance.driver import MaintenanceDriver
-from robocal_ros.maintenance.inputs import require_robot, told_correction, told_drift
-from robocal_ros.maintenance.outputs import MaintenanceOutputs
 from robocal_ros.maintenance.requests import DriverAnswer, DriverRequest, Move
-from robocal_ros.maintenance.services import MaintenanceServices, Now
+from robocal_ros.maintenance.services import (
+    MaintenanceOutputs,
+    MaintenanceServices,
+    Now,
+    require_robot,
+    told_correction,
+    told_drift,
+)
 from robocal_ros.maintenance.settings import SETTINGS, session_config
+from robocal_ros.motion.cell import load_motion
 from robocal_ros.motion.driver import LeaseHolder, MotionDriver
 from robocal_ros.motion.gap_sources import GapSources
-from robocal_ros.motion.graph import CommandPath
-from robocal_ros.motion.loading import load_motion
+from robocal_ros.motion.graph import CommandPath, SourceGuard
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import goal_tolerances
-from robocal_ros.motion.source_guard import SourceGuard
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.clocks import SteadyClock
 from robocal_ros.ros.diagnostics import ERROR, WARN, Health
 from robocal_ros.ros.endpoints import NotActiveError
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
-from robocal_ros.ros.steady_clock import SteadyClock
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.accuracy_state import Accuracy

@@ -6,17 +6,102 @@ from typing import Any, NamedTuple
 from action_msgs.msg import GoalStatus
 from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.qos import QoSProfile
 from robocal_msgs.action import RunMaintenance
+from robocal_msgs.msg import AccuracyState, MaintenanceResult, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
 
+from robocal_ros.correction.status import CorrectionState, ToldCorrection
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.maintenance import CycleResult, MaintenanceSession, Status
-from robocal_ros.maintenance.outputs import MaintenanceOutputs, result_message
-from robocal_ros.ros.decision_services import TWIN
-from robocal_ros.ros.deferred_action import DeferredActionServer
+from robocal_ros.maintenance.accuracy import Drift
+from robocal_ros.ros import conversions, qos
+from robocal_ros.ros.decision_services import TWIN, DeferredActionServer, SessionEvents
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.accuracy_state import Accuracy
+from robocal_ros.thermal.services import accuracy_message
+from robocal_ros.tool.services import ANSWERS
+
+# ---- what the maintenance node says: its topics, and its results as messages --------------------
+
+
+AddOutput = Callable[[type, str, QoSProfile], Any]
+
+
+def result_message(result: CycleResult | None) -> MaintenanceResult:
+    """How a cycle ended; all empty without one."""
+    if result is None:
+        return MaintenanceResult()
+    return MaintenanceResult(
+        cycle_id=result.cycle_id,
+        stamp=conversions.time_message(result.stamp_ns),
+        run=result.run,
+        code=int(result.code),
+        message=result.message,
+        complete=result.complete,
+        left=list(result.left),
+        thermal_code=int(result.thermal_code),
+        thermal_id=result.thermal_id,
+        tool_found_code=int(result.tool_found_code),
+        tool_code=int(result.tool_code),
+        tool_id=result.tool_id,
+        tool_answer=ANSWERS.get(result.tool_answer, 0),
+        accepted=list(result.accepted),
+    )
+
+
+class MaintenanceOutputs:
+    """Publishers of one robot's maintenance."""
+
+    def __init__(self, add: AddOutput, robot: str, serial: str, base_frame: str) -> None:
+        self._robot, self._serial, self._base = robot, serial, base_frame
+        self._status = add(MaintenanceStatus, "~/status", qos.LATCHED)
+        self._accuracy = add(AccuracyState, "accuracy_state", qos.LATCHED)
+        self.accuracy_topic: str = self._accuracy.topic_name
+        self.events = SessionEvents(add)
+
+    def status_message(self, status: Status, now_ns: int) -> MaintenanceStatus:
+        """A status."""
+        return MaintenanceStatus(
+            header=conversions.header(now_ns, self._base),
+            state=int(status.state),
+            beat=status.beat,
+            cycle_id=status.cycle_id,
+            doing="; ".join(filter(None, (status.doing or status.closed, status.trouble))),
+            left_s=status.left_s,
+            at_home=status.at_home,
+            disarmed=status.disarmed,
+            thermal_pending=status.thermal_pending,
+            tool_pending=status.tool_pending,
+            fault_code=int(status.fault_code),
+            fault=status.fault,
+            last=result_message(status.last),
+        )
+
+    def status(self, status: Status, now_ns: int) -> MaintenanceStatus:
+        """Say it."""
+        message = self.status_message(status, now_ns)
+        self._status.publish(message)
+        return message
+
+    def accuracy(self, found: Accuracy, tolerance_m: float, now_ns: int) -> None:
+        """Tell the line how accurate the cell is believed to be."""
+        self._accuracy.publish(
+            accuracy_message(
+                found,
+                tolerance_m,
+                robot=self._robot,
+                serial=self._serial,
+                stamp=conversions.header(now_ns, self._base),
+            )
+        )
+
+
+# ---- services -----------------------------------------------------------------------------------
+
 
 DECISIONS = (ACCEPT, REJECT, ROLLBACK)
 
@@ -224,3 +309,71 @@ class MaintenanceServices:
             return outcome.calibration_id, outcome.status, outcome.message
 
         return decide
+
+
+# ---- what other nodes say of one robot, as the maintenance session takes it: pure mapping -------
+
+
+MM = 1e-3
+LARGEST = 1e9  # mm, s: a figure beyond is a defect, and its square might be infinite
+
+
+def require_robot(topic: str, message: Any, robot: str, serial: str) -> None:
+    """Refuse what another robot's node says.
+
+    Raises
+    ------
+    InputError
+    """
+    told, mine = (message.robot, message.serial), (robot, serial)
+    if told != mine:
+        raise InputError(
+            f"{topic} is of robot and serial {told}, this node keeps {mine}: "
+            "give both nodes the same, or mend the remapping"
+        )
+
+
+def told_drift(message: Any) -> Drift:
+    """Read a ``robocal_msgs/AccuracyState`` of the thermal node.
+
+    Raises
+    ------
+    InputError
+        When its state is unknown, or a figure cannot be.
+    """
+    try:
+        level = AccuracyLevel(message.state)
+    except ValueError as error:
+        raise InputError(f"accuracy state {message.state} is unknown") from error
+    rms_mm, bound_mm, due_in_s = message.predicted_error_mm, message.bound_mm, message.due_in_s
+    if not all(abs(figure) <= LARGEST for figure in (rms_mm, bound_mm, due_in_s)):
+        raise InputError(f"rms {rms_mm:g} mm, bound {bound_mm:g} mm, due in {due_in_s:g} s")
+    known = rms_mm >= 0.0 and bound_mm >= 0.0
+    found = ToolError(rms_mm * MM, bound_mm * MM) if known else None
+    return Drift(level, message.reason, found, due_in_s)
+
+
+def told_correction(message: Any) -> ToldCorrection:
+    """Read a ``robocal_msgs/CorrectionStatus``.
+
+    Raises
+    ------
+    InputError
+        When its state is unknown.
+    """
+    try:
+        state = CorrectionState(message.state)
+    except ValueError as error:
+        raise InputError(f"correction state {message.state} is unknown") from error
+    return ToldCorrection(
+        state=state,
+        enabled=message.enabled,
+        shadow=message.shadow,
+        model_revision=message.model_revision,
+        tool_revision=message.tool_revision,
+        waiting_tool_revision=message.waiting_tool_revision if message.tool_waits else None,
+        stale=message.stale,
+        mismatch=message.mismatch,
+        commanders=message.commanders,
+        last_refusal=message.last_refusal,
+    )

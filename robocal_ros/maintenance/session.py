@@ -7,30 +7,117 @@ the host is suspended; ``wall_ns`` is the wall clock, for records.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.correction.status import ToldCorrection
-from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.maintenance.accuracy import Accuracy, Drift, accuracy_of
-from robocal_ros.maintenance.conductor import Conductor
+from robocal_ros.maintenance.accuracy import Accuracy, Drift, Heard, accuracy_of
 from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.hands import Hands
-from robocal_ros.maintenance.heard import Heard
 from robocal_ros.maintenance.memory import CycleResult, DocumentStore, Memory
+from robocal_ros.maintenance.mover import Ways
 from robocal_ros.maintenance.requests import DriverAnswer, DriverRequest
-from robocal_ros.maintenance.run import CycleRun
-from robocal_ros.maintenance.status import MaintenanceState, Status, status_of
+from robocal_ros.maintenance.run import Conductor, CycleRun
 from robocal_ros.maintenance.thermal_part import ThermalCycle, ThermalPart
-from robocal_ros.maintenance.ways import Ways
 from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.results import FULL, QUICK
+
+# ---- what is said of the maintenance ------------------------------------------------------------
+
+
+class MaintenanceState(IntEnum):
+    """Numbers of ``MaintenanceStatus.msg``; 0 is never sent."""
+
+    IDLE = 1
+    """Nothing runs; the robot is the PLC's."""
+    RUNNING = 2
+    """A cycle runs; this node may move the robot."""
+    BREAKING_OFF = 3
+    """A cycle was cancelled: the robot is stopped and brought home."""
+    FAULT = 4
+    """A person must look; nothing moves until it is acknowledged."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """The maintenance at one instant.
+
+    Attributes
+    ----------
+    cycle_id : that runs, or ran last.
+    doing : in words.
+    left_s : of the gap; 0 while nothing runs.
+    at_home, disarmed : of the robot and of the tool's driver, as far as is known; disarmed is one
+        of which nothing is under way either.
+    last : how the last cycle ended; None before any.
+    thermal_pending, tool_pending : newest candidates that wait for a decision; 0: none.
+    fault_code, fault : NONE and empty without one.
+    beat : counts up with each status that is published; the PLC's heartbeat echoes it.
+    closed : why the gap counts as closed; empty while it is open.
+    trouble : why nobody knows what waits; empty: the pending ids are true.
+    """
+
+    state: MaintenanceState
+    cycle_id: str
+    doing: str
+    left_s: float
+    at_home: bool
+    disarmed: bool
+    last: CycleResult | None
+    thermal_pending: int
+    tool_pending: int
+    fault_code: Code
+    fault: str
+    beat: int
+    closed: str = ""
+    trouble: str = ""
+
+
+def status_of(
+    state: MaintenanceState,
+    running: CycleResult | None,
+    memory: Memory,
+    hands: Hands,
+    decider: Decider,
+    now_s: float,
+) -> Status:
+    """All of it, at a time; ``running``: the cycle that runs, as far as it has come."""
+    last = next(reversed(memory.cycles.values()), None)
+    named = last.cycle_id if last is not None else ""
+    thermal, tool, trouble = 0, 0, ""
+    try:
+        newest = [decider.newest(kind) for kind in (THERMAL, TOOL)]
+        thermal, tool = (found.id if found else 0 for found in newest)
+    except RobocalError as error:
+        trouble = str(error)
+    return Status(
+        state=state,
+        cycle_id=named if running is None else running.cycle_id,
+        doing=hands.doing,
+        left_s=0.0 if running is None else max(hands.gap.left_s(now_s), 0.0),
+        at_home=not hands.robot.beside_home(),
+        disarmed=not hands.tool.doubted,
+        last=last,
+        thermal_pending=thermal,
+        tool_pending=tool,
+        fault_code=memory.fault_code,
+        fault=memory.fault,
+        beat=hands.gap.beat,
+        closed=hands.gap.closed(now_s),
+        trouble=trouble,
+    )
+
+
+# ---- session ------------------------------------------------------------------------------------
+
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.maintenance.asking import Script, SilentError
 from robocal_ros.maintenance.hands import Hands
-from robocal_ros.maintenance.requests import BeginCycle, DriverAnswer, EndCycle
-from robocal_ros.maintenance.ways import HOME
+from robocal_ros.maintenance.mover import HOME
+from robocal_ros.maintenance.requests import BeginCycle, DriverAnswer, EndCycle, Script, SilentError
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
 

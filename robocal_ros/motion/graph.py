@@ -14,6 +14,11 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
+from robocal_ros.ground.samples import JOINTS, UNCORRECTED
+
+# ---- who else commands the robot: by who publishes and serves on the graph, never by name -------
+
+
 PREFIX = 12  # bytes of a gid
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
 KILLED = "one that was killed counts until DDS gives it up, after up to 20 s"
@@ -133,3 +138,53 @@ class CommandPath:
                 f": nobody else may command the robot while the cell moves it; {KILLED}"
             )
         return self.violation
+
+
+# ---- source guard -------------------------------------------------------------------------------
+
+
+_STATUS = "robocal_msgs/msg/CorrectionStatus"  # who publishes it is a correction node
+
+
+class SourceGuard:
+    """Looks at who publishes a topic: a correction node, whatever its name, must not.
+
+    Attributes
+    ----------
+    fault : why the readings must not be used; empty when they may.
+    """
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node = node
+        self._topic = node.resolve_topic_name(topic)
+        self._why = (
+            "its joint states are un-corrected, subscribe the robot's"
+            if topic.rsplit("/", 1)[-1] == JOINTS
+            else "it is corrected already, subscribe what the planner publishes"
+        )
+        self.fault = ""
+        self._hinted = UNCORRECTED in self._topic
+        if self._hinted:
+            self.fault = f"{self._topic} comes from a correction node: {self._why}"
+
+    def fault_at(self, received: int) -> str:
+        """The fault, when so many readings were received; before the first one it looks."""
+        if not received:
+            self.look()
+        return self.fault
+
+    def look(self) -> None:
+        """Look again; before its publishers are discovered the topic's name is a hint."""
+        found = set(publishers(self._node, self._topic))
+        if self._hinted and (not found or any(one.name.endswith(UNKNOWN) for one in found)):
+            return
+        correcting = {
+            who
+            for topic, kinds in self._node.get_topic_names_and_types()
+            if _STATUS in kinds
+            for who in publishers(self._node, topic)
+        }
+        culprits = sorted({one.name for one in found & correcting})
+        self.fault = (
+            f"{self._topic} is published by {', '.join(culprits)}: {self._why}" if culprits else ""
+        )

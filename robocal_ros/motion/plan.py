@@ -3,9 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from robocal_ros.ground import frames
+
+# ---- a motion of the joints over time, as a trajectory controller will interpolate it -----------
+
 
 Array = NDArray[np.float64]
 
@@ -113,3 +119,156 @@ def joined(plans: Sequence[JointPlan]) -> JointPlan:
             for name in ("q", "qd", "qdd")
         ),
     )
+
+
+# ---- a way over time: from rest to a constant speed and back to rest, smoothly ------------------
+
+
+SHORTEST_RAMP_S = 0.07  # a controller smooths over some of its cycles
+SPACING_S = 0.01  # of points; the cubic between two of a circle of 12 mm misses by nanometres
+MOST_POINTS = 200  # of one phase
+
+
+@dataclass(frozen=True)
+class Ride:
+    """A way of ``length_m`` at ``speed_m_s`` but for two ramps of ``ramp_s``.
+
+    On a ramp the speed is v (3 u^2 - 2 u^3), u from 0 to 1: its acceleration begins and ends at
+    zero, and is 1.5 v / ramp_s at most.
+    """
+
+    length_m: float
+    speed_m_s: float
+    ramp_s: float
+
+    @classmethod
+    def within(cls, length_m: float, speed_m_s: float, acceleration_m_s2: float) -> "Ride":
+        """The fastest within bounds; a short way does not reach the speed."""
+        reached = min(
+            speed_m_s,
+            length_m / SHORTEST_RAMP_S,
+            float(np.sqrt(length_m * acceleration_m_s2 / 1.5)),
+        )
+        return cls(length_m, reached, ramp_of(reached, acceleration_m_s2))
+
+    @property
+    def cruise_s(self) -> float:
+        """At constant speed."""
+        if self.speed_m_s == 0.0:
+            return 0.0
+        return max(self.length_m / self.speed_m_s - self.ramp_s, 0.0)
+
+    @property
+    def duration_s(self) -> float:
+        """From rest to rest."""
+        return self.cruise_s + 2.0 * self.ramp_s
+
+    def times(self) -> Array:
+        """Times (k,) for points: dense enough for cubics, and where a phase begins or ends."""
+        ends = np.cumsum([0.0, self.ramp_s, self.cruise_s, self.ramp_s])
+        phases = [np.zeros(1)]
+        for start, end in pairwise(ends):
+            count = min(int(np.ceil((end - start) / SPACING_S - 1e-6)), MOST_POINTS)
+            phases.append(np.linspace(start, end, count + 1)[1:])
+        return np.concatenate(phases)
+
+    def __call__(self, time_s: Array) -> tuple[Array, Array, Array]:
+        """Way, speed and acceleration (k,) along it."""
+        v, ramp = self.speed_m_s, self.ramp_s
+        to_go = self.duration_s - time_s
+        late = to_go < time_s  # the second half mirrors the first
+        t = np.where(late, to_go, time_s)
+        u = np.clip(t / ramp, 0.0, 1.0)
+        way = v * (ramp * (u**3 - 0.5 * u**4) + np.maximum(t - ramp, 0.0))
+        push = 6.0 * v / ramp * (u - u * u)
+        return (
+            np.where(late, self.length_m - way, way),
+            v * (3.0 * u**2 - 2.0 * u**3),
+            np.where(late, -push, push),
+        )
+
+
+def ramp_of(speed_m_s: float, acceleration_m_s2: float) -> float:
+    """Duration of a ramp up to a speed, s."""
+    return max(SHORTEST_RAMP_S, 1.5 * speed_m_s / acceleration_m_s2)
+
+
+# ---- paths of a tool's tip over time: straight lines, circles, plunges --------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TipPath:
+    """The flange's orientation and the tip's place over time.
+
+    Attributes
+    ----------
+    time_s : (k,).
+    T_base_tip : (k, 4, 4) with the flange's axes and the tip as origin.
+    twist, twist_rate : (k, 6) [v; w] of the tip in base, and its derivative.
+    """
+
+    time_s: Array
+    T_base_tip: Array
+    twist: Array
+    twist_rate: Array
+
+
+def line(T_start: Array, T_end: Array, ride: Ride) -> TipPath:
+    """Straight from pose to pose (4, 4), turning evenly by the smallest angle on the way."""
+    time = ride.times()
+    along = np.stack(ride(time)) / max(ride.length_m, 1e-300)
+    screw = np.concatenate(
+        [T_end[:3, 3] - T_start[:3, 3], frames.log_rotation(T_end[:3, :3] @ T_start[:3, :3].T)]
+    )
+    share, speed, push = along[:, :, None] * screw
+    R = frames.exp_rotation(share[:, 3:]) @ T_start[:3, :3]
+    return TipPath(time, frames.transform(R, T_start[:3, 3] + share[:, :3]), speed, push)
+
+
+def circle(
+    T_start: Array,
+    R_base_laser: Array,
+    radius_m: float,
+    from_rad: float,
+    direction: int,
+    ride: Ride,
+) -> TipPath:
+    """Along a circle in the laser's x-y plane, from its angle ``from_rad``; turning not at all."""
+    time = ride.times()
+    way, speed, push = (direction * x / radius_m for x in ride(time))
+    angle = from_rad + way
+    out = _across(angle, R_base_laser) - _across(np.array([from_rad]), R_base_laser)
+    velocity = _across(angle + np.pi / 2.0, R_base_laser) * speed[:, None]
+    acceleration = (
+        _across(angle + np.pi / 2.0, R_base_laser) * push[:, None]
+        - _across(angle, R_base_laser) * speed[:, None] ** 2
+    )
+    return _shifted(T_start, time, radius_m * out, radius_m * velocity, radius_m * acceleration)
+
+
+def plunge(T_start: Array, R_base_laser: Array, ride: Ride) -> TipPath:
+    """Down along the laser's -z, at rest for an instant, and up again."""
+    down = ride.times()
+    way, speed, push = ride(down)
+    z = -R_base_laser[:, 2]
+    time = np.concatenate([down, down[-1] + down[1:]])
+    back = slice(-2, None, -1)
+    return _shifted(
+        T_start,
+        time,
+        np.concatenate([way, way[back]])[:, None] * z,
+        np.concatenate([speed, -speed[back]])[:, None] * z,
+        np.concatenate([push, push[back]])[:, None] * z,
+    )
+
+
+def _across(angle: Array, R_base_laser: Array) -> Array:
+    """Unit vectors (k, 3), base, at angles from the laser's x."""
+    return np.asarray(np.column_stack([np.cos(angle), np.sin(angle)]) @ R_base_laser[:, :2].T)
+
+
+def _shifted(T: Array, time: Array, shift: Array, velocity: Array, acceleration: Array) -> TipPath:
+    poses = np.tile(T, (len(time), 1, 1))
+    poses[:, :3, 3] += shift
+    still = np.zeros_like(shift)
+    return TipPath(time, poses, np.hstack([velocity, still]), np.hstack([acceleration, still]))

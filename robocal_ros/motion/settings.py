@@ -11,8 +11,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.housing import DrivingConfig, Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.messages import joint_trajectory
 from robocal_ros.motion.plan import JointPlan

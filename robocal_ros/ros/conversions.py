@@ -1,12 +1,14 @@
 """Documents and history entries as messages: pure mapping. A number that is not finite stays."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, Transform
+from geometry_msgs.msg import Pose, Transform, TransformStamped
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
 from robocal_msgs.msg import (
     CalibrationQuality,
     CalibrationSummary,
@@ -17,10 +19,16 @@ from std_msgs.msg import Header
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.proposals import Entry
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import COLUMNS
+from robocal_ros.ros import qos
 
-if TYPE_CHECKING:  # most nodes have no thermal session
+if TYPE_CHECKING:
     from robocal_ros.session.events import Outcome
+
+
+# ---- conversions --------------------------------------------------------------------------------
+
 
 NS = 1_000_000_000
 _ERRORS = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
@@ -175,3 +183,79 @@ def pose_message(T: Any) -> Pose:
     message = Pose(orientation=moved.rotation)
     message.position.x, message.position.y, message.position.z = T[:3, 3].tolist()
     return message
+
+
+# ---- joint poses as parameters: a text of numbers for each, in degrees --------------------------
+
+
+Array = NDArray[np.float64]
+
+MM = 1e-3
+
+
+def joints_of(arm: SerialArm, numbers: Sequence[float], name: str) -> Array:
+    """Joints (n,) in rad (prismatic: m) of degrees (mm).
+
+    Raises
+    ------
+    InputError
+        When there is not one for each joint.
+    """
+    given = np.array(numbers, dtype=np.float64)
+    if given.shape != (arm.n,) or not np.all(np.isfinite(given)):
+        raise InputError(
+            f"{name} has {given.size} numbers, {arm.name} has {arm.n} joints: teach it"
+        )
+    return np.where(arm.prismatic, given * MM, np.radians(given))
+
+
+def joint_poses(arm: SerialArm, texts: Sequence[str], name: str) -> Array:
+    """Poses (m, n) in rad (prismatic: m) of a parameter ``name``, a text for each; m may be 0.
+
+    Raises
+    ------
+    InputError
+        When a text is no list of a number for each joint.
+    """
+    poses = [_pose(arm, text, f"{name}, pose {i}") for i, text in enumerate(texts, start=1)]
+    return np.array(poses, dtype=np.float64).reshape(-1, arm.n)
+
+
+def _pose(arm: SerialArm, text: str, name: str) -> Array:
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError as error:
+        raise InputError(f"{name}: '{text}' is no list of numbers") from error
+    return joints_of(arm, numbers, name)
+
+
+# ---- transforms onto ``/tf_static``, where this machine has its message -------------------------
+
+
+class StaticTf:
+    """Publisher of a node's static transforms.
+
+    Parameters
+    ----------
+    add : creates a publisher.
+
+    Attributes
+    ----------
+    missing : why nothing can be published on this machine; empty when it can.
+    """
+
+    def __init__(self, add: Callable[[type, str, QoSProfile], Any]) -> None:
+        self._publisher: Any = None
+        self.missing = ""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            self.missing = "no /tf_static: tf2_msgs is missing (apt install ros-jazzy-tf2-msgs)"
+        else:
+            self._message = TFMessage
+            self._publisher = add(TFMessage, "/tf_static", qos.LATCHED)
+
+    def publish(self, transforms: Sequence[TransformStamped]) -> None:
+        """Publish these; none: late subscribers get no transform."""
+        if self._publisher is not None:
+            self._publisher.publish(self._message(transforms=list(transforms)))

@@ -1,10 +1,12 @@
 """Node parameters as a table: what each means, its unit, its bounds, when it may change."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -14,7 +16,12 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.streams import StandstillRule
+
+# ---- parameters ---------------------------------------------------------------------------------
+
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
@@ -198,3 +205,89 @@ def _without_blanks(value: Any) -> Any:
     if isinstance(value, str) or not hasattr(value, "__iter__"):
         return value
     return [item for item in value if item != ""]
+
+
+# ---- a pose as two parameters: millimetres and a quaternion -------------------------------------
+
+
+ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+
+
+def count_fault(length: int) -> Callable[[list[float]], str | None]:
+    """A check that a list has so many numbers."""
+    return lambda values: None if len(values) == length else f"{length} numbers are wanted"
+
+
+def pose_settings(name: str, place: str, turn: str) -> tuple[Setting, Setting]:
+    """``<name>_xyz_mm`` and ``<name>_quat_xyzw`` with their descriptions."""
+    return (
+        Setting(
+            f"{name}_xyz_mm",
+            ORIGIN,
+            place,
+            unit="mm",
+            low=-5000.0,
+            high=5000.0,
+            check=count_fault(3),
+        ),
+        Setting(f"{name}_quat_xyzw", UNTURNED, turn, low=-1.0, high=1.0, check=count_fault(4)),
+    )
+
+
+def given_pose(settings: Mapping[str, Any], name: str) -> NDArray[np.float64] | None:
+    """The pose (4, 4), m; None where both parameters are at their default.
+
+    Raises
+    ------
+    InputError
+        When the quaternion is not of unit length.
+    """
+    xyz_mm, quat = settings[f"{name}_xyz_mm"], settings[f"{name}_quat_xyzw"]
+    if xyz_mm == ORIGIN and quat == UNTURNED:
+        return None
+    norm = float(np.linalg.norm(quat))
+    if abs(norm - 1.0) > 1e-3:
+        raise InputError(f"{name}_quat_xyzw has length {norm:.6g}, not 1")
+    return frames.transform_from_quat(1e-3 * np.array(xyz_mm), np.array(quat) / norm)
+
+
+# ---- parameters of the nodes that measure at standstill -----------------------------------------
+
+
+STANDSTILL = (
+    Setting(
+        "standstill_before_s",
+        0.3,
+        "The robot stands still so long before a measurement's stamp",
+        unit="s",
+        low=0.0,
+        high=10.0,
+    ),
+    Setting("standstill_after_s", 0.1, "and so long after it", unit="s", low=0.0, high=10.0),
+    Setting(
+        "standstill_tolerance_deg",
+        0.02,
+        "Largest range of a joint that stands still",
+        unit="deg",
+        low=1e-4,
+        high=5.0,
+    ),
+    Setting(
+        "joint_gap_s",
+        0.25,
+        "Longest pause between two joint readings about a measurement",
+        unit="s",
+        low=1e-3,
+        high=10.0,
+    ),
+)
+
+
+def standstill_rule(settings: Mapping[str, Any]) -> StandstillRule:
+    """The rule that they say."""
+    return StandstillRule(
+        before_s=settings["standstill_before_s"],
+        after_s=settings["standstill_after_s"],
+        tolerance_rad=float(np.radians(settings["standstill_tolerance_deg"])),
+        gap_s=settings["joint_gap_s"],
+    )

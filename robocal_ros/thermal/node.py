@@ -22,16 +22,15 @@ from robocal_ros.ground.samples import (
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
-from robocal_ros.motion.source_guard import SourceGuard
+from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.command_desk import CommandDesk
-from robocal_ros.ros.data_clock import DataClock
+from robocal_ros.ros.clocks import DataClock, StampWatch
+from robocal_ros.ros.decision_services import CommandDesk
 from robocal_ros.ros.diagnostics import ERROR, WARN, Health
 from robocal_ros.ros.endpoints import NotActiveError
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
-from robocal_ros.ros.stamp_watch import StampWatch
 from robocal_ros.session.events import CYCLE, Outcome
 from robocal_ros.thermal.documents import placed_of
 from robocal_ros.thermal.identification import require_parameters

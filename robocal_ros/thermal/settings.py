@@ -6,11 +6,9 @@ from typing import Any
 from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground.samples import DEFAULT_TARGET
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.ros.conversions import MM, joint_poses
 from robocal_ros.ros.history_settings import STATE_DIR
-from robocal_ros.ros.joint_poses import MM, joint_poses
-from robocal_ros.ros.parameters import Setting
-from robocal_ros.ros.pose_settings import ORIGIN, count_fault
-from robocal_ros.ros.standstill_settings import STANDSTILL, standstill_rule
+from robocal_ros.ros.parameters import ORIGIN, STANDSTILL, Setting, count_fault, standstill_rule
 from robocal_ros.thermal.config import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
 
 

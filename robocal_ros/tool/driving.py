@@ -14,18 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, LimitError, RobocalError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.motion import tip_path
-from robocal_ros.motion.cell import ROUNDING, MotionCell
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import ToolBody
-from robocal_ros.motion.limits import MotionLimits, start_near
-from robocal_ros.motion.loading import load_motion
-from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch
-from robocal_ros.motion.stopping import stop
-from robocal_ros.motion.timing import Ride, ramp_of
-from robocal_ros.motion.travel import along, corner_ride, raised_way
-from robocal_ros.motion.watched_stop import WatchedStop
+from robocal_ros.motion.cell import (
+    ROUNDING,
+    MotionCell,
+    along,
+    corner_ride,
+    load_motion,
+    raised_way,
+)
+from robocal_ros.motion.housing import DrivingConfig, ToolBody
+from robocal_ros.motion.limits import MotionLimits, start_near, stop
+from robocal_ros.motion.plan import JointPlan, Ride, TipPath, circle, plunge, ramp_of
+from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch, WatchedStop
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
 from robocal_ros.tool.flange_path import FEWEST_READINGS, JointPath
 from robocal_ros.tool.measuring_plan import PlannedStep
@@ -171,9 +171,9 @@ def _on_circle(step: PlannedStep, angle: float) -> Array:
     return step.radius_m * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
-def _path(cell: MotionCell, step: PlannedStep, T_start: Array) -> tip_path.TipPath:
+def _path(cell: MotionCell, step: PlannedStep, T_start: Array) -> TipPath:
     if step.kind == "circle":
-        return tip_path.circle(
+        return circle(
             T_start,
             step.R_base_laser,
             step.radius_m,
@@ -182,7 +182,7 @@ def _path(cell: MotionCell, step: PlannedStep, T_start: Array) -> tip_path.TipPa
             _turn(step, cell.limits),
         )
     ride = Ride.within(step.depth_m, step.speed_m_s, cell.limits.tcp_acceleration_m_s2)
-    return tip_path.plunge(T_start, step.R_base_laser, ride)
+    return plunge(T_start, step.R_base_laser, ride)
 
 
 def _require_step(limits: MotionLimits, step: PlannedStep, speed_m_s: float) -> None:

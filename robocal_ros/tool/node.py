@@ -13,16 +13,16 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalEr
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
+from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.motion.silence import Silence
-from robocal_ros.motion.source_guard import SourceGuard
 from robocal_ros.ros import qos
 from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.command_desk import CommandDesk
+from robocal_ros.ros.clocks import StampWatch
+from robocal_ros.ros.decision_services import CommandDesk
 from robocal_ros.ros.diagnostics import ERROR, WARN, Health
 from robocal_ros.ros.endpoints import NotActiveError
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
-from robocal_ros.ros.stamp_watch import StampWatch
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool import node_motion
 from robocal_ros.tool.driving import load_measuring

@@ -18,9 +18,9 @@ from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances, require_limits
 from robocal_ros.ros import qos
+from robocal_ros.ros.clocks import SteadyClock
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.parameters import Setting, length
-from robocal_ros.ros.steady_clock import SteadyClock
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver
 from robocal_ros.tool.edges import RESTORE

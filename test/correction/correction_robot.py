@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool, TrajectoryCommand
+from robocal_ros.correction.inputs import (
+    JointCommand,
+    OfferedModel,
+    OfferedTool,
+    Reason,
+    RefusedError,
+    TrajectoryCommand,
+)
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.limiter import TURNING
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm

@@ -5,10 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.correction.bounds import CorrectionConfig, Policy
-from robocal_ros.correction.clamping import FADES_WITHIN, ClampedCorrection, correction_between
+from robocal_ros.correction.bounds import (
+    FADES_WITHIN,
+    ClampedCorrection,
+    CorrectionConfig,
+    Policy,
+    correction_between,
+)
+from robocal_ros.correction.inputs import Reason
 from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm

@@ -15,11 +15,11 @@ from correction_robot import (
 
 from robocal_ros.correction.inputs import (
     JointCommand,
+    Reason,
     finite_command,
     joint_command,
     trajectory_command,
 )
-from robocal_ros.correction.refusals import Reason
 
 
 def test_joints_are_matched_by_name(warm: Robot) -> None:

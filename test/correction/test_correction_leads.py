@@ -9,8 +9,7 @@ import pytest
 from correction_robot import HOME, NAMES, REST, Robot, bent_tool, drifted, offer, refused, still
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import TrajectoryCommand
-from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.inputs import Reason, TrajectoryCommand
 
 LIMIT = 1.0
 NEAR = CorrectionConfig().start_rad

@@ -21,9 +21,8 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import TrajectoryCommand
+from robocal_ros.correction.inputs import Reason, TrajectoryCommand
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.correction.refusals import Reason
 
 
 def test_joint_limits_hold_after_the_correction(warm: Robot) -> None:

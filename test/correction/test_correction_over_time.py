@@ -29,9 +29,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, TrajectoryCommand
 from robocal_ros.correction.output import SentPath
-from robocal_ros.correction.refusals import Reason, RefusedError
 
 WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
 

@@ -10,9 +10,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.correction import solution, straight
-from robocal_ros.correction.joint_correction import RATE_STEP_S, JointCorrection, pack_model
+from robocal_ros.correction.joint_correction import (
+    RATE_STEP_S,
+    JointCorrection,
+    pack_model,
+    rates_batch,
+)
 from robocal_ros.correction.kernels import LENGTH
-from robocal_ros.correction.rates import rates_batch
 from robocal_ros.correction.solution import MOST_OVER, REPORT
 from robocal_ros.correction.staged import EXACT, StagedCorrection
 from robocal_ros.ground import frames

@@ -16,8 +16,7 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
-from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.inputs import JointCommand, Reason, TrajectoryCommand
 
 SECOND = 1_000_000_000
 

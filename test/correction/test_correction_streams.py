@@ -21,9 +21,8 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import Policy, ShiftBounds
-from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.inputs import JointCommand, Reason
 from robocal_ros.correction.output import spline
-from robocal_ros.correction.refusals import Reason
 
 SECOND = 1_000_000_000
 

@@ -16,8 +16,7 @@ from correction_robot import (
     swing,
 )
 
-from robocal_ros.correction.inputs import JointCommand
-from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.inputs import JointCommand, Reason
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 

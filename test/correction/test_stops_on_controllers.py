@@ -15,13 +15,10 @@ from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.kinematics.robots import load_description
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import Housing
-from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.housing import DrivingConfig, Housing
+from robocal_ros.motion.limits import MotionLimits, stop
 from robocal_ros.motion.messages import StatedController
-from robocal_ros.motion.robot_watch import RobotWatch
-from robocal_ros.motion.stopping import stop
-from robocal_ros.motion.watched_stop import STANDS_S, WatchedStop
+from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch, WatchedStop
 
 SPEED = 1.0  # rad/s of the first joint
 BRAKES = load_description("kr150_r3100").max_acceleration[0]

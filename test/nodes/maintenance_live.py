@@ -20,15 +20,14 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.cell import MotionCell
+from robocal_ros.motion.cell import MotionCell, joint_way
 from robocal_ros.motion.housing import Housing, ToolBody
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import REST_RAD
 from robocal_ros.motion.settings import trajectory_message
-from robocal_ros.motion.travel import joint_way
 from robocal_ros.ros import qos
-from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.ros.decision_services import EVENTS
 
 START_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]  # of cell_sim_node, over its station
 RAISED_M = 0.08

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
-from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.inputs import Reason
 from robocal_ros.motion.graph import own_endpoint
 from robocal_ros.ros import qos
 

@@ -14,10 +14,10 @@ from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.bags.bag_recording import recordings
+from robocal_ros.bags.bag_types import RECORDED, graph_name, recorded_name
 from robocal_ros.bags.bags import BagReader
-from robocal_ros.bags.recorded_names import RECORDED, graph_name, recorded_name
 from robocal_ros.bags.recorder_node import RecorderNode
-from robocal_ros.bags.recording_folders import recordings
 from robocal_ros.bags.replay_topics import chosen_topics, message_class
 from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.node import JointCorrectionNode

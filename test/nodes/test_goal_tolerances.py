@@ -16,8 +16,7 @@ from robocal_ros.cell_sim.trajectory_goal import GoalCode, GoalState, Tolerances
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.driver import MotionDriver
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.housing import DrivingConfig, Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport

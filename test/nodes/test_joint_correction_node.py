@@ -33,7 +33,7 @@ from std_srvs.srv import SetBool, Trigger
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.settings import SETTINGS
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
-from robocal_ros.motion.source_guard import SourceGuard
+from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.ros import conversions, qos
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.diagnostics import OK, WARN

@@ -19,8 +19,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from tool_driver import noisy_cell
 
-from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.clamping import correction_between
+from robocal_ros.correction.bounds import CorrectionConfig, correction_between
 from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.bags.recorded_names import recorded_name
+from robocal_ros.bags.bag_types import recorded_name
 from robocal_ros.bags.recorder_node import TOPICS
 from robocal_ros.bags.replay_topics import message_class
 

@@ -12,9 +12,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.correction.inputs import trajectory_command
+from robocal_ros.correction.inputs import Reason, RefusedError, trajectory_command
 from robocal_ros.correction.messages import PathMessage
-from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.wire import read_path
 
 FIELDS = ("positions", "velocities", "accelerations", "effort")

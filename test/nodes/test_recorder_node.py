@@ -14,16 +14,23 @@ from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
 from robocal_ros.bags import recorder_node
-from robocal_ros.bags.bag_recording import BagRecording
+from robocal_ros.bags.bag_recording import (
+    KEEP,
+    MB,
+    BagRecording,
+    Maker,
+    new_folder,
+    recordings,
+    size_bytes,
+)
 from robocal_ros.bags.bag_types import encode
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.bags.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
-from robocal_ros.bags.recording_folders import KEEP, MB, Maker, new_folder, recordings, size_bytes
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import qos
-from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.ros.decision_services import EVENTS
 from robocal_ros.thermal.node import ThermalNode
 from robocal_ros.tool.node import TcfNode
 

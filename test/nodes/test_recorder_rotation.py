@@ -13,12 +13,12 @@ from std_srvs.srv import Trigger
 from tool_cell_live import LiveCell
 from tool_driver import TRUTH
 
+from robocal_ros.bags.bag_recording import recordings
 from robocal_ros.bags.recorder_node import LOOK_S
-from robocal_ros.bags.recording_folders import recordings
 from robocal_ros.cli.main import main
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.ros.decision_services import EVENTS
 
 RECORDER = "recorder_node"
 MANY = EVENTS.depth + EVENTS.depth // 4  # more than a recording gets of what was before it

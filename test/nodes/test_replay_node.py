@@ -18,8 +18,8 @@ from shift import Shift, built, postures
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from robocal_ros.bags.bag_types import recorded_name
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.bags.recorded_names import recorded_name
 from robocal_ros.bags.replay_topics import chosen_topics, message_class
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import JointSample

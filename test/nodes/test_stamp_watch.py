@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros.ground.errors import WrongRobotError
 from robocal_ros.kinematics.robots import find_robot, load_robot, robot_file_hash
-from robocal_ros.ros import qos, stamp_watch
+from robocal_ros.ros import clocks, qos
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.history_settings import open_history
 from robocal_ros.thermal.node import ThermalNode
@@ -64,14 +64,14 @@ def test_one_wrong_stamp_among_right_ones_is_no_fault_of_the_clock(graph: Any) -
         message = JointState()
         message.header.stamp = time_message(reader.node.now_ns() + ahead_ns)
         watch.note("joint_states", message)
-    health = stamp_watch.Health()
+    health = clocks.Health()
     watch.judge(health)
     assert health.message == "ok"
 
 
 def test_silence_is_counted_by_receive_time(graph: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stamps that lie in the future do not keep a dead controller alive."""
-    monkeypatch.setattr(stamp_watch, "SILENT_S", 0.5)
+    monkeypatch.setattr(clocks, "SILENT_S", 0.5)
     reader = Reader(graph)
     reader.until("ok", 0)
     status = reader.until("joint_states is silent")

@@ -21,8 +21,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from bench.live.cell import set_fault
 from robocal_ros.cell_sim.joint_motion import LAG_S
 from robocal_ros.ground.errors import Code
-from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits
 from robocal_ros.ros import qos
 
 pytestmark = pytest.mark.cell

@@ -27,9 +27,9 @@ from maintenance_cell import (
 from robocal_ros.ground.errors import Code, RobocalError, StorageError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.hands import Hands
+from robocal_ros.maintenance.mover import Ways
 from robocal_ros.maintenance.requests import DriverAnswer
-from robocal_ros.maintenance.ways import Ways
-from robocal_ros.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.motion.limits import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
 

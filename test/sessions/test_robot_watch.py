@@ -6,14 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.cell import MotionCell
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import Housing, ToolBody
-from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.cell import MotionCell, joint_way
+from robocal_ros.motion.housing import DrivingConfig, Housing, ToolBody
+from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits, stop
 from robocal_ros.motion.plan import LEAD_S
 from robocal_ros.motion.robot_watch import LEAST, RobotWatch
-from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
-from robocal_ros.motion.travel import joint_way
 
 ARM = load_robot("kr150_r3100")
 LIMITS = MotionLimits()

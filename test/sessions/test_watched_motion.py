@@ -9,12 +9,18 @@ from hypothesis import strategies as st
 from robocal_ros.cell_sim.joint_motion import JointMotion
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.housing import DrivingConfig
+from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits, stop
 from robocal_ros.motion.plan import LEAD_S, JointPlan
-from robocal_ros.motion.robot_watch import REST_RAD, MotionReport, RobotWatch
-from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
-from robocal_ros.motion.watched_stop import PAUSED_S, SEEN_S, STANDS_S, WatchedStop
+from robocal_ros.motion.robot_watch import REPEAT_S as PAUSED_S
+from robocal_ros.motion.robot_watch import (
+    REST_RAD,
+    SEEN_S,
+    STANDS_S,
+    MotionReport,
+    RobotWatch,
+    WatchedStop,
+)
 from robocal_ros.session.events import TOOL_STEP
 from robocal_ros.tool.driving import DrivePhase
 

@@ -11,19 +11,19 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.bags.bag_recording import BagRecording
-from robocal_ros.bags.bag_types import encode
-from robocal_ros.bags.bags import BagReader
-from robocal_ros.bags.recording_folders import (
+from robocal_ros.bags.bag_recording import (
     MARKER,
+    BagRecording,
     Maker,
+    is_open,
     keep,
     make_room,
     new_folder,
     recordings,
     size_bytes,
 )
-from robocal_ros.bags.recording_locks import is_open
+from robocal_ros.bags.bag_types import encode
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.ground.errors import StorageError
 
 TEXT = "std_msgs/msg/String"

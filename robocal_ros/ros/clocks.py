@@ -1,11 +1,70 @@
-"""How the stamps of what comes in compare with this host's clock, and how long nothing came."""
+"""What time it is on the clock of the samples."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.ros.diagnostics import ERROR, WARN, Health
 from robocal_ros.ros.endpoints import EndpointNode
+
+# ---- what time it is on the clock of the samples ------------------------------------------------
+
+
+class DataClock:
+    """The samples' clock, read between them too: ROS time runs on where they pause."""
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self._read_ns = 0
+
+    def at(self, newest_ns: int | None, now_ns: int) -> int:
+        """Time of the samples' clock at ROS time ``now_ns``; that itself before the first."""
+        if newest_ns is None:
+            return now_ns
+        if newest_ns != self._newest_ns:
+            self._newest_ns, self._read_ns = newest_ns, now_ns
+        return newest_ns + max(now_ns - self._read_ns, 0)
+
+
+# ---- the clock of whoever moves the robot -------------------------------------------------------
+
+
+class SteadyClock:
+    """Seconds that no setting of the clock changes, those of a suspended host included.
+
+    What was heard before it was suspended is old when it wakes. A motion is not: the controller of
+    the same host stood still with it.
+
+    Parameters
+    ----------
+    slept : takes for how long the host was suspended, before a time of afterwards is given out.
+    """
+
+    def __init__(self, slept: Callable[[float], None]) -> None:
+        self._slept = slept
+        self._asleep_s = _both()[1]
+
+    def now_s(self) -> float:
+        """What it shows."""
+        now_s, asleep_s = _both()
+        if asleep_s > self._asleep_s:
+            for_s, self._asleep_s = asleep_s - self._asleep_s, asleep_s
+            self._slept(for_s)
+        return now_s
+
+
+def _both() -> tuple[float, float]:
+    """The time, and how much of it the host was asleep, at least.
+
+    The second clock is read later: what passes in between makes it less, never more.
+    """
+    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return now_s, now_s - time.clock_gettime(time.CLOCK_MONOTONIC)
+
+
+# ---- stamp watch --------------------------------------------------------------------------------
+
 
 AHEAD_S = 0.1  # hosts that NTP keeps are some ms apart; a busy host makes messages old, not early
 SILENT_S = 5.0
