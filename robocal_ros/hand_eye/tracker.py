@@ -243,7 +243,7 @@ def solve_best(
     Raises
     ------
     TooFewSamplesError, RankDeficientError
-        As `core.estimation.solve`.
+        As `estimation.estimation.solve`.
     ResidualError
         When the place of the sphere does not settle.
     """

@@ -182,7 +182,7 @@ OF_FACE = 2  # rows of a profile for each face; then come those of the sphere
 
 @dataclass(frozen=True, eq=False)
 class TrackerProblem:
-    """Residuals of all measurements; see `core.loss.Problem`.
+    """Residuals of all measurements; see `estimation.descent.Problem`.
 
     Attributes
     ----------

@@ -60,7 +60,7 @@ class MotionCell:
         Raises
         ------
         LimitError
-            As `core.kinematics.inverse.follow`.
+            As `kinematics.inverse.follow`.
         """
         found = follow(
             self.arm, path.T_base_tip, path.twist, path.twist_rate, q_now, self.tool.p_tip
