@@ -8,8 +8,8 @@ device stands elsewhere, the ball is mounted anew, the robot is the same.
 from pathlib import Path
 
 import numpy as np
-from robocal_ros.core import frames
 
+from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description

@@ -19,14 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.correction.inputs import Reason, RefusedError
-from robocal_ros.correction.joint_correction import (
-    MOST_STEPS,
-    STEP_AHEAD_S,
-    VELOCITY_EXACT,
-    CorrectionResult,
-    JointCorrection,
-)
+from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection
 from robocal_ros.correction.limiter import SLIDING, TURNING, OffsetLimits
+from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
 from robocal_ros.kinematics import SerialArm
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, require_finite
-from robocal_ros.correction.joint_correction import ordinary, plain
+from robocal_ros.correction.joint_correction import plain
+from robocal_ros.correction.solution import ordinary
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]

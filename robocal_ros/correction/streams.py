@@ -21,7 +21,7 @@ from robocal_ros.correction.limiter import (
 )
 from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.staged import ADDS, TOO_FAST
+from robocal_ros.correction.stepping import ADDS, TOO_FAST
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 

@@ -221,12 +221,13 @@ SLOW = """
 import sys, time
 from types import SimpleNamespace
 from robocal_ros.cli import main as frame
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.output import CliResult
 def run(args):
     if args.wait:
         print("ready", file=sys.stderr, flush=True)
         time.sleep(30)
-    return Outcome({"x": "y" * 1000}, lambda console: [console.print("line") for _ in range(9999)])
+    lines = lambda console: [console.print("line") for _ in range(9999)]
+    return CliResult({"x": "y" * 1000}, lines)
 frame.COMMANDS = {"probe": "probe"}
 frame.import_module = lambda name: SimpleNamespace(
     HELP="", run=run, add_arguments=lambda p: p.add_argument("--wait", action="store_true"))

@@ -64,12 +64,12 @@ def test_an_edit_of_what_a_kernel_is_built_from_compiles_it_again(tmp_path):
     shutil.copytree(PACKAGE, tmp_path / "robocal_ros", ignore=shutil.ignore_patterns("__pycache__"))
     assert walk(tmp_path) == (pytest.approx(0.8775825618903728, abs=1e-15), 0)
     assert walk(tmp_path) == (pytest.approx(0.8775825618903728, abs=1e-15), 1)
-    sines = tmp_path / "robocal_ros" / "core" / "kinematics" / "sines.py"
-    text = sines.read_text()
-    sines.write_text(text.replace("r = ((angle - ", "r = 0.0 * ((angle - "))
-    assert sines.read_text() != text
+    kernels = tmp_path / "robocal_ros" / "kinematics" / "kernels.py"
+    text = kernels.read_text()
+    kernels.write_text(text.replace("r = ((angle - ", "r = 0.0 * ((angle - "))
+    assert kernels.read_text() != text
     assert walk(tmp_path) == (1.0, 0)
-    sines.write_text(text)
+    kernels.write_text(text)
     assert walk(tmp_path) == (pytest.approx(0.8775825618903728, abs=1e-15), 0)
 
 
@@ -92,7 +92,7 @@ def modules(path: Path) -> set[Path]:
 
 @pytest.mark.parametrize("path", KERNELS, ids=lambda p: p.stem)
 def test_kernels_are_built_from_modules_that_the_digest_covers(path):
-    assert modules(path) <= {*KERNELS, PACKAGE / "core" / "compiled.py"}
+    assert modules(path) <= {*KERNELS, PACKAGE / "ground" / "compiled.py"}
 
 
 def test_nothing_else_compiles():
@@ -121,7 +121,7 @@ if len(sys.argv) > 1:
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     import numpy as np
-    from robocal_ros.core import compiled
+    from robocal_ros.ground import compiled
     from robocal_ros.kinematics.newton import copy
     cold = compiled.is_cold()
     out = np.empty((2, 3))
@@ -197,8 +197,8 @@ def test_code_that_was_compiled_at_the_installation_is_used_from_a_read_only_tre
     for path in writable.rglob("*"):
         path.chmod(0o755)
     assert call(writable)["hits"] == 0
-    made = writable / "robocal_ros" / "core" / "kinematics" / "__pycache__"
-    beside = tree / "robocal_ros" / "core" / "kinematics"
+    made = writable / "robocal_ros" / "kinematics" / "__pycache__"
+    beside = tree / "robocal_ros" / "kinematics"
     beside.chmod(0o755)
     shutil.copytree(made, beside / "__pycache__")
     beside.chmod(0o555)
@@ -221,7 +221,7 @@ def test_kept_code_that_a_power_cut_left_in_pieces_is_made_again(
     tree: Path, content: bytes
 ) -> None:
     assert call(tree)["hits"] == 0
-    folder = tree / "robocal_ros" / "core" / "kinematics" / "__pycache__"
+    folder = tree / "robocal_ros" / "kinematics" / "__pycache__"
     for end in ("nbi", "nbc"):
         for path in folder.glob(f"newton.copy*.{end}"):
             path.write_bytes(content)

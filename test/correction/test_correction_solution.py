@@ -10,14 +10,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.correction import solution, straight
-from robocal_ros.correction.joint_correction import (
-    RATE_STEP_S,
-    JointCorrection,
-    pack_model,
-    rates_batch,
-)
+from robocal_ros.correction.joint_correction import JointCorrection, pack_model
 from robocal_ros.correction.kernels import LENGTH
-from robocal_ros.correction.solution import MOST_OVER, REPORT
+from robocal_ros.correction.solution import MOST_OVER, RATE_STEP_S, REPORT, rates_batch
 from robocal_ros.correction.staged import EXACT, StagedCorrection
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
