@@ -2,10 +2,6 @@
 
 Each file has an index once it is full; of one that a crash left behind, `BagReader` reads
 everything up to the last flush.
-
-A recorder removes what it made and nothing else: its recordings carry a marker that names who made
-them, as which folder. What is a link, lies on another disk, has no marker or was copied is left
-alone, and so is every file in a recording that the recorder did not write.
 """
 
 import errno
@@ -279,6 +275,10 @@ def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:
 
 
 # ---- which folders are recordings and whose, and how room is made on their disk -----------------
+#
+# A recorder removes what it made and nothing else: its recordings carry a marker that names who
+# made them, as which folder. What is a link, lies on another disk, has no marker or was copied is
+# left alone, and so is every file in a recording that the recorder did not write.
 
 
 PREFIX = "robocal_"

@@ -1,9 +1,4 @@
-"""Message types without ROS: of Jazzy, of robocal_msgs, and of the definitions inside a bag.
-
-What moves a robot, says that it may be moved, or how its controller moves it, lies under
-`RECORDED`: ``/robot/gap_open`` as ``/recorded/robot/gap_open``. `BagReader` gives each topic the
-name that it had on the graph.
-"""
+"""Message types without ROS: of Jazzy, of robocal_msgs, and of the definitions inside a bag."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -163,6 +158,10 @@ def _field(store: Typestore, described: Any, value: Any) -> Any:
 
 
 # ---- names of commands in a recording: nobody listens to them, whoever plays it -----------------
+#
+# What moves a robot, says that it may be moved, or how its controller moves it, lies under
+# `RECORDED`: ``/robot/gap_open`` as ``/recorded/robot/gap_open``. `BagReader` gives each topic the
+# name that it had on the graph.
 
 
 RECORDED = "/recorded"

@@ -2,8 +2,6 @@
 
 A file without an index is what a recorder that was killed leaves behind. Everything up to the
 first incomplete record is read. A damaged chunk is left out. What was found wrong is told.
-
-A reader takes messages and a range of them, and gives contents with the place of each.
 """
 
 import heapq
@@ -391,6 +389,8 @@ def _earlier(heap: list[_Entry], before_ns: int | None) -> Iterator[Stretch]:
 
 
 # ---- message readers ----------------------------------------------------------------------------
+#
+# A reader takes messages and a range of them, and gives contents with the place of each.
 
 
 Decode = Callable[[Messages, int], Any]

@@ -1,16 +1,4 @@
-"""Bounds of the joint correction, and what is checked against them.
-
-With d(q) the whole shift of the joints, the shift made is k(q) d(q), with one share for all
-joints:
-
-    k = min(1, b_tool / e_tool, b_j / |d_j|, m_j / (FADES_WITHIN D_j))                        (1)
-
-where e_tool is the drift's error at the tool and b_tool its bound, b_j the bound of joint j, m_j
-its distance from the nearer limit, and D_j = b_j max_i |d_i| / b_i. A quotient by |d_j| in place
-of D_j would jump where a joint's shift changes its sign at its limit. Every term is continuous
-in q wherever d is not zero, so k d is continuous everywhere; and since the last one changes by
-at most 1 / FADES_WITHIN per unit of motion, taught joints follow from corrected ones.
-"""
+"""Bounds of the joint correction, and what is checked against them."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -189,6 +177,17 @@ def _require_joints(shift: Array, largest: Array, arm: SerialArm) -> None:
 
 
 # ---- correction of which no more is made than its bounds and the joint limits allow -------------
+#
+# With d(q) the whole shift of the joints, the shift made is k(q) d(q), with one share for all
+# joints:
+#
+#     k = min(1, b_tool / e_tool, b_j / |d_j|, m_j / (FADES_WITHIN D_j))                        (1)
+#
+# where e_tool is the drift's error at the tool and b_tool its bound, b_j the bound of joint j, m_j
+# its distance from the nearer limit, and D_j = b_j max_i |d_i| / b_i. A quotient by |d_j| in place
+# of D_j would jump where a joint's shift changes its sign at its limit. Every term is continuous
+# in q wherever d is not zero, so k d is continuous everywhere; and since the last one changes by
+# at most 1 / FADES_WITHIN per unit of motion, taught joints follow from corrected ones.
 
 
 TINY = 1e-300

@@ -4,12 +4,6 @@ Newton's method as in `solution`, three factored matrices with two steps each, w
 numbers: the compiler works on several points at a time in vector registers. Each gets the
 bits that it gets alone. Where that does not do (a direction may be weak, or a shift is so large
 that it needs more steps) a point is left to `straight_damped`.
-
-Frames are twelve numbers: axes x, y, z and origin. Twists and joints are six. A model's constants
-stand in one array, at places that are known when this is compiled.
-
-``work`` holds `work_size` numbers, so that a point allocates nothing; `settle` puts the models and
-the constants of a correction there, once.
 """
 
 from typing import NamedTuple
@@ -23,6 +17,9 @@ from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.kernels import LARGEST_ANGLE, reduced_cos_sin, turns_size
 
 # ---- compiled kinematics of six turning joints with single numbers, for `straight` --------------
+#
+# Frames are twelve numbers: axes x, y, z and origin. Twists and joints are six. A model's
+# constants stand in one array, at places that are known when this is compiled.
 
 
 Array = NDArray[np.float64]
@@ -392,6 +389,9 @@ def correct_lanes(c: Array, q: Array, out: Array) -> None:
 
 
 # ---- where the joint correction is worked out: its two models, and scratch numbers --------------
+#
+# ``work`` holds `work_size` numbers, so that a point allocates nothing; `settle` puts the models
+# and the constants of a correction there, once.
 
 
 POSES, SQUARES, TWISTS = 6, 3, 5

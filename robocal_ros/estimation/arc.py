@@ -5,11 +5,6 @@ circle nearest to most points (`arc_search`); the answer is the maximum likeliho
 whose residual fits its own predicted variance. How the noise depends on the slope of the surface
 is estimated with it: sensors err along the beam, along the surface's normal, or in between.
 Source of the use: methods of the fixed sphere, where y = +-sqrt(R^2 - r^2).
-
-Circles through three points of the smoothed profile, at all places and several widths, judged by
-truncated squares (MSAC, Torr and Zisserman 2000); the best ones are improved by Gauss-Newton
-over the points near them (Chum, Matas and Kittler 2003) and judged again. Nothing is drawn at
-random.
 """
 
 from dataclasses import dataclass, replace
@@ -30,6 +25,11 @@ from robocal_ros.estimation.surfaces import (
 from robocal_ros.ground.errors import InputError, ResidualError, RobocalError, TooFewSamplesError
 
 # ---- where in a profile a circle may be: the start of `fit_arc` ---------------------------------
+#
+# Circles through three points of the smoothed profile, at all places and several widths, judged by
+# truncated squares (MSAC, Torr and Zisserman 2000); the best ones are improved by Gauss-Newton
+# over the points near them (Chum, Matas and Kittler 2003) and judged again. Nothing is drawn at
+# random.
 
 
 Array = NDArray[np.float64]

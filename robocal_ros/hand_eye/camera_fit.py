@@ -1,11 +1,4 @@
-"""Maximum likelihood of a hand-eye calibration, with the noise of both sides.
-
-Variance components where the restricted likelihood (Patterson and Thompson 1971: of what the
-unknowns cannot explain) times a prior is largest. The prior is flat in each standard deviation
-(Gelman 2006, Bayesian Analysis 1:515): none of them is nothing because chance says so. Newton steps
-in the logarithms, with the average of observed and expected information (Gilmour, Thompson and
-Cullis 1995), which needs no product of two large matrices.
-"""
+"""Maximum likelihood of a hand-eye calibration, with the noise of both sides."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +21,12 @@ from robocal_ros.hand_eye.camera_model import (
 )
 
 # ---- camera noise -------------------------------------------------------------------------------
+#
+# Variance components where the restricted likelihood (Patterson and Thompson 1971: of what the
+# unknowns cannot explain) times a prior is largest. The prior is flat in each standard deviation
+# (Gelman 2006, Bayesian Analysis 1:515): none of them is nothing because chance says so. Newton
+# steps in the logarithms, with the average of observed and expected information (Gilmour, Thompson
+# and Cullis 1995), which needs no product of two large matrices.
 
 
 Array = NDArray[np.float64]

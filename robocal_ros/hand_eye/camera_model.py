@@ -1,9 +1,4 @@
-"""The model of a hand-eye calibration, as the estimators take it.
-
-R_carrier R_X = R_Z R_camera_board^T by singular vectors of a sum of Kronecker products, then both
-translations by linear least squares (Shah 2013, "Solving the robot-world/hand-eye calibration
-problem using the Kronecker product"), for many subsets of the samples at once.
-"""
+"""The model of a hand-eye calibration, as the estimators take it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -309,6 +304,10 @@ def _mean(T: Array) -> Array:
 
 
 # ---- camera start -------------------------------------------------------------------------------
+#
+# R_carrier R_X = R_Z R_camera_board^T by singular vectors of a sum of Kronecker products, then
+# both translations by linear least squares (Shah 2013, "Solving the robot-world/hand-eye
+# calibration problem using the Kronecker product"), for many subsets of the samples at once.
 
 
 _SUBSETS = 32  # of which one is clean with 99 % chance where three in ten samples are wrong

@@ -3,8 +3,6 @@
     T_flange_sensor: {xyz_mm: [60, -40, 110], rpy_deg: [0, 0, 45]}
 
 in YAML or JSON, with ``quat_xyzw`` or ``rpy_deg`` (about the fixed x, y, z).
-
-URDF's rpy turn about the fixed x, then y, then z of the parent.
 """
 
 from collections.abc import Callable, Mapping
@@ -93,6 +91,8 @@ def _place(fields: Fields, farthest_m: float) -> Array:
 
 
 # ---- a sensor's place in the words of robot descriptions: URDF, xacro, a static transform -------
+#
+# URDF's rpy turn about the fixed x, then y, then z of the parent.
 
 
 Format = Literal["urdf", "xacro", "yaml", "static-transform"]

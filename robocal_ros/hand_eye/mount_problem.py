@@ -3,9 +3,6 @@
 A sighting's residual is value(X, target, T (1 + d)) - measured: the pose error d is common to all
 that one profile shows. It is marginalised: its covariance is added to the features' own before the
 residuals are whitened, profile by profile.
-
-Restricted maximum likelihood (Patterson and Thompson 1971): the noise at which that part of the
-measurements is most likely which the unknowns cannot explain.
 """
 
 from dataclasses import dataclass, replace
@@ -231,6 +228,9 @@ def _place_in_sample(sample: Index) -> Index:
 
 
 # ---- how well the robot repeats and the eye aims, from what a fit leaves over -------------------
+#
+# Restricted maximum likelihood (Patterson and Thompson 1971): the noise at which that part of the
+# measurements is most likely which the unknowns cannot explain.
 
 
 FIRST_NOISE = PoseNoise(5e-5, 5e-5, 1e-4)  # turns count as shifts at an arm's length of 1 m

@@ -1,7 +1,4 @@
-"""From captured samples to a calibration in the history.
-
-The estimators are loaded when they are first used: a node's start does not need them.
-"""
+"""From captured samples to a calibration in the history."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -34,6 +31,8 @@ from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
 
 # ---- which estimator answers for which target ---------------------------------------------------
+#
+# The estimators are loaded when they are first used: a node's start does not need them.
 
 
 Array = NDArray[np.float64]

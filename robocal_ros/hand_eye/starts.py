@@ -1,13 +1,4 @@
-"""First poses of the sensor from corners at known places, and from points on a straight line.
-
-A circle tells the sphere's centre but for the side: y = +-sqrt(R^2 - r^2). The sides are found with
-the pose: of all patterns of a few profiles, the right one agrees best (with rotation columns that
-are a rotation; the mirrored pattern has the determinant -1).
-
-A profile may show more corners than are wanted (concave ones, the block's rear edge, the table) or
-fewer. First each profile is laid along the target by the distances between its corners; the pose
-that comes of this then tells, for every profile, where each corner must be.
-"""
+"""First poses of the sensor from corners at known places, and from points on a straight line."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -173,6 +164,10 @@ def least_distances(view: TargetView, near: MountState) -> MountState:
 
 
 # ---- a first pose of the sensor from circles on a sphere, and the classic closed form -----------
+#
+# A circle tells the sphere's centre but for the side: y = +-sqrt(R^2 - r^2). The sides are found
+# with the pose: of all patterns of a few profiles, the right one agrees best (with rotation
+# columns that are a rotation; the mirrored pattern has the determinant -1).
 
 
 FEWEST_PROFILES = 5
@@ -292,6 +287,10 @@ def agreed_centre(sightings: Sightings, radius_m: float, T_flange_sensor: Array)
 
 
 # ---- which corner of a profile is which corner of the staircase ---------------------------------
+#
+# A profile may show more corners than are wanted (concave ones, the block's rear edge, the table)
+# or fewer. First each profile is laid along the target by the distances between its corners; the
+# pose that comes of this then tells, for every profile, where each corner must be.
 
 
 CLEAR = 1.5  # times better than the next, from which a place along the target is sure

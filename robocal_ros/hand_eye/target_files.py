@@ -2,8 +2,6 @@
 
 The contract is written in docs/hand_eye_sphere.md, hand_eye_step.md, hand_eye_line.md and, of a
 board, hand_eye_node.md.
-
-The contract is written in docs/hand_eye_tracker.md.
 """
 
 from dataclasses import dataclass
@@ -241,6 +239,8 @@ def _document(target: Target) -> dict[str, Any]:
 
 
 # ---- tracker tables -----------------------------------------------------------------------------
+#
+# The contract is written in docs/hand_eye_tracker.md.
 
 
 ARCS = ("arc_a", "arc_b")

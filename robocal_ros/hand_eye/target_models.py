@@ -1,9 +1,4 @@
-"""Models of the targets: a sphere, a straight edge, the marked edges of a staircase.
-
-Each profile is reduced to features that hold all it says (Fisher information) about where the
-target is: the circle that the laser plane cuts out of a sphere (x0, z0, r), or the point where an
-edge pierces that plane (x, z), for a marked edge with the place along it.
-"""
+"""Models of the targets: a sphere, a straight edge, the marked edges of a staircase."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,6 +10,10 @@ from scipy.spatial import cKDTree
 from robocal_ros.ground import frames
 
 # ---- what profiles show of a target, and how a model of the target predicts it ------------------
+#
+# Each profile is reduced to features that hold all it says (Fisher information) about where the
+# target is: the circle that the laser plane cuts out of a sphere (x0, z0, r), or the point where
+# an edge pierces that plane (x, z), for a marked edge with the place along it.
 
 
 Array = NDArray[np.float64]

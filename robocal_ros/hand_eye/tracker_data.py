@@ -1,11 +1,4 @@
-"""What a laser tracker and a profile sensor measure of one cube with a sphere beside it.
-
-Source: Jing, Hu and Guo 2020, section 3.1, for the last two joints of a P-R-P arm; here for any
-two joints, by the lines of their axes in the flange that the nominal geometry gives.
-
-Both see the temporary frame K: origin in the sphere's centre, axes along the faces' outward
-normals, made orthonormal in the same way on both sides (Jing, Hu and Guo 2020, section 3.2).
-"""
+"""What a laser tracker and a profile sensor measure of one cube with a sphere beside it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -158,6 +151,9 @@ class TrackerData:
 
 
 # ---- pose of the flange in a laser tracker, from the paths of a reflector on it -----------------
+#
+# Source: Jing, Hu and Guo 2020, section 3.1, for the last two joints of a P-R-P arm; here for any
+# two joints, by the lines of their axes in the flange that the nominal geometry gives.
 
 
 SHORTEST_ARC_RAD = float(np.radians(20.0))
@@ -421,6 +417,9 @@ def reflector_in_flange(
 
 
 # ---- two faces of a cube and a sphere beside it, seen by a laser tracker or by a sensor ---------
+#
+# Both see the temporary frame K: origin in the sphere's centre, axes along the faces' outward
+# normals, made orthonormal in the same way on both sides (Jing, Hu and Guo 2020, section 3.2).
 
 
 NARROWEST_M = 5e-3  # rms extent of the points on a face in its narrower direction

@@ -2,9 +2,6 @@
 
 Rows are whitened one by one, so that each is a sample of its own; the errors of the joints at a
 profile are common to all that it shows, and at a point of an arc they move it along its path.
-
-Both are taken to miss the model by half of it: they turn about their common perpendicular, and
-shift along it, in opposite directions. What the flange is then lies midway, as in the closed form.
 """
 
 from collections.abc import Sequence
@@ -107,6 +104,10 @@ def adjoint(T: Array) -> Array:
 
 
 # ---- axes of a real arm that stand to each other a little otherwise than its model says ---------
+#
+# Both are taken to miss the model by half of it: they turn about their common perpendicular, and
+# shift along it, in opposite directions. What the flange is then lies midway, as in the closed
+# form.
 
 
 ANGLE_SIGMA, GAP_SIGMA_M = float(np.radians(0.5)), 1e-3  # of real arms: hardly a restraint

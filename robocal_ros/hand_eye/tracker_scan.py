@@ -1,9 +1,4 @@
-"""The scan of a cube and a sphere, built from profiles, and its parts.
-
-The sensor's noise is along its beam (z). Of a face a profile holds a line: its z at the middle of
-its x, and its slope, are all that it tells. Of the sphere it tells the centre, to first order
-about a place that is known well: three combinations of it.
-"""
+"""The scan of a cube and a sphere, built from profiles, and its parts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -221,6 +216,10 @@ def _unbroken(scan: Scan) -> Scan:
 
 
 # ---- tracker features ---------------------------------------------------------------------------
+#
+# The sensor's noise is along its beam (z). Of a face a profile holds a line: its z at the middle
+# of its x, and its slope, are all that it tells. Of the sphere it tells the centre, to first order
+# about a place that is known well: three combinations of it.
 
 
 Mask = NDArray[np.bool_]

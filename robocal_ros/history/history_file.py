@@ -4,13 +4,6 @@ A damaged file is never repaired and never deleted: it is set aside under anothe
 done only by an owner (see `history_damage`), and only while no other process has the file open, so
 that two of them cannot go on with two different histories; a lock file beside it (shared while
 open, exclusive to set aside) sees to it.
-
-Calibrations, their payloads, the decisions about them and what commands were corrected with are
-only ever added to; triggers refuse changes by any program.
-
-A history that begins anew forgets what was in force, so every node that reads it says so, also
-after a restart, until ``robocal history acknowledge`` has written who knows of it into
-``<serial>/damage/acknowledged.json``. A file that was moved away needs no acknowledgement.
 """
 
 import errno
@@ -31,6 +24,9 @@ from robocal_ros.ground.errors import InputError, StorageError, WrongRobotError
 from robocal_ros.ground.files import made_folder_beside, write_text
 
 # ---- history schema -----------------------------------------------------------------------------
+#
+# Calibrations, their payloads, the decisions about them and what commands were corrected with are
+# only ever added to; triggers refuse changes by any program.
 
 
 APPLICATION_ID = 0x52434C48
@@ -118,6 +114,10 @@ class DamagedError(Exception):
 
 
 # ---- damaged histories that were set aside, until a person has taken notice ---------------------
+#
+# A history that begins anew forgets what was in force, so every node that reads it says so, also
+# after a restart, until ``robocal history acknowledge`` has written who knows of it into
+# ``<serial>/damage/acknowledged.json``. A file that was moved away needs no acknowledgement.
 
 
 COMPANIONS = ("", "-wal", "-shm")

@@ -1,7 +1,4 @@
-"""Opening and reading the calibration history of one robot.
-
-The log alone says what is in force: there is no second place that could disagree with it.
-"""
+"""Opening and reading the calibration history of one robot."""
 
 import logging
 import sqlite3
@@ -54,6 +51,8 @@ if TYPE_CHECKING:
 
 
 # ---- the rules of accept, reject and rollback, as a fold over the decisions log -----------------
+#
+# The log alone says what is in force: there is no second place that could disagree with it.
 
 
 NOMINAL = 0

@@ -4,8 +4,6 @@ Every kernel takes ``links`` (n, 9): d, theta, a, cos/sin alpha, cos/sin beta, s
 (see ``pack_links``), and walks the chain
 ``Trans(z, d) Rot(z, theta) Trans(x, a) Rot(x, alpha) Rot(y, beta)`` (Hayati's five-parameter
 form) column by column, so that no matrix product is formed. Angles in rad, lengths in m.
-
-``J`` (m, 3 or 6, k) holds twists [v; w] in the measuring frame; lengths in m, angles in rad.
 """
 
 import math
@@ -61,6 +59,8 @@ def cos_sin(angle: float) -> tuple[float, float]:
 
 
 # ---- compiled columns of Jacobians, from the axes that a walk along the chain kept --------------
+#
+# ``J`` (m, 3 or 6, k) holds twists [v; w] in the measuring frame; lengths in m, angles in rad.
 
 
 Array = NDArray[np.float64]

@@ -1,7 +1,4 @@
-"""Measurements as CSV tables; the contract is written in docs/csv.md.
-
-The contract is written in docs/csv.md.
-"""
+"""Measurements as CSV tables; the contract is written in docs/csv.md."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -23,6 +20,8 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE
 
 # ---- columns of a measurement table: names, units, and what is missing or unknown ---------------
+#
+# The contract is written in docs/csv.md.
 
 
 Array = NDArray[np.float64]

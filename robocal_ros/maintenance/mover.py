@@ -1,8 +1,4 @@
-"""One motion of the robot at a time, supervised; whatever is odd is a reason to stop.
-
-Home and the measuring poses are a ring: home is 0, the poses are 1 to k in their order, and a
-straight joint line leads from each to the next, from the last one home. Nothing else is driven.
-"""
+"""One motion of the robot at a time, supervised; whatever is odd is a reason to stop."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +24,9 @@ from robocal_ros.motion.robot_watch import (
 from robocal_ros.tool.driving import least_s
 
 # ---- ways ---------------------------------------------------------------------------------------
+#
+# Home and the measuring poses are a ring: home is 0, the poses are 1 to k in their order, and a
+# straight joint line leads from each to the next, from the last one home. Nothing else is driven.
 
 
 Array = NDArray[np.float64]

@@ -1,19 +1,4 @@
-"""What the session asks of whoever drives it, and what is answered.
-
-A script is a generator: it yields whenever it has to wait, and is resumed at the next tick.
-
-Safety case: nothing moves, and no fault is acknowledged, while another node might move the robot.
-Only its own confirmation ends that doubt; a node that hangs gives none, and may be moving. One that
-is not there at all can give none either, and would block the cell for ever. It is let go where it
-cannot move anything: its service has not existed for `GONE_S`, with each disarm that was asked (a
-node that starts is found sooner, and starts disarmed); this node has not armed it since the last
-confirmed disarm, so that no motion that was asked for here can be under way, not the rest of a
-dead node's trajectory either; and the robot rests at home (`Hands` looks).
-
-A node that was started anew confirms too, but knows nothing of that trajectory. So a confirmation
-tells what will be sent; what was sent before it is over where the measurement has been answered, or
-was stopped from here, and the robot rests: until then it is in doubt as well.
-"""
+"""What the session asks of whoever drives it, and what is answered."""
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -133,6 +118,8 @@ class DriverAnswer:
 
 
 # ---- requests to others, and scripts that wait for their answers from tick to tick --------------
+#
+# A script is a generator: it yields whenever it has to wait, and is resumed at the next tick.
 
 
 R = TypeVar("R")
@@ -209,6 +196,19 @@ class Asking:
 
 
 # ---- disarming ----------------------------------------------------------------------------------
+#
+# Safety case: nothing moves, and no fault is acknowledged, while another node might move the
+# robot. Only its own confirmation ends that doubt; a node that hangs gives none, and may be
+# moving. One that is not there at all can give none either, and would block the cell for ever. It
+# is let go where it cannot move anything: its service has not existed for `GONE_S`, with each
+# disarm that was asked (a node that starts is found sooner, and starts disarmed); this node has
+# not armed it since the last confirmed disarm, so that no motion that was asked for here can be
+# under way, not the rest of a dead node's trajectory either; and the robot rests at home (`Hands`
+# looks).
+#
+# A node that was started anew confirms too, but knows nothing of that trajectory. So a
+# confirmation tells what will be sent; what was sent before it is over where the measurement has
+# been answered, or was stopped from here, and the robot rests: until then it is in doubt as well.
 
 
 AGAIN_S = 0.5

@@ -1,9 +1,4 @@
-"""Where the robot is, against the plan that it was sent.
-
-A controller has no order to stop: it drives on where it is sent nothing or a trajectory without
-points, and the cancel of a goal is a dead stop from any speed. What stops it is a motion that
-decelerates from where it is.
-"""
+"""Where the robot is, against the plan that it was sent."""
 
 from bisect import bisect_right
 from collections import deque
@@ -376,6 +371,10 @@ class RobotWatch:
 
 
 # ---- watched stop -------------------------------------------------------------------------------
+#
+# A controller has no order to stop: it drives on where it is sent nothing or a trajectory without
+# points, and the cancel of a goal is a dead stop from any speed. What stops it is a motion that
+# decelerates from where it is.
 
 
 STANDS_S = 0.1  # a robot that has rested for so long stands

@@ -1,9 +1,4 @@
-"""Run one node as a process.
-
-Python looks for garbage when so many objects were made, which is in the middle of a callback, and
-now and then through all objects: tens of milliseconds for a node with its libraries. Here what the
-start made is never looked at again, and the little rest between callbacks.
-"""
+"""Run one node as a process."""
 
 import gc
 import os
@@ -21,6 +16,10 @@ from rclpy.task import Future
 from robocal_ros.ros.base import HouseNode
 
 # ---- garbage collection that waits until no message does ----------------------------------------
+#
+# Python looks for garbage when so many objects were made, which is in the middle of a callback,
+# and now and then through all objects: tens of milliseconds for a node with its libraries. Here
+# what the start made is never looked at again, and the little rest between callbacks.
 
 
 class QuietMemory:

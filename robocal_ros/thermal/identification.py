@@ -3,14 +3,6 @@
 Drifts are so small that the model is linear in them (0.1 mrad over 3 m: the second order is
 30 nm). With y the displacement of the targets since the cold visit, ``y = A x + B s - b + v``:
 x the parameters' drift, s the set-up's shift, b the cold visit's noise and v the warm one's.
-
-Many cycles at once: all visit the same poses, so that one decomposition serves them all.
-
-With ``y ~ N(0, S)`` the error of forecasting part i from the rest is ``(S^-1)_ii^-1 (S^-1 y)_i``,
-and its covariance is ``(S^-1)_ii^-1`` (Rasmussen and Williams 2006, section 5.4.2).
-
-A step that the drift cannot explain is compared with few simple causes, each a linear model of the
-displacement; generalised least squares tells which of them leave no more than noise.
 """
 
 from collections.abc import Sequence
@@ -28,6 +20,8 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.reference import ColdReference, ColdSpots
 
 # ---- some of the parameters by least squares, the others held: the classic identification -------
+#
+# Many cycles at once: all visit the same poses, so that one decomposition serves them all.
 
 
 Array = NDArray[np.float64]
@@ -124,6 +118,9 @@ def _null(rows: Array, chosen: Sequence[int]) -> Array:
 
 
 # ---- agreement ----------------------------------------------------------------------------------
+#
+# With ``y ~ N(0, S)`` the error of forecasting part i from the rest is ``(S^-1)_ii^-1 (S^-1
+# y)_i``, and its covariance is ``(S^-1)_ii^-1`` (Rasmussen and Williams 2006, section 5.4.2).
 
 
 FALSE_SAMPLE = 0.001  # chance that a sound cycle loses a sample
@@ -344,6 +341,9 @@ def visit_variance(
 
 
 # ---- steps --------------------------------------------------------------------------------------
+#
+# A step that the drift cannot explain is compared with few simple causes, each a linear model of
+# the displacement; generalised least squares tells which of them leave no more than noise.
 
 
 SENSOR = "sensor"

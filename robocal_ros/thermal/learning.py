@@ -1,8 +1,4 @@
-"""What drift to expect of one robot, learned from cycles that it has measured.
-
-Widths are chosen where earlier cycles are most likely, each shift judged by what the others teach;
-of what is to be tracked nothing is used.
-"""
+"""What drift to expect of one robot, learned from cycles that it has measured."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -79,6 +75,9 @@ def learn_drift(
 
 
 # ---- process learning ---------------------------------------------------------------------------
+#
+# Widths are chosen where earlier cycles are most likely, each shift judged by what the others
+# teach; of what is to be tracked nothing is used.
 
 
 SCALES = tuple(2.0**-i for i in range(6))

@@ -1,12 +1,4 @@
-"""How a robot's parameters drift in time: the prior of the tracker.
-
-A motor and its gear move their own joint's parameters at once. The link that follows the joint lies
-between its motor and the next one, and follows both with a lag.
-
-At the poses of a cold reference the arm's static errors are known and cancel. What is left is
-compared with either answer: first as if sensor and target stood still, then, where neither
-answer explains it so, with both moved anywhere, which takes more or better poses to tell.
-"""
+"""How a robot's parameters drift in time: the prior of the tracker."""
 
 import math
 from dataclasses import dataclass, replace
@@ -125,6 +117,9 @@ def learned_prior(default: Array, drifts: Array, covariances: Array) -> Array:
 
 
 # ---- what the motors' temperatures say of the drift: features, and gains to be learned ----------
+#
+# A motor and its gear move their own joint's parameters at once. The link that follows the joint
+# lies between its motor and the next one, and follows both with a lag.
 
 
 SOURCES = 3  # of each parameter: its joint's motor, the same lagged, the next motor lagged
@@ -238,6 +233,10 @@ def joints_of(arm: SerialArm) -> NDArray[np.int64]:
 
 
 # ---- warmth -------------------------------------------------------------------------------------
+#
+# At the poses of a cold reference the arm's static errors are known and cancel. What is left is
+# compared with either answer: first as if sensor and target stood still, then, where neither
+# answer explains it so, with both moved anywhere, which takes more or better poses to tell.
 
 
 # Noise makes the wrong answer so much likelier in one case of as many (Wald 1945).

@@ -1,10 +1,6 @@
 """Which parameters a robot's drift needs: backward elimination by what it leaves at check points.
 
 Off line, from a shift that was recorded with many poses; see ``drift_history`` for lambda.
-
-C_p weighs the sum of all squared residuals against the number of parameters, so that a few bad
-points can hide in it. The search goes through every subset of the size, a million for 8 or 9 of
-24: the many that explain about the same would leave a branch-and-bound search little to skip.
 """
 
 from collections.abc import Iterator
@@ -225,6 +221,10 @@ def _classic_place(name: str) -> int:
 
 
 # ---- best subset --------------------------------------------------------------------------------
+#
+# C_p weighs the sum of all squared residuals against the number of parameters, so that a few bad
+# points can hide in it. The search goes through every subset of the size, a million for 8 or 9 of
+# 24: the many that explain about the same would leave a branch-and-bound search little to skip.
 
 
 Array = NDArray[np.float64]

@@ -9,12 +9,6 @@ A receiver switches back at more light than it switched off at: both edges come 
 which differs from a latency by the speed. The robot's repeatability is an unknown shift of each
 step with its own prior, and so is each point of the laser frame, so that the covariance of the
 tool is that of all of them together.
-
-The flange runs on a circle of radius R at constant speed in the beam plane, its orientation held.
-In the laser frame the axis is at ``c + R (cos theta, sin theta)``; its signed distance from beam b
-is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta, and at an edge it is
-exactly +rho_b or -rho_b. The centre is ``c = (d_y / sin beta + d_x / tan beta, d_x)``.
-Only ratios to R follow from times: R itself is the commanded one.
 """
 
 from collections.abc import Sequence
@@ -314,6 +308,12 @@ def touch_of(
 
 
 # ---- where the tool's axis is from one circle through two crossed beams, by time alone ----------
+#
+# The flange runs on a circle of radius R at constant speed in the beam plane, its orientation
+# held. In the laser frame the axis is at ``c + R (cos theta, sin theta)``; its signed distance
+# from beam b is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta, and at
+# an edge it is exactly +rho_b or -rho_b. The centre is ``c = (d_y / sin beta + d_x / tan beta,
+# d_x)``. Only ratios to R follow from times: R itself is the commanded one.
 
 
 CircleMethod = Literal["best", "classic"]

@@ -1,7 +1,4 @@
-"""A tool frame from circles and plunges through two crossed beams.
-
-joint readings came. No bend changes these; what differs from the healthy tool's run is a fault.
-"""
+"""A tool frame from circles and plunges through two crossed beams."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -328,6 +325,8 @@ def _require_fit(
 
 
 # ---- run traits ---------------------------------------------------------------------------------
+#
+# joint readings came. No bend changes these; what differs from the healthy tool's run is a fault.
 
 
 ONE_SIDED = 1.645  # sigmas: what is at a limit looks larger by so much in 5 % of cases

@@ -2,9 +2,6 @@
 
 Order is judged beam by beam: two beams' shadows may overlap, so nothing follows from the order of
 edges of different beams.
-
-In the laser frame the tool's axis is at ``c + R (cos theta, sin theta)``; its signed distance from
-beam b is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta.
 """
 
 from collections.abc import Mapping, Sequence
@@ -146,6 +143,9 @@ def edges_of(edges: Sequence[BeamEdge], beam: Beam, fewest: int) -> list[BeamEdg
 
 
 # ---- a circle through two crossed beams, and what each of its edges means -----------------------
+#
+# In the laser frame the tool's axis is at ``c + R (cos theta, sin theta)``; its signed distance
+# from beam b is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta.
 
 
 FEWEST_EDGES = 4  # of each beam: two shadows

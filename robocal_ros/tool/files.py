@@ -1,9 +1,4 @@
-"""Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print.
-
-Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
-W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB a
-unit quaternion, real part first; Universal Robots a rotation vector.
-"""
+"""Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -77,6 +72,10 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
 
 
 # ---- a tool frame in the words of a robot's controller ------------------------------------------
+#
+# Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
+# W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB a
+# unit quaternion, real part first; Universal Robots a rotation vector.
 
 
 Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]
