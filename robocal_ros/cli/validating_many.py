@@ -104,6 +104,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         try:
             yield client
         except (KeyboardInterrupt, GeneratorExit):  # nobody wants the other bags any more
+            for handler in logging.getLogger("distributed").handlers:
+                handler.setLevel(logging.CRITICAL)  # its threads miss the workers, with tracebacks
             for worker in cluster.workers.values():  # the cluster would wait for theirs
                 os.kill(worker.pid, signal.SIGKILL)
             raise
