@@ -200,9 +200,7 @@ def simulated(graph: Any, folder: Path, velocities: bool, **parameters: Any) -> 
 
 
 def real(graph: Any, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
-    """joint_trajectory_controller on mock_components/GenericSystem; skipped where it is missing."""
-    if missing := missing_packages():
-        pytest.skip(f"ros2_control is not installed: no {', '.join(missing)}")
+    """joint_trajectory_controller on mock_components/GenericSystem, see `missing_packages`."""
     from controller_manager_msgs.srv import ConfigureController, LoadController, SwitchController
 
     states = ["position", "velocity"] if velocities else ["position"]
