@@ -20,7 +20,7 @@ from robocal_ros.estimation.assessment import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification.documents import cell_document
+from robocal_ros.identification.judged import cell_document
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import parameters_document

@@ -11,7 +11,7 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, TooFewSam
 from robocal_ros.ground.proposals import REFERENCE, THERMAL, Proposal
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import Method, identify_and_hold_out
-from robocal_ros.identification.documents import identification_document, identified_model_document
+from robocal_ros.identification.judged import identification_document, identified_model_document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session.decisions import History

@@ -12,8 +12,8 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.housing import DrivingConfig
 from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits, stop
 from robocal_ros.motion.plan import LEAD_S, JointPlan
-from robocal_ros.motion.robot_watch import REPEAT_S as PAUSED_S
 from robocal_ros.motion.robot_watch import (
+    REPEAT_S,
     REST_RAD,
     SEEN_S,
     STANDS_S,
@@ -180,7 +180,7 @@ def test_a_stop_that_is_lost_in_a_pause_does_not_let_the_motion_go_on(lost):
             held = held or stopping.sent > lost
     assert stopping.under_way
     assert not stopping.failed
-    assert 30.0 / PAUSED_S - 2.0 <= stopping.sent <= 30.0 / PAUSED_S + 2.0
+    assert 30.0 / REPEAT_S - 2.0 <= stopping.sent <= 30.0 / REPEAT_S + 2.0
     went_on_s = now_s
     while stopping.under_way:
         read(1.0)
