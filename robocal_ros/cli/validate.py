@@ -25,7 +25,7 @@ from robocal_ros.cli.output import (
     refusal,
     tell,
 )
-from robocal_ros.cli.warm_workers import warm_up
+from robocal_ros.cli.workers import validated, warm_up
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.files import write_text
 
@@ -69,7 +69,6 @@ def run(args: argparse.Namespace) -> CliResult:
     workers = min(args.jobs or len(os.sched_getaffinity(0)), len(args.bags))
     if workers > 1 and args.scheduler is None:
         warm_up()
-    from robocal_ros.cli.validating_many import validated
     from robocal_ros.report.validation import summary_rows
     from robocal_ros.report.validation_page import page
 

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -37,11 +38,11 @@ from recordings import (
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.bags.replay import NOT_BITS
-from robocal_ros.cli import validating_many
+from robocal_ros.cli import workers
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validating import Job
-from robocal_ros.cli.validating_many import validated
 from robocal_ros.cli.validating_parts import require_finite
+from robocal_ros.cli.workers import validated
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text
 
@@ -398,7 +399,7 @@ class TestInParallel:
     def test_a_cluster_without_a_worker(self, validate, monkeypatch) -> None:
         from distributed import LocalCluster
 
-        monkeypatch.setattr(validating_many, "PATIENCE_S", 1)
+        monkeypatch.setattr(workers, "PATIENCE_S", 1)
         with LocalCluster(n_workers=0, dashboard_address=None, processes=False) as cluster:
             status, document, _, _ = validate(TOOL_RUNS, "--scheduler", cluster.scheduler_address)
         assert status == 2
@@ -421,6 +422,19 @@ class TestInParallel:
         assert status == 3
         assert "8 of 8 bags could not be validated" in document["error"]["message"]
         assert (out / "report.html").exists()
+
+    def test_a_bag_whose_process_is_killed_is_told(self, validate) -> None:
+        def kill_one() -> None:
+            until(multiprocessing.active_children)
+            multiprocessing.active_children()[0].kill()
+
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        status, document, _, _ = validate(*4 * [EXCERPT], jobs="2")
+        killer.join()
+        assert status == 3
+        assert "1 of 4 bags could not be validated" in document["error"]["message"]
+        assert "terminated abruptly" in document["error"]["message"]
 
     def test_ctrl_c_ends_all(self, tmp_path) -> None:
         command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *40 * [str(EXCERPT)]]
