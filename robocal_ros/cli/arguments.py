@@ -148,3 +148,20 @@ def warn(messages: Iterable[str]) -> None:
     """Tell people on standard error what may have escaped them."""
     for message in messages:
         print(f"robocal: warning: {message}", file=sys.stderr)
+
+
+def three_numbers(value: str) -> tuple[float, ...]:
+    """Type of three finite numbers such as ``1,-2.5,3``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    try:
+        numbers = tuple(float(cell) for cell in value.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3 or not all(abs(number) <= 1e6 for number in numbers):
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not three numbers such as 1,-2.5,3")
+    return numbers

@@ -6,31 +6,236 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import count, text
-from robocal_ros.cli.history_options import add_history, add_rollback_target
-from robocal_ros.cli.history_view import (
-    show_acknowledged,
-    show_corrections,
-    show_decision,
-    show_entry,
-    show_list,
-)
 from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.proposals import BEFORE_ANY, Decision, Entry
+from robocal_ros.ground.files import quoted
+from robocal_ros.ground.proposals import (
+    BEFORE_ANY,
+    HEALTHY_TOOL,
+    MANDREL,
+    THERMAL,
+    TOOL,
+    Decision,
+    Entry,
+    hand_eye_kind,
+)
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_file import acknowledge, damaged_files, known_serials, state_folder
+from robocal_ros.session.decisions import measured_with
 
 if TYPE_CHECKING:
-    from robocal_ros.history.calibrations import CalibrationHistory
-
-NAME = "history"
-HELP = "list the calibrations of a robot; accept, reject or roll back"
+    from rich.console import Console
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+# ---- the history for people ---------------------------------------------------------------------
+
+
+_STYLES = {"in_force": "bold green", "pending": "bold yellow", "refused": "red"}
+
+
+def show_list(console: "Console", document: Document) -> None:
+    """Print the calibrations as a table, and what is in force."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
+    for name in ("id", "revision", "kind", "state", "verdict", "rms mm", "data (UTC)", "cycle"):
+        table.add_column(name, justify="right" if name in ("id", "revision", "rms mm") else "left")
+    table.add_column("last decision")
+    for entry in document["calibrations"]:
+        rms = entry["candidate_rms_mm"]
+        table.add_row(
+            str(entry["id"]),
+            str(entry["revision"] or ""),
+            Text(entry["kind"]),
+            Text(entry["state"], style=_STYLES.get(entry["state"], "")),
+            entry["code"],
+            "" if rms is None else f"{rms:.3f}",
+            _time(entry["stamp_ns"]),
+            Text(entry["cycle_id"]),
+            Text(_words(entry["decisions"][-1]) if entry["decisions"] else ""),
+        )
+    console.print(table)
+    for head in document["in_force"]:
+        console.print(Text(_in_force(head)))
+    if not document["in_force"]:
+        console.print("In force: the nominal model; nothing was accepted yet")
+
+
+def show_entry(console: "Console", document: Document) -> None:
+    """Print one calibration: the record, its inputs, its decisions."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    entry = document["calibration"]
+    table = Table(box=None, show_header=False)
+    table.add_row("robot", Text(document["serial"]))
+    for name, value in entry.items():
+        if name == "decisions" or value is None:
+            continue
+        shown = _time(value) if name.endswith("_ns") else str(value)
+        table.add_row(name.removesuffix("_ns").replace("_", " "), Text(shown))
+    for name, kind in document["inputs"].items():
+        size = " x ".join(str(n) for n in kind["shape"])
+        table.add_row(f"input {name}", f"{kind['dtype']} {size}")
+    for decision in entry["decisions"]:
+        table.add_row("decision", Text(_words(decision)))
+    console.print(table)
+    console.print("The full document, the model and its figures: --json")
+
+
+def show_corrections(console: "Console", document: Document) -> None:
+    """Print what the commands were corrected with, and since when."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
+    for name in ("since (UTC)", "correction", "model", "tool", "reference", "from", "its hash"):
+        table.add_column(name, justify="right" if name in ("model", "tool") else "left")
+    table.add_column("version")
+    for record in document["corrections"]:
+        asked = ("shadow" if record["shadow"] else "on") if record["enabled"] else "off"
+        table.add_row(
+            _time(record["wall_ns"]),
+            Text(asked, style="bold green" if asked == "on" else ""),
+            str(record["model_revision"] or "none"),
+            str(record["tool_revision"] or "taught"),
+            record["reference"],
+            Text(record["reference_source"]),
+            record["reference_hash"][:8],
+            Text(record["software"]),
+        )
+    console.print(table)
+    if not document["corrections"]:
+        console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
+
+
+def show_acknowledged(console: "Console", document: Document) -> None:
+    """Print which damaged histories somebody knows of now."""
+    from rich.text import Text
+
+    for path in document["acknowledged"]:
+        console.print(Text(f"Acknowledged by {document['by']}: {path}"), soft_wrap=True)
+    if not document["acknowledged"]:
+        console.print("There is nothing to acknowledge")
+
+
+def show_decision(console: "Console", document: Document) -> None:
+    """Print what was done."""
+    from rich.text import Text
+
+    _show_damage(console, document)
+    console.print(Text(document["verdict"]["reason"].capitalize()), soft_wrap=True)
+
+
+def _show_damage(console: "Console", document: Document) -> None:
+    if document["damaged"]:
+        console.print(
+            f"The history was damaged and is kept as {document['damaged']}; 'robocal history "
+            "acknowledge' ends the warnings",
+            style="bold red",
+            soft_wrap=True,
+        )
+
+
+def _in_force(head: Document) -> str:
+    number = head["calibration_id"]
+    name = "the nominal model" if number is None else f"calibration {number}"
+    return f"In force: {name}, {head['kind']} revision {head['revision']}"
+
+
+def _words(decision: Document) -> str:
+    number = decision["calibration_id"]
+    target = ""
+    if decision["action"] == "rollback":
+        target = " to nominal" if number is None else f" to {number}"
+    by = f" by {decision['by']}" if decision["by"] else ""
+    why = f": {decision['reason']}" if decision["reason"] else ""
+    return f"{_time(decision['wall_ns'])} {decision['action']}{target}{by}{why}"
+
+
+def _time(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+# ---- options of ``robocal history`` -------------------------------------------------------------
+
+
+_PREVIOUS = "previous"
+_NOMINAL = "nominal"
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL)
+
+
+def add_history_options(action: argparse.ArgumentParser) -> None:
+    """Declare which history is meant."""
+    action.add_argument(
+        "--robot-serial",
+        type=text,
+        metavar="S",
+        help="robot serial; may be left out where only one robot has a history",
+    )
+    action.add_argument(
+        "--state",
+        type=Path,
+        metavar="DIR",
+        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
+    )
+
+
+def add_rollback_target(action: argparse.ArgumentParser) -> None:
+    """Declare what a rollback returns to."""
+    action.add_argument(
+        "--to",
+        type=_target,
+        default=None,
+        metavar="ID",
+        help="an accepted calibration, 'nominal', or 'previous' (default): the one in force "
+        "before the present one",
+    )
+    action.add_argument(
+        "--kind",
+        type=_kind,
+        metavar="KIND",
+        default=THERMAL,
+        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
+    )
+
+
+def _kind(value: str) -> str:
+    """A kind of calibration; each sensor has its own."""
+    start = hand_eye_kind("")
+    if value not in _KINDS and (not value.startswith(start) or value == start):
+        known = ", ".join((*_KINDS, hand_eye_kind("SENSOR")))
+        raise argparse.ArgumentTypeError(f"'{value}' is none of {known}")
+    return value
+
+
+def _target(value: str) -> int | None:
+    if value == _PREVIOUS:
+        return None
+    if value == _NOMINAL:
+        return 0
+    try:
+        return count(value)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(
+            f"{quoted(value)} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
+        ) from error
+
+
+# ---- ``robocal history``: what was proposed, what is in force, and decisions about it -----------
+
+
+def add_history(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``history``."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
@@ -69,11 +274,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             add_rollback_target(action)
 
 
-def run(args: argparse.Namespace) -> CliResult:
-    """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.history.calibrations import CalibrationHistory
-    from robocal_ros.history.history_file import damaged_files, known_serials, state_folder
-
+def run_history(args: argparse.Namespace) -> CliResult:
+    """Do ``history``. Raises `RobocalError` for what a user can mend."""
     folder = state_folder() if args.state is None else args.state.absolute()
     serial = args.robot_serial
     if serial is None:
@@ -118,7 +320,7 @@ def _list(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     return document, show_list
 
 
-def _show(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+def _show_history(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     entry = history.get(args.id)
     document = {
         "calibration": _entry(entry),
@@ -143,15 +345,11 @@ def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Ans
 
 
 def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    from robocal_ros.history.history_file import acknowledge
-
     files = acknowledge(history.path, _by(args), time.time_ns())
     return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_acknowledged
 
 
 def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    from robocal_ros.session.decisions import measured_with
-
     head = history.accept(
         args.id,
         by=_by(args),
@@ -191,7 +389,7 @@ def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer
 _ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]] = {
     "list": _list,
     "acknowledge": _acknowledge,
-    "show": _show,
+    "show": _show_history,
     "corrections": _corrections,
     "accept": _accept,
     "reject": _reject,

@@ -1,28 +1,158 @@
 """``robocal identify``: a robot's model from measurements, judged on measurements not used."""
 
 import argparse
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from robocal_ros import __version__
 from robocal_ros.cli.arguments import PARTS, ROBOT_HELP, describe_robot, parts, seed, share, warn
-from robocal_ros.cli.identify_view import headline, show_identification
 from robocal_ros.cli.output import DONE, NO_ANSWER, CliResult, refusal, tell
-from robocal_ros.ground.errors import Code, InputError
+from robocal_ros.estimation.assessment import hold_out, pose_groups
+from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
+from robocal_ros.ground.files import quoted
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge
+from robocal_ros.identification.judged import identification_document
+from robocal_ros.identification.mismatch import explain_mismatch, require_match
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import RobotDescription, save_robot
+from robocal_ros.kinematics.tables import beyond_limits, read_measurements
 
 if TYPE_CHECKING:
-    from robocal_ros.cli.identification import IdentifyAnswer, IdentifyRequest
-    from robocal_ros.kinematics.robots import RobotDescription
+    from rich.console import Console
+    from rich.table import Table
 
-NAME = "identify"
-HELP = "identify a robot's model from a table of measurements, and judge it on unseen ones"
+
+# ---- an identification for people: the verdict in one line, then what stands behind it ----------
+
+
+Document = dict[str, Any]
+
+MOVED_SIGMA = 2.0
+MOST_LISTED = 12
+_FIGURES = ("mean", "rms", "p95", "max")
+
+
+def headline(document: Document) -> str:
+    """The verdict in one plain line."""
+    verdict = document["verdict"]
+    after, before = document["calibrated"]["held_out"], document["in_force"]["held_out"]
+    line = (
+        f"{verdict['code']}: held-out mean {after['mean_mm']:.3f} mm instead of "
+        f"{before['mean_mm']:.3f} mm (largest {after['max_mm']:.3f} instead of "
+        f"{before['max_mm']:.3f}) at {after['n']} measurements not used to solve"
+    )
+    return line if verdict["accept"] else f"{line}. Keep the present model."
+
+
+def show_identification(console: "Console", document: Document) -> None:
+    """Print an identification."""
+    from rich.text import Text
+
+    verdict = document["verdict"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    console.print(Text(headline(document), style=style), soft_wrap=True)
+    if not verdict["accept"]:
+        console.print(Text(f"Why: {verdict['reason']}"), soft_wrap=True)
+    console.print()
+    console.print(_errors(document))
+    predicted = document["calibrated"]["predicted"]
+    console.print(
+        f"Uncertainty of the model itself: {predicted['model_rms_mm']:.3f} mm rms at these poses, "
+        f"{predicted['workspace_rms_mm']:.3f} mm throughout the joint limits. "
+        f"Noise: {document['noise_mm']:.3f} mm per coordinate.",
+        soft_wrap=True,
+    )
+    console.print()
+    _show_parameters(console, document)
+    _show_doubts(console, document)
+    if document.get("output"):
+        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+
+
+def _errors(document: Document) -> "Table":
+    from rich.table import Table
+
+    table = Table(title="Errors at held-out measurements, mm", title_justify="left", box=None)
+    table.add_column("")
+    for name in _FIGURES:
+        table.add_column(name, justify="right")
+    rows = {"nominal model": document["nominal"]}
+    if document["in_force"] != document["nominal"]:
+        rows["model in force"] = document["in_force"]
+    rows["identified model"] = document["calibrated"]
+    for name, judged in rows.items():
+        errors = judged["held_out"]
+        table.add_row(name, *(f"{errors[f'{figure}_mm']:.3f}" for figure in _FIGURES))
+    predicted = document["calibrated"]["predicted"]["total_rms_mm"]
+    table.add_row("  predicted by its covariance", "", f"{predicted:.3f}", "", "")
+    return table
+
+
+def _show_parameters(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
+    parameters = document["parameters"]
+    solved = {name: row for name, row in parameters.items() if row["sigma"] is not None}
+    if not solved:
+        console.print("No model parameter was solved for.")
+        return
+    table = Table(
+        title=f"Parameters that moved by more than {MOVED_SIGMA:g} sigma",
+        title_justify="left",
+        box=None,
+    )
+    table.add_column("parameter")
+    for name in ("nominal", "identified", "change", "sigma"):
+        table.add_column(name, justify="right")
+    for name, row in solved.items():
+        change = row["value"] - row["nominal"]
+        if abs(change) > MOVED_SIGMA * row["sigma"]:
+            shown = (f"{row['nominal']:.4f}", f"{row['value']:.4f}", f"{change:+.4f}")
+            table.add_row(name, *shown, f"{row['sigma']:.4f}")
+    if table.row_count:
+        console.print(table)
+    console.print(f"{table.row_count} of {len(solved)} parameters moved.")
+
+
+def _show_doubts(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    condition = document["condition"]
+    scale = "" if condition is None else f", condition {condition:.3g}"
+    console.print(
+        f"The data determine {document['rank']} of {document['unknowns']} unknowns{scale}."
+    )
+    if document["unobservable"]:
+        owner = "held as they were" if document["held"] else "left to the prior"
+        console.print(f"Not seen in the data, {owner}:")
+        for words in document["unobservable"]:
+            console.print(Text(f"  {words}"), soft_wrap=True)
+    rejected, not_judging = document["rejected"], document["held_out_rejected"]
+    if rejected:
+        words = f"Rejected, {len(rejected)} of {document['samples']} samples: {_listed(rejected)}"
+        console.print(Text(words), soft_wrap=True)
+    if not_judging:
+        words = f"Left out of the judgement, no model fits them: {_listed(not_judging)}"
+        console.print(Text(words), soft_wrap=True)
+
+
+def _listed(samples: list[str]) -> str:
+    return ", ".join(samples[:MOST_LISTED]) + (" …" if len(samples) > MOST_LISTED else "")
+
+
+# ---- identify -----------------------------------------------------------------------------------
+
 
 _HOLD_OUT = 0.5
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_identify(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``identify``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--data", required=True, type=Path, metavar="CSV", help="measurements to solve from"
@@ -75,10 +205,9 @@ def _add_judging(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> CliResult:
-    """Do it. Raises `RobocalError` for what a user can mend."""
+def run_identify(args: argparse.Namespace) -> CliResult:
+    """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
-    from robocal_ros.cli.identification import identify_files
 
     warnings: list[str] = []
     robot = describe_robot(args.robot, warnings)
@@ -110,7 +239,6 @@ def _require_sense(args: argparse.Namespace) -> None:
 
 
 def _request(args: argparse.Namespace) -> "IdentifyRequest":
-    from robocal_ros.cli.identification import IdentifyRequest
 
     return IdentifyRequest(
         data_file=args.data,
@@ -131,8 +259,6 @@ def _save(
     warnings: list[str],
 ) -> None:
     """Write the identified robot file, if the verdict accepts: a script may use it at once."""
-    from robocal_ros.kinematics.robots import save_robot
-
     verdict = answer.judged.verdict
     if not verdict.accept:
         warnings.append(f"{path} is not written: the verdict is {verdict.code.name}")
@@ -146,3 +272,164 @@ def _save(
     )
     save_robot(arm, path, like=robot, comment=comment)
     document["output"] = str(path)
+
+
+# ---- identification -----------------------------------------------------------------------------
+
+
+_OTHER_SET_UP = (
+    "if the check data come from another set-up (measuring device or targets moved), say so with "
+    "--check-refit base,tool"
+)
+
+
+@dataclass(frozen=True)
+class IdentifyRequest:
+    """What to identify from which files.
+
+    ``check_file`` None: a share ``hold_out`` of the poses of ``data_file`` judges instead.
+    """
+
+    data_file: Path
+    check_file: Path | None = None
+    check_refit: tuple[Part, ...] = ()
+    hold_out: float = 0.5
+    seed: int = 0
+    fit: tuple[Part, ...] = ("base", "tool", "geometry")
+    method: Method = "map"
+
+
+@dataclass(frozen=True)
+class IdentifyAnswer:
+    """An identification, its document and what the user should know beside it."""
+
+    judged: JudgedIdentification
+    document: Document
+    warnings: tuple[str, ...] = field(default=())
+
+
+def identify_files(arm: SerialArm, request: IdentifyRequest) -> IdentifyAnswer:
+    """Identify from tables and judge.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read, or its data cannot belong to this robot or to each other.
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer.
+    """
+    warnings: list[str] = []
+    data = _read(request.data_file, arm, warnings)
+    if request.check_file is None:
+        held = hold_out(pose_groups(data.q), request.hold_out, request.seed)
+        train, check = data.take(~held), data.take(held)
+    else:
+        train, check = data, _read(request.check_file, arm, warnings)
+        _require_other_data(train, check, request)
+        _require_known_targets(train, check, request)
+        warnings += _compared(train, check, request)
+    base, tool = "base" in request.fit, "tool" in request.fit
+    require_match(arm, data, base=base, tool=tool, file=str(request.data_file))
+    try:
+        judged = identify_and_judge(
+            arm,
+            train,
+            check,
+            fit=request.fit,
+            method=request.method,
+            check_refit=request.check_refit,
+        )
+    except TooFewSamplesError as error:
+        if request.check_file is not None:
+            raise
+        raise TooFewSamplesError(
+            f"{request.data_file}: {error} ({len(check)} of its {len(data)} measurements are held "
+            "out to judge)"
+        ) from error
+    if request.check_file is not None:
+        _require_check_fits(judged, check, request)
+        if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not request.check_refit:
+            warnings.append(_OTHER_SET_UP)
+    document = identification_document(judged) | {"data": _data_document(request, train, check)}
+    return IdentifyAnswer(judged, document, tuple(warnings))
+
+
+def _read(path: Path, arm: SerialArm, warnings: list[str]) -> Measurements:
+    data = read_measurements(path, arm)
+    warnings += [f"{path}: {words}" for words in beyond_limits(data, arm)]
+    return data
+
+
+def _data_document(request: IdentifyRequest, train: Measurements, check: Measurements) -> Document:
+    split = request.check_file is None
+    return {
+        "file": str(request.data_file),
+        "check_file": None if split else str(request.check_file),
+        "fit": list(request.fit),
+        "check_refit": list(request.check_refit),
+        "hold_out": request.hold_out if split else None,
+        "seed": request.seed if split else None,
+        "train": len(train),
+        "check": len(check),
+    }
+
+
+def _require_check_fits(
+    judged: JudgedIdentification, check: Measurements, request: IdentifyRequest
+) -> None:
+    """Name the mistake in check data that miss the identified model, as for training data."""
+    arm, refit, file = judged.identification.cell.arm, request.check_refit, str(request.check_file)
+    if frozenset(refit) >= {"base", "tool"}:
+        require_match(arm, check, base=True, tool=True, file=file)
+    elif not refit and (
+        mistake := explain_mismatch(arm, check, judged.identification.cell.residual)
+    ):
+        raise InputError(mistake, file=file)
+
+
+def _require_other_data(train: Measurements, check: Measurements, request: IdentifyRequest) -> None:
+    known = {row.tobytes(): i for i, row in enumerate(_rows(train))}
+    same = [i for i, row in enumerate(_rows(check)) if row.tobytes() in known]
+    if same:
+        raise InputError(
+            f"{len(same)} of {len(check)} measurements are in {request.data_file} too (the first "
+            f"is sample {check.sample[same[0]]}): a model is judged on data not used to solve; "
+            "take them out of one file, or leave out --check to hold out a part",
+            file=str(request.check_file),
+        )
+
+
+def _rows(data: Measurements) -> Any:
+    return np.ascontiguousarray(np.hstack([data.q, data.position]))
+
+
+def _require_known_targets(
+    train: Measurements, check: Measurements, request: IdentifyRequest
+) -> None:
+    unknown = [name for name in check.targets if name not in train.targets]
+    if unknown and "tool" not in request.check_refit:
+        raise InputError(
+            f"target {quoted(unknown[0])} is not in {request.data_file} (it has "
+            f"{', '.join(train.targets)}): use the same name, or --check-refit tool (or "
+            "base,tool) to place it anew from the check data",
+            file=str(request.check_file),
+            column="target",
+        )
+
+
+def _compared(train: Measurements, check: Measurements, request: IdentifyRequest) -> list[str]:
+    """What the user should know about the two files together."""
+    found = []
+    group = pose_groups(np.vstack([train.q, check.q]))
+    again = int(np.sum(np.isin(group[len(train) :], group[: len(train)])))
+    if again:
+        found.append(
+            f"{again} of {len(check)} check measurements are at poses that were also used to "
+            "solve: errors at new poses can be larger"
+        )
+    if train.rotation is None and check.rotation is not None:
+        found.append(
+            f"{request.check_file} has orientations and {request.data_file} has none: the "
+            "model is solved and judged by positions"
+        )
+    return found

@@ -1,27 +1,31 @@
 """From a bag to its calibrations: what ``robocal replay`` computes, without its printing."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from robocal_ros import __version__
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
-from robocal_ros.cli.hand_eye_replaying import replay_hand_eye
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recording import UNASKED, BagOverview, open_recording
-from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
-from robocal_ros.cli.tool_replaying import replay_tool
 from robocal_ros.ground.errors import InputError
-from robocal_ros.hand_eye.recorded import is_hand_eye_session
+from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.proposals import Head
+from robocal_ros.ground.streams import JointStream
+from robocal_ros.hand_eye.recorded import hand_eye_session_as_recorded, is_hand_eye_session
+from robocal_ros.hand_eye.session import take_hand_eye_message
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
+from robocal_ros.session.base import Commanded
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import (
@@ -32,7 +36,155 @@ from robocal_ros.thermal.seeding import (
     window_commands,
 )
 from robocal_ros.thermal.session import ThermalSession, take_message
-from robocal_ros.tool.recorded import is_tool_session
+from robocal_ros.tool.recorded import is_tool_session, take_tool_message, tool_session_as_recorded
+from robocal_ros.tool.session import ToolSession
+
+# ---- what replays of all kinds tell: commands, pauses, damaged parts of the bag -----------------
+
+
+S = TypeVar("S", bound=Commanded)
+AsRecorded = Callable[[SerialArm, CalibrationHistory, Command, str], S]
+
+
+def seconds(stamp_ns: int | None) -> float:
+    """A stamp in s."""
+    return (stamp_ns or 0) * 1e-9
+
+
+def gaps_document(stream: JointStream, recording: BagOverview) -> Document:
+    """Pauses of the joint readings, and damaged parts of the bag."""
+    damaged = recording.reader.info.lost
+    return {
+        "count": stream.gap_count,
+        "longest_s": stream.longest_gap_ns * 1e-9,
+        "damaged": [{"from_ns": part.from_ns, "to_ns": part.to_ns} for part in damaged],
+    }
+
+
+def command_document(outcome: Outcome) -> Document:
+    """A command and what came of it."""
+    return {
+        "command": outcome.command.name,
+        "stamp": seconds(outcome.command.stamp_ns),
+        "code": outcome.status.name,
+        "message": outcome.message,
+        "samples": outcome.samples,
+    }
+
+
+def commanded_document(
+    report: ReplayReport, session: Commanded, recording: BagOverview
+) -> Document:
+    """What the replay of a recorded session tells, whatever it measures."""
+    topic = {kind: name for name, kind in recording.inputs.items()}
+    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
+    return {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "start_ns": recording.start_ns,
+        "topics": topic,
+        "recorded": True,
+        "ignored": {name: sum(why.values()) for name, why in ignored.items()},
+        "ignored_reasons": ignored,
+        "gaps": gaps_document(session.stream, recording),
+        "commands": [command_document(outcome) for outcome in report.outcomes],
+        "differs": report.differs,
+        "warnings": recording.warnings,
+    }
+
+
+def replay_commanded(
+    recording: BagOverview,
+    arm: SerialArm,
+    history: CalibrationHistory,
+    samples: Iterable[Any],
+    as_recorded: AsRecorded[S],
+    take: Callable[[S, str, Any], None],
+) -> tuple[ReplayReport, S]:
+    """Replay what a node recorded, in a session with its settings.
+
+    ``as_recorded`` makes the session; ``take`` gives it a message of an input.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag lacks what a replay needs.
+    """
+    if recording.configured is None:
+        raise InputError("the bag holds no configuration of the node")
+    session = as_recorded(arm, history, recording.configured, __version__)
+    return replay(session, samples, recording.commands, recording.inputs, take), session
+
+
+# ---- from the bag of a tool node to its tools: what ``robocal replay`` computes of it -----------
+
+
+def replay_tool(
+    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+) -> Document:
+    """Replay what a tool node recorded: each run with its answer.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag lacks what a replay needs.
+    """
+    report, session = replay_commanded(
+        recording, arm, history, samples, tool_session_as_recorded, take_tool_message
+    )
+    return _tool_document(report, session, recording)
+
+
+def _tool_document(report: ReplayReport, session: ToolSession, recording: BagOverview) -> Document:
+    return commanded_document(report, session, recording) | {
+        "runs": [_run(o) for o in report.outcomes if o.document is not None],
+        "final_tool": transform_document(session.current.tool.T_flange_tool)
+        | {"revision": session.in_force.revision},
+    }
+
+
+def _run(outcome: Outcome) -> Document:
+    number = outcome.command.arguments.get("run", 0)
+    return {"stamp": seconds(outcome.command.stamp_ns), "run": number, **(outcome.document or {})}
+
+
+# ---- hand eye replaying -------------------------------------------------------------------------
+
+
+def replay_hand_eye(
+    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+) -> Document:
+    """Replay what a hand-eye node recorded: each calibration with its figures.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag lacks what a replay needs.
+    """
+    report, session = replay_commanded(
+        recording, arm, history, samples, hand_eye_session_as_recorded, take_hand_eye_message
+    )
+    return commanded_document(report, session, recording) | {
+        "calibrations": [
+            {"stamp": seconds(o.command.stamp_ns), **(o.document or {})}
+            for o in report.outcomes
+            if o.document is not None and o.calibration_id
+        ],
+        "final_sensor": _sensor(session.in_force),
+    }
+
+
+def _sensor(head: Head) -> Document | None:
+    """What is in force at the end; None: nothing is."""
+    if head.model is None:
+        return None
+    frames = {name: head.model[name] for name in ("parent", "child")}
+    T = np.array(head.model["T_parent_sensor"])
+    return frames | transform_document(T) | {"revision": head.revision}
+
+
+# ---- replaying ----------------------------------------------------------------------------------
+
 
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]

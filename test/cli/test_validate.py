@@ -38,11 +38,9 @@ from recordings import (
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.bags.replay import NOT_BITS
-from robocal_ros.cli import workers
 from robocal_ros.cli.main import main
-from robocal_ros.cli.validating import Job
-from robocal_ros.cli.validating_parts import require_finite
-from robocal_ros.cli.workers import validated
+from robocal_ros.cli.validate import validated
+from robocal_ros.cli.validating import Job, require_finite
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text
 
@@ -399,7 +397,7 @@ class TestInParallel:
     def test_a_cluster_without_a_worker(self, validate, monkeypatch) -> None:
         from distributed import LocalCluster
 
-        monkeypatch.setattr(workers, "PATIENCE_S", 1)
+        monkeypatch.setattr("robocal_ros.cli.validate.PATIENCE_S", 1)
         with LocalCluster(n_workers=0, dashboard_address=None, processes=False) as cluster:
             status, document, _, _ = validate(TOOL_RUNS, "--scheduler", cluster.scheduler_address)
         assert status == 2

@@ -1,0 +1,375 @@
+"""``robocal fk``: where the flange and the tool are at given joints."""
+
+import argparse
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
+from robocal_ros.cli.output import CliResult, Document
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.files import nearest, quoted, read_text
+from robocal_ros.ground.frames import transform_document
+from robocal_ros.identification.iso9283 import CYCLES, Repeated, repeated
+from robocal_ros.identification.position_tables import read_positions
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import save_robot
+from robocal_ros.kinematics.universal_robots import (
+    factory_arm,
+    factory_dh,
+    nominal_arm,
+    parse_settings,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    Array = NDArray[np.float64]
+
+
+# ---- ``robocal fk``: where the flange and the tool are at given joints --------------------------
+
+
+_VALUE = re.compile(r"\s*([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", re.IGNORECASE)
+_TO_SI = {"deg": 3.141592653589793 / 180.0, "rad": 1.0, "mm": 1e-3, "m": 1.0}
+
+_MOST_DEG = 1e6
+
+
+def add_fk(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``fk``."""
+    parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
+    joints = parser.add_mutually_exclusive_group(required=True)
+    joints.add_argument("--joints-deg", metavar="Q1,Q2,…", help="joints in degrees")
+    joints.add_argument("--joints-rad", metavar="Q1,Q2,…", help="joints in radians")
+    joints.add_argument(
+        "--joints",
+        metavar="Q1,Q2,…",
+        help="joints each with its unit, such as 100mm,90deg,0.5m (prismatic joints need it)",
+    )
+
+
+def run_fk(args: argparse.Namespace) -> CliResult:
+    """Do ``fk``. Raises `RobocalError` for what a user can mend."""
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    q = np.array(_given_joints(args, arm))
+    T_base_flange = arm.fk(q)
+    document: Document = {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "joints": _joint_documents(arm, q.tolist()),
+        "T_base_flange": transform_document(T_base_flange),
+    }
+    if not np.array_equal(arm.T_flange_tool, np.eye(4)):
+        document["T_base_tool"] = transform_document(T_base_flange @ arm.T_flange_tool)
+    warnings += [
+        f"{joint['name']} at {joint['value']:g} {joint['unit']} is beyond its limits"
+        for joint in document["joints"]
+        if not joint["within_limits"]
+    ]
+    document["warnings"] = warnings
+    warn(warnings)
+    return CliResult(document, partial(_show_fk, document=document))
+
+
+def _given_joints(args: argparse.Namespace, arm: "SerialArm") -> list[float]:
+    """Joint values in SI."""
+    option, unit = "--joints", ""
+    if args.joints_deg is not None:
+        option, unit = "--joints-deg", "deg"
+    elif args.joints_rad is not None:
+        option, unit = "--joints-rad", "rad"
+    cells = getattr(args, option[2:].replace("-", "_")).split(",")
+    if len(cells) != arm.n:
+        raise InputError(f"{option} has {len(cells)} values; {arm.name} has {arm.n} joints")
+    if unit and any(arm.prismatic):
+        raise InputError(f"{arm.name} has prismatic joints: use --joints, each with its unit")
+    return [_value(cell, unit, option, arm, joint) for joint, cell in enumerate(cells)]
+
+
+def _value(cell: str, unit: str, option: str, arm: "SerialArm", joint: int) -> float:
+    found = _VALUE.fullmatch(cell)
+    units = ("mm", "m") if arm.prismatic[joint] else ("deg", "rad")
+    try:
+        number, given = float(found[1] if found else cell), found[2].lower() if found else ""
+    except ValueError:
+        number, given = float("nan"), ""
+    if number != number or abs(number) == float("inf"):
+        raise InputError(f"{option}: {quoted(cell)} of joint {joint + 1} is not a number")
+    if unit and given:
+        raise InputError(f"{option}: {quoted(cell)} has a unit; use --joints for values with one")
+    if not unit and given not in units:
+        kind = "prismatic" if arm.prismatic[joint] else "revolute"
+        raise InputError(
+            f"{option}: {quoted(cell)} needs the unit {' or '.join(units)}; joint {joint + 1} "
+            f"of {arm.name} is {kind}"
+        )
+    value = number * _TO_SI[unit or given]
+    if not arm.prismatic[joint] and abs(value) > _MOST_DEG * _TO_SI["deg"]:
+        raise InputError(
+            f"{option}: {quoted(cell)} of joint {joint + 1} is beyond {_MOST_DEG:g} deg; no "
+            "joint turns that far"
+        )
+    return value
+
+
+def _joint_documents(arm: "SerialArm", q: list[float]) -> list[dict[str, Any]]:
+    documents = []
+    for joint, value in enumerate(q):
+        unit = "mm" if arm.prismatic[joint] else "deg"
+        documents.append(
+            {
+                "name": arm.joint_names[joint],
+                "value": value / _TO_SI[unit],
+                "unit": unit,
+                "within_limits": bool(arm.lower[joint] <= value <= arm.upper[joint]),
+            }
+        )
+    return documents
+
+
+def _show_fk(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
+    values = ", ".join(f"{joint['value']:g} {joint['unit']}" for joint in document["joints"])
+    table = Table(title=f"{document['robot']} at {values}")
+    for heading in ("", "x mm", "y mm", "z mm", "qx", "qy", "qz", "qw"):
+        table.add_column(heading, justify="right")
+    for key, name in (("T_base_flange", "flange"), ("T_base_tool", "tool")):
+        if key in document:
+            pose = document[key]
+            lengths = [f"{value:z.3f}" for value in pose["xyz_mm"]]
+            table.add_row(name, *lengths, *(f"{value:z.6f}" for value in pose["quat_xyzw"]))
+    console.print(table)
+
+
+# ---- ``robocal iso9283``: how accurately and how repeatably a robot attains its positions -------
+
+
+EVERY = ""  # stands for every target that has no commanded position of its own
+Point = tuple[float, ...]
+
+
+def add_iso9283(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``iso9283``."""
+    parser.add_argument(
+        "--data",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="attained positions: x_mm, y_mm, z_mm, and target where there are several",
+    )
+    parser.add_argument(
+        "--commanded",
+        type=_commanded,
+        action="append",
+        default=[],
+        metavar="[TARGET=]X,Y,Z",
+        help="commanded position in mm, in the frame of the table, which must come from other "
+        "points than these; TARGET=X,Y,Z, repeated, where there are several targets. Without it "
+        "AP is not known",
+    )
+
+
+def run_iso9283(args: argparse.Namespace) -> CliResult:
+    """Do ``iso9283``. Raises `RobocalError` for what a user can mend."""
+    table = read_positions(args.data)
+    commanded = _by_target(args.commanded, list(table), str(args.data))
+    targets: Document = {}
+    warnings = []
+    if EVERY in commanded and len(table) > 1:
+        warnings.append(
+            "one commanded position is taken for the targets "
+            f"{', '.join(name for name in table if name not in commanded)}: give each its own "
+            "with --commanded TARGET=X,Y,Z"
+        )
+    for name, position in table.items():
+        where = commanded.get(name, commanded.get(EVERY))
+        try:
+            found = repeated(position, None if where is None else np.array(where) * 1e-3)
+        except TooFewSamplesError as error:
+            raise TooFewSamplesError(f"{args.data}, target {quoted(name)}: {error}") from error
+        targets[name] = _document(found)
+        if found.n < CYCLES:
+            warnings.append(
+                f"target {quoted(name)}: {found.n} cycles; ISO 9283 asks for {CYCLES}: RP is less "
+                "certain"
+            )
+    warn(warnings)
+    document: Document = {"targets": targets, "warnings": warnings}
+    return CliResult(document, partial(_show_iso9283, document=document))
+
+
+def _document(found: "Repeated") -> Document:
+    axes = (None,) * 3 if found.offset is None else (found.offset * 1e3).tolist()
+    return {
+        "n": found.n,
+        "AP_mm": None if found.AP_m is None else found.AP_m * 1e3,
+        "RP_mm": found.RP_m * 1e3,
+        "mean_distance_mm": found.mean_distance_m * 1e3,
+        "S_mm": found.S_m * 1e3,
+        "barycentre_mm": (found.barycentre * 1e3).tolist(),
+        **dict(zip(("AP_x_mm", "AP_y_mm", "AP_z_mm"), axes, strict=True)),
+    }
+
+
+def _commanded(value: str) -> tuple[str, Point]:
+    """Target, or ``EVERY``, and its commanded position in mm."""
+    name, sign, cells = value.rpartition("=")
+    try:
+        point = tuple(float(cell) for cell in cells.split(","))
+    except ValueError:
+        point = ()
+    if len(point) != 3 or not all(map(math.isfinite, point)) or (sign and not name):
+        raise argparse.ArgumentTypeError(
+            f"{quoted(value)} is not X,Y,Z or TARGET=X,Y,Z, in mm with a point as decimal mark"
+        )
+    return name, point
+
+
+def _by_target(
+    given: Sequence[tuple[str, Point]], targets: Sequence[str], file: str
+) -> Mapping[str, Point]:
+    """Commanded positions by target.
+
+    Raises
+    ------
+    InputError
+        For a target that the table has not, or that is given twice.
+    """
+    found: dict[str, Point] = {}
+    for name, point in given:
+        if name != EVERY and name not in targets:
+            hint = nearest(name, targets)
+            raise InputError(
+                f"--commanded: no target {quoted(name)}{hint}; the table has {', '.join(targets)}",
+                file=file,
+            )
+        if name in found:
+            whose = f"target {quoted(name)}" if name else "all targets"
+            raise InputError(f"--commanded: a position of {whose} is given twice")
+        found[name] = point
+    return found
+
+
+def _show_iso9283(console: "Console", document: Document) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    title = "Position accuracy and repeatability as in ISO 9283, 7.2, in mm"
+    table = Table(title=title, title_justify="left", box=None)
+    table.add_column("target")
+    for head in ("cycles", "AP", "AP x", "AP y", "AP z", "RP", "mean distance", "S"):
+        table.add_column(head, justify="right")
+    keys = ("AP_mm", "AP_x_mm", "AP_y_mm", "AP_z_mm", "RP_mm", "mean_distance_mm", "S_mm")
+    for name, found in document["targets"].items():
+        values = ["-" if found[key] is None else f"{found[key]:z.4f}" for key in keys]
+        table.add_row(Text(name), str(found["n"]), *values)
+    console.print(table)
+
+
+# ---- ``robocal import-ur``: a Universal Robots factory calibration as a robot file --------------
+
+
+_POSES = 1000
+
+
+def add_import_ur(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``import-ur``."""
+    parser.add_argument(
+        "--calibration",
+        required=True,
+        type=Path,
+        metavar="calibration.conf",
+        help="deltas of this robot, from its controller's folder .urcontrol",
+    )
+    parser.add_argument(
+        "--nominal",
+        required=True,
+        type=Path,
+        metavar="urcontrol.conf",
+        help="nominal model of its type, from the same folder",
+    )
+    parser.add_argument(
+        "--output", required=True, type=Path, metavar="R.yaml", help="robot file to write"
+    )
+    parser.add_argument("--name", help="name of the robot, default that of the output file")
+
+
+def run_import_ur(args: argparse.Namespace) -> CliResult:
+    """Do ``import-ur``. Raises `RobocalError` for what a user can mend."""
+    name = args.name or args.output.stem
+    nominal, factory, dh = _arms(args.nominal, args.calibration, name)
+    save_robot(factory, args.output)
+    distances = _distances(nominal, factory)
+    document: Document = {
+        "robot": name,
+        "model_hash": factory.model_hash,
+        "output": str(args.output),
+        "joints": _joint_rows(factory),
+        "from_nominal": {
+            "mean_mm": float(distances.mean() * 1e3),
+            "max_mm": float(distances.max() * 1e3),
+            "n": _POSES,
+        },
+        "conversion_error_mm": float(_distances(dh, factory).max() * 1e3),
+    }
+    return CliResult(document, partial(_show_import_ur, document=document))
+
+
+def _arms(nominal: Path, calibration: Path, name: str) -> "tuple[SerialArm, SerialArm, SerialArm]":
+    """The arm as designed, as calibrated, and as calibrated in the controller's own numbers."""
+    settings = [
+        parse_settings(read_text(path, "configuration"), str(path))
+        for path in (nominal, calibration)
+    ]
+    try:
+        designed = nominal_arm(settings[0], name)
+        calibrated = factory_arm(settings[0], settings[1], name)
+    except InputError as error:
+        path = calibration if "delta_" in str(error) else nominal
+        raise InputError(str(error), file=str(path)) from error
+    return designed, calibrated, replace(designed, mdh=factory_dh(settings[0], settings[1]))
+
+
+def _distances(a: "SerialArm", b: "SerialArm") -> "Array":
+    """Distances (m,), m, between the flanges of two arms over the whole joint space."""
+    q = np.random.default_rng(0).uniform(a.lower, a.upper, (_POSES, a.n))
+    return np.asarray(np.linalg.norm(a.fk(q)[:, :3, 3] - b.fk(q)[:, :3, 3], axis=1))
+
+
+def _joint_rows(arm: "SerialArm") -> list[dict[str, Any]]:
+    keys = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
+    factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
+    rows = (arm.mdh * factors).tolist()
+    return [
+        {"name": name, **dict(zip(keys, row, strict=True))}
+        for name, row in zip(arm.joint_names, rows, strict=True)
+    ]
+
+
+def _show_import_ur(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{document['robot']}, as calibrated by the factory")
+    headings = {"name": "joint", "d_mm": "d mm", "theta_deg": "theta deg", "a_mm": "a mm"}
+    headings |= {"alpha_deg": "alpha deg", "beta_deg": "beta deg"}
+    for heading in headings.values():
+        table.add_column(heading, justify="left" if heading == "joint" else "right")
+    for joint in document["joints"]:
+        numbers = (f"{joint[key]:z.4f}" for key in headings if key != "name")
+        table.add_row(joint["name"], *numbers)
+    console.print(table)
+    far = document["from_nominal"]
+    console.print(
+        f"The flange is {far['mean_mm']:.3f} mm (at most {far['max_mm']:.3f} mm) from the nominal "
+        f"model's over {far['n']} poses.\nWritten: {document['output']}"
+    )

@@ -1,0 +1,414 @@
+"""``robocal hand-eye camera``: a camera's place, from images of a chessboard or board poses."""
+
+import argparse
+from dataclasses import replace
+from functools import partial
+from math import radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
+from robocal_ros.cli.output import CliResult, Document
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.files import quoted
+from robocal_ros.hand_eye.board import (
+    Chessboard,
+    Intrinsics,
+    SeenBoards,
+    board_pairs,
+    intrinsics_document,
+    read_images,
+    read_intrinsics,
+    see_boards,
+)
+from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
+from robocal_ros.hand_eye.camera_fit import GivenNoise
+from robocal_ros.hand_eye.camera_model import PosePairs
+from robocal_ros.hand_eye.cli_shots import (
+    add_limit,
+    add_robot,
+    add_robot_sigma,
+    arm_of,
+    require_unused,
+    robot_sigma_of,
+    show_judged,
+    show_placed,
+)
+from robocal_ros.hand_eye.result import HandEyeResult, hand_eye_document
+from robocal_ros.hand_eye.shots import Profile
+from robocal_ros.hand_eye.streams import PoseStream, calibrate_streams, stream_of
+from robocal_ros.hand_eye.tables import PoseTable, read_pose_table, read_profiles
+from robocal_ros.hand_eye.target_files import read_tracker_points, read_tracker_target
+from robocal_ros.hand_eye.tracker import solve_tracker
+from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
+from robocal_ros.kinematics import SerialArm
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+# ---- from the tables and images of ``robocal hand-eye camera`` to its result --------------------
+
+
+def calibrate(args: argparse.Namespace) -> "HandEyeResult":
+    """Read what the options name and place the camera.
+
+    Raises
+    ------
+    InputError
+        When files or options are wrong.
+    TooFewSamplesError, RankDeficientError, ResidualError
+        As `robocal_ros.hand_eye.camera.calibrate_camera`.
+    """
+    settings = _settings(args)
+    if args.measured is not None:
+        for option in ("profiles", "board", "square_mm", "intrinsics"):
+            if getattr(args, option) is not None:
+                raise InputError(
+                    f"--{option.replace('_', '-')} belongs to images, --measured to poses: give "
+                    "one of both"
+                )
+        return _from_poses(args, settings)
+    if args.profiles is None or args.board is None or args.square_mm is None:
+        raise InputError(
+            "give --profiles, --board and --square-mm for images, or --measured for board poses"
+        )
+    return _from_images(args, settings)
+
+
+def _settings(args: argparse.Namespace) -> "CameraSettings":
+    return CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
+
+
+def _tables(
+    args: argparse.Namespace, file_column: str | None
+) -> "tuple[PoseTable, PoseTable | None]":
+    """The robot's poses that solve, and those that judge."""
+    arm = arm_of(args)
+    used = read_pose_table(args.poses, arm, file_column)
+    if args.check is None:
+        return used, None
+    judges = read_pose_table(args.check, arm, file_column)
+    require_unused(judges, used)
+    return used, judges
+
+
+def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
+    columns, rows = args.board
+    board = Chessboard(columns, rows, args.square_mm * 1e-3)
+    intrinsics = None if args.intrinsics is None else read_intrinsics(args.intrinsics)
+    used, judges = _tables(args, "image")
+    pairs, seen = _pairs_of_images(used, args, board, intrinsics)
+    check = None
+    if judges is not None:
+        held, shown = _pairs_of_images(judges, args, board, seen.intrinsics)
+        check = CheckPairs(held, shown.rejected)
+    return calibrate_camera(
+        pairs,
+        settings,
+        check=check,
+        rejected=seen.rejected,
+        more={"intrinsics": intrinsics_document(seen, intrinsics is None)},
+    )
+
+
+def _pairs_of_images(
+    table: "PoseTable", args: argparse.Namespace, board: "Chessboard",
+    intrinsics: "Intrinsics | None",
+) -> "tuple[PosePairs, SeenBoards]":  # fmt: skip
+
+    images, unread = read_images(args.profiles, table)
+    seen = see_boards(images, board, intrinsics)
+    pairs = board_pairs(seen, table.names, table.T_base_flange, args.mount)
+    return pairs, replace(seen, rejected=unread | seen.rejected)
+
+
+def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
+    robot, check = _tables(args, None)
+    camera = read_pose_table(args.measured, None, None)
+    tables = [robot, camera] if check is None else [robot, camera, check]
+    stamped = all(table.stamp_ns is not None for table in tables)
+    if stamped and not all(table.named for table in tables):
+        origin_ns = int(min(_stamps(table)[0] for table in tables))
+        streams = [_stream(table, origin_ns) for table in tables]
+        judge = None if check is None else streams[2]
+        return calibrate_streams(streams[0], streams[1], args.mount, settings, judge)
+    if check is not None and not check.named:
+        raise InputError("needs a column sample, as the measured poses", file=check.path, row=1)
+    pairs, alone = _paired(robot, camera, args.mount)
+    judges = None
+    if check is not None:
+        _require_other_samples(check, robot)
+        held, absent = _paired(check, camera, args.mount)
+        judges = CheckPairs(held, {name: absent[name] for name in check.names if name in absent})
+        alone = {name: why for name, why in alone.items() if name not in held.names}
+    return calibrate_camera(pairs, settings, check=judges, rejected=alone)
+
+
+def _require_other_samples(judges: "PoseTable", used: "PoseTable") -> None:
+    known = set(used.names)
+    for name, row in zip(judges.names, judges.rows, strict=True):
+        if name in known:
+            raise InputError(
+                f"{quoted(name)} is in --poses too: other samples must judge",
+                file=judges.path, row=row, column="sample",
+            )  # fmt: skip
+
+
+def _stamps(table: "PoseTable") -> Any:
+    if table.stamp_ns is None:
+        raise ValueError("a table without stamps is no stream")
+    return table.stamp_ns
+
+
+def _stream(table: "PoseTable", origin_ns: int) -> "PoseStream":
+    return stream_of(_stamps(table), table.T_base_flange, table.names, origin_ns, table.path)
+
+
+def _paired(
+    robot: "PoseTable", camera: "PoseTable", mount: Any
+) -> "tuple[PosePairs, dict[str, str]]":
+    """Pairs of the same sample, or row; and the samples that only one table has."""
+    if not robot.named and not camera.named and len(robot) != len(camera):
+        raise InputError(
+            f"has {len(camera)} rows, {robot.path} has {len(robot)}: name them in a column sample "
+            "in both tables, or give stamp_s in both",
+            file=camera.path,
+        )
+    place = {name: index for index, name in enumerate(camera.names)}
+    rows = [index for index, name in enumerate(robot.names) if name in place]
+    names = tuple(robot.names[index] for index in rows)
+    if not names:
+        raise InputError(f"has no sample of {robot.path}", file=camera.path, column="sample")
+    pairs = PosePairs(
+        robot.T_base_flange[rows],
+        camera.T_base_flange[[place[name] for name in names]],
+        names,
+        mount,
+    )
+    alone = {name: f"not in {camera.path}" for name in robot.names if name not in place}
+    known = set(robot.names)
+    alone |= {name: f"not in {robot.path}" for name in camera.names if name not in known}
+    return pairs, alone
+
+
+# ---- hand eye camera ----------------------------------------------------------------------------
+
+
+CAMERA_METHODS = (
+    "best",
+    "classic",
+    "tsai",
+    "park",
+    "horaud",
+    "andreff",
+    "daniilidis",
+    "shah",
+    "li",
+)
+MOUNTS = ("in-hand", "to-hand")
+CAMERA_LIMIT_MM = 2.0
+CAMERA_WHERE = "where the boards were"  # the expected error holds
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``camera``."""
+    parser.add_argument(
+        "--poses",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="flange poses in base, or joints with --robot; column image names each file",
+    )
+    parser.add_argument(
+        "--profiles", "--images", type=Path, metavar="DIR", help="folder of the images"
+    )
+    parser.add_argument("--board", type=_board, metavar="9x6", help="inner corners of the board")
+    parser.add_argument("--square-mm", type=positive, metavar="S", help="side of a square")
+    parser.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="YAML",
+        help="of the camera, as ROS writes them; default: from the same images",
+    )
+    _add_other_options(parser)
+
+
+def _add_other_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--measured",
+        type=Path,
+        metavar="CSV",
+        help="instead of images: the board's poses in the camera, paired by row, sample or stamp_s",
+    )
+    parser.add_argument("--mount", choices=MOUNTS, default=MOUNTS[0])
+    parser.add_argument(
+        "--method",
+        choices=CAMERA_METHODS,
+        default=CAMERA_METHODS[0],
+        help="best; the closed form from which the search starts; or classic, a closed form alone",
+    )
+    add_robot(parser)
+    add_robot_sigma(parser, "default: from the residuals")
+    add_limit(parser, CAMERA_WHERE, CAMERA_LIMIT_MM)
+    parser.add_argument(
+        "--check",
+        type=Path,
+        metavar="CSV",
+        help="poses as --poses that judge the result and are not used to find it",
+    )
+
+
+def run_camera(args: argparse.Namespace) -> CliResult:
+    """Do ``camera``. Raises `RobocalError` for what a user can mend."""
+    document = hand_eye_document(calibrate(args))
+    return CliResult(document, partial(_show_camera, document=document))
+
+
+def _board(value: str) -> tuple[int, int]:
+    """Type of inner corners along both sides, such as 9x6.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    sides = value.lower().split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        raise argparse.ArgumentTypeError(f"'{value}' is not columns and rows such as 9x6")
+    return int(sides[0]), int(sides[1])
+
+
+def _show_camera(console: "Console", document: Document) -> None:
+    show_placed(console, document, "Camera", CAMERA_WHERE)
+    if document.get("time_offset_s") is not None:
+        console.print(
+            f"Time offset, to be added to the camera's stamps: {document['time_offset_s']:.4f} s "
+            f"± {document['time_offset_sigma_s']:.4f}"
+        )
+    _show_residuals(console, document)
+    show_judged(console, document)
+
+
+def _show_residuals(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
+    table = Table(title="Mean residual, mm", title_justify="left")
+    table.add_column("method")
+    table.add_column("mm", justify="right")
+    for name, value in document["closed_forms_mean_mm"].items():
+        table.add_row(name, "failed" if value is None else f"{value:.3f}")
+    per_sample = document["residual_mm"]["per_sample"].values()
+    table.add_row(document["method"], f"{sum(per_sample) / len(per_sample):.3f}")
+    console.print(table)
+
+
+# ---- ``robocal hand-eye tracker``: a profile sensor on a robot, placed by a laser tracker -------
+
+
+TRACKER_METHODS = ("best", "classic")
+TRACKER_LIMIT_MM = 0.5
+TRACKER_WHERE = "at the working distance"  # the expected error holds
+
+
+def add_tracker(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``tracker``."""
+    parser.add_argument("--robot", required=True, metavar="NAME", help=ROBOT_HELP)
+    parser.add_argument(
+        "--poses",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="the scan: joints q1_deg …, and profile, the file of each",
+    )
+    parser.add_argument(
+        "--profiles", required=True, type=Path, metavar="DIR", help="folder of the profiles"
+    )
+    parser.add_argument(
+        "--points",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="of the tracker: role (arc_a, arc_b, sphere, face_1, face_2), x_mm, y_mm, z_mm, and "
+        "on the arcs the joints",
+    )
+    target = parser.add_mutually_exclusive_group(required=True)
+    target.add_argument("--target", type=Path, metavar="YAML", help="radii and reflector's height")
+    target.add_argument(
+        "--radius-mm",
+        type=positive,
+        metavar="R",
+        help="instead of a target file: of the sphere and of the reflector alike",
+    )
+    parser.add_argument("--method", choices=TRACKER_METHODS, default=TRACKER_METHODS[0])
+    _add_limits(parser)
+
+
+def _add_limits(parser: argparse.ArgumentParser) -> None:
+    noise = parser.add_argument_group("noise, one sigma")
+    for option, default in (
+        ("tracker-sigma-mm", "0.015"), ("joint-sigma-deg", "0.0029 (5e-5 rad)"),
+        ("joint-sigma-mm", "0.02"),
+    ):  # fmt: skip
+        noise.add_argument(f"--{option}", type=positive, metavar="S", help=f"default {default}")
+    add_limit(parser, TRACKER_WHERE, TRACKER_LIMIT_MM)
+
+
+def run_tracker(args: argparse.Namespace) -> CliResult:
+    """Do ``tracker``. Raises `RobocalError` for what a user can mend."""
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    if args.target is None:
+        target = TrackerTarget(args.radius_mm * 1e-3, args.radius_mm * 1e-3)
+    else:
+        target = read_tracker_target(args.target)
+    data, rejected = _read(args, arm)
+    result = solve_tracker(data, target, _noise(args), args.method, args.limit_mm * 1e-3)
+    warn(warnings)
+    result = replace(result, rejected={**rejected, **result.rejected})
+    document = hand_eye_document(result)
+    return CliResult(document, partial(_show_tracker, document=document))
+
+
+def _noise(args: argparse.Namespace) -> "TrackerNoise":
+    """What is given of it; the rest as `TrackerNoise` has it."""
+    given = {}
+    if args.tracker_sigma_mm is not None:
+        given["tracker_m"] = args.tracker_sigma_mm * 1e-3
+    if args.joint_sigma_deg is not None:
+        given["joint_rad"] = radians(args.joint_sigma_deg)
+    if args.joint_sigma_mm is not None:
+        given["joint_m"] = args.joint_sigma_mm * 1e-3
+    return TrackerNoise(**given)
+
+
+def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", dict[str, str]]:
+    """All measurements, and the profiles that show next to nothing, with why."""
+    points = read_tracker_points(args.points, arm)
+    table = read_pose_table(args.poses, arm)
+    if table.q is None:
+        raise InputError(
+            "the joints are missing: the arcs and the scan are tied by the robot's joints; add "
+            "q1_deg …",
+            file=str(args.poses),
+            row=1,
+        )
+    shots = read_profiles(args.profiles, table)
+    rejected = {
+        name: str(shot)
+        for name, shot in zip(table.names, shots, strict=True)
+        if isinstance(shot, TooFewSamplesError)
+    }
+    seen = [index for index, name in enumerate(table.names) if name not in rejected]
+    profiles = [shot for shot in shots if isinstance(shot, Profile)]
+    data = TrackerData(arm, points.arcs, points.sphere, points.faces, table.q[seen], profiles)
+    return data, rejected
+
+
+def _show_tracker(console: "Console", document: Document) -> None:
+    show_placed(console, document, "Sensor", TRACKER_WHERE)
+    residual = document["residual_mm"]
+    console.print(
+        f"Profiles from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
+    )
+    show_judged(console, document)

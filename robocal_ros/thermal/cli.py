@@ -1,0 +1,410 @@
+"""``robocal thermal calibrate-sensor``: where the sensor stands, and the sphere on the flange."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, text, warn
+from robocal_ros.cli.identify import show_identification
+from robocal_ros.cli.output import CliResult, Document
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.identification.cell import CellModel
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.tables import read_measurements
+from robocal_ros.thermal.documents import (
+    cycle_document,
+    flange_sensor_document,
+    judge_cycle,
+    sensor_document,
+)
+from robocal_ros.thermal.flange_sensor import identify_and_judge_flange_sensor
+from robocal_ros.thermal.identification import CycleDrift, identify_cycle, identify_subset
+from robocal_ros.thermal.learning import learn_drift, read_prior, write_prior
+from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.reference import (
+    ONLY_CYCLE,
+    ColdSpots,
+    Visits,
+    read_visits,
+    require_cold_counterparts,
+)
+from robocal_ros.thermal.sensor_calibration import (
+    PlacedSensor,
+    calibrate_sensor,
+    read_sensor,
+    write_sensor,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+# ---- thermal sensor -----------------------------------------------------------------------------
+
+
+def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``calibrate-sensor``."""
+    parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
+    parser.add_argument(
+        "--data", required=True, type=Path, metavar="CSV", help="joints and measured sphere centres"
+    )
+    parser.add_argument(
+        "--method",
+        choices=("ml", "classic"),
+        default="ml",
+        help="ml (default): maximum likelihood on the manifold; classic: linear with a penalty",
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="write the sensor file, only if it is accepted"
+    )
+
+
+def run_calibrate_sensor(args: argparse.Namespace) -> CliResult:
+    """Do ``calibrate-sensor``. Raises `RobocalError` for what a user can mend."""
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    data = read_measurements(args.data, arm)
+    document = sensor_document(calibrate_sensor(arm, data, args.method), arm)
+    document |= {"data": {"file": str(args.data)}, "output": None}
+    verdict = document["verdict"]
+    if args.output is not None and verdict["accept"]:
+        write_sensor(args.output, document)
+        document["output"] = str(args.output)
+    elif args.output is not None:
+        warnings.append(f"{args.output} is not written: the verdict is {verdict['code']}")
+    document["warnings"] = warnings
+    warn(warnings)
+    return CliResult(document, partial(_show_calibrate_sensor, document=document))
+
+
+def _show_calibrate_sensor(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    verdict, left = document["verdict"], document["left_out"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
+    pose = document["T_sensor_base"]
+    console.print(f"T_sensor_base: {_numbers(pose['xyz_mm'], 3)} mm, quaternion x y z w "
+                  f"{_numbers(pose['quat_xyzw'], 6)}")  # fmt: skip
+    console.print(f"Sphere in the flange frame: {_numbers(document['sphere_in_flange_mm'], 3)} mm")
+    if document["sigma"] is not None:
+        words = ", ".join(f"{name} {value:.4f}" for name, value in document["sigma"].items())
+        console.print(f"Standard deviations: {words}", soft_wrap=True)
+    if left is not None:
+        console.print(
+            f"Each of {document['samples']} poses from the others, mm: mean {left['mean_mm']:.3f}, "
+            f"rms {left['rms_mm']:.3f}, largest {left['max_mm']:.3f}"
+        )
+    if document["rejected"]:
+        console.print(Text(f"Rejected: {', '.join(document['rejected'])}"), soft_wrap=True)
+    if document["output"]:
+        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+
+
+def _numbers(values: list[float], digits: int) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)
+
+
+# ---- ``robocal thermal identify``: a thermal drift from tables of cold and warm visits ----------
+
+
+FIXED, FLANGE = "fixed-sensor", "flange-sensor"
+_FIXED_ONLY = ("sensor", "cold", "warm", "prior", "parameters")
+
+
+def add_identify(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``identify``."""
+    parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
+    parser.add_argument(
+        "--arrangement",
+        choices=(FIXED, FLANGE),
+        default=FIXED,
+        help="where the sensor is: fixed with the sphere on the flange (default), or on the flange "
+        "with spheres fixed in the cell",
+    )
+    parser.add_argument("--check", type=Path, metavar="CSV", help="measurements to judge on")
+    fixed = parser.add_argument_group(FIXED)
+    fixed.add_argument("--sensor", type=Path, metavar="S.yaml", help="from calibrate-sensor")
+    fixed.add_argument("--cold", type=Path, metavar="CSV", help="visits of the cold robot")
+    fixed.add_argument("--warm", type=Path, metavar="CSV", help="visits of the warm robot")
+    fixed.add_argument("--prior", type=Path, metavar="P.yaml", help="from learn-prior, for map")
+    fixed.add_argument(
+        "--method",
+        choices=("map", "subset"),
+        default="map",
+        help="map (default): all parameters with a prior; subset: some by least squares",
+    )
+    fixed.add_argument(
+        "--parameters", type=text, metavar="NAMES", help="for subset: d4_mm,a1_mm,beta2_deg …"
+    )
+    add_sigma(fixed, ", sensor and repeatability, where the tables have no sigma_mm")
+    flange = parser.add_argument_group(FLANGE)
+    flange.add_argument(
+        "--data",
+        type=Path,
+        action="append",
+        metavar="CSV",
+        help="a session: joints and sphere centres in the sensor; repeat for several",
+    )
+
+
+def run_identify(args: argparse.Namespace) -> CliResult:
+    """Do ``identify``. Raises `RobocalError` for what a user can mend."""
+    _require_sense(args)
+
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    if args.arrangement == FLANGE:
+        document = identify_flange_files(arm, args.data, args.check)
+    else:
+        chosen = tuple(name.strip() for name in (args.parameters or "").split(",") if name.strip())
+        request = FixedRequest(
+            sensor_file=args.sensor,
+            cold_file=args.cold,
+            warm_file=args.warm,
+            check_file=args.check,
+            prior_file=args.prior,
+            parameters=chosen,
+            sigma_m=args.sigma_mm * 1e-3,
+        )
+        document = identify_fixed_files(arm, request)
+    document |= {"arrangement": args.arrangement, "warnings": warnings}
+    warn(warnings)
+    return CliResult(document, partial(show_identification, document=document))
+
+
+def _require_sense(args: argparse.Namespace) -> None:
+    """Refuse options that are missing or belong to the other arrangement."""
+    if args.arrangement == FLANGE:
+        wrong = [name for name in _FIXED_ONLY if getattr(args, name) is not None]
+        if wrong:
+            raise InputError(f"--{wrong[0]} is for --arrangement {FIXED}: leave it out")
+        if not args.data:
+            raise InputError(f"--arrangement {FLANGE} needs --data: a session's table")
+        return
+    if args.data:
+        raise InputError(f"--data is for --arrangement {FLANGE}; give --sensor, --cold and --warm")
+    missing = [name for name in ("sensor", "cold", "warm") if getattr(args, name) is None]
+    if missing:
+        raise InputError(f"--{missing[0]} is missing: {FIXED} needs --sensor, --cold and --warm")
+    if (args.method == "subset") != (args.parameters is not None):
+        raise InputError("--method subset and --parameters NAMES belong together")
+    if args.method == "subset" and args.prior is not None:
+        raise InputError("--prior is for --method map: a subset is solved without one")
+
+
+# ---- thermal prior ------------------------------------------------------------------------------
+
+
+def add_learn_prior(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``learn-prior``."""
+    parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
+    parser.add_argument(
+        "--sensor", required=True, type=Path, metavar="S.yaml", help="from calibrate-sensor"
+    )
+    for name, words in (
+        ("cold", "visits of the cold robot"),
+        ("warm", "the cycles that followed, with a column cycle"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            required=True,
+            type=Path,
+            action="append",
+            metavar="CSV",
+            help=f"{words}; repeat both for several shifts",
+        )
+    add_sigma(parser)
+    parser.add_argument("--output", type=Path, metavar="FILE", help="write the prior file")
+
+
+def run_learn_prior(args: argparse.Namespace) -> CliResult:
+    """Do ``learn-prior``. Raises `RobocalError` for what a user can mend."""
+    if len(args.cold) != len(args.warm):
+        raise InputError(
+            f"{len(args.cold)} --cold and {len(args.warm)} --warm: give one of each for each shift"
+        )
+
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    sensor = read_sensor(args.sensor, arm)
+    histories = []
+    for cold_file, warm_file in zip(args.cold, args.warm, strict=True):
+        cold, spots = cold_spots(arm, sensor, cold_file)
+        warm = warm_visits(warm_file, arm, cold)
+        histories.append((spots, [warm.of_cycle(name).data for name in warm.cycles]))
+    learned = learn_drift(histories, sigma_m=args.sigma_mm * 1e-3)
+    spread = np.sqrt(np.diag(learned.covariance)) * arm.parameters.to_display
+    document: Document = {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "parameters": list(arm.parameters.names),
+        "covariance": learned.covariance.tolist(),
+        "sigma": dict(zip(arm.parameters.names, spread.tolist(), strict=True)),
+        "cycles": learned.cycles,
+        "output": None,
+        "warnings": warnings,
+    }
+    if args.output is not None:
+        write_prior(args.output, document)
+        document["output"] = str(args.output)
+    warn(warnings)
+    return CliResult(document, partial(_show_learn_prior, document=document))
+
+
+def _show_learn_prior(console: "Console", document: Document) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=f"Expected drift, learned from {document['cycles']} cycles",
+        title_justify="left",
+        box=None,
+    )
+    table.add_column("parameter")
+    table.add_column("sigma", justify="right")
+    for name, value in document["sigma"].items():
+        table.add_row(name, f"{value:.4f}")
+    console.print(table)
+    if document["output"]:
+        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+
+
+# ---- thermal identification ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FixedRequest:
+    """Files of a fixed sensor; ``parameters`` empty: all of them, with a prior."""
+
+    sensor_file: Path
+    cold_file: Path
+    warm_file: Path
+    check_file: Path | None
+    prior_file: Path | None
+    parameters: tuple[str, ...]
+    sigma_m: float
+
+
+def identify_fixed_files(arm: SerialArm, request: FixedRequest) -> Document:
+    """Identify each cycle of the warm table; the document is the last one's.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        When a file cannot be read, or does not belong to this robot or to the cold visit.
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer.
+    """
+    sensor = read_sensor(request.sensor_file, arm)
+    cold, spots = cold_spots(arm, sensor, request.cold_file)
+    warm = warm_visits(request.warm_file, arm, cold)
+    check = (
+        None if request.check_file is None else check_visits(request.check_file, arm, cold, warm)
+    )
+    prior = drift_prior(arm) if request.prior_file is None else read_prior(request.prior_file, arm)
+    documents = []
+    for name in warm.cycles:
+        found = _solve(spots, warm.of_cycle(name), request, prior)
+        own = None if check is None else _of_cycle(check, name, warm.cycles[-1])
+        unseen = None if own is None else own.data
+        judged = judge_cycle(found, spots, in_force=arm, check=unseen, sigma_m=request.sigma_m)
+        method = "subset" if request.parameters else "map"
+        documents.append(cycle_document(found, judged, spots, arm, method) | {"cycle": name})
+    return documents[-1] | {
+        "cycles": documents,
+        "cold_rejected": list(spots.rejected),
+        "data": {
+            "sensor": str(request.sensor_file),
+            "cold": str(request.cold_file),
+            "warm": str(request.warm_file),
+            "check": _name(request.check_file),
+            "prior": _name(request.prior_file),
+        },
+    }
+
+
+def _name(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def cold_spots(arm: SerialArm, sensor: PlacedSensor, path: Path) -> tuple[Visits, ColdSpots]:
+    """Read a table of cold visits and average those of each pose."""
+    cold = read_visits(path, arm)
+    targets = cold.data.targets
+    if len(targets) > 1:
+        raise InputError(
+            f"{len(targets)} targets ({', '.join(targets)}): the sensor file knows one sphere",
+            file=str(path),
+            column="target",
+        )
+    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
+    cell = CellModel(arm, sensor.T_sensor_base, targets, tool)
+    return cold, ColdSpots.of(cell, cold.data)
+
+
+def warm_visits(path: Path, arm: SerialArm, cold: Visits) -> Visits:
+    """Read a table of warm visits of poses that were visited cold."""
+    warm = read_visits(path, arm)
+    require_cold_counterparts(cold, warm, str(path))
+    return warm
+
+
+def check_visits(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visits:
+    """Read a table of warm visits of poses that are not in the warm table."""
+    check = warm_visits(path, arm, cold)
+    shared = sorted(set(check.pose) & set(warm.pose))
+    if shared:
+        raise InputError(
+            f"pose '{shared[0]}' is in the warm table too: a drift is judged at poses that were "
+            "not used to solve",
+            file=str(path),
+            column="pose",
+        )
+    return check
+
+
+def _of_cycle(check: Visits, name: str, last: str) -> Visits | None:
+    """The check visits of a cycle; those without a cycle belong to the last one."""
+    if check.cycles == (ONLY_CYCLE,) and name == last:
+        return check
+    own = check.of_cycle(name)
+    return own if len(own.data) else None
+
+
+def _solve(
+    spots: ColdSpots, cycle: Visits, request: FixedRequest, prior: NDArray[np.float64]
+) -> CycleDrift:
+    if request.parameters:
+        return identify_subset(spots, cycle.data, request.parameters, sigma_m=request.sigma_m)
+    return identify_cycle(spots, cycle.data, prior_covariance=prior, sigma_m=request.sigma_m)
+
+
+def identify_flange_files(
+    arm: SerialArm, data_files: Sequence[Path], check_file: Path | None
+) -> Document:
+    """Identify geometry, hand-eye and spheres from sessions; judge on the check session.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read.
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer.
+    """
+    sessions = [read_measurements(path, arm) for path in data_files]
+    check = None if check_file is None else read_measurements(check_file, arm)
+    judged = identify_and_judge_flange_sensor(arm, sessions, check)
+    return flange_sensor_document(judged) | {
+        "data": {
+            "sessions": [str(path) for path in data_files],
+            "check": _name(check_file),
+        }
+    }

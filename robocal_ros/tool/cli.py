@@ -1,0 +1,508 @@
+"""``robocal tool beams``: where two crossed beams are, from their sixteen edges.
+
+From one circle the place of its axis; from a whole run tip and axis (see ``tool_crossed_run``).
+"""
+
+import argparse
+from functools import partial
+from math import isfinite, radians
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.cli.arguments import (
+    ROBOT_HELP,
+    SIGMA_MM,
+    describe_robot,
+    positive,
+    text,
+    three_numbers,
+    warn,
+)
+from robocal_ros.cli.output import CliResult, Document
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import transform_document
+from robocal_ros.tool.crossed_model import fit_circle
+from robocal_ros.tool.crossed_run import estimate_tool
+from robocal_ros.tool.driven_circle import classic_from_path
+from robocal_ros.tool.edges import CircleMotion, InputRule, debounced
+from robocal_ros.tool.files import (
+    Load,
+    exported,
+    read_beam_points,
+    read_edges,
+    read_flange_poses,
+    read_joint_path,
+    read_step_edges,
+    read_sweeps,
+    read_tool,
+)
+from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
+from robocal_ros.tool.laser_frame import (
+    LaserFile,
+    LaserFrame,
+    calibrate_laser,
+    read_laser_for,
+    write_laser,
+)
+from robocal_ros.tool.measuring_plan import named_steps
+from robocal_ros.tool.parallel_beams import ParallelBeams, fit_parallel
+from robocal_ros.tool.quick_check import (
+    circle_document,
+    classic_run_document,
+    laser_document,
+    parallel_document,
+    run_document,
+    touch_document,
+)
+from robocal_ros.tool.touch_points import fit_four, fit_seven
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+# ---- ``robocal tool beams``: where two crossed beams are, from their sixteen edges --------------
+
+
+def add_beams(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``beams``."""
+    parser.add_argument(
+        "--data",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="columns point (A1 to D4), x_mm, y_mm, z_mm: the flange at each edge",
+    )
+    parser.add_argument(
+        "--radius-mm",
+        type=positive,
+        metavar="R",
+        help="radius of the cylinder: tells how far from its middle each beam is broken",
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="write the laser file; needs the two below"
+    )
+    parser.add_argument(
+        "--robot", metavar="R.yaml", help=f"that carried the cylinder: {ROBOT_HELP}"
+    )
+    parser.add_argument("--station", type=text, metavar="NAME", help="of these beams")
+    parser.add_argument(
+        "--sigma-mm",
+        type=positive,
+        metavar="S",
+        help=f"noise of a coordinate of a beam's point, for the file; default {SIGMA_MM}",
+    )
+
+
+def run_beams(args: argparse.Namespace) -> CliResult:
+    """Do ``beams``. Raises `RobocalError` for what a user can mend."""
+    _require_together(args)
+    radius_m = None if args.radius_mm is None else args.radius_mm * 1e-3
+    sigma_m = 1e-3 * (SIGMA_MM if args.sigma_mm is None else args.sigma_mm)
+    laser = calibrate_laser(read_beam_points(args.data), sigma_m, radius_m)
+    document: Document = laser_document(laser)
+    document["reach_mm"] = None
+    if radius_m is not None:
+        document["reach_mm"] = dict(zip("xy", (laser.reach * 1e3).tolist(), strict=True))
+    document["output"] = None
+    if args.output is not None:
+        _write(args, laser)
+        document["output"] = str(args.output)
+    return CliResult(document, partial(_show_beams, document=document))
+
+
+def _require_together(args: argparse.Namespace) -> None:
+    """Refuse a file without its robot or station, and options that only the file needs."""
+    for option in ("robot", "station", "sigma_mm"):
+        given, name = getattr(args, option) is not None, f"--{option.replace('_', '-')}"
+        if args.output is not None and not given and option != "sigma_mm":
+            raise InputError(f"--output needs {name}: a laser file says whose it is")
+        if args.output is None and given:
+            raise InputError(f"{name} only matters for a laser file: give --output too")
+
+
+def _write(args: argparse.Namespace, laser: "LaserFrame") -> None:
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    warn(warnings)
+    write_laser(args.output, LaserFile(laser, args.station, arm.name, arm.model_hash))
+
+
+def _show_beams(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    x, y, z = document["origin_mm"]
+    console.print(f"The beams cross at {x:.3f} {y:.3f} {z:.3f} mm in base")
+    console.print(
+        f"at {document['beam_angle_deg']:.3f} deg, the y-beam {document['gap_mm']:+.4f} mm above "
+        "the x-beam."
+    )
+    for name, axis in zip("xyz", document["axes"], strict=True):
+        console.print(f"{name} axis in base: {' '.join(f'{value:.6f}' for value in axis)}")
+    if document["output"]:
+        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+
+
+# ---- options that give a tool's frame: a document of a measured tool, or numbers ----------------
+
+
+def add_frame_options(parser: "argparse._ActionsContainer", tip: str, turn: str) -> None:
+    """Offer ``--tool``, and in numbers its ``tip`` and its ``turn``: the names of both options."""
+    parser.add_argument(
+        "--tool", type=Path, metavar="FILE", help="JSON of a tool, as robocal tool prints it"
+    )
+    parser.add_argument(
+        tip,
+        dest="xyz_mm",
+        type=three_numbers,
+        metavar="X,Y,Z",
+        help="or the tip in the flange frame",
+    )
+    parser.add_argument(
+        turn,
+        dest="rpy_deg",
+        type=three_numbers,
+        metavar="R,P,Y",
+        help="turns about the flange's x, y, z in this order, where the tool brings none",
+    )
+
+
+def given_frame(args: argparse.Namespace) -> "NDArray[np.float64] | None":
+    """T_flange_tool (4, 4) of the options of `add_frame_options`; None without any.
+
+    Raises
+    ------
+    InputError
+        When both are given, or a turn alone; further what `read_tool` raises.
+    """
+    R = None if args.rpy_deg is None else frames.rotation_from_rpy(np.radians(args.rpy_deg))
+    if args.tool is not None and args.xyz_mm is not None:
+        raise InputError("the tool is given twice: as a file, and in numbers; keep one")
+    if args.tool is not None:
+        return read_tool(args.tool, R)
+    if args.xyz_mm is not None:
+        return frames.transform(np.eye(3) if R is None else R, 1e-3 * np.array(args.xyz_mm))
+    if R is not None:
+        raise InputError("roll, pitch and yaw alone are no tool: give its tip too")
+    return None
+
+
+# ---- tool crossed run ---------------------------------------------------------------------------
+
+
+NEEDED = ("joints", "robot", "laser")
+
+
+def add_run_options(parser: "argparse._ActionsContainer") -> None:
+    """Declare the options of a whole run."""
+    parser.add_argument(
+        "--joints",
+        type=Path,
+        metavar="CSV",
+        help="joint readings during the whole run: stamp_s and q1_deg …, on the edges' clock",
+    )
+    parser.add_argument("--robot", metavar="R.yaml", help=ROBOT_HELP)
+    parser.add_argument(
+        "--laser", type=Path, metavar="FILE", help="laser file of robocal tool beams"
+    )
+    add_frame_options(parser, "--taught-mm", "--taught-rpy-deg")
+
+
+def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
+    """Do it. Raises `RobocalError` for what a user can mend."""
+    missing = [f"--{name}" for name in NEEDED if getattr(args, name) is None]
+    if missing:
+        raise InputError(
+            f"a whole run needs --joints, --robot and --laser: {missing[0]} is missing"
+        )
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    laser = read_laser_for(args.laser, arm).laser
+    given = given_frame(args)
+    taught = arm.T_flange_tool if given is None else given
+    path, origin_ns = read_joint_path(args.joints, arm)
+    edges, names = read_step_edges(args.events, rule.sigma_s, origin_ns)
+    steps = named_steps(edges, names, rule.debounce_s)
+    if args.method == "classic":
+        document = classic_run_document(classic_from_path(laser, path, steps, taught))
+    else:
+        circles = [step.name for step in steps if step.kind == "circle"]
+        found = estimate_tool(laser, path, steps, taught)
+        known = KnownTool.measured(found)
+        document = run_document(known, found, circles, judge_run(found, ToolLimits()))
+    document["warnings"] = warnings
+    warn(warnings)
+    return CliResult(document, partial(_show_run, document=document))
+
+
+def _show_run(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    verdict = document["verdict"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
+    sigma = document["sigma_mm"] or [None] * 3
+    tip = ", ".join(
+        f"{value:.3f}" + ("" if spread is None else f" ± {spread:.3f}")
+        for value, spread in zip(document["tcp_mm"], sigma, strict=True)
+    )
+    console.print(f"Tip in the flange frame, mm: {tip}")
+    for name, key in (("Axis", "axis"), ("Orientation, quaternion x y z w", "quat_xyzw")):
+        console.print(f"{name}: {' '.join(f'{value:.6f}' for value in document[key])}")
+    for radius in document["tool_radius_mm"] or ():
+        console.print(Text(f"Tool radius on {radius['circle']}: {radius['x']:.3f} mm as the x-beam "
+                           f"sees it, {radius['y']:.3f} mm as the y-beam"))  # fmt: skip
+    if document["latency_s"] is not None:
+        console.print(f"Latency of the input: {document['latency_s'] * 1e3:.3f} ms")
+
+
+# ---- ``robocal tool crossed``: a tool from its edges through two crossed beams ------------------
+
+
+METHODS = ("best", "classic")
+DIRECTIONS = {"ccw": 1, "cw": -1}
+JITTER_S = 20e-6
+OF_CIRCLE = ("radius_mm", "period_s", "start_deg", "direction", "beam_angle_deg", "latency_s")
+OF_RUN = ("joints", "robot", "laser", "tool", "xyz_mm", "rpy_deg")
+
+
+def add_crossed(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``crossed``."""
+    parser.add_argument(
+        "--events",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="columns stamp_s, beam (x or y), blocked (1 or 0), sigma_s where it is known, and of "
+        "a whole run step",
+    )
+    parser.add_argument("--method", choices=METHODS, default=METHODS[0])
+    parser.add_argument(
+        "--sample-period-s",
+        type=float,
+        default=0.0,
+        metavar="P",
+        help="of an input that is read every so often; default 0: stamped by interrupt",
+    )
+    add_run_options(parser.add_argument_group("a whole run"))
+    circle = parser.add_argument_group("one circle at constant speed")
+    circle.add_argument("--radius-mm", type=positive, metavar="R")
+    circle.add_argument("--period-s", type=positive, metavar="T", help="of a turn")
+    circle.add_argument(
+        "--start-deg",
+        type=float,
+        metavar="A",
+        help="where the flange stands at stamp 0, counter-clockwise from the laser's x; default 0",
+    )
+    circle.add_argument("--direction", choices=tuple(DIRECTIONS), help="default ccw")
+    circle.add_argument("--beam-angle-deg", type=positive, metavar="B", help="default 90")
+    circle.add_argument(
+        "--latency-s", type=float, metavar="L", help="of the input, where it is known"
+    )
+
+
+def run_crossed(args: argparse.Namespace) -> CliResult:
+    """Do ``crossed``. Raises `RobocalError` for what a user can mend."""
+    if not isfinite(args.sample_period_s) or args.sample_period_s < 0.0:
+        raise InputError("--sample-period-s must be a finite number, not below 0")
+    rule = InputRule(JITTER_S, args.sample_period_s)
+    of_run, of_circle = _given(args, OF_RUN), _given(args, OF_CIRCLE)
+    if of_run and of_circle:
+        raise InputError(
+            f"{of_run[0]} belongs to a whole run, {of_circle[0]} to one circle: the joints tell "
+            "how the circle was driven; give the options of one of them"
+        )
+    if of_run:
+        return run_whole(args, rule)
+    if args.radius_mm is None or args.period_s is None:
+        raise InputError(
+            "give --joints, --robot and --laser for a whole run, or --radius-mm and --period-s "
+            "for one circle"
+        )
+    document = _circle(args, rule)
+    return CliResult(document, partial(_show_crossed, document=document))
+
+
+def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
+    taught = {"xyz_mm": "taught_mm", "rpy_deg": "taught_rpy_deg"}
+    return [
+        f"--{taught.get(name, name).replace('_', '-')}"
+        for name in names
+        if getattr(args, name) is not None
+    ]
+
+
+def _circle(args: argparse.Namespace, rule: "InputRule") -> Document:
+    start_deg = args.start_deg or 0.0
+    beam_angle_deg = 90.0 if args.beam_angle_deg is None else args.beam_angle_deg
+    if not (isfinite(start_deg) and isfinite(args.latency_s or 0.0)):
+        raise InputError("--start-deg and --latency-s must be finite numbers")
+    if not beam_angle_deg < 180.0:
+        raise InputError(f"--beam-angle-deg {beam_angle_deg:g}: must lie between 0 and 180")
+    motion = CircleMotion(
+        radius_m=args.radius_mm * 1e-3,
+        period_s=args.period_s,
+        start_rad=radians(start_deg),
+        direction=DIRECTIONS[args.direction or "ccw"],
+        beam_angle_rad=radians(beam_angle_deg),
+    )
+    edges = debounced(read_edges(args.events, rule.sigma_s), rule.debounce_s)
+    return circle_document(fit_circle(motion, edges, args.method, latency_s=args.latency_s))
+
+
+def _show_crossed(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    verdict = document["verdict"]
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style="bold green"))
+    if document["tool_radius_mm"] is not None:
+        x, y = document["tool_radius_mm"].values()
+        console.print(f"Tool radius: {x:.3f} mm as the x-beam sees it, {y:.3f} mm as the y-beam")
+    console.print(f"Latency of the input: {document['latency_s'] * 1e3:.3f} ms")
+
+
+# ---- ``robocal tool points``: a tool's tip, and its orientation, by touching a point ------------
+
+
+POINT_METHODS = ("four", "seven")
+
+
+def add_points(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``points``."""
+    parser.add_argument("--method", choices=POINT_METHODS, default=POINT_METHODS[0])
+    parser.add_argument(
+        "--data",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="flange poses: x_mm, y_mm, z_mm, and qx, qy, qz, qw or another orientation",
+    )
+    parser.add_argument(
+        "--sigma-mm", type=positive, metavar="S", help="of one touch; default: from the residuals"
+    )
+
+
+def run_points(args: argparse.Namespace) -> CliResult:
+    """Do ``points``. Raises `RobocalError` for what a user can mend."""
+    fit = {"four": fit_four, "seven": fit_seven}[args.method]
+    sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
+    document: Document = {"method": args.method}
+    document |= touch_document(fit(read_flange_poses(args.data), sigma_m))
+    return CliResult(document, partial(_show_points, document=document))
+
+
+def _show_points(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    verdict = document["verdict"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
+    pairs = zip(document["tcp_mm"], document["sigma_mm"], strict=True)
+    tip = ", ".join(f"{value:.3f} ± {sigma:.3f}" for value, sigma in pairs)
+    console.print(f"Tip in the flange frame, mm: {tip}")
+    if document["quat_xyzw"] is not None:
+        quat = " ".join(f"{value:.6f}" for value in document["quat_xyzw"])
+        console.print(f"Orientation, quaternion x y z w: {quat}")
+
+
+# ---- ``robocal tool parallel``: a tool by two parallel beams, one above the other ---------------
+
+
+def add_parallel(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``parallel``."""
+    parser.add_argument(
+        "--data",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="columns sweep (straight, turned, upright, upright_turned, plunge), beam (up, down), "
+        "and the flange's pose at each edge",
+    )
+    for name in ("up", "down"):
+        parser.add_argument(
+            f"--{name}-mm",
+            required=True,
+            type=float,
+            metavar="Z",
+            help=f"height of the {'upper' if name == 'up' else 'lower'} beam in base",
+        )
+    parser.add_argument(
+        "--x-mm",
+        type=float,
+        metavar="X",
+        help="place of both beams along the base's x, for the tip",
+    )
+
+
+def run_parallel(args: argparse.Namespace) -> CliResult:
+    """Do ``parallel``. Raises `RobocalError` for what a user can mend."""
+    if not all(map(isfinite, (args.up_mm, args.down_mm, args.x_mm or 0.0))):
+        raise InputError("--up-mm, --down-mm and --x-mm must be finite numbers")
+    beams = ParallelBeams(args.up_mm * 1e-3, args.down_mm * 1e-3)
+    x_m = None if args.x_mm is None else args.x_mm * 1e-3
+    fit = fit_parallel(beams, x_m, read_sweeps(args.data))
+    document: Document = parallel_document(fit.axis, fit.tip)
+    return CliResult(document, partial(_show_parallel, document=document))
+
+
+def _show_parallel(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    verdict = document["verdict"]
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style="bold green"))
+    console.print(f"Axis: {' '.join(f'{value:.6f}' for value in document['axis'])}")
+    if document["tcp_mm"] is not None:
+        tip = ", ".join(f"{value:.3f}" for value in document["tcp_mm"])
+        console.print(f"Tip in the flange frame, mm: {tip}")
+
+
+# ---- ``robocal tool export``: a tool's frame in the words of a controller -----------------------
+
+
+FORMATS = ("urdf", "kuka", "abb", "fanuc", "ur")
+
+
+def add_export(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``export``."""
+    add_frame_options(parser, "--xyz-mm", "--rpy-deg")
+    parser.add_argument("--format", required=True, choices=FORMATS)
+    parser.add_argument(
+        "--mass-kg", type=positive, metavar="M", help="of the tool, for abb; with the next"
+    )
+    parser.add_argument(
+        "--cog-mm",
+        type=three_numbers,
+        metavar="X,Y,Z",
+        help="the tool's centre of gravity in the flange frame, for abb",
+    )
+
+
+def run_export(args: argparse.Namespace) -> CliResult:
+    """Do ``export``. Raises `RobocalError` for what a user can mend."""
+    T_flange_tool = given_frame(args)
+    if T_flange_tool is None:
+        raise InputError("give the tool: --tool, or --xyz-mm and --rpy-deg")
+    document: Document = {
+        "format": args.format,
+        "text": exported(T_flange_tool, args.format, _load(args)),
+        "T_flange_tool": transform_document(T_flange_tool),
+    }
+    return CliResult(document, partial(_show_export, document=document))
+
+
+def _load(args: argparse.Namespace) -> "Load | None":
+    if args.mass_kg is None and args.cog_mm is None:
+        return None
+    if args.format != "abb":
+        raise InputError(f"--mass-kg and --cog-mm are for --format abb, not for {args.format}")
+    if args.mass_kg is None or args.cog_mm is None:
+        raise InputError("--mass-kg and --cog-mm go together: a load has both")
+    x, y, z = args.cog_mm
+    return Load(args.mass_kg, (x * 1e-3, y * 1e-3, z * 1e-3))
+
+
+def _show_export(console: "Console", document: Document) -> None:
+    console.out(document["text"], highlight=False)
