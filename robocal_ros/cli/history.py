@@ -240,7 +240,7 @@ def add_history(parser: argparse.ArgumentParser) -> None:
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
         action = actions.add_parser(name, help=words, description=words)
-        add_history(action)
+        add_history_options(action)
         return action
 
     for name, words in (

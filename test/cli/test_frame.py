@@ -119,8 +119,9 @@ class TestStart:
 
 def with_command(monkeypatch, run):
     """A frame whose only command is this function."""
-    module = SimpleNamespace(HELP="made for a test", add_arguments=lambda parser: None, run=run)
-    monkeypatch.setattr(frame, "COMMANDS", {"probe": "probe"})
+    module = SimpleNamespace(add_probe=lambda parser: None, run_probe=run)
+    command = frame.CliCommand("test:probe", "made for a test")
+    monkeypatch.setattr(frame, "COMMANDS", {"probe": command})
     monkeypatch.setattr(frame, "import_module", lambda name: module)
 
 
@@ -206,7 +207,7 @@ class TestOutcomes:
             monkeypatch, lambda args: seen.append(args.at) or CliResult({}, lambda c: None)
         )
         probe = frame.import_module("")
-        probe.add_arguments = lambda parser: parser.add_argument("--at")
+        probe.add_probe = lambda parser: parser.add_argument("--at")
         for value in ("-90,0,1", "-.5", "-1e-3"):
             assert frame.main(["probe", "--at", value, "--json"]) == 0
             assert frame.main(["probe", f"--at={value}", "--json"]) == 0
@@ -228,9 +229,9 @@ def run(args):
         time.sleep(30)
     lines = lambda console: [console.print("line") for _ in range(9999)]
     return CliResult({"x": "y" * 1000}, lines)
-frame.COMMANDS = {"probe": "probe"}
+frame.COMMANDS = {"probe": frame.CliCommand("test:probe", "")}
 frame.import_module = lambda name: SimpleNamespace(
-    HELP="", run=run, add_arguments=lambda p: p.add_argument("--wait", action="store_true"))
+    run_probe=run, add_probe=lambda p: p.add_argument("--wait", action="store_true"))
 sys.exit(frame.main(sys.argv[1:]))
 """
 
