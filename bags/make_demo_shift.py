@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim import kr150
-from robocal_ros.cell_sim.motion import readings
-from robocal_ros.cell_sim.poses import read_poses
+from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim.programs import read_poses, readings
 from robocal_ros.cell_sim.robot import Effects, TrueRobot
-from robocal_ros.cell_sim.sensor import SphereSensor
-from robocal_ros.cell_sim.shift import Shift, ShiftPlan, simulate
+from robocal_ros.cell_sim.stations import SphereSensor
+from robocal_ros.cell_sim.thermal_shift import Shift, ShiftPlan, simulate
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -59,8 +58,8 @@ class DemoCell:
 def build(effects: Effects | None = None, seed: int = SEED) -> DemoCell:
     """Simulate the shift; the same seed gives the same robot and the same noise."""
     body, course = np.random.default_rng(seed).spawn(2)
-    robot = kr150.true_robot(load_robot(ROBOT), body, effects)
-    sensor = kr150.sphere_sensor(effects)
+    robot = thermal_shift.true_robot(load_robot(ROBOT), body, effects)
+    sensor = thermal_shift.sphere_sensor(effects)
     plan = ShiftPlan(
         reference=read_poses(POSES, "cycle", "reference"),
         cycle=read_poses(POSES, "cycle"),
@@ -70,7 +69,10 @@ def build(effects: Effects | None = None, seed: int = SEED) -> DemoCell:
         period_s=PERIOD_S,
     )
     return DemoCell(
-        robot, sensor, plan, simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course)
+        robot,
+        sensor,
+        plan,
+        simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course),
     )
 
 
@@ -143,7 +145,7 @@ def cycle_records(cell: DemoCell) -> list[Record]:
         truth = {
             "simulated": True,
             "cycle": cycle.name,
-            "tool_in_flange_m": kr150.TOOL.tolist(),
+            "tool_in_flange_m": thermal_shift.TOOL.tolist(),
             "q_rad": cell.plan.check.round(9).tolist(),
             "position_m": cycle.check.round(9).tolist(),
         }

@@ -43,9 +43,12 @@ from numpy.typing import NDArray
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import (
+from robocal_ros.cell_sim.hand_eye_cell import (
+    ArmRobot,
+    HandEyeCell,
+    SimulatedShots,
     TrueStairs,
     edge_block,
     edge_shots,
@@ -53,13 +56,9 @@ from robocal_ros.cell_sim.hand_eye_sets import (
     step_shots,
     taught,
 )
-from robocal_ros.cell_sim.motion import Path as JointPath
-from robocal_ros.cell_sim.motion import readings
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
-from robocal_ros.cell_sim.profile_targets import Scene, ball_on_table
-from robocal_ros.cell_sim.robot import TrueRobot
-from robocal_ros.cell_sim.thermal import Warmth
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor, Scene, ball_on_table
+from robocal_ros.cell_sim.programs import JointPath, readings
+from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.tables import write_shots

@@ -21,17 +21,22 @@ from session_events import EventLog
 
 from robocal_ros import __version__
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
-from robocal_ros.cell_sim.robot_program import RobotProgram, Sample
-from robocal_ros.cell_sim.tool_cell import ToolCell
-from robocal_ros.cell_sim.ur10_station import (
+from robocal_ros.cell_sim.beams import (
     BETA_RAD,
     GAP_M,
     Q_NEAR,
     T_BASE_LASER,
     TAUGHT,
+    BeamStation,
+    RoundTool,
+    TrueInput,
+    TrueNoise,
+    beams_of,
+    bent,
     laser_of,
 )
+from robocal_ros.cell_sim.programs import RobotProgram, Sample
+from robocal_ros.cell_sim.tool_cell import ToolCell
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

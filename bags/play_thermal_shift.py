@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 from bench.live.graph import CellController, LiveError
 from bench.startup import ROOT
 from robocal_ros.bags.bags import BagReader, BagWriter
-from robocal_ros.cell_sim.shift import REFERENCE
+from robocal_ros.cell_sim.thermal_shift import REFERENCE
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import qos
 from robocal_ros.ros.decision_services import EVENTS

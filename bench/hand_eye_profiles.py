@@ -23,10 +23,10 @@ from bench.hand_eye_worlds import (
     squared_error,
 )
 from bench.tables import Goal, Table
+from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.cell_plan import rigid_robot
 from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.mount_problem import pivot_of

@@ -15,10 +15,17 @@ from bench.hand_eye_worlds import (
     T_BASE_USER,
     calibrated,
 )
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Robot, SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
-from robocal_ros.cell_sim.thermal import Warmth
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.hand_eye_cell import (
+    ArmRobot,
+    HandEyeCell,
+    Robot,
+    SimulatedShots,
+    edge_shots,
+    sphere_shots,
+    step_shots,
+)
+from robocal_ros.cell_sim.robot import Warmth
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.mount_fit import MountFit

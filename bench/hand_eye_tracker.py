@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.laser_tracker import Sizes, TrackerCell
-from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.laser_tracker import Sizes, TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.tracker import solve_best, spread
 from robocal_ros.hand_eye.tracker_classic import solve_classic

@@ -18,10 +18,15 @@ from bench.hand_eye_bound import (
     least_covariance,
     piercings,
 )
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot
-from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
-from robocal_ros.cell_sim.profile_targets import Scene
+from robocal_ros.cell_sim.hand_eye_cell import (
+    HandEyeCell,
+    PoseRobot,
+    TrueStairs,
+    edge_shots,
+    sphere_shots,
+    step_shots,
+)
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor, Scene
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen

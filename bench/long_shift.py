@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from robocal_ros.bags.bag_types import encode
 from robocal_ros.bags.bag_writer import BagWriter, ros_time
-from robocal_ros.cell_sim import kr150
-from robocal_ros.cell_sim.drift import MEASURING, poses
-from robocal_ros.cell_sim.motion import readings
-from robocal_ros.cell_sim.shift import MOVE_S, Shift, ShiftPlan, simulate
-from robocal_ros.cell_sim.sphere_cloud import sphere_cloud
+from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim.programs import readings
+from robocal_ros.cell_sim.stations import sphere_cloud
+from robocal_ros.cell_sim.thermal_shift import MEASURING, MOVE_S, Shift, ShiftPlan, poses, simulate
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -50,13 +49,13 @@ class LongShift:
 def write_shift(path: Path, hours: float) -> LongShift:
     """Simulate a shift of some hours after its cold reference, and write its bag."""
     course, joints, clouds, warmth = np.random.default_rng(SEED).spawn(4)
-    robot = kr150.true_robot(load_robot(ROBOT), course, None)
+    robot = thermal_shift.true_robot(load_robot(ROBOT), course, None)
     measuring = poses("sphere")[list(MEASURING)]
     reference = np.tile(measuring, (ROUNDS, 1))
     phases = ((hours, 1.0),)
     plan = ShiftPlan(reference, measuring, poses("check"), phases, DUTY, PERIOD_S)
-    sensor = kr150.sphere_sensor(None)
-    shift = simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course)
+    sensor = thermal_shift.sphere_sensor(None)
+    shift = simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course)
     end_s = float(shift.path.depart[-1])
     names = list(robot.nominal.joint_names)
     times = np.arange(1.0 / JOINTS_HZ, end_s, 1.0 / JOINTS_HZ)

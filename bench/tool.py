@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
-from robocal_ros.cell_sim.beam_moves import Circle
 from robocal_ros.cell_sim.beams import (
+    BETA_RAD,
+    GAP_M,
     NO_NOISE,
     PERFECT,
+    Q_NEAR,
+    T_BASE_LASER,
+    TAUGHT,
     BeamStation,
     RoundTool,
     TrueBeam,
@@ -24,8 +27,15 @@ from robocal_ros.cell_sim.beams import (
     TrueNoise,
     beams_of,
 )
-from robocal_ros.cell_sim.tool_cell import MeasuredRun, RunPlan, ToolCell
-from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT
+from robocal_ros.cell_sim.tool_cell import (
+    CYLINDER_M,
+    Circle,
+    MeasuredRun,
+    RunPlan,
+    ToolCell,
+    laser_points,
+    point_sigma,
+)
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import Held, closed_form, fit_circle

@@ -36,7 +36,7 @@ from bench.closed_loop.shift import ROBOT
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.cell import SimulatedCell
 from robocal_ros.cell_sim.cell_faults import Fault
-from robocal_ros.cell_sim.kr150_cell import kr150_cell
+from robocal_ros.cell_sim.cell_plan import kr150_cell
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.results import FULL, QUICK

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from bench.closed_loop import setting
 from bench.closed_loop.earlier import seen, taught
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.drift import PERIOD_S, DriftPlan
-from robocal_ros.cell_sim.kr150_cell import DUTY, kr150_cell, poses
-from robocal_ros.cell_sim.robot import TrueRobot
-from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.cell_sim.cell_plan import DUTY, kr150_cell, poses
+from robocal_ros.cell_sim.robot import TrueRobot, Warmth
+from robocal_ros.cell_sim.thermal_shift import PERIOD_S, DriftPlan
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.accuracy import AccuracyForecast, Work

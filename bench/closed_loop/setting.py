@@ -2,9 +2,15 @@
 
 import numpy as np
 
-from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, point_sigma
-from robocal_ros.cell_sim.cell_plan import CellPlan, known_laser
-from robocal_ros.cell_sim.kr150_cell import SPIN_RAD, T_BASE_LASER, TAUGHT, poses
+from robocal_ros.cell_sim.cell_plan import (
+    SPIN_RAD,
+    T_BASE_LASER,
+    TAUGHT,
+    CellPlan,
+    known_laser,
+    poses,
+)
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M, point_sigma
 from robocal_ros.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.motion.housing import DrivingConfig, Housing
 from robocal_ros.motion.limits import MotionLimits

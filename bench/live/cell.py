@@ -22,8 +22,8 @@ from bench.live.graph import LiveError
 from bench.startup import ROOT
 from robocal_ros.cell_sim.cell import SimulatedCell
 from robocal_ros.cell_sim.cell_faults import Fault
+from robocal_ros.cell_sim.cell_plan import kr150_cell
 from robocal_ros.cell_sim.cell_samples import CellSamples
-from robocal_ros.cell_sim.kr150_cell import kr150_cell
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, save_robot
 from robocal_ros.tool.laser_frame import LaserFile, write_laser

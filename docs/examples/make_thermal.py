@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cell_sim import kr150
-from robocal_ros.cell_sim.drift import MEASURING, DriftRecord, drifting_cell, poses, record
+from robocal_ros.cell_sim.thermal_shift import MEASURING, DriftRecord, drifting_cell, poses, record
 from robocal_ros.kinematics.robots import load_robot
 
 ROBOT, SEED = "kr150_r3100", 1

@@ -12,10 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.cell_sim.beam_moves import Circle, Plunge
-from robocal_ros.cell_sim.beam_program import program
-from robocal_ros.cell_sim.beam_watch import BeamWatch
-from robocal_ros.cell_sim.beams import RoundTool, on_one_clock
+from robocal_ros.cell_sim.beams import BeamWatch, RoundTool, on_one_clock
 from robocal_ros.cell_sim.cell_faults import (
     LASTING,
     NEXT_MOTION,
@@ -24,19 +21,20 @@ from robocal_ros.cell_sim.cell_faults import (
     FaultyInput,
     size_of,
 )
-from robocal_ros.cell_sim.cell_outputs import Happened, Outbox
 from robocal_ros.cell_sim.cell_plan import CellPlan
-from robocal_ros.cell_sim.command_gate import CommandGate
-from robocal_ros.cell_sim.draws import Draws, Stream
-from robocal_ros.cell_sim.heating import Heating
-from robocal_ros.cell_sim.joint_motion import ROOM, JointMotion
-from robocal_ros.cell_sim.joint_readings import JointReadings
-from robocal_ros.cell_sim.profile_station import ProfileStation
-from robocal_ros.cell_sim.scatter import Scatter
-from robocal_ros.cell_sim.sphere_station import SphereStation
-from robocal_ros.cell_sim.standing import TICK_S, Standing, standstills
-from robocal_ros.cell_sim.thermal import Warmth
-from robocal_ros.cell_sim.trajectory import Trajectory
+from robocal_ros.cell_sim.cell_samples import Happened, Outbox
+from robocal_ros.cell_sim.joint_motion import ROOM, CommandGate, JointMotion, JointReadings
+from robocal_ros.cell_sim.programs import program
+from robocal_ros.cell_sim.robot import Draws, Heating, Scatter, Stream, Warmth
+from robocal_ros.cell_sim.stations import (
+    TICK_S,
+    ProfileStation,
+    SphereStation,
+    Standing,
+    standstills,
+)
+from robocal_ros.cell_sim.tool_cell import Circle, Plunge
+from robocal_ros.cell_sim.trajectory_controller import Trajectory
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.tool.measuring_plan import PlannedStep
 

@@ -17,8 +17,8 @@ from rclpy.qos import ReliabilityPolicy
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.messages import odd_length, tolerances_of, trajectory_of
-from robocal_ros.cell_sim.trajectory_goal import GoalState, TrajectoryGoal
+from robocal_ros.cell_sim.outputs import odd_length, tolerances_of, trajectory_of
+from robocal_ros.cell_sim.trajectory_controller import GoalState, TrajectoryGoal
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ros import qos
 from robocal_ros.ros.conversions import header

@@ -8,13 +8,11 @@ from robocal_msgs.msg import ToolStep
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import known_laser
+from robocal_ros.cell_sim.cell_plan import known_laser, worked_for
 from robocal_ros.cell_sim.controller import SimulatedController
-from robocal_ros.cell_sim.kr150_cell import worked_for
-from robocal_ros.cell_sim.messages import planned_step, trajectory_of
-from robocal_ros.cell_sim.outputs import CellOutputs
+from robocal_ros.cell_sim.outputs import CellOutputs, planned_step, trajectory_of
 from robocal_ros.cell_sim.settings import SETTINGS, at_station, bent_tool, cell_plan, laser_pose
-from robocal_ros.cell_sim.standing import TICK_S
+from robocal_ros.cell_sim.stations import TICK_S
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.files import write_text
 from robocal_ros.ros import qos

@@ -5,14 +5,76 @@ mistake in the estimators' compiled kernels cannot hide.
 """
 
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.kinematics import SerialArm
 
+# ---- thermal ------------------------------------------------------------------------------------
+
+
 Array = NDArray[np.float64]
+
+LONGEST_STEP_S = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Warmth:
+    """Temperatures above those of the cold robot, K.
+
+    Attributes
+    ----------
+    motor : (n,) of each joint's motor and gear.
+    link : (n,) of the link that follows each joint.
+    """
+
+    motor: Array
+    link: Array
+
+    @classmethod
+    def cold(cls, n: int) -> "Warmth":
+        """The cold robot."""
+        return cls(np.zeros(n), np.zeros(n))
+
+
+@dataclass(frozen=True, eq=False)
+class WarmUp:
+    """How motors and links heat up.
+
+    ``tau dT/dt = T_end - T``: a motor tends to ``motor_rise`` times its duty, a link to
+    ``link_share`` times the mean of the motors at its two ends.
+
+    Attributes
+    ----------
+    motor_rise : (n,) steady rise of each motor at duty 1, K.
+    motor_tau_s, link_tau_s : time constants.
+    link_share : (n,) part of the motors' rise that a link reaches.
+    """
+
+    motor_rise: Array
+    motor_tau_s: float
+    link_share: Array
+    link_tau_s: float
+
+    def step(self, warmth: Warmth, duty: ArrayLike, duration_s: float) -> Warmth:
+        """Return the temperatures after ``duration_s`` at a constant duty (n,), each 0 to 1."""
+        count = max(1, int(np.ceil(duration_s / LONGEST_STEP_S)))
+        keep_motor = np.exp(-duration_s / count / self.motor_tau_s)
+        keep_link = np.exp(-duration_s / count / self.link_tau_s)
+        motor, link = warmth.motor, warmth.link
+        goal = self.motor_rise * np.asarray(duty, dtype=np.float64)
+        for _ in range(count):
+            ends = 0.5 * (motor + np.append(motor[1:], motor[-1]))
+            motor = goal + keep_motor * (motor - goal)
+            link_goal = self.link_share * ends
+            link = link_goal + keep_link * (link - link_goal)
+        return Warmth(motor, link)
+
+
+# ---- robot --------------------------------------------------------------------------------------
+
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -176,3 +238,130 @@ def turn(axis: int, angle: Array) -> Array:
     T[:, i, i] = T[:, j, j] = np.cos(angle)
     T[:, i, j], T[:, j, i] = -np.sin(angle), np.sin(angle)
     return T
+
+
+# ---- draws --------------------------------------------------------------------------------------
+
+
+class Stream(IntEnum):
+    """What random numbers are for."""
+
+    STATION = 0
+    SCATTER = 1
+    RIPPLE = 2
+    EDGES = 3
+    READINGS = 4
+    LOST_READINGS = 5
+    SHOTS = 6
+    LOST_SHOTS = 7
+    LOST_EDGES = 8
+    TEMPERATURES = 9
+    PROFILES = 10
+    LOST_COMMANDS = 11
+
+
+class Draws:
+    """Generators of one seed: the same purpose and place give the same numbers.
+
+    So it does not matter how time is cut into pieces, and one thing that is switched on or off
+    leaves the numbers of all others alone.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+
+    def of(self, stream: Stream, place: int = 0) -> np.random.Generator:
+        """A generator for a purpose at a place, such as a tick."""
+        return np.random.default_rng([self._seed, stream, place])
+
+
+# ---- heating ------------------------------------------------------------------------------------
+
+
+ROUNDED_K = 0.1  # a temperature is told in such steps
+
+
+@dataclass(frozen=True, eq=False)
+class HeatPlan:
+    """What heats a robot.
+
+    Attributes
+    ----------
+    rated : (n,) mean speed of each joint that is duty 1, rad/s (prismatic: m/s).
+    ambient_c, noise_k : of the cell, and of a told temperature.
+    """
+
+    warm_up: WarmUp
+    rated: Array
+    ambient_c: float = 22.0
+    noise_k: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Temperatures:
+    """Motor temperatures (n,), deg C, as told at a time."""
+
+    time_s: float
+    celsius: Array
+
+
+class Heating:
+    """A robot that warms up, from cold.
+
+    Attributes
+    ----------
+    warmth : as it is.
+    level : factor on the heat; 0: it stays as it is, or cools.
+    """
+
+    def __init__(self, plan: HeatPlan, draws: Draws) -> None:
+        self.plan, self._draws = plan, draws
+        self.warmth = Warmth.cold(len(plan.rated))
+        self.level = 1.0
+
+    def step(self, way: Array, duration_s: float) -> None:
+        """The joints went so far (n,), to and fro, in this time."""
+        duty = self.level * way / duration_s / self.plan.rated
+        self.warmth = self.plan.warm_up.step(self.warmth, duty, duration_s)
+
+    def tell(self, time_s: float, number: int, swapped: bool) -> Temperatures:
+        """What the motors' sensors say; ``swapped``: with the second and third cable exchanged."""
+        noise = self._draws.of(Stream.TEMPERATURES, number).standard_normal(len(self.plan.rated))
+        celsius = self.plan.ambient_c + self.warmth.motor + self.plan.noise_k * noise
+        if swapped:
+            celsius[[1, 2]] = celsius[[2, 1]]
+        return Temperatures(time_s, np.round(celsius / ROUNDED_K) * ROUNDED_K)
+
+
+# ---- how far the robot is off this time: anew for each motion, reached smoothly -----------------
+
+
+SETTLE_S = 0.05  # another one is reached smoothly: the flange never jumps
+KEPT = 32  # motions in one stretch of time that is looked at
+
+
+class Scatter:
+    """Offsets (k,) over time, each from a motion's begin on."""
+
+    def __init__(self, size: int) -> None:
+        self._time_s = np.array([-np.inf])
+        self._before = self._after = np.zeros((1, size))
+
+    @property
+    def settled_s(self) -> float:
+        """When the last one is reached."""
+        return float(self._time_s[-1]) + SETTLE_S
+
+    def begin(self, time_s: float, offset: Array) -> None:
+        """Another offset (k,), from a time on that is not before the last one."""
+        before = self.at(np.array([time_s]))
+        self._time_s = np.append(self._time_s, time_s)[-KEPT:]
+        self._before = np.vstack([self._before, before])[-KEPT:]
+        self._after = np.vstack([self._after, offset])[-KEPT:]
+
+    def at(self, time_s: Array) -> Array:
+        """Offsets (m, k) at times (m,)."""
+        i = np.maximum(np.searchsorted(self._time_s, time_s, side="right") - 1, 0)
+        share = np.clip((time_s - self._time_s[i]) / SETTLE_S, 0.0, 1.0)[:, None]
+        smooth = share**2 * (3.0 - 2.0 * share)
+        return np.asarray(self._before[i] + smooth * (self._after[i] - self._before[i]))

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
 from robocal_ros.cell_sim.cell_faults import CONTROLLER_FAULTS, FAULTS
-from robocal_ros.cell_sim.cell_plan import CellPlan, rigid_robot
+from robocal_ros.cell_sim.cell_plan import T_BASE_LASER, CellPlan, kr150_cell, poses, rigid_robot
 from robocal_ros.cell_sim.joint_motion import LAG_S
-from robocal_ros.cell_sim.kr150_cell import T_BASE_LASER, kr150_cell, poses
-from robocal_ros.cell_sim.trajectory_goal import ControllerOptions
+from robocal_ros.cell_sim.trajectory_controller import ControllerOptions
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm

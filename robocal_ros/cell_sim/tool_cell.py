@@ -2,24 +2,146 @@
 
 The robot goes where it is told but for its scatter; its joint readings show where it was told to
 go. What it is told follows from what the estimators say after each step, as in a real cell.
+
+Each gives T_base_flange (m, 4, 4) at times (m,); the orientation is held.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.beam_moves import Circle, Plunge
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.crossed_model import BeamStep, CircleMethod, Held, RobotNoise, fit_circle
 from robocal_ros.tool.crossed_run import CommandedCircle, ToolEstimate, estimate_tool
-from robocal_ros.tool.edges import CircleMotion
+from robocal_ros.tool.edges import BEAMS, CircleMotion
 from robocal_ros.tool.flange_path import JointPath, axis_from_centres, upright_pose
 from robocal_ros.tool.laser_frame import LaserFrame
 
+# ---- beam moves ---------------------------------------------------------------------------------
+
+
 Array = NDArray[np.float64]
+
+
+def _moved(T_base_flange: Array, shift: Array) -> Array:
+    T = np.tile(T_base_flange, (len(shift), 1, 1))
+    T[:, :3, 3] += shift
+    return T
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """One turn, from ``start_s``, with a run-up and a run-out of ``ramp_s`` along the circle.
+
+    Attributes
+    ----------
+    T_base_centre : (4, 4) the flange at the centre.
+    R_base_laser : (3, 3) the circle lies in its x-y plane; ``start_rad`` counts from x.
+    ripple : relative amplitude of the speed, ``ripples`` times a turn.
+    """
+
+    T_base_centre: Array
+    R_base_laser: Array
+    radius: float
+    period_s: float
+    start_s: float = 0.0
+    start_rad: float = float(np.pi / 4.0)
+    direction: int = 1
+    ripple: float = 0.0
+    ripples: int = 7
+    phase_rad: float = 0.0
+    ramp_s: float = 0.2
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """The turn at full speed."""
+        return self.start_s, self.start_s + self.period_s
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """From rest to rest."""
+        return self.start_s - self.ramp_s, self.start_s + self.period_s + self.ramp_s
+
+    def starting(self, start_s: float) -> "Circle":
+        """The same turn, begun at another time."""
+        return replace(self, start_s=start_s)
+
+    def __call__(self, time_s: Array) -> Array:
+        """T_base_flange (m, 4, 4)."""
+        t = time_s - self.start_s
+        before = np.clip(t, -self.ramp_s, 0.0)
+        after = np.clip(t - self.period_s, 0.0, self.ramp_s)
+        run = np.clip(t, 0.0, self.period_s) + before + after
+        run += (before**2 - after**2) / (2.0 * self.ramp_s)
+        turn = 2.0 * np.pi * run / self.period_s
+        turn = turn + self.ripple / self.ripples * np.sin(self.ripples * turn + self.phase_rad)
+        angle = self.start_rad + self.direction * turn
+        flat = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+        return _moved(self.T_base_centre, self.radius * flat @ self.R_base_laser.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Plunge:
+    """Down and up again along ``down`` (3,), base, at ``speed`` but for the ramps at each end."""
+
+    T_base_top: Array
+    down: Array
+    depth: float
+    speed: float
+    start_s: float = 0.0
+    ramp_s: float = 0.1
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """From rest to rest."""
+        return self.start_s, self.start_s + 2.0 * self._one_way_s
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The same."""
+        return self.window
+
+    @property
+    def _one_way_s(self) -> float:
+        return self.depth / self.speed + self.ramp_s
+
+    def __call__(self, time_s: Array) -> Array:
+        """T_base_flange (m, 4, 4)."""
+        whole, ramp = self._one_way_s, self.ramp_s
+        t = whole - np.abs(np.clip(time_s - self.start_s, 0.0, 2.0 * whole) - whole)
+        t = np.clip(t, 0.0, whole)
+        to_go = whole - t
+        depth = np.where(
+            to_go < ramp,
+            self.depth - self.speed * to_go**2 / (2.0 * ramp),
+            np.where(t < ramp, self.speed * t**2 / (2.0 * ramp), self.speed * (t - 0.5 * ramp)),
+        )
+        return _moved(self.T_base_top, depth[:, None] * self.down)
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """At constant speed along ``along`` (3,), base, m; backwards where ``duration_s`` < 0."""
+
+    T_base_start: Array
+    along: Array
+    duration_s: float
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """From begin to end."""
+        return min(self.duration_s, 0.0), max(self.duration_s, 0.0)
+
+    def __call__(self, time_s: Array) -> Array:
+        """T_base_flange (m, 4, 4)."""
+        return _moved(self.T_base_start, (time_s / self.duration_s)[:, None] * self.along)
+
+
+# ---- tool cell ----------------------------------------------------------------------------------
+
 
 ABOVE_TIP_M = 5e-3  # where the lower circles meet the tool
 PLANNING = Held(along_m=5e-3)
@@ -227,3 +349,75 @@ def joints_at(arm: SerialArm, T_base_flange: Array, q_near: Array) -> Array:
         if np.max(np.abs(step)) < 1e-12:
             return np.asarray(q)
     raise ValueError("the poses are out of reach")
+
+
+# ---- calibration of a beam station by a robot that carries a cylinder: the edges A1 to D4 -------
+
+
+DOWN = np.array([0.0, 0.0, -1.0])
+SWEEP_M = 1e-2
+SWEEP_S = 1.0
+CYLINDER_M = 2.5e-3  # radius
+
+
+def calibration_tool(reach: float = 0.15) -> RoundTool:
+    """A cylinder along the flange's z."""
+    T = np.eye(4)
+    T[2, 3] = reach
+    return RoundTool.cylinder(T, CYLINDER_M)
+
+
+def laser_points(
+    station: BeamStation, T_base_laser: Array, rng: np.random.Generator, along: float = 6e-3
+) -> dict[str, Array]:
+    """Flange positions A1 ... D4 at the edges of a calibration tool in base.
+
+    Each point is swept back and forth, so that a constant latency cancels.
+
+    ``T_base_laser`` is roughly known; ``along`` is the way of the points from the crossing.
+    """
+    return {
+        name: place
+        for b, ends in ((0, "AB"), (1, "CD"))
+        for end, sign in zip(ends, (-1.0, 1.0), strict=True)
+        for name, place in _points_of(station, b, T_base_laser, sign * along, end, rng).items()
+    }
+
+
+def _points_of(
+    station: BeamStation,
+    b: int,
+    T_base_laser: Array,
+    along: float,
+    name: str,
+    rng: np.random.Generator,
+) -> dict[str, Array]:
+    """Two sweeps of one point: upright across the beam, then level in z."""
+    tool = calibration_tool()
+    e = np.eye(3)[b]  # base axis nearest to the beam
+    side = np.cross([0.0, 0.0, 1.0], e)
+    beam = station.beams[b]
+    u = (beam.end - beam.start) / np.linalg.norm(beam.end - beam.start)
+    to = (T_base_laser[:3, 3] + along * e - beam.start) @ e / (u @ e)
+    target = beam.start + to * u
+    reach = tool.T_flange_tool[2, 3] - 0.02
+    found: dict[str, Array] = {}
+    for first, pointing, way in ((1, DOWN, side), (3, -side, DOWN)):
+        R = np.column_stack([e, np.cross(pointing, e), pointing])
+        start = frames.transform(R, target - reach * pointing - 0.5 * SWEEP_M * way)
+        places = []
+        for sweep in (Sweep(start, SWEEP_M * way, SWEEP_S), Sweep(start, SWEEP_M * way, -SWEEP_S)):
+            edges = station.edges(tool, sweep, sweep.window, rng)
+            own = [edge.time_s for edge in edges if edge.beam == BEAMS[b]]
+            places.append(sweep(np.array(own))[:, :3, 3])
+        both = 0.5 * (places[0] + places[1][::-1])
+        found[f"{name}{first}"], found[f"{name}{first + 1}"] = both
+    return found
+
+
+def point_sigma(station: BeamStation) -> float:
+    """Standard deviation of a coordinate of A ... D across its beam, m."""
+    source, noise, speed = station.input, station.noise, SWEEP_M / SWEEP_S
+    stamp = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
+    edge = np.hypot(noise.edge_m, speed * stamp)
+    return float(np.sqrt(noise.step_m**2 / 2.0 + edge**2 / 4.0))

@@ -16,8 +16,11 @@ from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge
-from robocal_ros.identification.judged import identification_document
-from robocal_ros.identification.mismatch import explain_mismatch, require_match
+from robocal_ros.identification.judged import (
+    explain_mismatch,
+    identification_document,
+    require_match,
+)
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import RobotDescription, save_robot
 from robocal_ros.kinematics.tables import beyond_limits, read_measurements

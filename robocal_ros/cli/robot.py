@@ -17,8 +17,7 @@ from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_text
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.identification.iso9283 import CYCLES, Repeated, repeated
-from robocal_ros.identification.position_tables import read_positions
+from robocal_ros.identification.iso9283 import CYCLES, Repeated, read_positions, repeated
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.universal_robots import (

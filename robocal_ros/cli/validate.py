@@ -270,7 +270,7 @@ def _jobs(paths: Sequence[Path], robot: str | None) -> "list[Job]":
 
 
 def _report(bags: Sequence[Document]) -> Document:
-    from robocal_ros.report.drift import TOLERANCE_MM
+    from robocal_ros.report.validation import TOLERANCE_MM
 
     return {
         "title": TITLE,

@@ -39,9 +39,14 @@ from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.hand_eye.recorded import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.report.drift import TOLERANCE_MM, ShiftErrors
-from robocal_ros.report.validation_cell import CellCourse
-from robocal_ros.report.validation_figures import Drawn, cell_drawn, thermal_figures, tool_figures
+from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
+from robocal_ros.report.validation_figures import (
+    CellCourse,
+    Drawn,
+    cell_drawn,
+    thermal_figures,
+    tool_figures,
+)
 from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command
 from robocal_ros.thermal.config import ThermalConfig

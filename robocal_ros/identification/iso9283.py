@@ -4,11 +4,18 @@ ISO 9283:1998, 7.2.1 (pose accuracy) and 7.2.2 (pose repeatability), for positio
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.ground.cells import read_cells
 from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.ground.samples import DEFAULT_TARGET
+from robocal_ros.kinematics.tables import POSITION, check_plain
+
+# ---- iso9283 ------------------------------------------------------------------------------------
+
 
 Array = NDArray[np.float64]
 
@@ -73,3 +80,21 @@ def repeated(position: Array, commanded: Array | None = None) -> Repeated:
         S_m=float(distance.std(ddof=1)),
         offset=None if commanded is None else barycentre - commanded,
     )
+
+
+# ---- tables of attained positions (docs/iso9283.md) ---------------------------------------------
+
+
+def read_positions(path: Path) -> dict[str, Array]:
+    """Positions (n, 3), m, of each target, in the order of the table.
+
+    Raises
+    ------
+    InputError
+        With file, row and column, when the table is not as docs/iso9283.md says.
+    """
+    columns = POSITION["mm"]
+    table = read_cells(path, lambda header, file: check_plain(header, file, columns, ("target",)))
+    position = np.column_stack([table.numbers(name) for name in columns]) * 1e-3
+    target = np.array(table.words("target") or (DEFAULT_TARGET,) * len(position))
+    return {str(name): position[target == name] for name in dict.fromkeys(target.tolist())}

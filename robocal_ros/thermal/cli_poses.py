@@ -24,7 +24,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import write_text
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import read_measurements
-from robocal_ros.report.screening import draw_rounds
+from robocal_ros.report.figures import draw_rounds
 from robocal_ros.thermal.cli import check_visits, cold_spots, warm_visits
 from robocal_ros.thermal.learning import DriftHistory, read_prior, share_within
 from robocal_ros.thermal.planning import PosePlan, SensorField, plan_cycle

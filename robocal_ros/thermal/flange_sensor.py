@@ -27,8 +27,7 @@ from robocal_ros.estimation.estimation import describe
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification.priors import default_prior, fitted_prior
-from robocal_ros.identification.solve import random_postures
+from robocal_ros.identification.solve import default_prior, fitted_prior, random_postures
 from robocal_ros.kinematics import SerialArm
 
 # ---- flange sensor ------------------------------------------------------------------------------

@@ -22,9 +22,8 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel
-from robocal_ros.identification.mismatch import require_match
-from robocal_ros.identification.solve import identify
-from robocal_ros.identification.start import linear_start
+from robocal_ros.identification.judged import require_match
+from robocal_ros.identification.solve import identify, linear_start
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_made, write_made
 

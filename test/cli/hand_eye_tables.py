@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import (
+from robocal_ros.cell_sim.hand_eye_cell import (
+    HandEyeCell,
+    PoseRobot,
+    SimulatedShots,
     TrueStairs,
     edge_shots,
     groove_shots,

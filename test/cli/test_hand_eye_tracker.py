@@ -8,9 +8,8 @@ import pytest
 from command import robocal, robocal_json
 from tracker_files import SCAN, tracker_files
 
-from robocal_ros.cell_sim.laser_tracker import TrackerCell
-from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.laser_tracker import TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.target_files import read_tracker_points, read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker

@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 from tool_tables import write
 
-from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
-from robocal_ros.cell_sim.beam_moves import Sweep
 from robocal_ros.cell_sim.beams import (
     BeamStation,
     RoundTool,
@@ -18,7 +16,14 @@ from robocal_ros.cell_sim.beams import (
     bent,
     crossings,
 )
-from robocal_ros.cell_sim.tool_cell import MeasuredRun, ToolCell
+from robocal_ros.cell_sim.tool_cell import (
+    CYLINDER_M,
+    MeasuredRun,
+    Sweep,
+    ToolCell,
+    laser_points,
+    point_sigma,
+)
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, RobotNoise

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.cell_sim.beam_moves import Circle
 from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.cell_sim.tool_cell import Circle
 from robocal_ros.ground import frames
 
 PUBLISHED_MM = {  # thesis table 5-3

@@ -3,15 +3,19 @@
 import numpy as np
 
 from robocal_ros.cell_sim.beams import (
+    BETA_RAD,
+    GAP_M,
     NO_NOISE,
     PERFECT,
+    Q_NEAR,
+    T_BASE_LASER,
     BeamStation,
     TrueInput,
     TrueNoise,
     beams_of,
+    laser_of,
 )
 from robocal_ros.cell_sim.tool_cell import RunPlan, ToolCell
-from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, laser_of
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import RobotNoise
 

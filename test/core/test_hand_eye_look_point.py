@@ -5,7 +5,7 @@ import pytest
 from hand_eye_sets import CELL, CENTRE, RADIUS_M
 from scipy.optimize import minimize
 
-from robocal_ros.cell_sim.hand_eye_sets import sphere_shots
+from robocal_ros.cell_sim.hand_eye_cell import sphere_shots
 from robocal_ros.hand_eye.planning import BEHIND, OFF_EQUATOR, SensorRange, looked_at
 
 SENSOR = SensorRange(width_m=0.09)

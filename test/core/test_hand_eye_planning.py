@@ -15,9 +15,14 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
-from robocal_ros.cell_sim.profile_targets import ball_on_table
+from robocal_ros.cell_sim.hand_eye_cell import (
+    SimulatedShots,
+    TrueStairs,
+    edge_shots,
+    sphere_shots,
+    step_shots,
+)
+from robocal_ros.cell_sim.profile_sensor import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_problem import PoseNoise

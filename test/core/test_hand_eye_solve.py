@@ -18,16 +18,17 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import (
+from robocal_ros.cell_sim.hand_eye_cell import (
+    HandEyeCell,
+    PoseRobot,
+    SimulatedShots,
     edge_block,
     edge_shots,
     groove_shots,
     sphere_shots,
     step_shots,
 )
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
-from robocal_ros.cell_sim.profile_targets import Scene, ball_on_table
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor, Scene, ball_on_table
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hand_eye_sets import CELL, STAIRS, T_BASE_USER, data_of, stairs_target
 
-from robocal_ros.cell_sim.hand_eye_sets import step_shots
+from robocal_ros.cell_sim.hand_eye_cell import step_shots
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.tasks import StepTask, features, looked

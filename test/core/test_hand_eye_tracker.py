@@ -6,10 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.laser_tracker import TrackerCell
-from robocal_ros.cell_sim.profile_targets import Prism, Stem
-from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.laser_tracker import TrackerCell, prp_cell, six_axis_cell
+from robocal_ros.cell_sim.profile_sensor import Prism, Stem
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,

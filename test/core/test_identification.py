@@ -10,7 +10,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.identification import CellModel, identify, identify_and_judge
 from robocal_ros.identification.cell import CellProblem, make_layout
-from robocal_ros.identification.start import linear_start
+from robocal_ros.identification.solve import linear_start
 
 # the sliding arm's limits depend on what was bought
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")

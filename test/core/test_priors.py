@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.identification import identify
-from robocal_ros.identification.priors import (
+from robocal_ros.identification.solve import (
     SMALLEST_SCALE,
     TOLERANCE_ANGLE_RAD,
     TOLERANCE_LENGTH_M,

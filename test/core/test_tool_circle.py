@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.beam_moves import Circle
 from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.cell_sim.tool_cell import Circle
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ResidualError
 from robocal_ros.tool.crossed_model import (

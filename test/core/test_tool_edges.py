@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from beam_cell import make_cell
 
+from robocal_ros.cell_sim.beams import TAUGHT
 from robocal_ros.cell_sim.tool_cell import joints_at
-from robocal_ros.cell_sim.ur10_station import TAUGHT
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.tool.edges import BeamEdge, BeamError, InputRule, debounced, edges_of
 from robocal_ros.tool.flange_path import JointPath

@@ -5,17 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
 from robocal_ros.cell_sim.beams import (
+    BETA_RAD,
+    GAP_M,
     NO_NOISE,
     PERFECT,
+    T_BASE_LASER,
     BeamStation,
     TrueBeam,
     TrueInput,
     TrueNoise,
     beams_of,
+    laser_of,
 )
-from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, T_BASE_LASER, laser_of
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M, laser_points, point_sigma
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError
 from robocal_ros.tool.flange_path import (

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import RoundTool, bent
+from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, bent
 from robocal_ros.cell_sim.tool_cell import joints_at
-from robocal_ros.cell_sim.ur10_station import TAUGHT
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError
 from robocal_ros.tool.crossed_model import BeamStep

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from beam_cell import SILENT, make_cell
 
-from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
+from robocal_ros.cell_sim.beams import (
+    BETA_RAD,
+    T_BASE_LASER,
+    TAUGHT,
+    RoundTool,
+    TrueInput,
+    TrueNoise,
+    bent,
+    laser_of,
+)
 from robocal_ros.cell_sim.tool_cell import MeasuredRun, RunPlan, ToolCell
-from robocal_ros.cell_sim.ur10_station import BETA_RAD, T_BASE_LASER, TAUGHT, laser_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, fit_circle

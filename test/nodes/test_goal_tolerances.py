@@ -10,9 +10,14 @@ from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionServer
 
 from robocal_ros.cell_sim.joint_motion import JointMotion
-from robocal_ros.cell_sim.messages import tolerances_of
-from robocal_ros.cell_sim.trajectory import Trajectory
-from robocal_ros.cell_sim.trajectory_goal import GoalCode, GoalState, Tolerances, TrajectoryGoal
+from robocal_ros.cell_sim.outputs import tolerances_of
+from robocal_ros.cell_sim.trajectory_controller import (
+    GoalCode,
+    GoalState,
+    Tolerances,
+    Trajectory,
+    TrajectoryGoal,
+)
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.driver import MotionDriver

@@ -12,7 +12,7 @@ from action_msgs.msg import GoalStatus
 from control_msgs.msg import JointTolerance
 from trajectory_controllers import CONTROLLERS, HOME, NAMES, Controlled, seconds, trajectory
 
-from robocal_ros.cell_sim.trajectory import SampledPath, Trajectory
+from robocal_ros.cell_sim.trajectory_controller import SampledPath, Trajectory
 
 REST = np.zeros(6)
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.report import figures
-from robocal_ros.report.drift import ShiftErrors, figures_of
+from robocal_ros.report.validation import ShiftErrors, figures_of
 
 CYCLES, POSES = 4, 6
 

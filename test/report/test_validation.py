@@ -18,8 +18,8 @@ from robocal_ros.report.validation import (
     pooled_rms_mm,
     summary_rows,
 )
-from robocal_ros.report.validation_cell import CellCourse
 from robocal_ros.report.validation_figures import (
+    CellCourse,
     accuracy_by_cycle,
     cell_drawn,
     thermal_figures,

@@ -11,8 +11,7 @@ import numpy as np
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import sphere_shots
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots, sphere_shots
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.ground import frames

@@ -9,7 +9,7 @@ from hand_eye_driver import (
     sphere_shots_of,
 )
 
-from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, groove_shots, step_shots
+from robocal_ros.cell_sim.hand_eye_cell import TrueStairs, edge_shots, groove_shots, step_shots
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession

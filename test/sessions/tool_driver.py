@@ -9,10 +9,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "core"))  # for beam_cell
 
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
-from robocal_ros.cell_sim.robot_program import RobotProgram, Sample
+from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, TrueInput, TrueNoise, bent
+from robocal_ros.cell_sim.programs import RobotProgram, Sample
 from robocal_ros.cell_sim.tool_cell import ToolCell
-from robocal_ros.cell_sim.ur10_station import TAUGHT
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.edges import InputRule

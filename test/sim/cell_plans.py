@@ -5,11 +5,18 @@ from dataclasses import replace
 import numpy as np
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, RoundTool, TrueInput, TrueNoise, bent
+from robocal_ros.cell_sim.beams import (
+    NO_NOISE,
+    PERFECT,
+    TAUGHT,
+    RoundTool,
+    TrueInput,
+    TrueNoise,
+    bent,
+)
 from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_outputs import Happened
 from robocal_ros.cell_sim.cell_plan import CellPlan, rigid_robot
-from robocal_ros.cell_sim.ur10_station import TAUGHT
+from robocal_ros.cell_sim.cell_samples import Happened
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise
 from robocal_ros.tool.crossed_run import ToolEstimate, estimate_tool

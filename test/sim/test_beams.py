@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.beam_moves import Circle, Plunge, Sweep
 from robocal_ros.cell_sim.beams import (
     NO_NOISE,
     PERFECT,
@@ -16,6 +15,7 @@ from robocal_ros.cell_sim.beams import (
     bent,
     reported,
 )
+from robocal_ros.cell_sim.tool_cell import Circle, Plunge, Sweep
 from robocal_ros.ground import frames
 
 UPRIGHT = frames.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.15])

@@ -7,13 +7,19 @@ import pytest
 from beam_cell import SILENT, make_cell
 from cell_plans import ARM, Q_START, TRUTH, driven, measured, plan_of
 
-from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, point_sigma
-from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise
+from robocal_ros.cell_sim.beams import (
+    T_BASE_LASER,
+    TAUGHT,
+    RoundTool,
+    TrueInput,
+    TrueNoise,
+    laser_of,
+)
 from robocal_ros.cell_sim.cell import SimulatedCell
 from robocal_ros.cell_sim.cell_plan import known_laser
 from robocal_ros.cell_sim.joint_motion import CYCLE_S
-from robocal_ros.cell_sim.standing import TICK_S
-from robocal_ros.cell_sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
+from robocal_ros.cell_sim.stations import TICK_S
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M, point_sigma
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.edges import BeamError, debounced

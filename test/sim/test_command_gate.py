@@ -5,8 +5,13 @@ import pytest
 from cell_plans import Q_START, plan_of
 
 from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.trajectory import Trajectory
-from robocal_ros.cell_sim.trajectory_goal import GoalCode, GoalState, Tolerances, TrajectoryGoal
+from robocal_ros.cell_sim.trajectory_controller import (
+    GoalCode,
+    GoalState,
+    Tolerances,
+    Trajectory,
+    TrajectoryGoal,
+)
 from robocal_ros.ground.errors import InputError
 
 REST = np.zeros((1, 6))

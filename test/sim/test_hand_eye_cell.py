@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, SimulatedShots
-from robocal_ros.cell_sim.hand_eye_sets import (
+from robocal_ros.cell_sim.hand_eye_cell import (
+    ArmRobot,
+    HandEyeCell,
+    PoseRobot,
+    SimulatedShots,
     TrueStairs,
     edge_shots,
     groove_shots,

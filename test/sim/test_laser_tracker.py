@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.laser_tracker import TrackerCell, true_flange
-from robocal_ros.cell_sim.tracker_cells import prp_cell, prp_sphere_shots, six_axis_cell
-from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.laser_tracker import (
+    TrackerCell,
+    prp_cell,
+    prp_sphere_shots,
+    six_axis_cell,
+    true_flange,
+)
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robocal_ros.cell_sim.hand_eye_cell import view
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
-from robocal_ros.cell_sim.profile_targets import (
+from robocal_ros.cell_sim.profile_sensor import (
+    ProfileSensor,
     Scene,
     ball_on_table,
     block,

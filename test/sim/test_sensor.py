@@ -5,22 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim import kr150
-from robocal_ros.cell_sim.motion import Path, readings
+from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim.programs import JointPath, readings
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.cell_sim.sensor import SphereSensor
-from robocal_ros.cell_sim.shift import ShiftPlan, simulate
+from robocal_ros.cell_sim.stations import SphereSensor
+from robocal_ros.cell_sim.thermal_shift import ShiftPlan, simulate
 from robocal_ros.kinematics.robots import load_robot
 
 FLANGE = np.array([[1.0, 0, 0, 1.2], [0, 0, -1.0, 0.1], [0, 1.0, 0, 0.8], [0, 0, 0, 1.0]])
 
 
 def sensor(**switched: bool) -> SphereSensor:
-    return kr150.sphere_sensor(replace(Effects.none(), **switched))
+    return thermal_shift.sphere_sensor(replace(Effects.none(), **switched))
 
 
 def exact() -> np.ndarray:
-    return (kr150.T_SENSOR_BASE @ FLANGE @ np.append(kr150.BALL, 1.0))[:3]
+    return (thermal_shift.T_SENSOR_BASE @ FLANGE @ np.append(thermal_shift.BALL, 1.0))[:3]
 
 
 def test_a_perfect_sensor_tells_the_truth():
@@ -38,7 +38,7 @@ def test_noise_is_two_hundredths():
 def test_the_stem_grows_with_the_flange():
     """A stem of 0.219 m warmed by 5 K: 0.219 * 12e-6 * 5 = 0.013 mm along itself."""
     grown = sensor(stem=True).measure(FLANGE, 5.0, 0.0, np.random.default_rng(0)) - exact()
-    stem = exact() - (kr150.T_SENSOR_BASE @ FLANGE)[:3, 3]
+    stem = exact() - (thermal_shift.T_SENSOR_BASE @ FLANGE)[:3, 3]
     np.testing.assert_allclose(grown, stem * 12e-6 * 5.0, atol=1e-12)
     assert np.linalg.norm(grown) == pytest.approx(1.3e-5, rel=0.02)
 
@@ -71,7 +71,9 @@ def test_switching_an_effect_off_leaves_the_other_draws_alone():
 
 
 def test_a_path_rests_where_it_says_and_never_jumps():
-    path = Path(np.array([0.0, 5.0, 12.0]), np.array([0.0, 6.0, 13.0]), np.diag([1.0, 2.0, 3.0]))
+    path = JointPath(
+        np.array([0.0, 5.0, 12.0]), np.array([0.0, 6.0, 13.0]), np.diag([1.0, 2.0, 3.0])
+    )
     time_s = np.linspace(-1.0, 15.0, 8001)
     q = path.at(time_s)
     resting = (time_s >= 5.0) & (time_s <= 6.0)
@@ -98,9 +100,9 @@ def plan() -> ShiftPlan:
 
 def shift(plan: ShiftPlan, effects: Effects | None = None, seed: int = 0):
     body, course = np.random.default_rng(seed).spawn(2)
-    robot = kr150.true_robot(load_robot("kr150_r3100"), body, effects)
-    sensor = kr150.sphere_sensor(effects)
-    return robot, simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course)
+    robot = thermal_shift.true_robot(load_robot("kr150_r3100"), body, effects)
+    sensor = thermal_shift.sphere_sensor(effects)
+    return robot, simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course)
 
 
 def test_a_shift_visits_each_pose_in_each_cycle(plan):
@@ -127,7 +129,7 @@ def test_cycles_come_at_their_period(plan):
 def test_the_truth_is_the_warm_robot_at_the_check_poses(plan):
     robot, found = shift(plan)
     for cycle in found.cycles:
-        expected = robot.point(plan.check, cycle.warmth, kr150.TOOL)
+        expected = robot.point(plan.check, cycle.warmth, thermal_shift.TOOL)
         assert np.array_equal(cycle.check, expected)
     heat = [cycle.warmth.motor[1] for cycle in found.cycles]
     assert heat[0] == 0.0
@@ -149,5 +151,5 @@ def test_without_effects_the_visits_are_the_nominal_ones(plan):
     robot, found = shift(plan, Effects.none())
     for visit in found.visits:
         flange = robot.nominal.fk(visit.reading)
-        expected = kr150.T_SENSOR_BASE @ flange @ np.append(kr150.BALL, 1.0)
+        expected = thermal_shift.T_SENSOR_BASE @ flange @ np.append(thermal_shift.BALL, 1.0)
         np.testing.assert_allclose(visit.position, expected[:3], atol=1e-12)
