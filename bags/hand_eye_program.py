@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.programs import JointPath
+from robocal_ros.cell_sim.programs import SmoothPath
 from robocal_ros.hand_eye.target_files import Target
 from robocal_ros.hand_eye.targets import KIND_OF, target_document
 from robocal_ros.session import events
@@ -40,11 +40,11 @@ def shot_times() -> Array:
     return np.asarray(arrivals() + waits() + SHOT_S)
 
 
-def way(q_start: Array, q: Array) -> JointPath:
+def way(q_start: Array, q: Array) -> SmoothPath:
     """From joints (n,) to the standstills (m, n)."""
     rests = np.append(0.0, arrivals())
     departs = np.append(0.0, arrivals() + REST_S + waits())
-    return JointPath(rests, departs, np.vstack([q_start, q]))
+    return SmoothPath(rests, departs, np.vstack([q_start, q]))
 
 
 def asked(marks: Sequence[str], target: Target) -> list[tuple[float, Command]]:

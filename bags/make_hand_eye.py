@@ -57,7 +57,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     taught,
 )
 from robocal_ros.cell_sim.profile_sensor import ProfileSensor, Scene, ball_on_table
-from robocal_ros.cell_sim.programs import JointPath, readings
+from robocal_ros.cell_sim.programs import SmoothPath, readings
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.config import HandEyeConfig
@@ -152,7 +152,7 @@ def _shown(
     return shots, target, truth
 
 
-def _way(recording: Recording) -> JointPath:
+def _way(recording: Recording) -> SmoothPath:
     q = recording.shots.q
     if q is None:
         raise ValueError("a robot without joints")

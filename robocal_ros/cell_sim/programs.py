@@ -26,7 +26,7 @@ COUNT_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class JointPath:
+class SmoothPath:
     """Way points in order of time; between them the joints run smoothly (minimum jerk).
 
     Attributes
@@ -48,7 +48,7 @@ class JointPath:
         return np.asarray(self.q[after - 1] + share * (self.q[after] - self.q[after - 1]))
 
 
-def readings(path: JointPath, time_s: Array, rng: np.random.Generator) -> Array:
+def readings(path: SmoothPath, time_s: Array, rng: np.random.Generator) -> Array:
     """Encoder readings (k, n) at times (k,), in whole counts."""
     q = path.at(time_s)
     q = q + JITTER_RAD * rng.standard_normal(q.shape)
@@ -114,7 +114,7 @@ def program(
         end = move.span[1]
         time = np.linspace(0.0, end, int(np.ceil(end / PITCH_S)) + 1)
         driven = time > arrive[-1]
-        q = JointPath(arrive, arrive, way).at(time)
+        q = SmoothPath(arrive, arrive, way).at(time)
         q[driven] = joints_at(arm, move(time[driven]), way[-1])
     except ValueError as error:
         raise LimitError(f"the robot does not reach step {step.name}: {error}") from error

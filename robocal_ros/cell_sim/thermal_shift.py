@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.programs import COUNT_RAD, JointPath, read_poses
+from robocal_ros.cell_sim.programs import COUNT_RAD, SmoothPath, read_poses
 from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot, Warmth, WarmUp
 from robocal_ros.cell_sim.stations import SphereSensor
 from robocal_ros.ground import frames
@@ -103,7 +103,7 @@ class Shift:
 
     cycles: tuple[Cycle, ...]
     visits: tuple[Visit, ...]
-    path: JointPath
+    path: SmoothPath
     temperature_time_s: Array
     temperatures: Array
 
@@ -172,7 +172,7 @@ def simulate(
     return Shift(
         tuple(cycles),
         tuple(visits),
-        JointPath(np.array(course.arrive), np.array(course.depart), np.array(course.q)),
+        SmoothPath(np.array(course.arrive), np.array(course.depart), np.array(course.q)),
         np.array(time_s),
         np.array(temperatures),
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.programs import JointPath, readings
+from robocal_ros.cell_sim.programs import SmoothPath, readings
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.stations import SphereSensor
 from robocal_ros.cell_sim.thermal_shift import ShiftPlan, simulate
@@ -71,7 +71,7 @@ def test_switching_an_effect_off_leaves_the_other_draws_alone():
 
 
 def test_a_path_rests_where_it_says_and_never_jumps():
-    path = JointPath(
+    path = SmoothPath(
         np.array([0.0, 5.0, 12.0]), np.array([0.0, 6.0, 13.0]), np.diag([1.0, 2.0, 3.0])
     )
     time_s = np.linspace(-1.0, 15.0, 8001)
