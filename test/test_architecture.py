@@ -30,10 +30,8 @@ MAY_IMPORT = {
     "cli": ABOVE | {"report", "cell_sim"},
 }
 ROS_FILES = {
-    "node", "messages", "action", "settings", "report", "graph", "driver", "gap_sources",
-    "outputs", "services", "controller", "source_guard", "replay_node", "recorder_node",
-    "recorded_topics", "replay_topics", "set_up_services", "data_files", "plan",
-    "node_motion",
+    "node", "node_motion", "messages", "action", "settings", "services", "outputs", "report",
+    "graph", "driver", "gap_sources", "controller", "replay_node", "replay_topics", "recorder_node",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",
