@@ -11,8 +11,7 @@ from robocal_ros import __version__
 from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.config import HandEyeConfig
-from robocal_ros.hand_eye.recorded import configuration
-from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
+from robocal_ros.hand_eye.session import HandEyeSession, configuration, take_hand_eye_message
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

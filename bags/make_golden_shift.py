@@ -47,7 +47,7 @@ from robocal_ros.ground.samples import (  # noqa: E402
 )
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
 from robocal_ros.thermal import seeding  # noqa: E402
-from robocal_ros.tool import recorded  # noqa: E402
+from robocal_ros.tool import session  # noqa: E402
 from robocal_ros.tool.edges import (  # noqa: E402
     BREAK,
     EDGES,
@@ -139,7 +139,7 @@ class Recorder:
         }
         made = {
             "thermal": lambda: seeding.configuration(thermal, THERMAL),
-            "tool": lambda: recorded.configuration(tool, TOOL),
+            "tool": lambda: session.configuration(tool, TOOL),
         }
         for node, state in shown.items():
             if self._shown.get(node) != state:

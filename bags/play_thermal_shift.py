@@ -25,7 +25,7 @@ from bench.startup import ROOT
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.cell_sim.thermal_shift import REFERENCE
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.decision_services import EVENTS
 
 SERIAL = "SIM-KR150-2"
@@ -43,13 +43,13 @@ class Player:
         self.events: deque[SessionEvent] = deque()
         self.accuracy: deque[AccuracyState] = deque(maxlen=1)
         controller.listen(SessionEvent, EVENT_TOPIC, self.events, EVENTS)
-        controller.listen(AccuracyState, "/thermal_node/accuracy", self.accuracy, qos.LATCHED)
+        controller.listen(AccuracyState, "/thermal_node/accuracy", self.accuracy, endpoints.LATCHED)
         self._done: deque[String] = deque()
         self._status: deque[String] = deque(maxlen=1)
         self._diagnostics: deque[DiagnosticArray] = deque(maxlen=30)
-        controller.listen(String, "cycle_done", self._done, qos.RELIABLE)
-        controller.listen(String, "/replay_node/status", self._status, qos.LATCHED)
-        controller.listen(DiagnosticArray, "/diagnostics", self._diagnostics, qos.RELIABLE)
+        controller.listen(String, "cycle_done", self._done, endpoints.RELIABLE)
+        controller.listen(String, "/replay_node/status", self._status, endpoints.LATCHED)
+        controller.listen(DiagnosticArray, "/diagnostics", self._diagnostics, endpoints.RELIABLE)
 
     def start(self, folder: Path) -> None:
         """Start thermal_node and replay_node; the replay waits."""

@@ -218,7 +218,7 @@ def _paths(probe: "Probe", streams: "list[Stream]") -> dict[str, list[float]]:
     from rclpy.serialization import serialize_message
     from trajectory_msgs.msg import JointTrajectory
 
-    from robocal_ros.ros import qos
+    from robocal_ros.ros import endpoints
 
     came: list[float] = []
     chosen = [stream for stream in streams if stream.subject.name in (NODE, RELAY)]
@@ -226,10 +226,16 @@ def _paths(probe: "Probe", streams: "list[Stream]") -> dict[str, list[float]]:
     for stream in chosen:
         subject = stream.subject
         name = subject.topic("joint_trajectory")
-        publishers[subject.name] = probe.node.create_publisher(JointTrajectory, name, qos.RELIABLE)
+        publishers[subject.name] = probe.node.create_publisher(
+            JointTrajectory, name, endpoints.RELIABLE
+        )
         out = subject.topic(f"{subject.node}/joint_trajectory")
         probe.node.create_subscription(
-            JointTrajectory, out, lambda _: came.append(time.perf_counter()), qos.RELIABLE, raw=True
+            JointTrajectory,
+            out,
+            lambda _: came.append(time.perf_counter()),
+            endpoints.RELIABLE,
+            raw=True,
         )
     for publisher in publishers.values():
         probe.wait(publisher.get_subscription_count, "the trajectories' inputs")

@@ -23,7 +23,7 @@ from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 
 SERIAL, ROBOT = "SOAK-1", "kr150_r3100"
@@ -59,7 +59,10 @@ class LoadedGraph:
         self._node = rclpy.create_node("soak", start_parameter_services=False)
         self._models: list[KinematicModel] = []
         self._node.create_subscription(
-            KinematicModel, f"/{THERMAL}/model", self._models.append, qos.own(qos.LATCHED)
+            KinematicModel,
+            f"/{THERMAL}/model",
+            self._models.append,
+            endpoints.own(endpoints.LATCHED),
         )
         self._publishers = {topic: self._stream(topic) for topic in STREAMS}
         self._list = self._node.create_client(ListCalibrations, f"/{THERMAL}/list")
@@ -112,7 +115,7 @@ class LoadedGraph:
             if sent is not None:
                 self._took[topic].append(time.perf_counter() - sent)
 
-        profile = qos.own(qos.RELIABLE)
+        profile = endpoints.own(endpoints.RELIABLE)
         self._node.create_subscription(JointState, f"/{CORRECTION}/{topic}", come_back, profile)
         return self._node.create_publisher(JointState, topic, profile)
 

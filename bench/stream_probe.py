@@ -26,7 +26,7 @@ from bench.processes import resident_mb
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import header, kinematic_model
 
 Array = NDArray[np.float64]
@@ -184,12 +184,14 @@ class Stream:
         self._publishers = {}
         for topic in (TARGETS, STATES):
             name = subject.topic(topic)
-            self._publishers[topic] = probe.node.create_publisher(JointState, name, qos.RELIABLE)
+            self._publishers[topic] = probe.node.create_publisher(
+                JointState, name, endpoints.RELIABLE
+            )
             probe.node.create_subscription(
                 JointState,
                 subject.topic(f"{subject.node}/{topic}"),
                 self._taker(topic),
-                qos.RELIABLE,
+                endpoints.RELIABLE,
                 raw=True,
             )
 
@@ -296,14 +298,14 @@ class Probe:
     def model_publisher(self, subject: Subject) -> Any:
         """Where the subject hears of models."""
         return self.node.create_publisher(
-            KinematicModel, subject.topic("kinematic_model"), qos.own(qos.LATCHED)
+            KinematicModel, subject.topic("kinematic_model"), endpoints.own(endpoints.LATCHED)
         )
 
     def latest(self, kind: type, topic: str) -> deque[Any]:
         """Where the last message of a latched topic is found."""
         found: deque[Any] = deque(maxlen=1)
         take = lambda message: found.append(message)  # noqa: E731 (rclpy looks at it)
-        self.node.create_subscription(kind, topic, take, qos.own(qos.LATCHED))
+        self.node.create_subscription(kind, topic, take, endpoints.own(endpoints.LATCHED))
         return found
 
     def close(self, *subjects: Subject) -> None:

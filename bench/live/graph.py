@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from bench.processes import ENDS_WITH_PARENT
 from bench.startup import EXECUTABLES
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 PATIENCE_S = 30.0
 END_S = 5.0
@@ -104,12 +104,12 @@ class CellController:
     def listen(self, kind: type, topic: str, inbox: deque[Any], profile: Any) -> None:
         """Gather what comes on a topic in ``inbox``."""
         self._node.create_subscription(
-            kind, topic, lambda message: inbox.append(message), qos.own(profile)
+            kind, topic, lambda message: inbox.append(message), endpoints.own(profile)
         )
 
     def publisher(self, kind: type, topic: str) -> Publisher:
         """Offer a topic."""
-        return self._node.create_publisher(kind, topic, qos.own(qos.RELIABLE))
+        return self._node.create_publisher(kind, topic, endpoints.own(endpoints.RELIABLE))
 
     def start(
         self,

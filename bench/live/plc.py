@@ -28,7 +28,7 @@ from robocal_ros.cell_sim.cell_plan import poses
 from robocal_ros.cell_sim.programs import programme
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 BEAT_S = 0.05  # a PLC's program goes round many times for each beat
 GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
@@ -60,12 +60,12 @@ class Plc:
         self._program = controller.publisher(JointTrajectory, PROGRAM)
         self._accuracy: deque[AccuracyState] = deque(maxlen=1)
         self._correction: deque[CorrectionStatus] = deque(maxlen=1)
-        controller.listen(AccuracyState, "accuracy_state", self._accuracy, qos.LATCHED)
+        controller.listen(AccuracyState, "accuracy_state", self._accuracy, endpoints.LATCHED)
         status = "/joint_correction_node/status"
-        controller.listen(CorrectionStatus, status, self._correction, qos.LATCHED)
+        controller.listen(CorrectionStatus, status, self._correction, endpoints.LATCHED)
         self._maintenance: deque[MaintenanceStatus] = deque(maxlen=1)
         beats = "/maintenance_node/status"
-        controller.listen(MaintenanceStatus, beats, self._maintenance, qos.LATCHED)
+        controller.listen(MaintenanceStatus, beats, self._maintenance, endpoints.LATCHED)
         self._heart = threading.Thread(target=self._beat, daemon=True)
         self._heart.start()
         self._names = list(load_robot(ROBOT).joint_names)
@@ -195,7 +195,7 @@ class Judge:
     def __init__(self, controller: CellController) -> None:
         self._controller = controller
         self._told: deque[String] = deque(maxlen=1)
-        controller.listen(String, TRUTH, self._told, qos.LATCHED)
+        controller.listen(String, TRUTH, self._told, endpoints.LATCHED)
 
     def now(self) -> Judged:
         """As of now; before anything was commanded: as taught at all working poses."""

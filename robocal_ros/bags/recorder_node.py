@@ -21,8 +21,7 @@ from robocal_ros.bags.replay_topics import DIAGNOSTICS, TOPICS, RecordedTopic, R
 from robocal_ros.ground.errors import Code, ConflictError, StorageError
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.ros.base import HouseNode
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import trigger_text
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, trigger_text
 from robocal_ros.ros.parameters import Setting
 from robocal_ros.ros.run import run
 

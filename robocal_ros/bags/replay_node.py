@@ -17,11 +17,10 @@ from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay_topics import CLOCK, ReplayTopics, chosen_topics
 from robocal_ros.ground.errors import ConflictError, InputError, RobocalError
 from robocal_ros.ground.files import share_folders
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.conversions import time_message
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import LOG_EVERY_S
+from robocal_ros.ros.endpoints import ERROR, LOG_EVERY_S, WARN, Health
 from robocal_ros.ros.parameters import Setting
 from robocal_ros.ros.run import run
 
@@ -77,7 +76,7 @@ class ReplayNode(HouseNode):
 
     def configure(self) -> None:
         """Open the bag and make the publishers."""
-        self._status = self.add_output(String, "~/status", qos.LATCHED)
+        self._status = self.add_output(String, "~/status", endpoints.LATCHED)
         self.add_service(Trigger, "~/play", self._play)
         self.add_service(Trigger, "~/pause", self._pause)
         if self.settings["bag"]:

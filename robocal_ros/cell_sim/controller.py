@@ -20,13 +20,13 @@ from robocal_ros.cell_sim.cell import SimulatedCell
 from robocal_ros.cell_sim.outputs import odd_length, tolerances_of, trajectory_of
 from robocal_ros.cell_sim.trajectory_controller import GoalState, TrajectoryGoal
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import header
 from robocal_ros.ros.decision_services import DeferredActionServer
 from robocal_ros.ros.endpoints import EndpointNode
 
 MONITOR_S = 0.05  # action_monitor_rate: goals' ends and feedback are told so often
-COMMANDS = qos.own(qos.RELIABLE)
+COMMANDS = endpoints.own(endpoints.RELIABLE)
 COMMANDS.reliability = ReliabilityPolicy.BEST_EFFORT
 """Of the topic: rclcpp's SystemDefaultsQoS, which is best effort for a reader of Fast DDS."""
 STATUS = {
@@ -64,9 +64,9 @@ class SimulatedController:
         self._cell = cell
         add = self._node.add_input
         add(JointTrajectory, "joint_trajectory", self._follow, COMMANDS)
-        add(SpeedScalingFactor, "~/speed_scaling_input", self._scale, qos.LATCHED)
+        add(SpeedScalingFactor, "~/speed_scaling_input", self._scale, endpoints.LATCHED)
         self._state = self._node.add_output(
-            JointTrajectoryControllerState, "~/controller_state", qos.RELIABLE
+            JointTrajectoryControllerState, "~/controller_state", endpoints.RELIABLE
         )
         self._node.add_timer(MONITOR_S, self.monitor, steady=True)
 

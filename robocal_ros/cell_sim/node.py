@@ -15,9 +15,9 @@ from robocal_ros.cell_sim.settings import SETTINGS, at_station, bent_tool, cell_
 from robocal_ros.cell_sim.stations import TICK_S
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.files import write_text
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
-from robocal_ros.ros.diagnostics import WARN, Health
+from robocal_ros.ros.endpoints import WARN, Health
 from robocal_ros.ros.run import run
 from robocal_ros.tool.measuring_plan import PlannedStep
 
@@ -53,9 +53,9 @@ class CellSimNode(HouseNode):
             write_text(Path(settings["laser_csv"]), "point,x_mm,y_mm,z_mm\n" + "".join(rows))
         self._out = CellOutputs(self.add_output, settings, self._cell)
         self._controller.open(self._cell)
-        self.add_input(JointTrajectory, "~/truth/commanded", self._judge, qos.RELIABLE)
+        self.add_input(JointTrajectory, "~/truth/commanded", self._judge, endpoints.RELIABLE)
         if settings["run_program"]:
-            self.add_input(ToolStep, "next_step", self._await_step, qos.LATCHED)
+            self.add_input(ToolStep, "next_step", self._await_step, endpoints.LATCHED)
         self._refused = ""
         self.add_timer(TICK_S, self._tick, steady=True)
 

@@ -22,7 +22,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD, stamp_ns
 from robocal_ros.hand_eye.shots import PROFILE
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import NS, header, transform_message
 from robocal_ros.thermal.learning import THRESHOLD_M
 from robocal_ros.tool.crossed_model import StepKind
@@ -241,10 +241,10 @@ class CellOutputs:
         if cell.heating:
             kinds |= {"motor_temperatures": Temperature}
         self._outputs = {
-            topic: add_output(kind, topic, qos.RELIABLE) for topic, kind in kinds.items()
+            topic: add_output(kind, topic, endpoints.RELIABLE) for topic, kind in kinds.items()
         }
-        self._tool = add_output(TransformStamped, "~/truth", qos.LATCHED)
-        self._state = add_output(String, "~/truth/state", qos.LATCHED)
+        self._tool = add_output(TransformStamped, "~/truth", endpoints.LATCHED)
+        self._state = add_output(String, "~/truth/state", endpoints.LATCHED)
         self.told = dict.fromkeys(kinds, 0)
         self.commanded: Commanded | None = None
         self.forget()

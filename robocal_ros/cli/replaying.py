@@ -18,8 +18,11 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.streams import JointStream
-from robocal_ros.hand_eye.recorded import hand_eye_session_as_recorded, is_hand_eye_session
-from robocal_ros.hand_eye.session import take_hand_eye_message
+from robocal_ros.hand_eye.session import (
+    hand_eye_session_as_recorded,
+    is_hand_eye_session,
+    take_hand_eye_message,
+)
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
@@ -36,8 +39,12 @@ from robocal_ros.thermal.seeding import (
     window_commands,
 )
 from robocal_ros.thermal.session import ThermalSession, take_message
-from robocal_ros.tool.recorded import is_tool_session, take_tool_message, tool_session_as_recorded
-from robocal_ros.tool.session import ToolSession
+from robocal_ros.tool.session import (
+    ToolSession,
+    is_tool_session,
+    take_tool_message,
+    tool_session_as_recorded,
+)
 
 # ---- what replays of all kinds tell: commands, pauses, damaged parts of the bag -----------------
 

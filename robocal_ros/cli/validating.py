@@ -36,7 +36,7 @@ from robocal_ros.cli.recording import UNASKED, BagOverview, begin_ns, find_robot
 from robocal_ros.cli.replaying import ReplayRequest, replay_bag, seconds
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError
-from robocal_ros.hand_eye.recorded import is_hand_eye_session
+from robocal_ros.hand_eye.session import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
@@ -51,7 +51,7 @@ from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import is_thermal_session
-from robocal_ros.tool.recorded import is_tool_session
+from robocal_ros.tool.session import is_tool_session
 
 # ---- validating cell ----------------------------------------------------------------------------
 

@@ -15,9 +15,17 @@ from robocal_ros.correction.bounds import (
 )
 from robocal_ros.correction.inputs import Reason
 from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.correction.limiter import OffsetLimiter, put_out
+from robocal_ros.correction.limiter import (
+    FIGURES,
+    LARGEST,
+    NOT_WITHIN,
+    REDUCED,
+    REMAINING,
+    SHIFT,
+    OffsetLimiter,
+    put_out,
+)
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
-from robocal_ros.correction.stepping import FIGURES, LARGEST, NOT_WITHIN, REDUCED, REMAINING, SHIFT
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]

@@ -49,11 +49,10 @@ from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
-from robocal_ros.motion.speed_scaling import SpeedScaling
-from robocal_ros.ros import qos
+from robocal_ros.motion.robot_watch import SpeedScaling
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
-from robocal_ros.ros.diagnostics import Health
-from robocal_ros.ros.endpoints import trigger_text
+from robocal_ros.ros.endpoints import Health, trigger_text
 from robocal_ros.ros.run import run
 
 Array = NDArray[np.float64]
@@ -142,28 +141,28 @@ class JointCorrectionNode(HouseNode):
 
     def _open_topics(self) -> None:
         self._outputs = {
-            topic: self.add_output(kind, f"~/{topic}", qos.RELIABLE)
+            topic: self.add_output(kind, f"~/{topic}", endpoints.RELIABLE)
             for topic, kind in KINDS.items()
         }
-        self._offsets = self.add_output(JointOffset, "~/correction", qos.RELIABLE)
-        self._statuses = self.add_output(StatusMessage, "~/status", qos.LATCHED)
-        self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
-        self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
-        self.add_input(MotionLease, LEASE, self._on_lease, qos.LATCHED)
-        self.add_input(Float64, SCALING, self._on_scaling, qos.NEWEST)
+        self._offsets = self.add_output(JointOffset, "~/correction", endpoints.RELIABLE)
+        self._statuses = self.add_output(StatusMessage, "~/status", endpoints.LATCHED)
+        self.add_input(KinematicModel, MODEL, self._on_model, endpoints.LATCHED)
+        self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED)
+        self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED)
+        self.add_input(Float64, SCALING, self._on_scaling, endpoints.NEWEST)
         try:
             from control_msgs.msg import JointTrajectoryControllerState as ControllerState
         except ImportError:  # an old control_msgs
             pass
         else:
-            self.add_input(ControllerState, CONTROLLER, self._on_controller, qos.NEWEST)
+            self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
         states = partial(JointMessage, JointWire(is_reading=True), is_reading=True)
         targets, act = partial(JointMessage, JointWire()), self._on_target
-        self._listen(STATES, states, self._on_states, qos.SENSOR)
-        self._listen(TARGETS, targets, partial(act, TARGETS), qos.HEARTBEAT)
+        self._listen(STATES, states, self._on_states, endpoints.SENSOR)
+        self._listen(TARGETS, targets, partial(act, TARGETS), endpoints.HEARTBEAT)
         commands = partial(ArrayMessage, self._names)
-        self._listen(COMMANDS, commands, partial(act, COMMANDS), qos.HEARTBEAT)
-        self._listen(TRAJECTORY, self._read_path, self._on_path, qos.RELIABLE)
+        self._listen(COMMANDS, commands, partial(act, COMMANDS), endpoints.HEARTBEAT)
+        self._listen(TRAJECTORY, self._read_path, self._on_path, endpoints.RELIABLE)
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_service(Trigger, "~/acknowledge", self._on_acknowledge)
         self.add_service(Trigger, "~/take_over", self._on_take_over)

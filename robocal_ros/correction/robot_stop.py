@@ -15,8 +15,7 @@ from robocal_ros.correction.inputs import Array, JointCommand, TrajectoryCommand
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.robot_state import RESPONSE_S
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits, stop
-from robocal_ros.motion.plan import REACTION_S, JointPlan
+from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits, stop
 
 TRACK_S = 0.1  # readings of so long tell speed and standstill
 LEAST_TRACK_S = 0.02  # shorter ones tell no speed

@@ -27,12 +27,19 @@ from robocal_ros.correction.inputs import (
     RefusedError,
     TrajectoryCommand,
 )
-from robocal_ros.correction.limiter import MOST, WORST, WORST_OUT
+from robocal_ros.correction.limiter import (
+    LARGEST,
+    MOST,
+    REDUCED,
+    REMAINING,
+    SHIFT,
+    WORST,
+    WORST_OUT,
+)
 from robocal_ros.correction.offers import CorrectionGate
 from robocal_ros.correction.output import Output, SentPath
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.status import CorrectionStatus, Offset
-from robocal_ros.correction.stepping import LARGEST, REDUCED, REMAINING, SHIFT
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.samples import CORRECTED, TAUGHT

@@ -20,7 +20,7 @@ from robocal_ros.correction.joint_correction import (
     path_rates,
     plain,
 )
-from robocal_ros.correction.stepping import step_out
+from robocal_ros.correction.limiter import step_out
 from robocal_ros.kinematics import SerialArm
 
 # ---- one target of a stream, from taught joints to what goes out: compiled in one piece ---------

@@ -12,16 +12,17 @@ from robocal_ros.correction.bounds import ClampedCorrection, CorrectionConfig, r
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import Array, Index, JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
+    ADDS,
     DESIRED,
     LONGEST_STEP_S,
     OFFSET,
     OFFSET_RATE,
     ROUNDING,
+    TOO_FAST,
     VELOCITY,
 )
 from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.stepping import ADDS, TOO_FAST
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 

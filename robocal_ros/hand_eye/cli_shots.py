@@ -23,7 +23,7 @@ from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.hand_eye.config import HandEyeConfig, flange_poses
 from robocal_ros.hand_eye.data import data_set_of
 from robocal_ros.hand_eye.quality import HandEyeSettings
-from robocal_ros.hand_eye.recorded import is_hand_eye_session
+from robocal_ros.hand_eye.session import is_hand_eye_session
 from robocal_ros.hand_eye.shots import (
     PROFILE,
     Profile,

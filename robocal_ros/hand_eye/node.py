@@ -16,21 +16,19 @@ from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.proposals import Head, hand_eye_kind
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.recorded import configuration
+from robocal_ros.ground.streams import Silence
 from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
-from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
+from robocal_ros.hand_eye.session import HandEyeSession, configuration, take_hand_eye_message
 from robocal_ros.hand_eye.settings import SETTINGS, session_config
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.graph import SourceGuard
-from robocal_ros.motion.silence import Silence
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import POLL_S, HouseNode
 from robocal_ros.ros.clocks import StampWatch
 from robocal_ros.ros.decision_services import CommandDesk, DecisionServices
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import NotActiveError
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.frame_watch import FrameWatch
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
@@ -40,10 +38,10 @@ from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome
 COMMAND_S = 1.0
 WATCH_S = 0.1
 INPUTS = {
-    JOINTS: (JointState, qos.STREAM),
-    PROFILE: (PointCloud2, qos.SENSOR),
-    TARGET_POSE: (PoseStamped, qos.SENSOR),
-    IMAGE: (Image, qos.SENSOR),
+    JOINTS: (JointState, endpoints.STREAM),
+    PROFILE: (PointCloud2, endpoints.SENSOR),
+    TARGET_POSE: (PoseStamped, endpoints.SENSOR),
+    IMAGE: (Image, endpoints.SENSOR),
 }
 
 

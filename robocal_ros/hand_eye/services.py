@@ -49,7 +49,7 @@ from robocal_ros.hand_eye.session_planning import (
 from robocal_ros.hand_eye.settings import start_arguments
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import StaticTf, pose_message, transform_message
 from robocal_ros.ros.decision_services import SessionEvents, answer, twin
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
@@ -92,8 +92,8 @@ class HandEyeOutputs:
 
     def __init__(self, add: AddOutput, robot: str, serial: str) -> None:
         self._robot, self._serial = robot, serial
-        self._status = add(HandEyeStatus, "~/status", qos.LATCHED)
-        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self._status = add(HandEyeStatus, "~/status", endpoints.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", endpoints.LATCHED)
         self.events = SessionEvents(add)
         self.transforms: list[TransformStamped] = []
         self._tf = StaticTf(add)

@@ -21,8 +21,7 @@ accuracy        drift, tool, correction and faults in one state
 status          what is said
 """
 
-from robocal_ros.maintenance.config import AcceptBounds, MaintenanceConfig, Times
-from robocal_ros.maintenance.memory import CycleResult
+from robocal_ros.maintenance.memory import AcceptBounds, CycleResult, MaintenanceConfig, Times
 from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState, Status
 
 __all__ = [

@@ -27,8 +27,8 @@ from robocal_ros.ground.proposals import (
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.hands import Hands
+from robocal_ros.maintenance.memory import MaintenanceConfig
 from robocal_ros.maintenance.requests import Script
 from robocal_ros.session.decisions import History, decide, measured_with
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, LimitError
 from robocal_ros.maintenance import requests as asked
-from robocal_ros.maintenance.config import MaintenanceConfig
+from robocal_ros.maintenance.memory import MaintenanceConfig
 from robocal_ros.maintenance.mover import HOME, STATION, FaultError, Mover, Route, Ways
 from robocal_ros.maintenance.requests import SENT, Asking, Disarming, DriverAnswer, Script
 from robocal_ros.motion.gap import Gap

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.maintenance.config import MaintenanceConfig
-from robocal_ros.motion.cell import MotionCell, along, departure, joint_way, raised_way
-from robocal_ros.motion.housing import ToolBody
-from robocal_ros.motion.limits import start_near, stop, stop_time
-from robocal_ros.motion.plan import JointPlan, joined
+from robocal_ros.maintenance.memory import MaintenanceConfig
+from robocal_ros.motion.cell import MotionCell, ToolBody, along, departure, joint_way, raised_way
+from robocal_ros.motion.plan import JointPlan, joined, start_near, stop, stop_time
 from robocal_ros.motion.robot_watch import (
     VELOCITY_S,
     LeftPlanError,

@@ -36,15 +36,13 @@ from robocal_ros.maintenance.services import (
 from robocal_ros.maintenance.settings import SETTINGS, session_config
 from robocal_ros.motion.cell import load_motion
 from robocal_ros.motion.driver import LeaseHolder, MotionDriver
-from robocal_ros.motion.gap_sources import GapSources
-from robocal_ros.motion.graph import CommandPath, SourceGuard
+from robocal_ros.motion.graph import CommandPath, GapSources, SourceGuard
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import goal_tolerances
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.clocks import SteadyClock
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import NotActiveError
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
 from robocal_ros.session.events import Command, Outcome
@@ -111,12 +109,12 @@ class MaintenanceNode(HouseNode):
             self, self._running, self._looked, self._clocks, self._outputs, default_gap_s
         )
         self._guard = SourceGuard(self, JOINTS)
-        self.add_input(JointState, JOINTS, self._take_joints, qos.STREAM)
+        self.add_input(JointState, JOINTS, self._take_joints, endpoints.STREAM)
         self._sources = GapSources(self, settings["gap_bool"], self._take_gap)
-        self.add_input(AccuracyState, ACCURACY, self._take_accuracy, qos.LATCHED)
-        self.add_input(CorrectionStatus, CORRECTION, self._take_correction, qos.LATCHED)
+        self.add_input(AccuracyState, ACCURACY, self._take_accuracy, endpoints.LATCHED)
+        self.add_input(CorrectionStatus, CORRECTION, self._take_correction, endpoints.LATCHED)
         for topic, kind in MEASUREMENTS.items():
-            self.add_input(kind, topic, self._take_measurement, qos.STREAM)
+            self.add_input(kind, topic, self._take_measurement, endpoints.STREAM)
         self.add_timer(TICK_S, self._tick, steady=True)
         self.add_timer(SHOW_S, self._show, steady=True)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)

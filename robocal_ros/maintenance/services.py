@@ -16,7 +16,7 @@ from robocal_ros.correction.status import CorrectionState, ToldCorrection
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.maintenance import CycleResult, MaintenanceSession, Status
 from robocal_ros.maintenance.accuracy import Drift
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.decision_services import TWIN, DeferredActionServer, SessionEvents
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
@@ -58,8 +58,8 @@ class MaintenanceOutputs:
 
     def __init__(self, add: AddOutput, robot: str, serial: str, base_frame: str) -> None:
         self._robot, self._serial, self._base = robot, serial, base_frame
-        self._status = add(MaintenanceStatus, "~/status", qos.LATCHED)
-        self._accuracy = add(AccuracyState, "accuracy_state", qos.LATCHED)
+        self._status = add(MaintenanceStatus, "~/status", endpoints.LATCHED)
+        self._accuracy = add(AccuracyState, "accuracy_state", endpoints.LATCHED)
         self.accuracy_topic: str = self._accuracy.topic_name
         self.events = SessionEvents(add)
 

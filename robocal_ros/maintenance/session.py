@@ -18,10 +18,9 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitErro
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import Accuracy, Drift, Heard, accuracy_of
-from robocal_ros.maintenance.config import MaintenanceConfig
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.hands import Hands
-from robocal_ros.maintenance.memory import CycleResult, DocumentStore, Memory
+from robocal_ros.maintenance.memory import CycleResult, DocumentStore, MaintenanceConfig, Memory
 from robocal_ros.maintenance.mover import Ways
 from robocal_ros.maintenance.requests import DriverAnswer, DriverRequest
 from robocal_ros.maintenance.run import Conductor, CycleRun

@@ -24,10 +24,9 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.ground.errors import InputError
 from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
-from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
+from robocal_ros.motion.robot_watch import MotionReport, RobotWatch, SpeedScaling
 from robocal_ros.motion.settings import trajectory_message
-from robocal_ros.motion.speed_scaling import SpeedScaling
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.parameters import Setting
 
@@ -82,16 +81,16 @@ class MotionDriver:
         self._tolerances = dict(tolerances)
         self._index: dict[tuple[str, ...], list[int]] = {}
         self._now = now
-        self.topic = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
+        self.topic = node.add_output(JointTrajectory, "~/joint_trajectory", endpoints.RELIABLE)
         self.action = node.resolve_topic_name(action) if action else ""
         self._client = None
         if self.action:  # rclpy remaps the parts of an action, but not its name
             self._client = ActionClient(node, FollowJointTrajectory, self.action)
         self._hard_stop = node.add_client(Trigger, hard_stop) if hard_stop else None
         node.add_input(
-            JointTrajectoryControllerState, "controller_state", self._take_state, qos.SENSOR
+            JointTrajectoryControllerState, "controller_state", self._take_state, endpoints.SENSOR
         )
-        node.add_input(Float64, "speed_scaling", self._take_scaling, qos.SENSOR)
+        node.add_input(Float64, "speed_scaling", self._take_scaling, endpoints.SENSOR)
         self._controller = StatedController()
         self._scaling, self._rejected = SpeedScaling(), False
         self._newest = 0
@@ -236,7 +235,7 @@ class LeaseHolder:
 
     def __init__(self, node: EndpointNode, robot: str, serial: str) -> None:
         self._node, self._robot, self._serial = node, robot, serial
-        self._output = node.add_output(MotionLease, "motion_lease", qos.LATCHED)
+        self._output = node.add_output(MotionLease, "motion_lease", endpoints.LATCHED)
         self._held, self._told_s = False, -np.inf
 
     def hold(self, purpose: str) -> None:

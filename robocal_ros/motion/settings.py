@@ -11,10 +11,9 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.motion.housing import DrivingConfig, Housing
-from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.messages import joint_trajectory
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import UNSAID_S
 from robocal_ros.ros.parameters import Setting, length
 

@@ -20,8 +20,7 @@ from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.ros.diagnostics import ERROR, Diagnostics, Health
-from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.endpoints import ERROR, Diagnostics, EndpointNode, Health
 from robocal_ros.ros.parameters import ParameterTable, Setting
 
 NO_SERIAL = "unset"  # the history's name where none is set

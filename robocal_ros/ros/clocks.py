@@ -5,8 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from robocal_ros.ground.samples import stamp_ns
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.endpoints import ERROR, WARN, EndpointNode, Health
 
 # ---- what time it is on the clock of the samples ------------------------------------------------
 

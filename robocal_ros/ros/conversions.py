@@ -21,7 +21,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.proposals import Entry
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import COLUMNS
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 if TYPE_CHECKING:
     from robocal_ros.session.events import Outcome
@@ -253,7 +253,7 @@ class StaticTf:
             self.missing = "no /tf_static: tf2_msgs is missing (apt install ros-jazzy-tf2-msgs)"
         else:
             self._message = TFMessage
-            self._publisher = add(TFMessage, "/tf_static", qos.LATCHED)
+            self._publisher = add(TFMessage, "/tf_static", endpoints.LATCHED)
 
     def publish(self, transforms: Sequence[TransformStamped]) -> None:
         """Publish these; none: late subscribers get no transform."""

@@ -4,22 +4,72 @@ import inspect
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ros import qos
 from robocal_ros.session.base import MOST_REASONS, kind_of
+
+# ---- the named QoS profiles of all nodes, and the policies that a user may override -------------
+
+
+def _profile(
+    depth: int,
+    reliability: ReliabilityPolicy,
+    durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=reliability,
+        durability=durability,
+    )
+
+
+LATCHED = _profile(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Results and states: a late subscriber gets the last one."""
+
+SENSOR = _profile(100, ReliabilityPolicy.BEST_EFFORT)
+"""Sensor streams. Deep enough for stalls of 10 to 30 ms at 1 kHz."""
+
+RELIABLE = _profile(100, ReliabilityPolicy.RELIABLE)
+"""Commands and events, where none may be lost."""
+
+HEARTBEAT = _profile(1, ReliabilityPolicy.RELIABLE)
+"""What holds for a short time only: an older one that still waits says nothing."""
+
+NEWEST = _profile(1, ReliabilityPolicy.BEST_EFFORT)
+"""States of others of which only the newest says something."""
+
+STREAM = _profile(1000, ReliabilityPolicy.BEST_EFFORT)
+"""What a session is computed from: deep enough for the seconds that a large solution takes."""
+
+
+def own(profile: QoSProfile) -> QoSProfile:
+    """Return a copy, because overrides are written into the profile that an entity is given."""
+    return copy(profile)
+
+
+def overridable() -> QoSOverridingOptions:
+    """Let a user set history, depth and reliability (parameters ``qos_overrides.<topic>.…``)."""
+    return QoSOverridingOptions.with_default_policies()
+
+
+# ---- endpoints ----------------------------------------------------------------------------------
+
 
 LOG_EVERY_S = 5.0
 MOST_WAITING = 10_000  # messages of an input that are taken at once
@@ -123,9 +173,9 @@ class EndpointNode(LifecycleNode):
             kind,
             topic,
             receive,
-            qos.own(profile),
+            own(profile),
             event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
-            qos_overriding_options=qos.overridable(),
+            qos_overriding_options=overridable(),
             raw=raw,
         )
         self._takers.append((subscription, receive))
@@ -150,7 +200,7 @@ class EndpointNode(LifecycleNode):
     def add_output(self, kind: type, topic: str, profile: QoSProfile) -> Any:
         """Return a publisher that is silent while the node is inactive, until cleanup."""
         publisher = self.create_lifecycle_publisher(
-            kind, topic, qos.own(profile), qos_overriding_options=qos.overridable()
+            kind, topic, own(profile), qos_overriding_options=overridable()
         )
         self._release.append(lambda: self.destroy_lifecycle_publisher(publisher))
         return publisher
@@ -263,3 +313,59 @@ class EndpointNode(LifecycleNode):
 
 def _defect(error: Exception) -> str:
     return f"a defect of this software, please report it: {type(error).__name__}: {error}"
+
+
+# ---- diagnostics --------------------------------------------------------------------------------
+
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+STALE = DiagnosticStatus.STALE
+
+PERIOD_S = 1.0
+
+
+@dataclass
+class Health:
+    """What a node says of itself: level, one sentence, and figures by name."""
+
+    level: bytes = OK
+    message: str = "ok"
+    values: dict[str, object] = field(default_factory=dict)
+
+    def worsen(self, level: bytes, message: str) -> None:
+        """Add a finding; the worst one gives the level, all of them the message."""
+        self.message = message if self.level == OK else f"{self.message}; {message}"
+        self.level = max(self.level, level)
+
+
+class Diagnostics:
+    """Publishes a node's `Health`, whatever state the node is in.
+
+    The period runs on the steady clock, so that a stopped simulation still reports.
+    """
+
+    def __init__(
+        self, node: LifecycleNode, health: Callable[[], Health], serial: Callable[[], str]
+    ) -> None:
+        self._node = node
+        self._health = health
+        self._serial = serial
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", own(RELIABLE))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(PERIOD_S, self.publish, clock=steady)
+
+    def publish(self) -> None:
+        """Publish now; also called at once when a transition fails."""
+        health = self._health()
+        status = DiagnosticStatus(
+            level=health.level,
+            name=self._node.get_fully_qualified_name().lstrip("/"),
+            message=health.message,
+            hardware_id=self._serial(),
+            values=[KeyValue(key=key, value=str(value)) for key, value in health.values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)

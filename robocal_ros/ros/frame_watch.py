@@ -12,13 +12,13 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from robocal_ros.ground import frames
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import NotActiveError
 
 Array = NDArray[np.float64]
 
 MANY_LATCHED = QoSProfile(
-    depth=100, reliability=qos.LATCHED.reliability, durability=qos.LATCHED.durability
+    depth=100, reliability=endpoints.LATCHED.reliability, durability=endpoints.LATCHED.durability
 )
 
 STATIC, MOVING = "/tf_static", "/tf"
@@ -51,7 +51,7 @@ class FrameWatch:
     def _listen_anew(self) -> None:
         self.settled, self._since = False, time.monotonic()
         self._subscribe(STATIC, MANY_LATCHED)
-        self._subscribe(MOVING, qos.SENSOR)
+        self._subscribe(MOVING, endpoints.SENSOR)
 
     def _subscribe(self, topic: str, profile: QoSProfile) -> None:
         try:
@@ -59,7 +59,9 @@ class FrameWatch:
         except ImportError:
             return
         if topic not in self._subscriptions:
-            made = self._node.create_subscription(TFMessage, topic, self._take, qos.own(profile))
+            made = self._node.create_subscription(
+                TFMessage, topic, self._take, endpoints.own(profile)
+            )
             self._subscriptions[topic] = made
 
     def _unsubscribe(self, topic: str) -> None:

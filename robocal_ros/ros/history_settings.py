@@ -12,7 +12,7 @@ from robocal_ros.history.history_file import acknowledge, damage_notice, history
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_file_hash
 from robocal_ros.ros.base import NO_SERIAL
-from robocal_ros.ros.diagnostics import WARN, Health
+from robocal_ros.ros.endpoints import WARN, Health
 from robocal_ros.ros.parameters import Setting
 
 STATE_DIR = Setting(

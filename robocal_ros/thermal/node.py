@@ -23,12 +23,11 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.motion.graph import SourceGuard
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import POLL_S, HouseNode
 from robocal_ros.ros.clocks import DataClock, StampWatch
 from robocal_ros.ros.decision_services import CommandDesk
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import NotActiveError
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
 from robocal_ros.session.events import CYCLE, Outcome
@@ -85,7 +84,7 @@ class ThermalNode(HouseNode):
         self._stamps = StampWatch(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, message_type in INPUTS.items():
-            self.add_input(message_type, kind, self._taker(kind), qos.STREAM)
+            self.add_input(message_type, kind, self._taker(kind), endpoints.STREAM)
         self._desk = CommandDesk(self, settings["command_timeout_s"], self._show)
         ThermalServices(self.add_service, self._desk.ask, self._history)
         SetUpServices(

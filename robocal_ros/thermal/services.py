@@ -25,7 +25,7 @@ from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import transform_message
 from robocal_ros.ros.decision_services import (
     AddService,
@@ -221,11 +221,11 @@ class ThermalOutputs:
     ) -> None:
         self._nominal, self._serial, self._base_frame = nominal, serial, base_frame
         self._robot_file_hash = robot_file_hash
-        self._candidate = add(KinematicModel, "~/candidate", qos.LATCHED)
-        self._model = add(KinematicModel, "~/model", qos.LATCHED)
-        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
-        self._accuracy = add(AccuracyState, "~/accuracy", qos.LATCHED)
-        self._sensor = add(TransformStamped, "~/sensor", qos.LATCHED)
+        self._candidate = add(KinematicModel, "~/candidate", endpoints.LATCHED)
+        self._model = add(KinematicModel, "~/model", endpoints.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", endpoints.LATCHED)
+        self._accuracy = add(AccuracyState, "~/accuracy", endpoints.LATCHED)
+        self._sensor = add(TransformStamped, "~/sensor", endpoints.LATCHED)
         self.events = SessionEvents(add)
 
     def model(self, model: Mapping[str, Any], revision: int, stamp_ns: int) -> None:

@@ -49,7 +49,6 @@ from robocal_ros.tool.laser_frame import (
     write_laser,
 )
 from robocal_ros.tool.measuring_plan import named_steps
-from robocal_ros.tool.parallel_beams import ParallelBeams, fit_parallel
 from robocal_ros.tool.quick_check import (
     circle_document,
     classic_run_document,
@@ -58,7 +57,7 @@ from robocal_ros.tool.quick_check import (
     run_document,
     touch_document,
 )
-from robocal_ros.tool.touch_points import fit_four, fit_seven
+from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -16,15 +16,25 @@ from robocal_ros.ground.errors import Code, ConflictError, LimitError, RobocalEr
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import (
     ROUNDING,
+    DrivingConfig,
     MotionCell,
+    ToolBody,
     along,
     corner_ride,
     load_motion,
     raised_way,
 )
-from robocal_ros.motion.housing import DrivingConfig, ToolBody
-from robocal_ros.motion.limits import MotionLimits, start_near, stop
-from robocal_ros.motion.plan import JointPlan, Ride, TipPath, circle, plunge, ramp_of
+from robocal_ros.motion.plan import (
+    JointPlan,
+    MotionLimits,
+    Ride,
+    TipPath,
+    circle,
+    plunge,
+    ramp_of,
+    start_near,
+    stop,
+)
 from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch, WatchedStop
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
 from robocal_ros.tool.flange_path import FEWEST_READINGS, JointPath

@@ -26,7 +26,7 @@ from robocal_ros.kinematics.tables import (
 from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge
 from robocal_ros.tool.flange_path import JointPath
 from robocal_ros.tool.measuring_plan import STEP_NAMES, step_kind
-from robocal_ros.tool.parallel_beams import HEIGHTS, SWEEPS, Height
+from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height
 
 # ---- files --------------------------------------------------------------------------------------
 

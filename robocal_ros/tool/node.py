@@ -11,16 +11,15 @@ from sensor_msgs.msg import JointState
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS
+from robocal_ros.ground.streams import Silence
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.motion.graph import SourceGuard
-from robocal_ros.motion.silence import Silence
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import POLL_S, HouseNode
 from robocal_ros.ros.clocks import StampWatch
 from robocal_ros.ros.decision_services import CommandDesk
-from robocal_ros.ros.diagnostics import ERROR, WARN, Health
-from robocal_ros.ros.endpoints import NotActiveError
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
@@ -30,15 +29,14 @@ from robocal_ros.tool.edges import EDGES
 from robocal_ros.tool.laser_frame import read_laser_for
 from robocal_ros.tool.measuring_plan import PlannedStep
 from robocal_ros.tool.node_motion import TcfMotion
-from robocal_ros.tool.recorded import configuration, take_tool_message
 from robocal_ros.tool.results import WITNESS, WITNESS_REFERENCE, ToolInForce
 from robocal_ros.tool.services import Runner, TcfOutputs, TcfServices
-from robocal_ros.tool.session import ToolSession
+from robocal_ros.tool.session import ToolSession, configuration, take_tool_message
 from robocal_ros.tool.settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 
 COMMAND_S = 1.0
 WATCH_S = 0.02
-INPUTS = {JOINTS: (JointState, qos.STREAM), EDGES: (BeamEvent, qos.RELIABLE)}
+INPUTS = {JOINTS: (JointState, endpoints.STREAM), EDGES: (BeamEvent, endpoints.RELIABLE)}
 
 
 class TcfNode(HouseNode):

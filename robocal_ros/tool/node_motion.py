@@ -12,12 +12,11 @@ from robocal_ros.ground.samples import joint_sample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.driver import CONTROLLER, LeaseHolder, MotionDriver
 from robocal_ros.motion.gap import Gap
-from robocal_ros.motion.gap_sources import GAP_BOOL, SHORTEST_STALE_S, STATUS, GapSources
-from robocal_ros.motion.graph import CommandPath
+from robocal_ros.motion.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances, require_limits
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.clocks import SteadyClock
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.parameters import Setting, length
@@ -96,7 +95,7 @@ class TcfMotion:
             self._sources = GapSources(node, is_bool, self._take_gap)
             if not is_bool:
                 # Not latched: a beat of before is not taken for one of now.
-                node.add_input(MaintenanceStatus, STATUS, self._take_beat, qos.RELIABLE)
+                node.add_input(MaintenanceStatus, STATUS, self._take_beat, endpoints.RELIABLE)
         else:
             node.get_logger().warning(self.deaf())
         node.add_service(SetBool, "~/arm", self._arm, inactive=True)

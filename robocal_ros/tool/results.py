@@ -20,15 +20,17 @@ from robocal_ros.tool.crossed_model import Held
 from robocal_ros.tool.crossed_run import RunTraits
 from robocal_ros.tool.judging import (
     KnownTool,
+    StationFinding,
     change_between,
     changed_tool,
     difference,
     judge_healthy,
     judge_tool,
     spread_between,
+    station_finding,
+    with_mandrel,
     witness_of,
 )
-from robocal_ros.tool.mandrel import StationFinding, station_finding, with_mandrel
 from robocal_ros.tool.quick_check import (
     Answer,
     QuickCheck,

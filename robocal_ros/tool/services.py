@@ -19,7 +19,7 @@ from robocal_ros.ground.frames import Document
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import StaticTf, header, pose_message, transform_message
 from robocal_ros.ros.decision_services import DecisionServices, SessionEvents
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
@@ -316,11 +316,11 @@ class TcfOutputs:
         self._base, flange, tool = frames
         self._nominal, self._serial = nominal, serial
         self._messages = ToolMessages(nominal, serial, robot_file_hash, flange, tool)
-        self._step = add(ToolStep, "~/next_step", qos.LATCHED)
-        self._candidate = add(ToolFrame, "~/candidate", qos.LATCHED)
-        self._tool = add(ToolFrame, "~/tool", qos.LATCHED)
-        self._frame = add(TransformStamped, "~/tool_frame", qos.LATCHED)
-        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self._step = add(ToolStep, "~/next_step", endpoints.LATCHED)
+        self._candidate = add(ToolFrame, "~/candidate", endpoints.LATCHED)
+        self._tool = add(ToolFrame, "~/tool", endpoints.LATCHED)
+        self._frame = add(TransformStamped, "~/tool_frame", endpoints.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", endpoints.LATCHED)
         self.events = SessionEvents(add)
         self._tf = StaticTf(add)
         self.missing = self._tf.missing

@@ -2,21 +2,33 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
-from robocal_ros.ground.proposals import TOOL
-from robocal_ros.ground.samples import JOINTS, JointSample
+from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL
+from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.base import Commanded, Handler
-from robocal_ros.session.decisions import History
+from robocal_ros.session.base import Commanded, Handler, configured_with, recorded_arguments
+from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.tool.edges import AHEAD_NS, EDGES, MOST_EDGES, BeamError, EdgeLog, EdgeSample
+from robocal_ros.tool.edges import (
+    AHEAD_NS,
+    EDGES,
+    MOST_EDGES,
+    BeamError,
+    EdgeLog,
+    EdgeSample,
+    edge_sample,
+)
 from robocal_ros.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.tool.results import FULL, MODES, QUICK, ToolInForce, ToolResults
 from robocal_ros.tool.run import ToolConfig, ToolRun
+
+# ---- session ------------------------------------------------------------------------------------
+
 
 AHEAD_S = AHEAD_NS * 1e-9
 BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges themselves show
@@ -218,3 +230,64 @@ class ToolSession(Commanded):
         if self.run is None:
             raise ConflictError("no measurement is open: begin one first")
         return self.run
+
+
+# ---- recorded -----------------------------------------------------------------------------------
+
+
+IN_FORCE = {"model": THERMAL, "tool": TOOL, "healthy": HEALTHY_TOOL}
+OWN = "healthy"  # only a tool session's configuration has it
+
+
+def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
+    """Settings and what is in force, so that a replay can start from the same.
+
+    ``topics``: name of each input's topic.
+    """
+    current = session.current
+    in_force = {
+        "model": current.thermal.model,
+        "tool": current.head.model,
+        OWN: current.healthy.model,
+        "mandrel": current.mandrel.model,
+    }
+    return configured_with(session, topics, session.config.document(), in_force)
+
+
+def is_tool_session(configured: Command | None) -> bool:
+    """Whether a configuration was recorded by a tool session."""
+    return configured is not None and OWN in configured.arguments
+
+
+def tool_session_as_recorded(
+    nominal: SerialArm, history: History, configured: Command, software: str
+) -> ToolSession:
+    """Make a session with the recorded settings; an empty history gets what was in force.
+
+    Raises
+    ------
+    WrongRobotError
+        The recording was made with another nominal model.
+    InputError
+        The configuration cannot be read.
+    """
+    arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
+    config = ToolConfig.of_document(arguments["config"])
+    in_force = {kind: arguments[name] for name, kind in IN_FORCE.items()}
+    in_force[MANDREL] = configured.arguments.get("mandrel")  # older recordings have none
+    seeded(history, nominal, in_force, software)
+    return ToolSession(nominal, history, config, software)
+
+
+# ---- messages into the tool session: the same for live topics and for recorded ones -------------
+
+
+def take_tool_message(session: ToolSession, kind: str, message: Any) -> None:
+    """Give a message to the session; one that cannot be used is counted with its reason."""
+    try:
+        if kind == JOINTS:
+            session.add(joint_sample(message))
+        elif kind == EDGES:
+            session.add(edge_sample(message, session.config.beams))
+    except RobocalError as error:
+        session.ignored.add(kind, str(error))

@@ -11,8 +11,7 @@ from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
 from robocal_ros.hand_eye.config import HandEyeConfig
-from robocal_ros.hand_eye.recorded import configuration
-from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.session import HandEyeSession, configuration
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text

@@ -15,8 +15,7 @@ from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
 from robocal_ros.bags.hand_eye_bags import write_data_set
 from robocal_ros.bags.replay import replay
 from robocal_ros.cli.recording import open_recording
-from robocal_ros.hand_eye.recorded import hand_eye_session_as_recorded
-from robocal_ros.hand_eye.session import take_hand_eye_message
+from robocal_ros.hand_eye.session import hand_eye_session_as_recorded, take_hand_eye_message
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 

@@ -4,10 +4,8 @@ import numpy as np
 
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.cell import MotionCell
-from robocal_ros.motion.housing import Housing, ToolBody
-from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.cell import Housing, MotionCell, ToolBody
+from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.tool.measuring_plan import PlannedStep
 
 POSTURES = {

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.motion.housing import Housing, ToolBody
+from robocal_ros.motion.cell import Housing, ToolBody
 
 HOUSING = Housing(clear_radius_m=0.04, top_m=0.02, floor_m=-0.08, retract_m=0.04)
 

@@ -10,7 +10,7 @@ from motion_cell import POSTURES, circle_step, make_motion_cell, tip_in_laser
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics.inverse import inverse
-from robocal_ros.motion.limits import SHORTEST_STOP_S, stop, stop_time
+from robocal_ros.motion.plan import SHORTEST_STOP_S, stop, stop_time
 from robocal_ros.tool.driving import measuring, start_pose
 
 

@@ -9,7 +9,7 @@ from motion_cell import POSTURES, make_motion_cell, shifted, upright
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.motion.cell import MotionCell, departure, joint_way
-from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.plan import MotionLimits
 
 SAMPLES = np.linspace(0.0, 1.0, 2001)
 

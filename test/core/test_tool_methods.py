@@ -13,8 +13,15 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.tool.parallel_beams import ParallelBeams, parallel_tip, straighten, sweep_axis
-from robocal_ros.tool.touch_points import fit_four, fit_seven, pose_from_euler
+from robocal_ros.tool.touch_points import (
+    ParallelBeams,
+    fit_four,
+    fit_seven,
+    parallel_tip,
+    pose_from_euler,
+    straighten,
+    sweep_axis,
+)
 
 TIP = np.array([0.012, -0.034, 0.21])
 POINT = np.array([0.9, 0.2, 0.5])

@@ -14,9 +14,9 @@ from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.kinematics.robots import load_description
-from robocal_ros.motion.housing import DrivingConfig, Housing
-from robocal_ros.motion.limits import MotionLimits, stop
+from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.messages import StatedController
+from robocal_ros.motion.plan import MotionLimits, stop
 from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch, WatchedStop
 
 SPEED = 1.0  # rad/s of the first joint

@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.samples import REFERENCE_SPHERE, JointSample, PointSample
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.decision_services import EVENTS
 
@@ -72,10 +72,14 @@ class Cell:
         self.serial = serial
         self.parameters = {"serial": serial, "command_timeout_s": 0.3} | LOSSLESS | parameters
         self.events = graph.collect(SessionEvent, "/thermal_node/session_events", EVENTS)
-        self.models = graph.collect(KinematicModel, "/thermal_node/model", qos.LATCHED)
-        self.candidates = graph.collect(KinematicModel, "/thermal_node/candidate", qos.LATCHED)
-        self.qualities = graph.collect(CalibrationQuality, "/thermal_node/quality", qos.LATCHED)
-        self.accuracies = graph.collect(AccuracyState, "/thermal_node/accuracy", qos.LATCHED)
+        self.models = graph.collect(KinematicModel, "/thermal_node/model", endpoints.LATCHED)
+        self.candidates = graph.collect(
+            KinematicModel, "/thermal_node/candidate", endpoints.LATCHED
+        )
+        self.qualities = graph.collect(
+            CalibrationQuality, "/thermal_node/quality", endpoints.LATCHED
+        )
+        self.accuracies = graph.collect(AccuracyState, "/thermal_node/accuracy", endpoints.LATCHED)
         self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
         probe = graph.probe
         self.joints = probe.create_publisher(JointState, "/joint_states", DEEP)

@@ -24,7 +24,7 @@ from rclpy.qos import QoSProfile
 from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 ROOT = Path(__file__).parent.parent.parent
 # For the helper modules beside the tests.
@@ -205,17 +205,19 @@ class Graph:
             self.probe.destroy_client(client)
         self._clients.clear()
 
-    def collect(self, kind: type, topic: str, profile: QoSProfile = qos.RELIABLE) -> list[Any]:
+    def collect(
+        self, kind: type, topic: str, profile: QoSProfile = endpoints.RELIABLE
+    ) -> list[Any]:
         """Subscribe; return the list that gathers what arrives."""
         inbox: list[Any] = []
-        self.probe.create_subscription(kind, topic, inbox.append, qos.own(profile))
+        self.probe.create_subscription(kind, topic, inbox.append, endpoints.own(profile))
         return inbox
 
     def publisher(
-        self, kind: type, topic: str, profile: QoSProfile = qos.RELIABLE, subscribers: int = 1
+        self, kind: type, topic: str, profile: QoSProfile = endpoints.RELIABLE, subscribers: int = 1
     ) -> Publisher:
         """Publish as the probe, once so many subscribers are there."""
-        publisher = self.probe.create_publisher(kind, topic, qos.own(profile))
+        publisher = self.probe.create_publisher(kind, topic, endpoints.own(profile))
         self.spin_until(
             lambda: publisher.get_subscription_count() >= subscribers,
             f"{subscribers} subscribers of {topic}",

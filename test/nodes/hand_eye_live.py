@@ -17,7 +17,7 @@ from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.hand_eye.target_files import write_target
 from robocal_ros.hand_eye.targets import SphereTarget
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
 TYPES = {JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped, IMAGE: Image}
@@ -49,7 +49,7 @@ class LiveSensor:
 
     def __init__(self, graph: Any, folder: Path, **parameters: Any) -> None:
         self.graph = graph
-        self.status = graph.collect(HandEyeStatus, f"{NAME}/status", qos.LATCHED)
+        self.status = graph.collect(HandEyeStatus, f"{NAME}/status", endpoints.LATCHED)
         self.node = graph.add(HandEyeNode, settings_of(folder, **parameters))
         self._publishers = {
             kind: graph.publisher(message, kind, STREAM) for kind, message in TYPES.items()

@@ -18,7 +18,7 @@ from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.services import ToolMessages
 
@@ -106,14 +106,14 @@ class Line:
         self.arrays = graph.collect(Float64MultiArray, f"{NODE}/joint_commands")
         self.states = graph.collect(JointState, f"{NODE}/joint_states")
         self.offsets = graph.collect(JointOffset, f"{NODE}/correction")
-        self.statuses = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
+        self.statuses = graph.collect(CorrectionStatus, f"{NODE}/status", endpoints.LATCHED)
         self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
         self.to_target = graph.publisher(JointState, "joint_targets")
         self.to_array = graph.publisher(Float64MultiArray, "joint_commands")
         self.to_path = graph.publisher(JointTrajectory, "joint_trajectory")
         self.to_states = graph.publisher(JointState, "joint_states")
-        self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
-        self.to_tool = graph.publisher(ToolFrame, "tool", qos.LATCHED)
+        self.to_model = graph.publisher(KinematicModel, "kinematic_model", endpoints.LATCHED)
+        self.to_tool = graph.publisher(ToolFrame, "tool", endpoints.LATCHED)
 
     def wait(self, inbox: list[Any], count: int = 1) -> Any:
         self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs")

@@ -20,13 +20,11 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.cell import MotionCell, joint_way
-from robocal_ros.motion.housing import Housing, ToolBody
-from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.cell import Housing, MotionCell, ToolBody, joint_way
+from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import REST_RAD
 from robocal_ros.motion.settings import trajectory_message
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.decision_services import EVENTS
 
 START_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]  # of cell_sim_node, over its station
@@ -82,10 +80,12 @@ class LiveCell:
         self.is_open = self.beating = self.sensing = True
         self.joints: list[JointState] = []
         self.sent = graph.collect(JointTrajectory, ROBOT)
-        self.statuses = graph.collect(MaintenanceStatus, "/maintenance_node/status", qos.LATCHED)
-        self.states = graph.collect(AccuracyState, "/accuracy_state", qos.LATCHED)
+        self.statuses = graph.collect(
+            MaintenanceStatus, "/maintenance_node/status", endpoints.LATCHED
+        )
+        self.states = graph.collect(AccuracyState, "/accuracy_state", endpoints.LATCHED)
         self.events = graph.collect(SessionEvent, "/maintenance_node/session_events", EVENTS)
-        graph.probe.create_subscription(JointState, "joint_states", self._joints, qos.STREAM)
+        graph.probe.create_subscription(JointState, "joint_states", self._joints, endpoints.STREAM)
         self.sphere = graph.probe.create_publisher(PointStamped, "sphere_center", 10)
         self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
         threading.Thread(target=self._beats, daemon=True).start()

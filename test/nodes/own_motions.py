@@ -16,14 +16,14 @@ from std_msgs.msg import String
 
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance.config import MaintenanceConfig
+from robocal_ros.maintenance.memory import MaintenanceConfig
 from robocal_ros.maintenance.mover import FaultError, Mover, Route, Ways
 from robocal_ros.motion.cell import joint_way, load_motion
 from robocal_ros.motion.driver import CONTROLLER, MotionDriver
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.clocks import SteadyClock
 from robocal_ros.ros.run import run
@@ -70,7 +70,7 @@ class OwnMotions(HouseNode):
             self._steady.now_s,
         )
         self.reports = self.add_output(String, "own/reports", DEEP)
-        self.add_input(JointState, "joint_states", self._take_joints, qos.STREAM)
+        self.add_input(JointState, "joint_states", self._take_joints, endpoints.STREAM)
         self.add_input(String, "own/orders", self._take_order, DEEP)
         self.add_timer(TICK_S, self._tick, steady=True)
 

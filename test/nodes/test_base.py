@@ -16,10 +16,9 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, InputError, StaleError
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
-from robocal_ros.ros.diagnostics import WARN, Health
-from robocal_ros.ros.endpoints import LOG_EVERY_S, LogLimit
+from robocal_ros.ros.endpoints import LOG_EVERY_S, WARN, Health, LogLimit
 from robocal_ros.ros.parameters import Setting
 from robocal_ros.session.base import MOST_REASONS
 
@@ -39,8 +38,8 @@ class Doubler(HouseNode):
     def configure(self) -> None:
         self.released = 0
         self.factor = self.settings["factor"]
-        self.output = self.add_output(Float64, "~/doubled", qos.RELIABLE)
-        self.add_input(Float64, "number", self.on_number, qos.RELIABLE)
+        self.output = self.add_output(Float64, "~/doubled", endpoints.RELIABLE)
+        self.add_input(Float64, "number", self.on_number, endpoints.RELIABLE)
         self.add_service(Decide, "~/decide", self.on_decide)
         self.add_service(Trigger, "~/decide_trigger", self.on_trigger)
         self.add_service(Trigger, "~/defect_trigger", self.on_defect)

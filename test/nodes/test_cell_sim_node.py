@@ -22,7 +22,7 @@ from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.cell_sim.settings import SETTINGS, laser_pose, straight_arm
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground import frames
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import header, transform_message
 from robocal_ros.tool.files import read_beam_points
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
@@ -91,7 +91,7 @@ class Cell:
         return abs(in_order(self.states[-1], self.states[-1].position)[0] - HOME[0])
 
     def steps(self) -> Any:
-        return self.graph.publisher(ToolStep, "next_step", qos.LATCHED)
+        return self.graph.publisher(ToolStep, "next_step", endpoints.LATCHED)
 
     def rest(self) -> None:
         """Wait until a motion has begun and is over."""
@@ -160,7 +160,7 @@ def test_a_trajectory_is_followed_by_name_and_in_time(graph):
 
 def test_a_trajectory_without_points_is_rejected_and_the_motion_goes_on(graph):
     cell = Cell(graph)
-    logs = graph.collect(Log, "/rosout", qos.RELIABLE)
+    logs = graph.collect(Log, "/rosout", endpoints.RELIABLE)
     cell.path([HOME + 0.5], [1.0])
     graph.spin_until(lambda: cell.away() > 0.02, "it moves")
     cell.path([], [])
@@ -198,8 +198,8 @@ def test_a_point_at_time_0_makes_it_jump(graph):
 
 def test_drives_with_limits_refuse_a_jump(graph):
     cell = Cell(graph, limits=True)
-    truths = graph.collect(String, "/cell_sim_node/truth/state", qos.LATCHED)
-    logs = graph.collect(Log, "/rosout", qos.LATCHED)
+    truths = graph.collect(String, "/cell_sim_node/truth/state", endpoints.LATCHED)
+    logs = graph.collect(Log, "/rosout", endpoints.LATCHED)
     diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
     cell.path([HOME + 0.5], [2.0])
     graph.spin_until(lambda: cell.away() > 0.02, "it moves")
@@ -304,7 +304,7 @@ def test_joints_fall_silent_and_their_clock_stands(graph):
 
 def test_the_truth_is_latched_and_follows_the_bend(graph):
     cell = Cell(graph, tool_bend_mm=[2.0, -1.0, 0.5])
-    truths = graph.collect(TransformStamped, "/cell_sim_node/truth", qos.LATCHED)
+    truths = graph.collect(TransformStamped, "/cell_sim_node/truth", endpoints.LATCHED)
     graph.spin_until(lambda: truths, "the truth")
     place = truths[0].transform.translation
     assert [place.x, place.y, place.z] == pytest.approx([0.002, -0.001, 0.1505], abs=1e-12)

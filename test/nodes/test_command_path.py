@@ -15,7 +15,7 @@ from tool_driver import TRUTH
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.motion.graph import CommandPath
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"
@@ -29,7 +29,7 @@ class Watched:
         self.graph = graph
         self.processes: list[Process] = []
         self.own = self.process("tcf_node").node
-        self.own.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+        self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
         self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
         self.watch = CommandPath(self.own, PATH, ACTION, (ACCURACY, CORRECTION))
 
@@ -64,14 +64,14 @@ def test_a_node_of_the_cell_may_command_the_robot_and_no_other_of_its_process(
     watched.becomes("")
     process = watched.process("another_name")
     own, planner = process.node, Node("planner", context=process.context)
-    own.create_publisher(kind, topic, qos.LATCHED)
+    own.create_publisher(kind, topic, endpoints.LATCHED)
     watched.graph.spin_until(lambda: watched.own.count_publishers(topic), "it is of the cell")
-    own.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     of_cell = ActionClient(own, FollowJointTrajectory, ACTION)
     watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "it is there")
     watched.graph.spin_for(0.3)
     watched.becomes("")
-    publisher = planner.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    publisher = planner.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(f"/planner publishes {PATH}")
     planner.destroy_publisher(publisher)
     watched.becomes("")
@@ -87,13 +87,13 @@ def test_the_topic_beside_the_controllers_action_is_looked_at(watched: Watched) 
     """Motions go by the action, so that the topic of this node was left as it is."""
     watched.watch = CommandPath(watched.own, "/tcf_node/joint_trajectory", ACTION, ())
     watched.becomes("")
-    watched.process("planner").node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.process("planner").node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(f"/planner publishes {PATH}")
 
 
 def test_a_second_node_of_the_same_name_is_told(watched: Watched) -> None:
     second = watched.process("tcf_node").node
-    publisher = second.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    publisher = second.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(f"a second /tcf_node publishes {PATH}")
     second.destroy_publisher(publisher)
     watched.becomes("")

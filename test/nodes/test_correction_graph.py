@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
 from robocal_ros.correction.inputs import Reason
 from robocal_ros.motion.graph import own_endpoint
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"
@@ -46,7 +46,7 @@ class Watched:
         self.graph = graph
         self.others: list[Process] = []
         self.own = self.process("joint_correction_node").node
-        self.own.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+        self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
         self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
         self.leases = Leases("kr150", "s1")
         sources = JointSources(self.own, "/joint_states", NAMES)
@@ -99,7 +99,7 @@ def test_a_second_correction_node_under_the_same_or_another_name(
 ) -> None:
     watched.becomes(None)
     other = watched.process(name)
-    publisher = other.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    publisher = other.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     second = "a second /joint_correction_node" if name == "joint_correction_node" else f"/{name}"
     watched.becomes(Reason.OTHER_COMMANDER, f"{second} publishes {PATH}")
     other.node.destroy_publisher(publisher)
@@ -108,15 +108,15 @@ def test_a_second_correction_node_under_the_same_or_another_name(
     watched.becomes(Reason.OTHER_COMMANDER, f"{second} is a client of {ACTION}")
     client.destroy()
     watched.becomes(None)
-    watched.own.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(Reason.OTHER_COMMANDER, "a second /joint_correction_node in this process")
 
 
 def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None:
     own = watched.process("some_name")
-    own.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
-    own.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
-    inbox = watched.graph.collect(MotionLease, "/motion_lease", qos.LATCHED)
+    own.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    own.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    inbox = watched.graph.collect(MotionLease, "/motion_lease", endpoints.LATCHED)
     watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
     watched.becomes(None)
     lease = MotionLease(robot="kr150", serial="s1", holder="/some_name", held=True, purpose="tool")
@@ -134,12 +134,12 @@ def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None
 def test_another_node_of_a_holders_process_is_a_stranger(watched: Watched) -> None:
     """Finding: whatever a process with a publisher of leases did, it was the cell's own."""
     own = watched.process("some_name")
-    own.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
-    own.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    own.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    own.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
     watched.becomes(None)
     planner = Node("planner", context=own.context)
-    publisher = planner.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    publisher = planner.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(Reason.OTHER_COMMANDER, f"/planner publishes {PATH}")
     planner.destroy_publisher(publisher)
     watched.becomes(None)
@@ -168,8 +168,8 @@ def test_a_lease_that_ends_by_silence_lasts_until_the_robot_stands() -> None:
 
 def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:
     other = watched.process("next_cell")
-    other.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
-    other.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    other.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    other.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     lease = MotionLease(robot="kr150", serial="s2", holder="/next_cell", held=True)
     watched.leases.hear(lease, time.monotonic())
     watched.becomes(Reason.OTHER_COMMANDER, f"/next_cell publishes {PATH}")
@@ -178,8 +178,8 @@ def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:
 
 def test_two_publishers_of_the_arms_joints_and_one_of_a_gripper(watched: Watched) -> None:
     driver, gripper = watched.process("driver"), watched.process("gripper")
-    arm = driver.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
-    hand = gripper.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
+    arm = driver.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
+    hand = gripper.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
     message = JointState(name=NAMES, position=[0.0] * 6, velocity=[float("nan")] * 6)
 
     def publish(*which: tuple[Any, list[str]]) -> None:
@@ -216,8 +216,8 @@ def test_two_publishers_of_the_arms_joints_and_one_of_a_gripper(watched: Watched
 def test_a_driver_that_was_restarted_is_one_driver(watched: Watched) -> None:
     """Its predecessor was killed and is still on the graph: its numbers begin anew once."""
     old, new = watched.process("driver"), watched.process("driver")
-    before = old.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
-    after = new.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
+    before = old.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
+    after = new.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
     message = JointState(name=NAMES, position=[0.0] * 6)
     watched.graph.spin_until(lambda: watched.own.count_publishers("/joint_states") == 2, "both")
     watched.watch.look(time.monotonic())

@@ -22,7 +22,7 @@ from bench.closed_loop.faults import RIGHT
 from bench.live.cell import TRUTH, set_fault
 from robocal_ros.cell_sim.cell_faults import Fault
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 
@@ -45,7 +45,7 @@ class FaultCell:
 
     def __init__(self, graph: Any, folder: Path) -> None:
         self.graph, self.cell = graph, LiveCell(graph, folder)
-        self.truths = graph.collect(String, TRUTH, qos.LATCHED)
+        self.truths = graph.collect(String, TRUTH, endpoints.LATCHED)
         self.until(lambda: self.told("/tcf_node/arm", SetBool, data=True), "armed")
         self.until(lambda: self.told("/tcf_node/measure_reference_trigger"), "it measures")
         self.until(lambda: " NONE " not in self.result(), "the healthy tool is measured")

@@ -33,7 +33,7 @@ from robocal_ros.session.decisions import ONLY
 from robocal_ros.session.events import Command
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
-from robocal_ros.tool.recorded import take_tool_message, tool_session_as_recorded
+from robocal_ros.tool.session import take_tool_message, tool_session_as_recorded
 
 
 @pytest.fixture

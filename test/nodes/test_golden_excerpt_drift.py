@@ -35,7 +35,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.decision_services import EVENTS
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
@@ -210,7 +210,7 @@ class Heard:
 
     def __init__(self, graph: Any) -> None:
         self._graph = graph
-        self._reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+        self._reports = graph.collect(String, "/replay_node/status", endpoints.LATCHED)
         self._diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
 
     def all_of_it(self, state: str) -> None:

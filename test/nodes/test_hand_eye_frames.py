@@ -14,8 +14,8 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros import qos
-from robocal_ros.ros.diagnostics import ERROR
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.endpoints import ERROR
 from robocal_ros.ros.frame_watch import FRESH_S
 from robocal_ros.session.events import ACCEPT, Command
 
@@ -42,7 +42,7 @@ def test_the_joint_of_a_urdf_is_told_from_the_candidate(
     graph: Any, calibrated: tuple[LiveSensor, Any]
 ) -> None:
     sensor, result = calibrated
-    urdf = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    urdf = graph.publisher(TFMessage, "/tf_static", endpoints.LATCHED)
     drawn = deepcopy(result.sensor)
     drawn.translation.x += 0.01
     urdf.publish(below("tool0", drawn))
@@ -71,7 +71,7 @@ def test_tf_is_listened_to_only_for_an_answer(graph: Any, tmp_path: Path) -> Non
     transform.rotation.w = 1.0
     told = below("base", transform)
     told.transforms[0].child_frame_id = "gripper"
-    tf = graph.probe.create_publisher(TFMessage, "/tf", qos.own(qos.RELIABLE))
+    tf = graph.probe.create_publisher(TFMessage, "/tf", endpoints.own(endpoints.RELIABLE))
     graph.probe.create_timer(0.05, lambda: tf.publish(told))
     sensor = LiveSensor(graph, tmp_path)
 
@@ -94,7 +94,7 @@ def test_an_accept_waits_until_all_was_heard(
     graph: Any, calibrated: tuple[LiveSensor, Any]
 ) -> None:
     sensor, result = calibrated
-    urdf = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    urdf = graph.publisher(TFMessage, "/tf_static", endpoints.LATCHED)
     urdf.publish(below("camera_rail", result.sensor))
     for step in ("deactivate", "activate"):
         getattr(sensor.node, f"trigger_{step}")()
@@ -119,7 +119,7 @@ def test_the_twin_looks_at_the_candidate_that_it_would_accept(
 ) -> None:
     sensor, result = calibrated
     assert sensor.calibrate().candidate_id > result.candidate_id
-    rail = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    rail = graph.publisher(TFMessage, "/tf_static", endpoints.LATCHED)
     rail.publish(below("camera_rail", result.sensor))
     graph.spin_until(
         lambda: sensor.node._frame_fault(Command(ACCEPT, {"id": result.candidate_id})), "it is seen"
@@ -137,9 +137,9 @@ def test_a_frame_that_is_taken_at_the_start_is_not_published(
         getattr(sensor.node, f"trigger_{step}")()
     rail = Transform()
     rail.rotation.w = 1.0
-    others = graph.probe.create_publisher(TFMessage, "/tf_static", qos.own(qos.LATCHED))
+    others = graph.probe.create_publisher(TFMessage, "/tf_static", endpoints.own(endpoints.LATCHED))
     others.publish(below("camera_rail", rail))
-    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     for step in ("configure", "activate"):
         getattr(sensor.node, f"trigger_{step}")()
     graph.spin_until(lambda: sensor.node._frames.settled, "all was heard")

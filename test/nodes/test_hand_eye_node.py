@@ -32,10 +32,10 @@ from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.hand_eye.services import HandEyeOutputs
 from robocal_ros.hand_eye.target_files import write_target
 from robocal_ros.hand_eye.targets import LineTarget
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import pose_message
 from robocal_ros.ros.decision_services import EVENTS
-from robocal_ros.ros.diagnostics import ERROR
+from robocal_ros.ros.endpoints import ERROR
 from robocal_ros.session.events import Command, Outcome
 
 NO_TEXT = "\ud800"  # cannot be carried: it has no UTF-8
@@ -59,8 +59,8 @@ def sensor(graph: Any, tmp_path: Path) -> LiveSensor:
 def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     graph: Any, sensor: LiveSensor, tmp_path: Path
 ) -> None:
-    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
-    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", qos.LATCHED)
+    tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
+    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", endpoints.LATCHED)
     sensor.sphere()
     result = sensor.calibrate()
     assert result.success, result.message
@@ -92,7 +92,7 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     # A node that starts anew publishes it again, also after a crash.
     sensor.node.trigger_deactivate()
     sensor.node.trigger_cleanup()
-    again = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    again = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     settings = {n: v for n, v in settings_of(tmp_path).items() if n != "target_file"}
     process = graph.start("hand_eye_node", settings, {"__node": "second_node"})
     graph.spin_until(lambda: again and again[-1].transforms, "after the start")
@@ -103,7 +103,7 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     assert again[-1].transforms == [transform]
     back = graph.call(Trigger, "/second_node/rollback_trigger")
     assert back.message == "0 ACCEPT revision 2: nothing in force"
-    late = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    late = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     graph.spin_until(lambda: late, "what a late subscriber gets")
     assert late[-1].transforms == []
 
@@ -261,7 +261,7 @@ def test_a_capture_comes_after_all_that_the_node_has_received(
 def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSensor) -> None:
     sensor.sphere(8)
     result = sensor.calibrate()
-    others = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    others = graph.publisher(TFMessage, "/tf_static", endpoints.LATCHED)
     wrong = TransformStamped(child_frame_id=FRAME)
     wrong.header.frame_id = "camera_rail"
     wrong.transform.rotation.w = 1.0
@@ -286,7 +286,7 @@ def test_what_another_process_accepts_is_not_put_below_two_parents(
 ) -> None:
     sensor.sphere(8)
     result = sensor.calibrate()
-    others = graph.publisher(TFMessage, "/tf", qos.RELIABLE)
+    others = graph.publisher(TFMessage, "/tf", endpoints.RELIABLE)
     wrong = TransformStamped(child_frame_id=FRAME)
     wrong.header.frame_id = "camera_rail"
 
@@ -297,7 +297,7 @@ def test_what_another_process_accepts_is_not_put_below_two_parents(
     graph.spin_until(seen, "the transform is seen")
     # Accepted elsewhere it is in force, but not put onto tf, and that is said.
     graph.spin_until(lambda: sensor.node._frames.settled, "it would publish")
-    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     sensor.node._history.accept(result.candidate_id, by="cli", reason="", wall_ns=1)
     graph.spin_until(lambda: sensor.status[-1].revision == 1, "it is taken over")
     graph.spin_for(0.6)
@@ -347,7 +347,7 @@ def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
     graph: Any, sensor: LiveSensor
 ) -> None:
     """The third profile is one of another pose."""
-    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", qos.LATCHED)
+    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", endpoints.LATCHED)
     assert sensor.start().success
     assert sensor.status[-1].header.frame_id == "tool0"
     for number, (q, shot) in enumerate(SHOTS[:10], 1):

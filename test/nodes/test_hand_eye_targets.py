@@ -24,7 +24,7 @@ from robocal_ros.hand_eye.quality import HandEyeSettings
 from robocal_ros.hand_eye.target_files import write_target
 from robocal_ros.hand_eye.targets import Staircase, StepTarget
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import pose_message
 
 TRUTH = sphere_set()[0].T_flange_sensor
@@ -68,7 +68,7 @@ def test_a_camera_by_the_poses_of_its_target(graph: Any, tmp_path: Path, mount: 
     result = sensor.calibrate()
     assert result.success, result.message
     assert off_m(result.sensor, TRUTH, 0.5) < OFF_M
-    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
     graph.spin_until(lambda: tf and tf[-1].transforms, "the transform")
     header = tf[-1].transforms[0].header

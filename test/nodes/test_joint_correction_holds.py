@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.kinematics.robots import load_description
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 
 PERIOD_S = 0.02  # of the joint states
 RESTS_S = 0.5  # of a stream that begins: its first messages may be lost
@@ -61,9 +61,14 @@ class Moving(Line):
         self._ticks = 0
         self._spline: Any = None
         self._spline_s = 0.0
-        graph.probe.create_subscription(JointState, OUTPUT, self._obey, qos.own(qos.RELIABLE))
         graph.probe.create_subscription(
-            JointTrajectory, PATH, lambda message: self._plan(message), qos.own(qos.RELIABLE)
+            JointState, OUTPUT, self._obey, endpoints.own(endpoints.RELIABLE)
+        )
+        graph.probe.create_subscription(
+            JointTrajectory,
+            PATH,
+            lambda message: self._plan(message),
+            endpoints.own(endpoints.RELIABLE),
         )
         graph.probe.create_timer(PERIOD_S, self._tick)
         graph.spin_for(0.5)
@@ -222,7 +227,7 @@ def test_a_second_correction_node_by_accident_ends_the_stream(line: Moving) -> N
     line.held("/by_accident publishes", CorrectionStatus.OTHER_COMMANDER)
     error = line.report(DiagnosticStatus.ERROR, "/by_accident publishes")
     assert error.hardware_id == "s1"
-    seen = graph.collect(CorrectionStatus, "/by_accident/status", qos.LATCHED)
+    seen = graph.collect(CorrectionStatus, "/by_accident/status", endpoints.LATCHED)
     change.call_async(ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE)))
     graph.spin_until(
         lambda: seen and seen[-1].state == CorrectionStatus.OTHER_COMMANDER, "the other says so"
@@ -234,10 +239,10 @@ def test_beside_the_action_nobody_publishes_the_controller_s_own_topic(graph: An
     """A controller takes trajectories there too, whatever a goal's correction is."""
     beside = "/arm_controller/joint_trajectory"
     action = "/arm_controller/follow_joint_trajectory"
-    told = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
+    told = graph.collect(CorrectionStatus, f"{NODE}/status", endpoints.LATCHED)
     graph.start("joint_correction_node", {"serial": "s1", "follow_joint_trajectory": action})
     graph.spin_until(lambda: told and not told[-1].commanders, "nobody else commands", 20.0)
-    stranger = graph.probe.create_publisher(JointTrajectory, beside, qos.RELIABLE)
+    stranger = graph.probe.create_publisher(JointTrajectory, beside, endpoints.RELIABLE)
     graph.spin_until(
         lambda: told[-1].state == CorrectionStatus.OTHER_COMMANDER, f"told of {beside}"
     )
@@ -251,8 +256,8 @@ def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
     line: Moving, how: str
 ) -> None:
     measuring = line.other("some_name")
-    lease = measuring.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
-    controller = measuring.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    lease = measuring.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
+    controller = measuring.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     line.graph.spin_until(lambda: line.node.count_publishers(PATH) == 2, "the own node")
     getattr(line, how)()
     assert line.statuses[-1].state == CorrectionStatus.OFF  # its publisher is no stranger
@@ -281,8 +286,8 @@ def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
 def test_a_lease_whose_holder_died_lasts_while_the_robot_moves(line: Moving) -> None:
     """Finding: after a second the program began, while the dead node's motion was driven on."""
     measuring = line.other("some_name")
-    lease = measuring.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
-    controller = measuring.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    lease = measuring.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
+    controller = measuring.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     line.graph.spin_until(lambda: line.node.count_publishers(PATH) == 2, "the own node")
     line.graph.spin_until(lambda: controller.get_subscription_count() == 2, "its listeners")
     held = MotionLease(
@@ -318,7 +323,7 @@ def test_a_dead_speed_slider_does_not_make_a_stop_go_back(line: Moving) -> None:
 
 def test_a_second_driver_of_the_arm_is_told_and_one_of_a_gripper_is_not(line: Moving) -> None:
     gripper = line.other("gripper")
-    hand = gripper.create_publisher(JointState, "joint_states", qos.RELIABLE)
+    hand = gripper.create_publisher(JointState, "joint_states", endpoints.RELIABLE)
     sent = line.graph.probe.create_timer(
         0.02, lambda: hand.publish(JointState(name=["finger"], position=[0.01]))
     )
@@ -388,7 +393,7 @@ def test_a_refused_target_ends_the_stream_in_order(line: Moving) -> None:
 
 def test_an_enable_while_everything_is_held_says_so(line: Moving) -> None:
     line.take(model_message(drifted()), line.to_model, "kinematic_model")
-    line.other("planner").create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    line.other("planner").create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     line.told(state=CorrectionStatus.OTHER_COMMANDER)
     answer = line.graph.call(SetBool, f"{NODE}/enable", data=True)
     assert not answer.success

@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import robot_file_hash
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 
 PERIOD_S, AHEAD_S = 0.1, 0.3  # of the stream; of its point, from when it is sent
 SPEED = np.array([0.3, 0.1, -0.1, 0.2, -0.1, 0.1])  # rad/s
@@ -46,13 +46,15 @@ class Stream:
         probe.destroy_publisher(controller.topic)  # the node alone commands the controller
         controller.action.destroy()
         self.sent: list[JointTrajectory] = graph.collect(
-            JointTrajectory, f"{NODE}/joint_trajectory", qos.RELIABLE
+            JointTrajectory, f"{NODE}/joint_trajectory", endpoints.RELIABLE
         )
         self.status: list[CorrectionStatus] = graph.collect(
-            CorrectionStatus, f"{CORRECTION}/status", qos.LATCHED
+            CorrectionStatus, f"{CORRECTION}/status", endpoints.LATCHED
         )
-        self._planner = probe.create_publisher(JointTrajectory, "joint_trajectory", qos.RELIABLE)
-        self._models = probe.create_publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+        self._planner = probe.create_publisher(
+            JointTrajectory, "joint_trajectory", endpoints.RELIABLE
+        )
+        self._models = probe.create_publisher(KinematicModel, "kinematic_model", endpoints.LATCHED)
         self._models.publish(self._model())
         self.taught, self.runs = HOME.copy(), False
         probe.create_timer(PERIOD_S, self._tick)

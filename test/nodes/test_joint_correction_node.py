@@ -34,9 +34,9 @@ from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.settings import SETTINGS
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.motion.graph import SourceGuard
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import AUTOSTART, SERIAL
-from robocal_ros.ros.diagnostics import OK, WARN
+from robocal_ros.ros.endpoints import OK, WARN
 
 
 def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:
@@ -345,7 +345,9 @@ def test_as_a_process_it_answers_and_streams(graph: Any) -> None:
     )
     actual = drifted()
     outputs = graph.collect(JointState, f"{NODE}/joint_targets")
-    graph.publisher(KinematicModel, "/somebody/model", qos.LATCHED).publish(model_message(actual))
+    graph.publisher(KinematicModel, "/somebody/model", endpoints.LATCHED).publish(
+        model_message(actual)
+    )
     taught = graph.collect(JointState, f"{NODE}/joint_states")
     target = graph.publisher(JointState, "joint_targets")
     state = graph.publisher(JointState, "joint_states")

@@ -25,7 +25,7 @@ from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.session.decisions import bring_into_force
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
@@ -60,11 +60,11 @@ class Cell:
         self.sent: list[tuple[float, np.ndarray, np.ndarray]] = []
         self._phase, self._answered, self._heard, self._pauses = 0.0, 0.0, 0.0, False
         self.status: list[CorrectionStatus] = graph.collect(
-            CorrectionStatus, f"{NODE}/status", qos.LATCHED
+            CorrectionStatus, f"{NODE}/status", endpoints.LATCHED
         )
         probe = graph.probe
         probe.create_subscription(
-            JointState, f"{NODE}/joint_targets", self._obey, qos.own(qos.RELIABLE)
+            JointState, f"{NODE}/joint_targets", self._obey, endpoints.own(endpoints.RELIABLE)
         )
         self._targets = probe.create_publisher(JointState, "joint_targets", 10)
         self._states = probe.create_publisher(JointState, "joint_states", 10)

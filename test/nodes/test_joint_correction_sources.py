@@ -9,8 +9,8 @@ from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.ros import qos
-from robocal_ros.ros.diagnostics import WARN
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.endpoints import WARN
 
 # A stream is a stream although other work on the machine may hold its messages up.
 SLOW = {"stream_gap_s": 2.0}
@@ -25,7 +25,7 @@ def test_a_stream_of_two_publishers_is_refused_until_one_is_left(graph: Any) -> 
     line = Line(graph, **SLOW)
     line.target()
     other = Node("teleop", context=graph.context)
-    also = other.create_publisher(JointState, "joint_targets", qos.RELIABLE)
+    also = other.create_publisher(JointState, "joint_targets", endpoints.RELIABLE)
     two_on(line, "joint_targets")
     for publisher in (line.to_target, also, line.to_target):
         line.refused(publisher, joints(HOME + 0.1), "joint_targets")
@@ -59,7 +59,7 @@ def test_two_streams_at_once_are_refused(graph: Any) -> None:
 
 def test_planners_that_wait_do_not_hold_up_another(graph: Any) -> None:
     line = Line(graph)
-    idle = graph.probe.create_publisher(JointTrajectory, "joint_trajectory", qos.RELIABLE)
+    idle = graph.probe.create_publisher(JointTrajectory, "joint_trajectory", endpoints.RELIABLE)
     two_on(line, "joint_trajectory")
     path = trajectory(np.stack([HOME, HOME]), np.array([0.5, 1.0]))
     line.rest()
@@ -89,13 +89,13 @@ def test_a_stream_whose_publisher_vanishes_is_told(graph: Any) -> None:
 def test_a_stranger_and_then_a_lease_are_both_told(graph: Any) -> None:
     line = Line(graph)
     stranger = line.graph.probe.create_publisher(
-        JointTrajectory, f"{NODE}/joint_trajectory", qos.RELIABLE
+        JointTrajectory, f"{NODE}/joint_trajectory", endpoints.RELIABLE
     )
     line.told(state=CorrectionStatus.OTHER_COMMANDER)
     graph.probe.destroy_publisher(stranger)
     line.statuses.clear()
     line.told(state=CorrectionStatus.OFF)
-    lease = graph.probe.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
+    lease = graph.probe.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
     lease.publish(
         MotionLease(robot=NOMINAL.name, serial="s1", holder="/h", held=True, purpose="tool")
     )

@@ -16,7 +16,7 @@ from robocal_msgs.msg import CorrectionStatus, KinematicModel
 from sensor_msgs.msg import JointState
 from stream_parts import BEGIN, PERIOD_S, WAY_RAD
 
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 PARTS = Path(__file__).with_name("stream_parts.py")
 DIRECT_RUNS = 10
@@ -61,8 +61,8 @@ def largest_step(places: np.ndarray) -> float:
 def test_no_step_is_larger_than_without_the_node(graph: Any) -> None:
     direct = [run(graph, "joint_targets") for _ in range(DIRECT_RUNS)]
     allowed = MOST * max(largest_step(places) for places in direct)
-    status = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
-    models = graph.probe.create_publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+    status = graph.collect(CorrectionStatus, f"{NODE}/status", endpoints.LATCHED)
+    models = graph.probe.create_publisher(KinematicModel, "kinematic_model", endpoints.LATCHED)
     models.publish(model_message(drifted()))
     for stall_s, on in STALLS:
         node = started(graph, status, on)

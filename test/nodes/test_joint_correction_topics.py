@@ -28,7 +28,7 @@ from tool_driver import noisy_cell
 
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.settings import session_config
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.tool.node import TcfNode
 
 
@@ -69,7 +69,7 @@ def test_wired_by_remapping_before_a_forward_command_controller(graph: Any) -> N
     )
     actual = drifted()
     outputs = graph.collect(Float64MultiArray, corrected)
-    model = graph.publisher(KinematicModel, "/thermal_node/model", qos.LATCHED)
+    model = graph.publisher(KinematicModel, "/thermal_node/model", endpoints.LATCHED)
     state = graph.publisher(JointState, "joint_states")
     command = graph.publisher(Float64MultiArray, "/servo/commands")
     model.publish(model_message(actual))
@@ -235,7 +235,7 @@ def test_the_status_tells_what_is_in_use(graph: Any) -> None:
 
 def test_the_status_is_latched_and_goes_out_every_second(graph: Any) -> None:
     line = Line(graph)
-    late = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
+    late = graph.collect(CorrectionStatus, f"{NODE}/status", endpoints.LATCHED)
     graph.spin_until(lambda: late, "the status for one who comes late")
     line.told(state=CorrectionStatus.OFF)
     line.statuses.clear()

@@ -27,7 +27,7 @@ from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.decision_services import EVENTS
 
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
@@ -44,8 +44,8 @@ class Plc:
         self.echo: int | None = None
         self.is_open, self.beating, self.q = True, bridge, np.radians(HOME_DEG)
         self.names = list(load_robot("ur10").joint_names)
-        self.states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
-        self.statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
+        self.states = graph.collect(AccuracyState, "accuracy_state", endpoints.LATCHED)
+        self.statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", endpoints.LATCHED)
         self.events = graph.collect(SessionEvent, f"{NODE}/session_events", EVENTS)
         self.node = start()
         self.gap = graph.publisher(GapOpen, "gap_open") if bridge else None
@@ -363,7 +363,7 @@ MINE = {"robot": "UR10", "serial": "unset"}
 @pytest.mark.parametrize("other", [{"serial": "K8"}, {"robot": "bx200l"}, {}], ids=str)
 def test_the_accuracy_of_another_robot_does_not_count(graph, other):
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
-    drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
+    drift = graph.publisher(AccuracyState, ACCURACY, endpoints.LATCHED)
     told = AccuracyState(state=AccuracyState.OK, **((MINE | other) if other else {}))
     drift.publish(told)
     graph.spin_until(lambda: node.inputs[ACCURACY].invalid == 1, "it is refused")
@@ -376,8 +376,8 @@ def test_the_accuracy_of_another_robot_does_not_count(graph, other):
 def test_a_figure_that_cannot_be_is_no_drift(graph, name):
     poses = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})
-    states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
-    drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
+    states = graph.collect(AccuracyState, "accuracy_state", endpoints.LATCHED)
+    drift = graph.publisher(AccuracyState, ACCURACY, endpoints.LATCHED)
     known = MINE | {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
     for count, value in enumerate((np.nan, np.inf, -np.inf, 1e300), 1):
         drift.publish(AccuracyState(state=AccuracyState.OK, **(known | {name: value})))
@@ -404,8 +404,8 @@ def test_a_second_publisher_of_the_heartbeat_closes_the_gap(plc, graph):
 
 def test_a_heartbeat_that_cannot_be_heard_is_told(graph):
     graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
-    statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
-    graph.probe.create_publisher(GapOpen, "gap_open", qos.own(qos.SENSOR))
+    statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", endpoints.LATCHED)
+    graph.probe.create_publisher(GapOpen, "gap_open", endpoints.own(endpoints.SENSOR))
     words = "gap_open of probe is BEST_EFFORT and not heard: publish it RELIABLE"
     graph.spin_until(lambda: statuses and statuses[-1].doing == words, "it is told")
 
@@ -454,7 +454,7 @@ def test_a_bridge_that_repeats_the_last_value_of_a_dead_plc_closes_the_gap(plc, 
 def test_a_bool_is_told_and_counts_only_where_the_parameter_says_so(graph):
     beats = graph.probe.create_publisher(Bool, "gap_open", 10)
     graph.probe.create_timer(PERIOD_S, lambda: beats.publish(Bool(data=True)))
-    statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
+    statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", endpoints.LATCHED)
     words = "gap_open of probe is std_msgs/msg/Bool and not heard: publish robocal_msgs/msg/GapOpen"
     # Processes of their own: in one, a topic has one type.
     node = process(graph)

@@ -15,7 +15,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import ACCURACY, CORRECTION, MaintenanceNode
-from robocal_ros.ros import conversions, qos
+from robocal_ros.ros import conversions, endpoints
 
 ARM = load_robot("ur10")
 POSES = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
@@ -35,8 +35,8 @@ class Line:
 
     def __init__(self, graph: Any, **settings: Any) -> None:
         self.graph, self.node = graph, graph.add(MaintenanceNode, SETTINGS | settings)
-        self.states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
-        drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
+        self.states = graph.collect(AccuracyState, "accuracy_state", endpoints.LATCHED)
+        drift = graph.publisher(AccuracyState, ACCURACY, endpoints.LATCHED)
         known = AccuracyState(state=AccuracyState.OK, robot=ARM.name, serial="K7", **DRIFT)
         drift.publish(known)
         graph.probe.create_timer(TELLS_S, lambda: drift.publish(known))
@@ -60,7 +60,7 @@ def test_after_a_restart_the_line_reads_that_nothing_is_corrected(graph):
     answer = graph.call(SetBool, "/joint_correction_node/enable", data=True)
     assert not answer.success  # no model yet
     line.reads(AccuracyState.DEGRADED, "wire its inputs")
-    models = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+    models = graph.publisher(KinematicModel, "kinematic_model", endpoints.LATCHED)
     models.publish(
         conversions.kinematic_model(
             model_document(ARM),
@@ -88,13 +88,13 @@ def test_who_commands_past_the_correction_is_named_to_the_line(graph):
     other = CorrectionStatus(
         **mine, state=CorrectionStatus.OTHER_COMMANDER, commanders="planner publishes targets"
     )
-    graph.publisher(CorrectionStatus, CORRECTION, qos.LATCHED).publish(other)
+    graph.publisher(CorrectionStatus, CORRECTION, endpoints.LATCHED).publish(other)
     line.reads(AccuracyState.DEGRADED, "puts nothing out, planner publishes targets: end them")
 
 
 def test_what_cannot_be_of_this_correction_does_not_count(graph):
     line = Line(graph)
-    correction = graph.publisher(CorrectionStatus, CORRECTION, qos.LATCHED)
+    correction = graph.publisher(CorrectionStatus, CORRECTION, endpoints.LATCHED)
     mine = {"robot": ARM.name, "serial": "K7", "state": CorrectionStatus.ON}
     counted = line.node.inputs[CORRECTION]
     for count, wrong in enumerate(({"serial": "K8"}, {"robot": "bx200l"}, {"state": 0}), 1):

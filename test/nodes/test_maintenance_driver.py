@@ -11,10 +11,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.driver import MaintenanceDriver
 from robocal_ros.maintenance.requests import Move
+from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import MotionDriver
-from robocal_ros.motion.housing import DrivingConfig, Housing
-from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
 

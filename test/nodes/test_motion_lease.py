@@ -17,7 +17,7 @@ from test_maintenance_calls import Plc, process
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 PROGRAM = "/program/joint_trajectory"
 STRANGER = f"/planner publishes {ROBOT}"
@@ -56,7 +56,7 @@ def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -
         settings,
         {"joint_trajectory": PROGRAM, "~/joint_trajectory": ROBOT},
     )
-    said = graph.collect(CorrectionStatus, "/joint_correction_node/status", qos.LATCHED)
+    said = graph.collect(CorrectionStatus, "/joint_correction_node/status", endpoints.LATCHED)
     target = np.radians(HOME_DEG) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1])
     motion = JointTrajectory(
         joint_names=cell.arm.joint_names,

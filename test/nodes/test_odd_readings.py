@@ -19,7 +19,7 @@ from trajectory_controllers import HOME, NODE, Controlled, simulated, trajectory
 
 from bench.live.cell import set_fault
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 
@@ -45,7 +45,9 @@ class Corrected:
         controller.action.destroy()  # nobody else commands the robot
         self.graph.probe.destroy_publisher(controller.topic)
         self.said = self.graph.collect(DiagnosticArray, "/diagnostics")
-        status = self.graph.collect(CorrectionStatus, "/joint_correction_node/status", qos.LATCHED)
+        status = self.graph.collect(
+            CorrectionStatus, "/joint_correction_node/status", endpoints.LATCHED
+        )
         self.node = self.graph.start(
             "joint_correction_node",
             {"robot": "ur10", "serial": "s1", "follow_joint_trajectory": ACTION},

@@ -19,7 +19,7 @@ from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.decision_services import EVENTS
 
 pytestmark = pytest.mark.data
@@ -34,7 +34,7 @@ def played(graph: Any, bag: Path, serial: str, poses: int) -> list[SessionEvent]
     """Play the bag into a thermal node; it has taken all of it in. Returns its events."""
     sent = {"/joint_states": poses * len(ur10_campaigns.AROUND_NS), "/measured_pose": poses}
     events = graph.collect(SessionEvent, EVENT_TOPIC, EVENTS)
-    reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+    reports = graph.collect(String, "/replay_node/status", endpoints.LATCHED)
     diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
     settings = {"robot": "ur10", "serial": serial}
     graph.start("thermal_node", settings, None, "--ros-args", "--params-file", str(CONFIG))

@@ -29,7 +29,7 @@ from robocal_ros.bags.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.decision_services import EVENTS
 from robocal_ros.thermal.node import ThermalNode
 from robocal_ros.tool.node import TcfNode
@@ -63,7 +63,7 @@ def said(graph, publisher, kind, data) -> None:
 
 def test_a_killed_recorder_keeps_what_it_flushed_and_the_next_begins_anew(graph):
     recorder = started(graph)
-    publisher = graph.publisher(String, "/words", qos.SENSOR)
+    publisher = graph.publisher(String, "/words", endpoints.SENSOR)
     for i in range(50):
         said(graph, publisher, String, f"{i}")
     graph.spin_for(0.5)  # five times as long as between two flushes
@@ -86,7 +86,7 @@ def test_a_killed_recorder_keeps_what_it_flushed_and_the_next_begins_anew(graph)
 
 def test_each_recording_opens_with_what_is_in_force(graph):
     started(graph)
-    model = graph.probe.create_publisher(String, "/model", qos.own(qos.LATCHED))
+    model = graph.probe.create_publisher(String, "/model", endpoints.own(endpoints.LATCHED))
     model.publish(String(data="revision 3"))  # long before anybody listens
     publisher = graph.publisher(String, "/words")
     said(graph, publisher, String, "before")
@@ -112,7 +112,7 @@ def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_
     graph.state.mkdir(exist_ok=True)
     obstacle = graph.state / "rec"
     obstacle.write_text("a file where the folder should be")
-    model = graph.probe.create_publisher(String, "/model", qos.own(qos.LATCHED))
+    model = graph.probe.create_publisher(String, "/model", endpoints.own(endpoints.LATCHED))
     model.publish(String(data="revision 3"))
     events = graph.probe.create_publisher(SessionEvent, "/events", EVENTS)
     commands = ["configure", "identify"]
@@ -223,12 +223,12 @@ def test_what_another_of_its_name_may_have_made_stays_while_that_one_writes(grap
     assert other.folder.exists()
 
 
-@pytest.mark.parametrize("less", [qos.SENSOR, qos.RELIABLE])
+@pytest.mark.parametrize("less", [endpoints.SENSOR, endpoints.RELIABLE])
 def test_what_comes_back_with_less_than_before_is_recorded(graph, less):
     """A driver is started anew: best effort instead of reliable, or no longer latched."""
     node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(graph.state / "rec")})
-    before = qos.RELIABLE if less is qos.SENSOR else qos.LATCHED
-    first = graph.probe.create_publisher(String, "/words", qos.own(before))
+    before = endpoints.RELIABLE if less is endpoints.SENSOR else endpoints.LATCHED
+    first = graph.probe.create_publisher(String, "/words", endpoints.own(before))
     count: dict[str, int] = {}
 
     def recorded(by: Any) -> bool:
@@ -239,7 +239,7 @@ def test_what_comes_back_with_less_than_before_is_recorded(graph, less):
     graph.probe.destroy_publisher(first)
     graph.spin_for(0.5)
     count["before"] = node.health().values["messages"]
-    second = graph.probe.create_publisher(String, "/words", qos.own(less))
+    second = graph.probe.create_publisher(String, "/words", endpoints.own(less))
     graph.spin_until(lambda: recorded(second), "the second is recorded")
 
 

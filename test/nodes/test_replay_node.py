@@ -24,7 +24,7 @@ from robocal_ros.bags.replay_topics import chosen_topics, message_class
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 
 ROOT = Path(__file__).parents[2]
@@ -72,7 +72,7 @@ class Listener:
         self.notes = graph.collect(String, "/note", KEEP_ALL)
         self.events = graph.collect(String, "/n/session_events", KEEP_ALL)
         self.clock = graph.collect(Clock, "/clock", BEST_EFFORT)
-        self.reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+        self.reports = graph.collect(String, "/replay_node/status", endpoints.LATCHED)
 
     @property
     def status(self) -> dict[str, Any]:
@@ -233,7 +233,7 @@ def test_wrong_choices_are_named():
 
 def test_without_a_bag_it_is_there_and_says_what_it_needs(graph):
     process = graph.start("replay_node", {})
-    reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+    reports = graph.collect(String, "/replay_node/status", endpoints.LATCHED)
     graph.spin_until(lambda: reports, "it is active")
     assert json.loads(reports[-1].data)["state"] == "no bag"
     answer = graph.call(Trigger, "/replay_node/play")
@@ -244,7 +244,7 @@ def test_without_a_bag_it_is_there_and_says_what_it_needs(graph):
 
 def test_play_waits_for_its_subscribers_and_says_for_which(graph, tmp_path):
     bag = write_bag(tmp_path / "shift.mcap", 20, 1_000_000)
-    reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+    reports = graph.collect(String, "/replay_node/status", endpoints.LATCHED)
     settings = {"bag": bag, "rate": 0.0, "start_paused": True, "wait_for_subscribers": "[note]"}
     process = graph.start("replay_node", settings)
     graph.spin_until(lambda: reports, "it is active")

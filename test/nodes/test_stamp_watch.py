@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros.ground.errors import WrongRobotError
 from robocal_ros.kinematics.robots import find_robot, load_robot, robot_file_hash
-from robocal_ros.ros import clocks, qos
+from robocal_ros.ros import clocks, endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.history_settings import open_history
 from robocal_ros.thermal.node import ThermalNode
@@ -25,7 +25,7 @@ class Reader:
 
     def __init__(self, graph: Any) -> None:
         self.graph = graph
-        self.models = graph.collect(KinematicModel, "/thermal_node/model", qos.LATCHED)
+        self.models = graph.collect(KinematicModel, "/thermal_node/model", endpoints.LATCHED)
         self.node = graph.add(ThermalNode, {"serial": "s1"})
         self.said = graph.collect(DiagnosticArray, "/diagnostics")
         self.joints = graph.publisher(JointState, "/joint_states")

@@ -18,7 +18,7 @@ from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
 
@@ -34,9 +34,9 @@ def cell(graph: Any, tmp_path: Any) -> LiveCell:
 
 
 def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCell) -> None:
-    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
-    frame = graph.collect(TransformStamped, "/tcf_node/tool_frame", qos.LATCHED)
-    tools = graph.collect(ToolFrame, "/tcf_node/tool", qos.LATCHED)
+    tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
+    frame = graph.collect(TransformStamped, "/tcf_node/tool_frame", endpoints.LATCHED)
+    tools = graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
     result = cell.measure()
     assert result.success, result.message
     assert result.status == CalibrationQuality.ACCEPT
@@ -76,7 +76,7 @@ def test_it_moves_with_a_heartbeat_that_echoes_the_beats_of_maintenance_node(
 ) -> None:
     """Beats, and a PLC that echoes the newest it has read; then one that echoes what it latched."""
     cell = LiveCell(graph, tmp_path, TRUTH, motion="trajectory")
-    status = graph.publisher(MaintenanceStatus, "/maintenance_node/status", qos.LATCHED)
+    status = graph.publisher(MaintenanceStatus, "/maintenance_node/status", endpoints.LATCHED)
     gap = graph.publisher(GapOpen, "/gap_open")
     beat, latched = 4_294_967_290, None if listens else 4_294_967_290
 

@@ -35,10 +35,10 @@ from robocal_ros.history.history_file import acknowledge
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.decision_services import EVENTS
-from robocal_ros.ros.diagnostics import Health
+from robocal_ros.ros.endpoints import Health
 from robocal_ros.ros.history_settings import history_notice
 from robocal_ros.thermal.node import ThermalNode
 from robocal_ros.thermal.seeding import config_of
@@ -308,7 +308,7 @@ def test_a_kill_during_accept_leaves_the_old_or_the_new_state(graph, nominal):
             with CalibrationHistory.open(serial, state_dir=graph.state) as history:
                 before = history.head()
                 chosen = propose(history, nominal, 10 * turn + robot + 1)
-            models = graph.collect(KinematicModel, f"/{name}/model", qos.LATCHED)
+            models = graph.collect(KinematicModel, f"/{name}/model", endpoints.LATCHED)
             client = graph.probe.create_client(Decide, f"/{name}/accept")
             process = graph.start("thermal_node", {"serial": serial}, {"__node": name})
             started.append((serial, before, chosen, models, client, process))
@@ -414,7 +414,7 @@ def test_uncorrected_joint_states_are_refused(graph, visits):
     """Who publishes the status of a correction is one, whatever its name."""
     cell = Cell(graph)
     impostor = Node("renamed", context=graph.context)
-    impostor.create_publisher(CorrectionStatus, "~/status", qos.LATCHED)
+    impostor.create_publisher(CorrectionStatus, "~/status", endpoints.LATCHED)
     publisher = impostor.create_publisher(JointState, "/joint_states", DEEP)
     graph.spin_until(lambda: publisher.get_subscription_count(), "the node hears it")
     graph.spin_until(

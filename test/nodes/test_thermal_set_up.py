@@ -10,7 +10,7 @@ from shift import BALL, T_SENSOR_BASE, Shift, built, postures
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 POSES = 10
 FIELD_MM = "[1500.0,1500.0,2000.0,500.0,4000.0]"
@@ -23,7 +23,7 @@ def placed(graph, method: str = ""):
 def test_from_an_unmounted_sphere_to_planned_poses(graph):
     nominal = load_robot("kr150_r3100")
     cell = Cell(graph, sensor_field_mm=FIELD_MM)
-    sensors = graph.collect(TransformStamped, "/thermal_node/sensor", qos.LATCHED)
+    sensors = graph.collect(TransformStamped, "/thermal_node/sensor", endpoints.LATCHED)
     refused = graph.call(PlanPoses, "/thermal_node/plan_poses")
     assert (refused.success, refused.status) == (False, Code.CONFLICT)
     assert "calibrate_sensor first" in refused.message

@@ -21,8 +21,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from bench.live.cell import set_fault
 from robocal_ros.cell_sim.joint_motion import LAG_S
 from robocal_ros.ground.errors import Code
-from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits
-from robocal_ros.ros import qos
+from robocal_ros.motion.plan import SHORTEST_STOP_S, MotionLimits
+from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 
@@ -51,10 +51,10 @@ class Cell:
             "next_step": "/tcf_node/next_step",
             "joint_trajectory": "/tcf_node/joint_trajectory",
         }
-        self.truth = graph.collect(TransformStamped, "/cell_sim_node/truth", qos.LATCHED)
+        self.truth = graph.collect(TransformStamped, "/cell_sim_node/truth", endpoints.LATCHED)
         self.joints = graph.collect(JointState, "joint_states")
         self.sent = graph.collect(JointTrajectory, "/tcf_node/joint_trajectory")
-        self.steps = graph.collect(ToolStep, "/tcf_node/next_step", qos.LATCHED)
+        self.steps = graph.collect(ToolStep, "/tcf_node/next_step", endpoints.LATCHED)
         graph.start("cell_sim_node", simulated, remap)
         graph.spin_until(lambda: self.truth and csv.exists(), "the cell")
         laser = folder / "laser.yaml"

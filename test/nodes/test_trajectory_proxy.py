@@ -28,7 +28,7 @@ from robocal_ros.correction import action as trajectory_proxy
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 OWN = f"{NODE}/follow_joint_trajectory"
 Result = FollowJointTrajectory.Result
@@ -101,7 +101,7 @@ class Cell:
 
     def begin(self, settled: bool = True) -> None:
         self.graph.spin_until(self.client.server_is_ready, "the action")
-        publisher = self.graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+        publisher = self.graph.publisher(KinematicModel, "kinematic_model", endpoints.LATCHED)
         publisher.publish(model_message(ACTUAL))
         self.taught()
         if settled:
@@ -270,7 +270,7 @@ def slows_down(points: Any) -> bool:
 def test_a_lease_stops_a_goal_by_a_goal_that_slows_down(cell: Any) -> None:
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=8.0).moves()
-    own = cell.graph.probe.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
+    own = cell.graph.probe.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
     held = MotionLease(robot=NOMINAL.name, serial="s1", holder="/probe", held=True)
     renewal = cell.graph.probe.create_timer(0.1, lambda: own.publish(held))
     result = sent.ends(GoalStatus.STATUS_ABORTED)

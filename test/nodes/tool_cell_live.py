@@ -16,7 +16,7 @@ from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.cell_sim.outputs import planned_step
 from robocal_ros.cell_sim.tool_cell import ToolCell
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
 
@@ -44,7 +44,7 @@ class LiveCell(Driver):
             "input_period_ms": 2.0,
             "taught_xyz_mm": (TAUGHT[:3, 3] * 1e3).tolist(),
         } | parameters
-        self.steps = graph.collect(ToolStep, "/tcf_node/next_step", qos.LATCHED)
+        self.steps = graph.collect(ToolStep, "/tcf_node/next_step", endpoints.LATCHED)
         self.node = graph.add(TcfNode, settings)
         self.joints = graph.publisher(JointState, "joint_states", STREAM)
         self.edges = graph.publisher(BeamEvent, "beam_events")

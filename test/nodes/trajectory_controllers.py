@@ -22,7 +22,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros import qos
+from robocal_ros.ros import endpoints
 
 ARM = load_robot("ur10")
 NAMES = list(ARM.joint_names)
@@ -95,7 +95,7 @@ class Controlled:
         graph.spin_until(self.action.server_is_ready, "its action")
         self.topic = graph.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
         self.scaling = graph.publisher(
-            SpeedScalingFactor, f"{NODE}/speed_scaling_input", qos.LATCHED
+            SpeedScalingFactor, f"{NODE}/speed_scaling_input", endpoints.LATCHED
         )
         graph.spin_for(0.3)
 
@@ -217,7 +217,9 @@ def real(graph: Any, folder: Path, velocities: bool, **parameters: Any) -> Contr
     file = folder / "controllers.yaml"
     file.write_text(yaml.dump({name: {"ros__parameters": of} for name, of in settings.items()}))
     controlled = Controlled(graph)
-    description = graph.probe.create_publisher(String, "robot_description", qos.own(qos.LATCHED))
+    description = graph.probe.create_publisher(
+        String, "robot_description", endpoints.own(endpoints.LATCHED)
+    )
     description.publish(String(data=_urdf(velocities)))
     node = Path(
         get_package_prefix("controller_manager"), "lib/controller_manager/ros2_control_node"

@@ -15,8 +15,7 @@ from bench.closed_loop.carrying import Carrier
 from bench.closed_loop.words import drift_of
 from robocal_ros.ground.samples import JointSample, PointSample
 from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession
-from robocal_ros.motion.cell import joint_way
-from robocal_ros.motion.housing import DrivingConfig
+from robocal_ros.motion.cell import DrivingConfig, joint_way
 from robocal_ros.session.events import CAPTURE_REFERENCE, Command, Outcome
 from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 

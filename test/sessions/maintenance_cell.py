@@ -21,7 +21,7 @@ from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.mover import STATION, Ways
 from robocal_ros.maintenance.requests import DriverAnswer
-from robocal_ros.motion.housing import DrivingConfig, Housing
+from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.tool.judging import KnownTool

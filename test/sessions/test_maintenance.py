@@ -34,8 +34,7 @@ from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import requests as ask
 from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.mover import Mover
-from robocal_ros.motion.limits import SHORTEST_STOP_S
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.plan import SHORTEST_STOP_S, JointPlan
 from robocal_ros.session.events import LEAVE
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 

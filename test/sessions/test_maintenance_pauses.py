@@ -29,7 +29,7 @@ from robocal_ros.maintenance.hands import DEAF_S
 from robocal_ros.maintenance.requests import Stop
 from robocal_ros.maintenance.run import UNSAVED_S
 from robocal_ros.motion.gap import DRAIN_S
-from robocal_ros.motion.limits import SHORTEST_STOP_S
+from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.tool.driving import SETTLED_S
 
 PAUSES_S = (0.3, 0.6, 3.0)

@@ -29,7 +29,7 @@ from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.mover import Ways
 from robocal_ros.maintenance.requests import DriverAnswer
-from robocal_ros.motion.limits import SHORTEST_STOP_S
+from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
 

@@ -23,8 +23,7 @@ from robocal_ros.ground.streams import JointStream, StandstillRule
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
 from robocal_ros.thermal.observations import ObservationDesk
-from robocal_ros.tool.recorded import take_tool_message
-from robocal_ros.tool.session import ToolSession
+from robocal_ros.tool.session import ToolSession, take_tool_message
 
 MS = 1_000_000
 NAMES = ("a", "b")

@@ -12,7 +12,7 @@ from robocal_ros.bags.replay import read_events
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import JOINTS, JUMPS
-from robocal_ros.hand_eye import recorded as hand_eye_recorded
+from robocal_ros.hand_eye import session as hand_eye_session
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession
 from robocal_ros.kinematics.arm import model_document
@@ -22,7 +22,7 @@ from robocal_ros.thermal import seeding
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import session_as_recorded
 from robocal_ros.thermal.session import ThermalSession
-from robocal_ros.tool import recorded
+from robocal_ros.tool import session as tool_session
 from robocal_ros.tool.session import ToolSession
 
 NS = 1_000_000_000
@@ -34,13 +34,13 @@ KINDS = {
     ),
     "tool": (
         lambda history: ToolSession(ARM, history, config_of(noisy_cell()), "test"),
-        recorded.configuration,
-        recorded.tool_session_as_recorded,
+        tool_session.configuration,
+        tool_session.tool_session_as_recorded,
     ),
     "hand-eye": (
         lambda history: HandEyeSession(ARM, history, HandEyeConfig(), "test"),
-        hand_eye_recorded.configuration,
-        hand_eye_recorded.hand_eye_session_as_recorded,
+        hand_eye_session.configuration,
+        hand_eye_session.hand_eye_session_as_recorded,
     ),
 }
 

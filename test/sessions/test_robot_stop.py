@@ -15,8 +15,7 @@ from robocal_ros.correction.robot_stop import (
     RobotTrack,
 )
 from robocal_ros.kinematics.robots import load_description
-from robocal_ros.motion.limits import SHORTEST_STOP_S
-from robocal_ros.motion.plan import REACTION_S, JointPlan
+from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan
 
 ROBOT = load_description("kr150_r3100")
 ARM = ROBOT.arm

@@ -6,10 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.cell import MotionCell, joint_way
-from robocal_ros.motion.housing import DrivingConfig, Housing, ToolBody
-from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits, stop
-from robocal_ros.motion.plan import LEAD_S
+from robocal_ros.motion.cell import DrivingConfig, Housing, MotionCell, ToolBody, joint_way
+from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, MotionLimits, stop
 from robocal_ros.motion.robot_watch import LEAST, RobotWatch
 
 ARM = load_robot("kr150_r3100")

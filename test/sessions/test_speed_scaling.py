@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from robocal_ros.motion.speed_scaling import TOLD_S, SpeedScaling
+from robocal_ros.motion.robot_watch import TOLD_S, SpeedScaling
 
 
 def test_what_is_not_told_again_is_forgotten() -> None:

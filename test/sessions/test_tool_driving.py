@@ -8,7 +8,7 @@ from tool_driver import TAUGHT, TRUTH
 from robocal_ros.cell_sim.beams import bent
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground.errors import Code, ConflictError
-from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.plan import MotionLimits
 from robocal_ros.session.events import MEASURE_TOOL, Command
 from robocal_ros.tool.driving import DrivePhase
 from robocal_ros.tool.edges import EdgeSample

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from robocal_ros.cell_sim.joint_motion import JointMotion
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.housing import DrivingConfig
-from robocal_ros.motion.limits import SHORTEST_STOP_S, MotionLimits, stop
-from robocal_ros.motion.plan import LEAD_S, JointPlan
+from robocal_ros.motion.cell import DrivingConfig
+from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, JointPlan, MotionLimits, stop
 from robocal_ros.motion.robot_watch import (
     REPEAT_S,
     REST_RAD,
