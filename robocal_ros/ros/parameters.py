@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -18,7 +19,11 @@ from rclpy.parameter import Parameter
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import nearest, share_folders
 from robocal_ros.ground.streams import StandstillRule
+
+QOS_OVERRIDES = "qos_overrides."  # of topics, which are declared with their endpoints
+
 
 # ---- parameters ---------------------------------------------------------------------------------
 
@@ -172,12 +177,30 @@ class ParameterTable:
         Raises
         ------
         InputError
-            When a parameter was given a bad value at the start; names all of them.
+            When a parameter was given a bad value at the start, or is none of any node of ours;
+            names all of them.
         """
-        if self._faults:
-            raise InputError("; ".join(self._faults.values()))
+        faults = [*self._faults.values(), *self._unknown()]
+        if faults:
+            raise InputError("; ".join(faults))
         values = {name: self._node.get_parameter(name).value for name in self._settings}
         return {name: _without_blanks(value) for name, value in values.items()}
+
+    def _unknown(self) -> list[str]:
+        """What is wrong with names that were given at the start; rclpy itself drops them unsaid."""
+        given = [
+            name
+            for name in self._node._parameter_overrides
+            if not name.startswith(QOS_OVERRIDES) and not self._node.has_parameter(name)
+        ]
+        # What all nodes of a cell are given (config/cell.yaml) need not be a parameter of each.
+        foreign = set(given) - _shipped_names() if given else ()
+        return [
+            f"{name} is no parameter{nearest(name, self._settings)}: correct its name, or give it "
+            "in a section of the node that has it"
+            for name in given
+            if name in foreign
+        ]
 
     def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -199,6 +222,16 @@ class ParameterTable:
             self._faults.pop(name, None)
         if ours and self.locked and self.changed is not None:
             self.changed()
+
+
+def _shipped_names() -> set[str]:
+    """Parameters of all nodes, as their files in config/ show them."""
+    names: set[str] = set()
+    for folder in share_folders("robocal_ros", "config", "config")[:1]:
+        for file in folder.glob("*_node.yaml"):
+            for section in yaml.load(file.read_bytes(), yaml.CSafeLoader).values():
+                names |= section["ros__parameters"].keys()
+    return names
 
 
 def _without_blanks(value: Any) -> Any:

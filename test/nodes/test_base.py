@@ -175,6 +175,21 @@ def test_a_bad_parameter_at_the_start_is_named_and_can_be_put_right(graph: Any) 
     assert set_parameter(graph, factor=4.0).successful
 
 
+def test_a_parameter_that_no_node_has_is_named(graph: Any) -> None:
+    """rclpy drops it unsaid: a misspelt limit would be the default."""
+    node = graph.add(Doubler, {"facter": 4.0})
+    assert state_of(graph) == "unconfigured"
+    message = node._full_health().message
+    assert "facter is no parameter (did you mean 'factor'?)" in message
+
+
+def test_what_is_given_to_all_nodes_need_not_be_a_parameter_of_each(graph: Any) -> None:
+    """Of config/cell.yaml, and what rclpy itself takes."""
+    shared = {"robot": "ur10", "laser": "", "use_sim_time": False}
+    graph.add(Doubler, shared | {"qos_overrides./number.subscription.depth": 7})
+    assert state_of(graph) == "active"
+
+
 def test_whole_numbers_stand_for_floats_and_blanks_for_no_entry(graph: Any) -> None:
     node = graph.add(Doubler, {"factor": 3})
     assert node.settings["factor"] == 3.0
