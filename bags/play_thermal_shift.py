@@ -26,7 +26,7 @@ from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.cell_sim.thermal_shift import REFERENCE
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 
 SERIAL = "SIM-KR150-2"
 INPUTS = ("joint_states", "sphere_cloud", "reference_sphere_center", "motor_temperatures")

@@ -28,7 +28,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
-from robocal_ros.session.base import Commanded
+from robocal_ros.session.base import SessionBase
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import (
@@ -49,7 +49,7 @@ from robocal_ros.tool.session import (
 # ---- what replays of all kinds tell: commands, pauses, damaged parts of the bag -----------------
 
 
-S = TypeVar("S", bound=Commanded)
+S = TypeVar("S", bound=SessionBase)
 AsRecorded = Callable[[SerialArm, CalibrationHistory, Command, str], S]
 
 
@@ -80,7 +80,7 @@ def command_document(outcome: Outcome) -> Document:
 
 
 def commanded_document(
-    report: ReplayReport, session: Commanded, recording: BagOverview
+    report: ReplayReport, session: SessionBase, recording: BagOverview
 ) -> Document:
     """What the replay of a recorded session tells, whatever it measures."""
     topic = {kind: name for name, kind in recording.inputs.items()}

@@ -1,7 +1,7 @@
 """Who else commands the robot, or publishes its joints: by who serves and publishes on the graph.
 
 A publisher numbers its messages, those of one publisher increase (rmw_fastrtps); what else is used
-of the graph stands in `motion.graph`.
+of the graph stands in `ros.graph`.
 """
 
 import math
@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros.correction.inputs import Reason
 from robocal_ros.correction.wire import joint_names
-from robocal_ros.motion.graph import KILLED, clients, own_endpoint, publishers, strangers
+from robocal_ros.ros.graph import KILLED, clients, own_endpoint, publishers, strangers
 
 LEASE_S = 1.0  # a lease that was not renewed for so long is lost: its holder died, or hangs
 STOOD_S = 1.0  # a lost one is over when the robot has stood for so long

@@ -23,19 +23,15 @@ from robocal_ros.hand_eye.settings import SETTINGS, session_config
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.clocks import StampWatch
-from robocal_ros.ros.decision_services import CommandDesk, DecisionServices
+from robocal_ros.ros.decision_services import DecisionServices
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.frame_watch import FrameWatch
-from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
+from robocal_ros.ros.session_node import SessionNode
 from robocal_ros.session.decisions import named
 from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome
 
-COMMAND_S = 1.0
 WATCH_S = 0.1
 INPUTS = {
     JOINTS: (JointState, endpoints.STREAM),
@@ -45,51 +41,41 @@ INPUTS = {
 }
 
 
-class HandEyeNode(HouseNode):
+class HandEyeNode(SessionNode[HandEyeSession]):
     """Drives a `HandEyeSession` with live messages and calls."""
 
     NAME = "hand_eye_node"
     SETTINGS = SETTINGS
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._session: HandEyeSession | None = None
-        self._history: CalibrationHistory | None = None
+    INPUTS = INPUTS
 
     def configure(self) -> None:
         """Read the robot, open the history, then the topics and services."""
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
         self._config = session_config(settings)
-        self._serial_in_use, self._history = open_history(settings, self._nominal)
+        history = self.open_session(sole=False)
         self._kind = hand_eye_kind(self._config.sensor_frame)
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
-        self._guard = SourceGuard(self, JOINTS)
-        self._stamps = StampWatch(self, JOINTS)
-        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
-        for kind, (message_type, profile) in INPUTS.items():
-            self.add_input(message_type, kind, self._taker(kind), profile)
-        self._desk = CommandDesk(self, COMMAND_S, self._show)
         ask, session = self._desk.ask, self._running
-        self._files = HandEyeFiles(self, ask, session, self._history)
-        HandEyeServices(self, settings, ask, self._files, session, self._history)
-        DecisionServices(self.add_service, self._ask_decision, self._history, self._kind)
-        self.add_timer(POLL_S, self._poll, steady=True)
+        self._files = HandEyeFiles(self, ask, session, history)
+        HandEyeServices(self, settings, ask, self._files, session, history)
+        DecisionServices(self.add_service, self._ask_decision, history, self._kind)
         self.add_timer(WATCH_S, self._watch, steady=True)
+
+    def new_session(self, history: CalibrationHistory) -> HandEyeSession:
+        """The session of an active node."""
+        return HandEyeSession(self._nominal, history, self._config, __version__)
 
     def activate(self) -> None:
         """Begin a session; it knows nothing of what was captured before."""
-        if self._history is None:
-            raise ValueError("activated before it was configured")
-        self._session = HandEyeSession(self._nominal, self._history, self._config, __version__)
-        self._desk.session = self._session
+        super().activate()
         self._frames = FrameWatch(self, self._config.sensor_frame, self._outputs.transforms)
         self._last: Outcome | None = None
         self._shown: tuple[int, int] | None = None
         self._on_tf: int | None = None  # the revision
         self._silence = Silence()
-        self._show_in_force()
-        self._outputs.status(self._session, None)
+        self.show_in_force()
+        self._outputs.status(self._running(), None)
 
     def deactivate(self) -> None:
         """End the session; the capture that waits fails, and calls that wait are answered."""
@@ -99,16 +85,8 @@ class HandEyeNode(HouseNode):
             if (command := session.broken_off(Code.CONFLICT, words)) is not None:
                 self._desk.ask(command)
             self._publish("the end", lambda: self._outputs.status(session, self._last, ended=True))
-        self._session = None
         self._frames.close()
-        self._desk.close()
-
-    def cleanup(self) -> None:
-        """Close the history."""
-        self._session = None
-        if self._history is not None:
-            self._history.close()
-        self._history = None
+        super().deactivate()
 
     def _running(self) -> HandEyeSession:
         if self._session is None:
@@ -117,21 +95,12 @@ class HandEyeNode(HouseNode):
 
     # ---- samples and commands -------------------------------------------------------------------
 
-    def _taker(self, kind: str) -> Any:
-        def take(message: Any) -> None:
-            session = self._session
-            if session is None:
-                return
-            self._stamps.note(kind, message)
-            if kind == JOINTS and (fault := self._guard.fault_at(session.received[JOINTS])):
-                session.refuse(JOINTS, InputError(fault))
-                return
-            take_hand_eye_message(session, kind, message)
-            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
-            if (command := session.recognised()) is not None:
-                self._desk.ask(command)
-
-        return take
+    def take(self, session: HandEyeSession, kind: str, message: Any) -> None:
+        """Give a message of the input ``kind`` to the session."""
+        take_hand_eye_message(session, kind, message)
+        self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
+        if (command := session.recognised()) is not None:
+            self._desk.ask(command)
 
     async def _ask_decision(self, command: Command) -> Outcome:
         if command.name == ACCEPT and self._chosen(command) is not None:
@@ -166,23 +135,15 @@ class HandEyeNode(HouseNode):
             self._desk.ask(command)
 
     def _poll(self) -> None:
-        self._guard.look()
-        if self._session is None:
-            return
-        self._frames.look()
-        for outcome in self._session.poll():
-            self._show(outcome)
-        self._publish("a decision", self._show_in_force)
+        if self._session is not None:
+            self._frames.look()
+        super()._poll()
 
     # ---- outputs --------------------------------------------------------------------------------
 
-    def _show(self, outcome: Outcome) -> None:
+    def show(self, outcome: Outcome) -> None:
+        """Publish what came of a command; it is logged already."""
         name, session = outcome.command.name, self._session
-        words = f"{name}: {outcome.status.name} {outcome.message}"
-        if outcome.done:
-            self.get_logger().info(words)
-        else:
-            self.get_logger().warning(words)
         if session is None:
             return
         self._last = outcome
@@ -190,7 +151,7 @@ class HandEyeNode(HouseNode):
         if name == CALIBRATE:
             self._publish(name, lambda: self._files.keep(outcome))
             self._publish(name, lambda: self._show_quality(outcome))
-        self._publish(name, self._show_in_force)
+        self._publish(name, self.show_in_force)
         self._publish(name, lambda: self._outputs.status(session, outcome))
 
     def _publish(self, name: str, publish: Callable[[], None]) -> None:
@@ -208,7 +169,7 @@ class HandEyeNode(HouseNode):
         frame = str(history.model(number)["parent"]) if number else self._config.flange_frame
         self._outputs.quality(outcome, frame)
 
-    def _show_in_force(self) -> None:
+    def show_in_force(self) -> None:
         """Put the sensor in force onto tf and record the new state, when either changed."""
         session = self._session
         if session is None:
@@ -237,30 +198,19 @@ class HandEyeNode(HouseNode):
     def _conflict(self, model: Mapping[str, Any]) -> str:
         return self._frames.conflict(model["parent"], np.array(model["T_parent_sensor"]))
 
-    def health(self) -> Health:
-        """Tell what is in force, what is captured, what was lost or ignored, what is wrong."""
-        session, health = self._session, Health()
-        if session is None:
-            return health
-        values: dict[str, object] = {"revision in force": session.in_force.revision}
+    def report(self, session: HandEyeSession, history: CalibrationHistory, health: Health) -> None:
+        """Tell what is captured, and whether the sensor's place stands on tf."""
         data = session.data
-        values["data set"] = (
+        health.values["data set"] = (
             "none"
             if data is None
             else f"{data.kind}, {len(data.samples)} samples of {len(data.captures)} captures"
         )
-        values |= session.ignored.listed() | self._stamps.judge(health)
         model = session.in_force.model
-        taken = "" if model is None else self._conflict(model)
-        for fault in (self._guard.fault, session.current.fault, taken):
-            if fault:
-                health.worsen(ERROR, fault)
+        if model is not None and (taken := self._conflict(model)):
+            health.worsen(ERROR, taken)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        if self._history is not None:
-            warn_of_history(health, self._history)
-        health.values = values
-        return health
 
 
 def main() -> None:

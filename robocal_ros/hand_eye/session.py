@@ -23,7 +23,7 @@ from robocal_ros.hand_eye.results import HandEyeResults, require_known
 from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Shot, ShotLog, shot_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.base import Commanded, Handler, configured_with, recorded_arguments
+from robocal_ros.session.base import Handler, SessionBase, configured_with, recorded_arguments
 from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command, Outcome
 
@@ -33,7 +33,7 @@ from robocal_ros.session.events import Command, Outcome
 _NO_SET = "no data set is open: call start, or load one"
 
 
-class HandEyeSession(Commanded):
+class HandEyeSession(SessionBase):
     """Calibrates one sensor of one robot.
 
     ``capture`` answers at once; that the robot stood still and what the sensor saw then becomes a
@@ -102,7 +102,7 @@ class HandEyeSession(Commanded):
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""
-        self.ignored.add(kind, str(error))
+        super().refuse(kind, error)
         if self.data is not None and kind == self.data.topic:
             self._why = error
 

@@ -36,13 +36,13 @@ from robocal_ros.maintenance.services import (
 from robocal_ros.maintenance.settings import SETTINGS, session_config
 from robocal_ros.motion.cell import load_motion
 from robocal_ros.motion.driver import LeaseHolder, MotionDriver
-from robocal_ros.motion.graph import CommandPath, GapSources, SourceGuard
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import goal_tolerances
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.clocks import SteadyClock
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
+from robocal_ros.ros.graph import CommandPath, GapSources, SourceGuard
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
 from robocal_ros.session.events import Command, Outcome

@@ -17,8 +17,9 @@ from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.maintenance import CycleResult, MaintenanceSession, Status
 from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.ros import conversions, endpoints
-from robocal_ros.ros.decision_services import TWIN, DeferredActionServer, SessionEvents
+from robocal_ros.ros.decision_services import TWIN, DeferredActionServer
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
+from robocal_ros.ros.session_node import SessionEvents
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.thermal.accuracy_state import Accuracy

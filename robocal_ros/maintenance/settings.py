@@ -10,9 +10,9 @@ import numpy as np
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.motion.driver import CONTROLLER
-from robocal_ros.motion.graph import GAP_BOOL, SHORTEST_STALE_S
 from robocal_ros.motion.settings import MOTION, driving_config, require_limits
 from robocal_ros.ros.conversions import MM, joint_poses, joints_of
+from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S
 from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import Setting, given_pose, length, pose_settings
 from robocal_ros.tool.laser_frame import read_laser_for

@@ -1,35 +1,26 @@
 """Accept, reject, roll back and list, with their Trigger twins: the same at every node."""
 
 import json
-import time
-import traceback
-from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionServer
 from rclpy.action.server import ServerGoalHandle
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
-from robocal_msgs.msg import SessionEvent
 from robocal_msgs.srv import Decide, ListCalibrations
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.ros.conversions import summary_message, time_message
-from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
+from robocal_ros.ros.conversions import summary_message
+from robocal_ros.ros.endpoints import EndpointNode, trigger_text
 from robocal_ros.session.decisions import NEWEST, ONLY
 from robocal_ros.session.events import (
     ACCEPT,
-    CONFIGURE,
     REJECT,
     ROLLBACK,
     Command,
     Outcome,
-    arguments_text,
-    outcome_text,
 )
 
 # ---- accept, reject, roll back and list, with their Trigger twins: the same at every node -------
@@ -130,136 +121,7 @@ def answer(response: Any, outcome: Outcome) -> Any:
 # ---- session events -----------------------------------------------------------------------------
 
 
-# A recorder that comes later still gets the events.
-EVENTS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
-AddOutput = Callable[[type, str, QoSProfile], Any]
-
-
-class SessionEvents:
-    """Publisher of one session's events."""
-
-    def __init__(self, add: AddOutput) -> None:
-        self._events = add(SessionEvent, "~/session_events", EVENTS)
-        self._sequence = 0
-        self._since = 0  # events after the last configuration
-
-    def tell(self, command: Command, outcome: Outcome | None) -> None:
-        """Record a command and what came of it, None for the configuration."""
-        self._sequence += 1
-        self._since = 0 if command.name == CONFIGURE else self._since + 1
-        self._events.publish(event_message(command, outcome, self._sequence))
-
-    @property
-    def need_configuration(self) -> bool:
-        """Whether to tell the configuration again although nothing has changed.
-
-        A recording that begins later gets the last events alone, and cannot be replayed without a
-        configuration among them.
-        """
-        return self._since >= EVENTS.depth // 2
-
-
-def event_message(command: Command, outcome: Outcome | None, sequence: int) -> SessionEvent:
-    """A command and what came of it, None for the configuration."""
-    return SessionEvent(
-        stamp=time_message(command.stamp_ns or 0),
-        sequence=sequence,
-        command=command.name,
-        arguments=arguments_text(command),
-        outcome="{}" if outcome is None else outcome_text(outcome),
-    )
-
-
 # ---- command desk -------------------------------------------------------------------------------
-
-
-class Session(Protocol):
-    """What a session does with commands."""
-
-    @property
-    def waiting(self) -> int:
-        """Number of commands not yet carried out."""
-
-    def submit(self, command: Command, clock_ns: int | None = None) -> None:
-        """Queue a command."""
-
-    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
-        """Carry out one command: what was decided outside before it, and it."""
-
-
-class CommandDesk:
-    """Between the callers of a node and its session.
-
-    Parameters
-    ----------
-    timeout_s : a command waits at most so long for its samples.
-    show : takes each outcome, also of what was decided outside.
-
-    Attributes
-    ----------
-    session : None while the node is inactive.
-    """
-
-    def __init__(
-        self, node: EndpointNode, timeout_s: float, show: Callable[[Outcome], None]
-    ) -> None:
-        self._node, self._show = node, show
-        self._asked: deque[Future] = deque()
-        self.session: Session | None = None
-        self._deadline = node.add_timer(timeout_s, self._force, steady=True)
-        self._deadline.cancel()
-
-    def ask(self, command: Command) -> Future:
-        """Give a command to the session; the future becomes its outcome."""
-        if self.session is None:
-            raise NotActiveError("no session: activate the node")
-        future: Future = Future()
-        if not self._asked:
-            self._deadline.reset()
-        self._asked.append(future)
-        self.session.submit(command, self._node.now_ns())
-        self.step()
-        return future
-
-    def step(self, *, force: bool = False) -> None:
-        """Carry out the commands whose samples are complete."""
-        while self.session is not None and self._asked:
-            try:
-                outcomes: list[Any] = self.session.step(wall_ns=time.time_ns(), force=force)
-            except Exception as error:  # a defect must not end the node: the caller is told
-                self._asked.popleft().set_exception(error)
-                continue
-            if not outcomes:
-                return
-            asked = self._asked.popleft()  # before it is shown: that may give a command too
-            for outcome in outcomes:
-                self._show_safely(outcome)
-            asked.set_result(outcomes[-1])
-        self._deadline.cancel()
-
-    def _show_safely(self, outcome: Outcome) -> None:
-        """A defect in showing what was done must not take the answer from its caller."""
-        try:
-            self._show(outcome)
-        except Exception:
-            self._node.get_logger().error(f"not shown:\n{traceback.format_exc()}")
-
-    def close(self) -> None:
-        """End the session; calls that wait are answered."""
-        self.session = None
-        self._deadline.cancel()
-        while self._asked:
-            error = NotActiveError("deactivated while the command waited: nothing was done")
-            self._asked.popleft().set_exception(error)
-
-    def _force(self) -> None:
-        self.step(force=True)
 
 
 # ---- an action server whose goals are ended from any callback -----------------------------------

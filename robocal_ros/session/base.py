@@ -123,7 +123,7 @@ GAP_NS = 250_000_000
 Handler = Callable[[Command, int], Outcome]
 
 
-class Commanded:
+class SessionBase:
     """Base of the sessions that carry out a command as soon as it is given.
 
     A subclass gives its handlers. A recorded command waits for its marks.
@@ -162,6 +162,11 @@ class Commanded:
         return self._followed.head
 
     @property
+    def fault(self) -> str:
+        """Why the history could not be read at the last look; empty when it could."""
+        return self._followed.fault
+
+    @property
     def marks(self) -> dict[str, int]:
         """How far the samples have come: newest stamps, and jumps of the clock."""
         return self.newest_ns | {JUMPS: self._jumps}
@@ -170,6 +175,10 @@ class Commanded:
     def newest_joints_ns(self) -> int:
         """Stamp of the newest joint reading; 0 before any."""
         return self.newest_ns.get(JOINTS, 0)
+
+    def refuse(self, kind: str, error: RobocalError) -> None:
+        """Count a message of an input that cannot be used."""
+        self.ignored.add(kind, str(error))
 
     def _take_joints(self, sample: JointSample) -> bool:
         """Take a reading; tells whether the clock jumped back, which begins everything anew."""
@@ -262,7 +271,7 @@ Document = Mapping[str, Any]
 
 
 def configured_with(
-    session: Commanded, topics: Mapping[str, str], config: Document, in_force: Document
+    session: SessionBase, topics: Mapping[str, str], config: Document, in_force: Document
 ) -> Command:
     """Settings and what is in force, so that a replay can start from the same.
 

@@ -22,14 +22,11 @@ from robocal_ros.ground.samples import (
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
-from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.clocks import DataClock, StampWatch
-from robocal_ros.ros.decision_services import CommandDesk
+from robocal_ros.ros.clocks import DataClock
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
-from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
+from robocal_ros.ros.session_node import SessionNode
 from robocal_ros.session.events import CYCLE, Outcome
 from robocal_ros.thermal.documents import placed_of
 from robocal_ros.thermal.identification import require_parameters
@@ -42,36 +39,32 @@ from robocal_ros.thermal.settings import SETTINGS, session_config
 Array = NDArray[np.float64]
 
 ACCURACY_S = 1.0
+
 INPUTS = {
-    JOINTS: JointState,
-    MEASURED_POINT: PointStamped,
-    SPHERE_CENTER: PointStamped,
-    SPHERE_CLOUD: PointCloud2,
-    REFERENCE_SPHERE: PointStamped,
-    MEASURED_POSE: PoseStamped,
-    TEMPERATURES: Temperature,
+    JOINTS: (JointState, endpoints.STREAM),
+    MEASURED_POINT: (PointStamped, endpoints.STREAM),
+    SPHERE_CENTER: (PointStamped, endpoints.STREAM),
+    SPHERE_CLOUD: (PointCloud2, endpoints.STREAM),
+    REFERENCE_SPHERE: (PointStamped, endpoints.STREAM),
+    MEASURED_POSE: (PoseStamped, endpoints.STREAM),
+    TEMPERATURES: (Temperature, endpoints.STREAM),
 }
 
 
-class ThermalNode(HouseNode):
+class ThermalNode(SessionNode[ThermalSession]):
     """Drives a `ThermalSession` with live messages and calls."""
 
     NAME = "thermal_node"
     SETTINGS = SETTINGS
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self._session: ThermalSession | None = None
-        self._history: CalibrationHistory | None = None
+    INPUTS = INPUTS
 
     def configure(self) -> None:
         """Open the history, then the topics and services."""
-        self._shown: tuple[Any, ...] = ()
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
         require_parameters(self._nominal, settings["drift_parameters"])
         self._config = session_config(settings, self._nominal)
-        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
+        history = self.open_session(settings["command_timeout_s"])
         self._outputs = ThermalOutputs(
             self.add_output,
             self._nominal,
@@ -80,57 +73,28 @@ class ThermalNode(HouseNode):
             settings["base_frame"],
         )
         self._data_clock = DataClock()
-        self._guard = SourceGuard(self, JOINTS)
-        self._stamps = StampWatch(self, JOINTS)
-        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
-        for kind, message_type in INPUTS.items():
-            self.add_input(message_type, kind, self._taker(kind), endpoints.STREAM)
-        self._desk = CommandDesk(self, settings["command_timeout_s"], self._show)
-        ThermalServices(self.add_service, self._desk.ask, self._history)
-        SetUpServices(
-            self.add_service, self._desk.ask, self._history, self._nominal, settings, self._prior
-        )
-        self.add_timer(POLL_S, self._poll, steady=True)
+        ask = self._desk.ask
+        ThermalServices(self.add_service, ask, history)
+        SetUpServices(self.add_service, ask, history, self._nominal, settings, self._prior)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
+
+    def new_session(self, history: CalibrationHistory) -> ThermalSession:
+        """The session of an active node."""
+        return ThermalSession(self._nominal, history, self._config, __version__)
 
     def activate(self) -> None:
         """Begin a session; it knows nothing of what was measured before."""
-        if self._history is None:
-            raise ValueError("activated before it was configured")
-        self._session = ThermalSession(self._nominal, self._history, self._config, __version__)
-        self._desk.session = self._session
-        self._shown = ()
-        self._show_in_force()
-
-    def deactivate(self) -> None:
-        """End the session; calls that wait are answered."""
-        self._session = None
-        self._desk.close()
-
-    def cleanup(self) -> None:
-        """Close the history."""
-        self._session = None
-        if self._history is not None:
-            self._history.close()
-        self._history = None
+        super().activate()
+        self._shown: tuple[Any, ...] = ()
+        self.show_in_force()
 
     # ---- samples and commands -------------------------------------------------------------------
 
-    def _taker(self, kind: str) -> Any:
-        def take(message: Any) -> None:
-            session = self._session
-            if session is None:
-                return
-            self._stamps.note(kind, message)
-            desk = session.desk
-            if kind == JOINTS and (fault := self._guard.fault_at(desk.received[JOINTS])):
-                desk.ignored.add(JOINTS, fault)
-                return
-            take_message(session, kind, message)
-            if session.waiting:
-                self._desk.step()
-
-        return take
+    def take(self, session: ThermalSession, kind: str, message: Any) -> None:
+        """Give a message of the input ``kind`` to the session."""
+        take_message(session, kind, message)
+        if session.waiting:
+            self._desk.step()
 
     def _prior(self) -> Array:
         if self._session is None:
@@ -138,33 +102,24 @@ class ThermalNode(HouseNode):
         return self._session.expected_drift()
 
     def _poll(self) -> None:
-        self._guard.look()
-        session = self._session
-        if session is None:
-            return
         try:
-            for outcome in session.poll():
-                self._show(outcome)
-            self._show_in_force()
-            if (command := session.overdue()) is not None:
+            super()._poll()
+            session = self._session
+            if session is not None and (command := session.overdue()) is not None:
                 self._desk.ask(command)
         except RobocalError as error:  # the history cannot be read: tried again at the next poll
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
 
     # ---- outputs --------------------------------------------------------------------------------
 
-    def _show(self, outcome: Outcome) -> None:
-        words = f"{outcome.command.name}: {outcome.status.name} {outcome.message}"
-        if outcome.done:
-            self.get_logger().info(words)
-        else:
-            self.get_logger().warning(words)
+    def show(self, outcome: Outcome) -> None:
+        """Publish what came of a command; it is logged already."""
         try:
             if not outcome.repeated:
                 self._outputs.events.tell(outcome.command, outcome)
                 if outcome.command.name in CYCLE:
                     self._show_candidate(outcome)
-            self._show_in_force()
+            self.show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{outcome.command.name} was done but not published: {error}")
 
@@ -176,7 +131,7 @@ class ThermalNode(HouseNode):
             model = self._history.model(outcome.calibration_id)
             self._outputs.candidate(model, outcome.command.stamp_ns or 0)
 
-    def _show_in_force(self) -> None:
+    def show_in_force(self) -> None:
         """Publish the model in force and record the new state, when either changed."""
         session, history = self._session, self._history
         if session is None or history is None:
@@ -206,12 +161,9 @@ class ThermalNode(HouseNode):
         found = self._session.accuracy(stamp_ns)
         self._outputs.accuracy(found, self._session.config.tolerance_m, stamp_ns)
 
-    def health(self) -> Health:
-        """Tell what is in force, what waits, what was lost or ignored, what is wrong."""
-        session, history, health = self._session, self._history, Health()
-        if session is None or history is None:
-            return health
-        values: dict[str, object] = {"revision in force": session.in_force.revision}
+    def report(self, session: ThermalSession, history: CalibrationHistory, health: Health) -> None:
+        """Tell what waits, how far the cycle is, and what was lost."""
+        values = health.values
         try:
             pending = [entry.id for entry in history.pending()]
             values["pending candidates"] = ", ".join(map(str, pending)) or "none"
@@ -222,17 +174,9 @@ class ThermalNode(HouseNode):
         named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
         values["cycle"] = f"{named}{visited} of {poses} poses measured"
         values["joint gaps"] = session.desk.stream.gap_count
-        values |= session.desk.ignored.listed() | self._stamps.judge(health)
-        if self._guard.fault:
-            health.worsen(ERROR, self._guard.fault)
-        if session.fault:
-            health.worsen(ERROR, session.fault)
         lost = [topic for topic, count in self.inputs.items() if count.lost]
         if lost:
             health.worsen(WARN, f"messages lost on {', '.join(lost)}")
-        warn_of_history(health, history)
-        health.values = values
-        return health
 
 
 def main() -> None:

@@ -27,15 +27,9 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import transform_message
-from robocal_ros.ros.decision_services import (
-    AddService,
-    Ask,
-    DecisionServices,
-    SessionEvents,
-    answer,
-    twin,
-)
+from robocal_ros.ros.decision_services import AddService, Ask, DecisionServices, answer, twin
 from robocal_ros.ros.endpoints import trigger_text
+from robocal_ros.ros.session_node import SessionEvents
 from robocal_ros.session.events import (
     BEGIN_CYCLE,
     CALIBRATE_SENSOR,

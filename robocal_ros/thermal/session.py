@@ -140,6 +140,7 @@ class ThermalSession:
         self.desk = ObservationDesk(
             nominal.joint_names, config.standstill, config.measuring_frame or None
         )
+        self.received, self.ignored = self.desk.received, self.desk.ignored
         self._history = history
         self._queue: list[Command] = []
         self._current = InForce(history, nominal)
@@ -176,6 +177,10 @@ class ThermalSession:
     def newest_joints_ns(self) -> int:
         """Stamp of the newest joint reading; 0 before any."""
         return self.desk.newest_ns.get(JOINTS, 0)
+
+    def refuse(self, kind: str, error: RobocalError) -> None:
+        """Count a message of an input that cannot be used."""
+        self.ignored.add(kind, str(error))
 
     @property
     def arm(self) -> SerialArm:
@@ -379,4 +384,4 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
         elif kind == MEASURED_POSE:
             session.add(pose_sample(message, session.config.target))
     except RobocalError as error:
-        session.desk.ignored.add(kind, str(error))
+        session.refuse(kind, error)

@@ -14,14 +14,10 @@ from robocal_ros.ground.samples import JOINTS
 from robocal_ros.ground.streams import Silence
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
-from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.clocks import StampWatch
-from robocal_ros.ros.decision_services import CommandDesk
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
-from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
+from robocal_ros.ros.session_node import SessionNode
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool import node_motion
 from robocal_ros.tool.driving import load_measuring
@@ -34,21 +30,19 @@ from robocal_ros.tool.services import Runner, TcfOutputs, TcfServices
 from robocal_ros.tool.session import ToolSession, configuration, take_tool_message
 from robocal_ros.tool.settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 
-COMMAND_S = 1.0
 WATCH_S = 0.02
 INPUTS = {JOINTS: (JointState, endpoints.STREAM), EDGES: (BeamEvent, endpoints.RELIABLE)}
 
 
-class TcfNode(HouseNode):
+class TcfNode(SessionNode[ToolSession]):
     """Drives a `ToolSession` with live messages and calls."""
 
     NAME = "tcf_node"
     SETTINGS = (*SETTINGS, *node_motion.SETTINGS)
+    INPUTS = INPUTS
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._session: ToolSession | None = None
-        self._history: CalibrationHistory | None = None
         self._calls: TcfServices | None = None
         self._motion: TcfMotion | None = None
 
@@ -62,7 +56,7 @@ class TcfNode(HouseNode):
         taught = taught_tool(settings, self._nominal)
         load_measuring(self._nominal)
         self._config = session_config(settings, placed.laser, placed.station, taught)
-        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
+        history = self.open_session()
         frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
         self._outputs = TcfOutputs(
             self.add_output,
@@ -71,12 +65,6 @@ class TcfNode(HouseNode):
             robot_file_hash(settings["robot"]),
             frames,
         )
-        self._guard = SourceGuard(self, JOINTS)
-        self._stamps = StampWatch(self, JOINTS)
-        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
-        for kind, (message_type, profile) in INPUTS.items():
-            self.add_input(message_type, kind, self._taker(kind), profile)
-        self._desk = CommandDesk(self, COMMAND_S, self._show)
         runner = Runner(
             begin=self._begin,
             ended=lambda: self._run_end,
@@ -87,34 +75,33 @@ class TcfNode(HouseNode):
             is_open=lambda: self._session is not None and self._session.run is not None,
             deaf=lambda: "" if self._motion is None else self._motion.deaf(),
         )
-        self._calls = TcfServices(self, runner, self._desk.ask, self._history)
+        self._calls = TcfServices(self, runner, self._desk.ask, history)
         if settings["motion"] == TRAJECTORY:
             robot = self._nominal, self._serial_in_use
             self._motion = TcfMotion(self, settings, self._desk.ask, *robot)
-        self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(WATCH_S, self._watch, steady=True)
+
+    def new_session(self, history: CalibrationHistory) -> ToolSession:
+        """The session of an active node."""
+        return ToolSession(self._nominal, history, self._config, __version__)
 
     def activate(self) -> None:
         """Begin a session; it knows nothing of what was measured before."""
-        if self._history is None:
-            raise ValueError("activated before it was configured")
-        self._session = ToolSession(self._nominal, self._history, self._config, __version__)
-        self._desk.session = self._session
+        super().activate()
         self._last: Outcome | None = None
         self._run_end: Future = Future()
         self._shown: tuple[int, int, int] | None = None
         self._silence = Silence()
-        if self._motion is not None:
+        if self._motion is not None and self._session is not None:
             self._motion.activate(self._session)
-        self._show_in_force()
+        self.show_in_force()
         self._show_step()
 
     def deactivate(self) -> None:
         """Stop what moves and end the session; calls that wait are answered."""
         if self._motion is not None:
             self._motion.deactivate()
-        self._session = None
-        self._desk.close()
+        super().deactivate()
         if not self._run_end.done():
             self._run_end.set_exception(NotActiveError("deactivated: the run is broken off"))
 
@@ -122,40 +109,27 @@ class TcfNode(HouseNode):
         """Take the action down and close the history."""
         if self._motion is not None:
             self._motion.close()
-        self._session = self._motion = None
+        self._motion = None
         if self._calls is not None:
             self._calls.close()
         self._calls = None
-        if self._history is not None:
-            self._history.close()
-        self._history = None
+        super().cleanup()
 
     # ---- samples and commands -------------------------------------------------------------------
 
-    def _taker(self, kind: str) -> Any:
-        def take(message: Any) -> None:
-            session = self._session
-            if session is None:
-                return
-            self._stamps.note(kind, message)
-            if kind == JOINTS:
-                if fault := self._guard.fault_at(session.received[JOINTS]):
-                    session.ignored.add(JOINTS, fault)
-                    return
-                if self._motion is not None:
-                    self._motion.take(message)
-            elif self._motion is not None:
-                self._motion.beam(message)
-            take_tool_message(session, kind, message)
-            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
-            command = session.recognised()
-            drives = self._motion is not None and self._motion.on_its_way()
-            if command is not None and not (drives and command.name == TOOL_STEP):
-                self._desk.ask(command)
-            elif session.waiting:
-                self._desk.step()
-
-        return take
+    def take(self, session: ToolSession, kind: str, message: Any) -> None:
+        """Give a message of the input ``kind`` to what moves, and to the session."""
+        motion = self._motion
+        if motion is not None:
+            motion.take(message) if kind == JOINTS else motion.beam(message)
+        take_tool_message(session, kind, message)
+        self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
+        command = session.recognised()
+        drives = motion is not None and motion.on_its_way()
+        if command is not None and not (drives and command.name == TOOL_STEP):
+            self._desk.ask(command)
+        elif session.waiting:
+            self._desk.step()
 
     def _begin(self, mode: str, cycle_id: str, by: str) -> Any:
         session = self._session
@@ -179,34 +153,22 @@ class TcfNode(HouseNode):
             words = f"joint states are silent for {silent_s:.2f} s: check the robot's driver"
             self._break_off(Code.TOO_FEW_SAMPLES, words)
 
-    def _poll(self) -> None:
-        self._guard.look()
-        if self._session is None:
-            return
-        for outcome in self._session.poll():
-            self._show(outcome)
-        self._show_in_force()
-
     # ---- outputs --------------------------------------------------------------------------------
 
-    def _show(self, outcome: Outcome) -> None:
+    def show(self, outcome: Outcome) -> None:
+        """Publish what came of a command; it is logged already."""
         name = outcome.command.name
-        words = f"{name}: {outcome.status.name} {outcome.message}"
-        if outcome.done:
-            self.get_logger().info(words)
-        else:
-            self.get_logger().warning(words)
         if outcome.repeated or self._session is None:
             return
         try:
             if name == MEASURE_TOOL:  # a run goes by the thermal model of its begin
-                self._show_in_force()
+                self.show_in_force()
             self._outputs.events.tell(outcome.command, outcome)
             if name == MEASURE_TOOL and outcome.done:
                 self._run_end, self._last = Future(), None
             if name in (MEASURE_TOOL, TOOL_STEP, BREAK_OFF):
-                self._show_step(words)
-            self._show_in_force()
+                self._show_step(f"{name}: {outcome.status.name} {outcome.message}")
+            self.show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{name} was done but not published: {error}")
         if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None and not self._last:
@@ -242,7 +204,7 @@ class TcfNode(HouseNode):
         model = self._history.model(outcome.calibration_id)
         return self._outputs.frame(model, outcome.command.stamp_ns or 0)
 
-    def _show_in_force(self) -> None:
+    def show_in_force(self) -> None:
         """Publish the tool in force and record the new state, when either changed."""
         session, history = self._session, self._history
         if session is None or history is None:
@@ -262,28 +224,19 @@ class TcfNode(HouseNode):
         thermal = 0 if head.model is None else int(head.model["thermal_revision"])
         self._outputs.tool(current.tool, head.revision, thermal, stamp)
 
-    def health(self) -> Health:
-        """Tell what is in force, what is awaited, what was lost or ignored, what is wrong."""
-        session, history, health = self._session, self._history, Health()
-        if session is None or history is None:
-            return health
-        values: dict[str, object] = {"revision in force": session.in_force.revision}
-        run = session.run
+    def report(self, session: ToolSession, history: CalibrationHistory, health: Health) -> None:
+        """Tell what is awaited, what moves, and what became of the last run."""
+        values, run = health.values, session.run
         values["run"] = "none" if run is None else f"{run.number}, {run.awaited.name} is awaited"
-        faults = [self._guard.fault, session.current.fault]
         if self._motion is not None:
-            values["motion"], faults = self._motion.words(), [*faults, self._motion.fault]
+            values["motion"] = self._motion.words()
+            if self._motion.fault:
+                health.worsen(ERROR, self._motion.fault)
             if trouble := self._motion.trouble():
                 health.worsen(WARN, trouble)
         values["last run"] = "none" if self._last is None else self._last.message
-        values |= session.ignored.listed() | self._stamps.judge(health)
-        for fault in filter(None, faults):
-            health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        warn_of_history(health, history)
-        health.values = values
-        return health
 
 
 def main() -> None:

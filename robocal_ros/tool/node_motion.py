@@ -12,13 +12,13 @@ from robocal_ros.ground.samples import joint_sample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.driver import CONTROLLER, LeaseHolder, MotionDriver
 from robocal_ros.motion.gap import Gap
-from robocal_ros.motion.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances, require_limits
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.clocks import SteadyClock
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
+from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.ros.parameters import Setting, length
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver

@@ -11,7 +11,7 @@ from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.base import Commanded, Handler, configured_with, recorded_arguments
+from robocal_ros.session.base import Handler, SessionBase, configured_with, recorded_arguments
 from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.edges import (
@@ -35,7 +35,7 @@ BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges th
 STRAYS = 2
 
 
-class ToolSession(Commanded):
+class ToolSession(SessionBase):
     """Measures the tool of one arm at one station of two crossed beams.
 
     A command ``measure_tool`` begins a run; each step that `recognised` sees the end of becomes a
@@ -290,4 +290,4 @@ def take_tool_message(session: ToolSession, kind: str, message: Any) -> None:
         elif kind == EDGES:
             session.add(edge_sample(message, session.config.beams))
     except RobocalError as error:
-        session.ignored.add(kind, str(error))
+        session.refuse(kind, error)

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from robocal_ros.ground.samples import REFERENCE_SPHERE, JointSample, PointSample
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 DEEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)

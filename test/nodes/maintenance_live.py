@@ -25,7 +25,7 @@ from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import REST_RAD
 from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 
 START_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]  # of cell_sim_node, over its station
 RAISED_M = 0.08

@@ -309,7 +309,7 @@ def test_endless_reasons_neither_flood_the_log_nor_the_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["ros.base", "ros.conversions", "bags.recorder_node", "motion.graph"]
+    "module", ["ros.base", "ros.conversions", "bags.recorder_node", "ros.graph"]
 )
 def test_what_every_node_imports_brings_no_session_and_no_kernels(module: str) -> None:
     """They cost each start of each node 80 ms."""

@@ -14,8 +14,8 @@ from tool_cell_live import LiveCell
 from tool_driver import TRUTH
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.motion.graph import CommandPath
 from robocal_ros.ros import endpoints
+from robocal_ros.ros.graph import CommandPath
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"

@@ -18,8 +18,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
 from robocal_ros.correction.inputs import Reason
-from robocal_ros.motion.graph import own_endpoint
 from robocal_ros.ros import endpoints
+from robocal_ros.ros.graph import own_endpoint
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"

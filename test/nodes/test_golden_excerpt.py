@@ -27,7 +27,7 @@ from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session import events
 from robocal_ros.session.decisions import ONLY
 from robocal_ros.session.events import Command

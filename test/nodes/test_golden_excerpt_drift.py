@@ -36,7 +36,7 @@ from robocal_ros.ground.proposals import THERMAL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.thermal.seeding import session_as_recorded

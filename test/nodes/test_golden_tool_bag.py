@@ -13,7 +13,7 @@ from tool_cell_live import STREAM
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode

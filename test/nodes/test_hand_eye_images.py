@@ -15,7 +15,7 @@ from robocal_msgs.srv import HandEyeFile
 from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 
 COUNT = 8
 CAMERA = HandEyeStatus.CAMERA

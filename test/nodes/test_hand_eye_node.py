@@ -34,8 +34,8 @@ from robocal_ros.hand_eye.target_files import write_target
 from robocal_ros.hand_eye.targets import LineTarget
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import pose_message
-from robocal_ros.ros.decision_services import EVENTS
 from robocal_ros.ros.endpoints import ERROR
+from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session.events import Command, Outcome
 
 NO_TEXT = "\ud800"  # cannot be carried: it has no UTF-8

@@ -33,10 +33,10 @@ from std_srvs.srv import SetBool, Trigger
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.settings import SETTINGS
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
-from robocal_ros.motion.graph import SourceGuard
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.endpoints import OK, WARN
+from robocal_ros.ros.graph import SourceGuard
 
 
 def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:

@@ -28,7 +28,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 PERIOD_S = 0.05

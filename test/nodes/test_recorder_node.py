@@ -30,7 +30,7 @@ from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.thermal.node import ThermalNode
 from robocal_ros.tool.node import TcfNode
 

@@ -18,7 +18,7 @@ from robocal_ros.bags.recorder_node import LOOK_S
 from robocal_ros.cli.main import main
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.ros.decision_services import EVENTS
+from robocal_ros.ros.session_node import EVENTS
 
 RECORDER = "recorder_node"
 MANY = EVENTS.depth + EVENTS.depth // 4  # more than a recording gets of what was before it
