@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import statistics
 import subprocess
 import sys
 import time
@@ -507,24 +506,15 @@ def test_a_state_folder_that_cannot_be_used_does_not_end_the_node(graph):
     assert process.stop() == 0
 
 
-def test_it_starts_within_the_time_promised(graph):
-    """The figure is bench/startup.py's; this bound holds on a busy machine too."""
+def test_it_starts_with_no_parameter_at_all(graph):
+    """How soon, bench/startup.py says."""
     client = graph.probe.create_client(ListCalibrations, "/thermal_node/list")
-    took = []
-    for _ in range(3):
-        begin = time.monotonic()
-        process = graph.start("thermal_node")  # no parameter at all
+    for _ in range(2):
+        process = graph.start("thermal_node")
         graph.spin_until(client.service_is_ready, "the service is there")
-        future = _answered(graph, client)
-        took.append(time.monotonic() - begin)
-        assert future.result().success
+        assert _answered(graph, client).result().success
         process.stop()
         graph.spin_until(lambda: not client.service_is_ready(), "it is gone")
-    assert statistics.median(took) < 1.5 * BUSY
-    assert max(took) < 3.0 * BUSY
-
-
-BUSY = 2.0  # other work on the machine
 
 
 def _answered(graph, client):
