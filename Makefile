@@ -41,7 +41,7 @@ demo: setup  ## a simulated cell in closed loop through the live nodes, report i
 # have starved it, and named; never one whose examples chance picks.
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 PYTEST := $(ROS) python -m pytest -p no:cacheprovider
-test: setup  ## all tests; TESTS="test/core -k tool" for some
+test: setup  ## all tests; TESTS="test/tool -k laser" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
 	failed=0

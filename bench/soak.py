@@ -88,7 +88,7 @@ def endurance(amount: Amount) -> Table:
         lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
-    properties = ("-m", "hypothesis and not ros", "test/core", "test/storage", "test/sessions")
+    properties = ("-m", "hypothesis and not ros", "test", "--ignore=test/nodes")
     add("all property tests, each time with other examples", amount.seeds,
         lambda: sum(not _pytest(*properties, f"--hypothesis-seed={seed}")
                     for seed in range(amount.seeds)))  # fmt: skip
@@ -97,7 +97,7 @@ def endurance(amount: Amount) -> Table:
 
 def _history_kills(count: int) -> int:
     """How many kills left neither the old nor the new state."""
-    worker = ROOT / "test" / "storage" / "history_workers.py"
+    worker = ROOT / "test" / "worlds" / "history_workers.py"
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, worker, "kill_while_accepting", folder, count, time.time_ns()]
         done = subprocess.run([str(w) for w in command], stdout=subprocess.PIPE, check=True)
@@ -113,7 +113,7 @@ def _history_runs(count: int) -> int:
     from hypothesis import settings
     from hypothesis.stateful import run_state_machine_as_test
 
-    sys.path.insert(0, str(ROOT / "test" / "storage"))
+    sys.path.insert(0, str(ROOT / "test" / "worlds"))
     from test_history_rules import History
 
     plan = settings(max_examples=count, stateful_step_count=100, deadline=None, database=None)

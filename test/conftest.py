@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import subprocess
+import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -10,6 +11,10 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "test" / "worlds"))  # what tests share: cells, robots, recordings
+from measured_cell import cell, known_set_up, make_cell_fixture  # noqa: E402, F401
+
+from robocal_ros.history.calibrations import CalibrationHistory  # noqa: E402
 
 # Cores are shared with other tests: how long an example takes tells nothing of it.
 settings.register_profile("shared", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,6 +56,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def data_dir() -> Path:
     """Folder of the real measurements; the test must be marked ``data``."""
     return find_data()
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Iterator[CalibrationHistory]:
+    """An empty history of a robot."""
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
+        yield opened
 
 
 @pytest.fixture

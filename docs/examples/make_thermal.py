@@ -17,8 +17,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim import kr150
-from robocal_ros.cell_sim.thermal_shift import MEASURING, DriftRecord, drifting_cell, poses, record
+from robocal_ros.cell_sim.thermal_shift import (
+    MEASURING,
+    DriftRecord,
+    drifting_cell,
+    poses,
+    record,
+    true_robot,
+)
 from robocal_ros.kinematics.robots import load_robot
 
 ROBOT, SEED = "kr150_r3100", 1
@@ -54,7 +60,7 @@ def main(folder: Path) -> None:
     """Simulate and write."""
     folder.mkdir(parents=True, exist_ok=True)
     shifts = np.random.default_rng([SEED, 1]).spawn(2)
-    robot = kr150.true_robot(load_robot(ROBOT), np.random.default_rng(SEED))
+    robot = true_robot(load_robot(ROBOT), np.random.default_rng(SEED))
     cell = drifting_cell(robot, poses("sphere"), poses("check"))
     before, after = (record(cell, plan, rng) for plan, rng in zip(cell.plans, shifts, strict=False))
     write(folder / "sensor.csv", before.cold_q, before.cold, [0], range(before.q.shape[1]))

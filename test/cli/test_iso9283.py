@@ -10,7 +10,7 @@ from command import conforms
 
 from robocal_ros.cli.main import main
 
-CROSS = ["101,2,3", "99,2,3", "100,4,3", "100,0,3"]  # as in test/core/test_iso9283.py
+CROSS = ["101,2,3", "99,2,3", "100,4,3", "100,0,3"]  # as in test/identification/test_iso9283.py
 HEADER = "x_mm,y_mm,z_mm"
 
 

@@ -2,10 +2,9 @@ import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
-
 from correction_robot import Robot, drifted, offer
+
+sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another
 
 
 @pytest.fixture

@@ -27,12 +27,7 @@ from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.ros import endpoints
 
 ROOT = Path(__file__).parent.parent.parent
-# For the helper modules beside the tests.
-sys.path[:0] = [
-    str(Path(__file__).parent),
-    str(ROOT / "test" / "sessions"),
-    str(ROOT / "test" / "cli"),
-]
+sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another
 from domains import free_domain  # noqa: E402
 from trajectory_controllers import missing_packages  # noqa: E402
 

@@ -18,7 +18,7 @@ from stream_parts import BEGIN, PERIOD_S, WAY_RAD
 
 from robocal_ros.ros import endpoints
 
-PARTS = Path(__file__).with_name("stream_parts.py")
+PARTS = Path(__file__).parents[1] / "worlds" / "stream_parts.py"
 DIRECT_RUNS = 10
 MOST = 1.1  # of the largest step of the direct runs
 STALLED_AT = BEGIN[0] + 0.8

@@ -12,7 +12,7 @@ from domains import free_domain
 
 ROOT = Path(__file__).parent.parent.parent
 WITHIN_S = 10.0
-FOLDERS = f"import sys; sys.path[:0] = [{str(ROOT)!r}, {str(Path(__file__).parent)!r}]"
+FOLDERS = f"import sys; sys.path[:0] = {[str(ROOT / f) for f in ('', 'test/nodes', 'test/worlds')]}"
 BENCH = f"""
 {FOLDERS}
 import time

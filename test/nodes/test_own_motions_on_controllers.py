@@ -32,7 +32,7 @@ pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
 ACTION = f"/{NODE}/follow_joint_trajectory"
 REST = np.zeros(6)
-SCRIPT = Path(__file__).with_name("own_motions.py")
+SCRIPT = Path(__file__).parents[1] / "worlds" / "own_motions.py"
 
 
 class Own:

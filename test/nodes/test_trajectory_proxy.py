@@ -475,7 +475,7 @@ def apart(graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     def start() -> Any:
         with monkeypatch.context() as patch:
             patch.setitem(graph._environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(profiles))
-            return graph.start(Path(__file__).parent / "follower.py")
+            return graph.start(Path(__file__).parents[1] / "worlds" / "follower.py")
 
     cell.start = start
     cell.controller = start()
@@ -548,7 +548,7 @@ def test_a_goal_accepted_too_late_is_cancelled(apart: Any, monkeypatch: Any) -> 
 def test_hostile_feedback_does_not_end_the_process(graph: Any) -> None:
     """Finding: fewer velocities than positions ended the process in mid-goal."""
     cell = Cell(graph)
-    graph.start(Path(__file__).parent / "follower.py", None, None, "hostile")
+    graph.start(Path(__file__).parents[1] / "worlds" / "follower.py", None, None, "hostile")
     process = graph.start("joint_correction_node", SETTINGS)
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=2.0)

@@ -1,8 +1,6 @@
 """A measured cell with a known truth: the arm off its nominal model, noise and nothing else."""
 
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
 
 T_FRAME_BASE = frames.transform(frames.exp_rotation([0.4, -0.3, 2.0]), [3.0, -1.5, 0.7])
 TOOLS = {

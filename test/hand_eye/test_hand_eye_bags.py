@@ -19,7 +19,7 @@ from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
 from robocal_ros.kinematics.robots import load_robot
 
 EVENTS = "/hand_eye_node/session_events"
-BAGS = Path(__file__).parent.parent / "bags"
+BAGS = Path(__file__).parents[2] / "bags"
 KINDS = ("sphere", "step", "line")
 UR10 = load_robot("ur10")
 FLANGE_M = 1e-3  # an arm whose lengths err by 0.05 mm and angles by 0.05 mrad, at a metre

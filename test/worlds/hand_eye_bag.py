@@ -1,9 +1,6 @@
 """The bag of a simulated hand-eye session: all that was said, and what came of it."""
 
-import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "sessions"))  # for hand_eye_driver
 
 from hand_eye_driver import ARM, FRAME, START_NS, TYPE, Driver, Recorded
 

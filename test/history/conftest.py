@@ -1,11 +1,7 @@
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
-
 from history_workers import SERIAL
 
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -22,7 +22,7 @@ from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import automatic_commands
 from robocal_ros.thermal.session import ThermalSession, take_message
 
-BAGS = Path(__file__).parent.parent / "bags"
+BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "demo_shift.mcap"
 INPUTS = {"joint_states": "joint_states", "measured_point": "measured_point"}
 

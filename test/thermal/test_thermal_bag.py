@@ -23,7 +23,7 @@ from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.session import ThermalSession, take_message
 
-BAGS = Path(__file__).parent.parent / "bags"
+BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "thermal_shift.mcap"
 INPUTS = {name: name for name in ("joint_states", "sphere_cloud", "reference_sphere_center")}
 CYCLES, POSES, ROUNDS = 12, 6, 3

@@ -1,12 +1,6 @@
 """A simulated robot that drives what a tool session asks for."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "core"))  # for beam_cell
-
 from beam_cell import make_cell
 
 from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, TrueInput, TrueNoise, bent
