@@ -1,6 +1,6 @@
 """Make every table, print it, and write it to out/bench, a file for each part: ``python -m bench``.
 
-With ``--keep`` also to docs/figures, where the documents refer to it.
+With ``--keep`` also to bench/results, and to docs/figures as the documents refer to it.
 """
 
 import os
@@ -23,7 +23,8 @@ from bench.tables import Table, show
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "out" / "bench"
-KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
+KEPT = ROOT / "bench" / "results"  # the last figures that stand in the documents
+PAGES = ROOT / "docs" / "figures"  # the same to read
 
 
 # Each part's module, which makes its ``tables()``; imported when asked for, since some load much.
@@ -110,21 +111,25 @@ def about(seconds: float) -> dict[str, str]:
     }
 
 
-def _write(folder: Path, part: str, tables: Sequence[Table], about: dict[str, str]) -> None:
+def _write(
+    folder: Path, pages: Path, part: str, tables: Sequence[Table], about: dict[str, str]
+) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     document = {"about": about, "tables": [table.document() for table in tables]}
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / f"{part}.json").write_text(text + "\n")
     words = ", ".join(f"{name} {value}" for name, value in about.items())
     body = "\n".join(table.markdown() for table in tables)
-    (folder / f"{part}.md").write_text(f"Made by `python -m bench {part}`: {words}.\n\n{body}")
+    (pages / f"{part}.md").write_text(f"Made by `python -m bench {part}`: {words}.\n\n{body}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the chosen parts. 1 when a goal is missed."""
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("part", nargs="*", choices=[*PARTS, []], help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--keep", action="store_true", help="write docs/figures too")
+    parser.add_argument(
+        "--keep", action="store_true", help="write bench/results and docs/figures too"
+    )
     given = parser.parse_args(arguments)
     chosen = [name for name in PARTS if not given.part or name in given.part]
     tables: list[Table] = []
@@ -136,8 +141,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         show(made)
         tables += made
         made_by = about(took_s)
-        for folder in (OUT, KEPT) if given.keep and made else (OUT,):
-            _write(folder, name, made, made_by)
+        _write(OUT, OUT, name, made, made_by)
+        if given.keep and made:
+            _write(KEPT, PAGES, name, made, made_by)
     missed += [table.title for table in tables if not table.met]
     for title in missed:
         print(f"goal missed: {title}", file=sys.stderr)

@@ -4,7 +4,7 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 
-from bench.__main__ import KEPT, about
+from bench.__main__ import PAGES, about
 from bench.tables import Table, show
 
 HOUR_S = 3600.0
@@ -24,5 +24,5 @@ def soak_main(
     if given.keep:
         command = f"python -m bench.{name} --seconds {given.seconds:g} --keep"
         facts = ", ".join(f"{name} {x}" for name, x in about(time.monotonic() - start).items())
-        (KEPT / f"{name}.md").write_text(f"Made by `{command}`: {facts}.\n\n{table.markdown()}")
+        (PAGES / f"{name}.md").write_text(f"Made by `{command}`: {facts}.\n\n{table.markdown()}")
     return 0 if table.met else 1

@@ -1,4 +1,4 @@
-"""What the pages quote of docs/figures is what stands there, rounded as the page has it."""
+"""What the pages quote of bench/results is what stands there, rounded as the page has it."""
 
 import json
 import re
@@ -8,7 +8,7 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.(\d+))?(?![\w.])")
-# First cell of a table of accuracy.md; part and table of docs/figures; how many rows make one of
+# First cell of a table of accuracy.md; part and table of bench/results; how many rows make one of
 # the page's.
 QUOTED = [
     ("campaign", "real_data", "ur10_campaigns", 2),
@@ -25,7 +25,7 @@ CLOSED_FORMS = [
 
 def figures(part, name):
     """Numbers of each row of a kept table, cells with a goal by their value."""
-    document = json.loads((DOCS / "figures" / f"{part}.json").read_text())
+    document = json.loads((DOCS.parent / "bench" / "results" / f"{part}.json").read_text())
     (table,) = (t for t in document["tables"] if t["name"] == name)
     values = [[c["value"] if isinstance(c, dict) else c for c in row] for row in table["rows"]]
     return [[v for v in row if isinstance(v, int | float)] for row in values], table["rows"]
