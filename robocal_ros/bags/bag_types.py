@@ -13,9 +13,6 @@ from rosbags.typesys.store import Typestore
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import share_folders
 
-# ---- bag types ----------------------------------------------------------------------------------
-
-
 INTERFACES = "robocal_msgs"
 _DTYPES = {"char": "uint8", "octet": "uint8"}
 

@@ -13,9 +13,6 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from robocal_ros.bags.bag_types import definition, recorded_name, withheld
 from robocal_ros.ground.errors import InputError
 
-# ---- recorded topics as publishers that lose nothing unseen -------------------------------------
-
-
 DEPTH = 1000
 LATCHED_DEPTH = 100
 CLOCK = "/clock"

@@ -18,9 +18,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge
 from robocal_ros.tool.laser_frame import LaserFrame
 
-# ---- beams --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Poses = Callable[[Array], Array]
 

@@ -27,9 +27,6 @@ from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.learning import THRESHOLD_M
 
-# ---- what the simulated cell is made of ---------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -129,7 +126,7 @@ def known_laser(
     return laser_points(replace(plan.station, beams=(x, y)), T_known_true @ T_base_laser, rng)
 
 
-# ---- kr150 cell ---------------------------------------------------------------------------------
+# ---- a whole cell: KR 150, sphere sensor, beams, line laser -------------------------------------
 
 
 TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.40])  # the pin, longer than the ball's stem

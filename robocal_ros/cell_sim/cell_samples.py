@@ -71,7 +71,7 @@ class Outbox:
         return Happened(time_s, q, qd, edges, shots, profiles, temperatures)
 
 
-# ---- cell samples -------------------------------------------------------------------------------
+# ---- samples that sessions take -----------------------------------------------------------------
 
 
 Sample = JointSample | PointSample | TemperatureSample | EdgeSample

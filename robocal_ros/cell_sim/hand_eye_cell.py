@@ -27,9 +27,6 @@ from robocal_ros.ground.errors import LimitError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.inverse import inverse
 
-# ---- hand eye cell ------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 T_FLANGE_SENSOR = frames.transform(frames.exp_rotation([0.1, -0.15, 0.6]), [0.06, -0.04, 0.11])

@@ -19,9 +19,6 @@ from robocal_ros.cell_sim.trajectory_controller import (
 )
 from robocal_ros.ground.errors import InputError
 
-# ---- joints that follow what a joint trajectory controller sends their drives -------------------
-
-
 Array = NDArray[np.float64]
 
 CYCLE_S = 4e-3  # of controller and drives
@@ -257,7 +254,7 @@ class JointMotion:
         self.controller.brake(BRAKES_S * float(np.max(np.abs(speed) / self._fastest)), speed)
 
 
-# ---- command gate -------------------------------------------------------------------------------
+# ---- what comes between commands and controller -------------------------------------------------
 
 
 class CommandGate:

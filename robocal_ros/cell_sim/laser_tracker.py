@@ -18,9 +18,6 @@ from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise, Tr
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.inverse import inverse
 
-# ---- laser tracker ------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 T_TRACKER_BASE = frames.transform(
@@ -186,7 +183,7 @@ class TrackerCell:
         return q + np.where(moves, sigma, 0.0) * rng.standard_normal(q.shape)
 
 
-# ---- tracker cells ------------------------------------------------------------------------------
+# ---- ready-made cells ---------------------------------------------------------------------------
 
 
 PRP_SENSOR = frames.transform(  # about as the source found it

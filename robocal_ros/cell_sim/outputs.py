@@ -1,4 +1,4 @@
-"""What the simulated cell tells the graph."""
+"""What the simulated cell reads from the graph, and tells it."""
 
 import json
 from array import array

@@ -1,4 +1,4 @@
-"""A sphere on the flange, the fixed sensor that measures it at rest, and a sphere on the floor."""
+"""What measures at the robot: sphere sensor and floor sphere, line laser; when it stands still."""
 
 from dataclasses import dataclass, field, replace
 
@@ -76,7 +76,7 @@ class SphereSensor:
         return np.asarray(p)
 
 
-# ---- sphere cloud -------------------------------------------------------------------------------
+# ---- what a 3-D sensor sees of a sphere ---------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def sphere_cloud(
     return np.asarray(cloud[rng.permutation(len(cloud))])
 
 
-# ---- sphere station -----------------------------------------------------------------------------
+# ---- a sphere at the flange and one on the floor ------------------------------------------------
 
 
 CLEAR_RAD = float(np.radians(60.0))  # between the stem and the view, else the stem hides the sphere

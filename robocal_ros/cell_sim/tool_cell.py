@@ -20,7 +20,7 @@ from robocal_ros.tool.edges import BEAMS, CircleMotion
 from robocal_ros.tool.flange_path import JointPath, axis_from_centres, upright_pose
 from robocal_ros.tool.laser_frame import LaserFrame
 
-# ---- beam moves ---------------------------------------------------------------------------------
+# ---- motions of the flange at a beam station ----------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -140,7 +140,7 @@ class Sweep:
         return _moved(self.T_base_start, (time_s / self.duration_s)[:, None] * self.along)
 
 
-# ---- tool cell ----------------------------------------------------------------------------------
+# ---- robot, tool and beams ----------------------------------------------------------------------
 
 
 ABOVE_TIP_M = 5e-3  # where the lower circles meet the tool

@@ -1,4 +1,4 @@
-"""What a simulated bag tells of the truth, on topics that are for judging only."""
+"""What a bag is judged by: the truth of a simulated one, else its own measurements."""
 
 import json
 import math
@@ -25,9 +25,6 @@ from robocal_ros.report.validation import figures_of
 from robocal_ros.thermal.identification import measured_errors, true_errors
 from robocal_ros.thermal.reference import ColdReference, holds_drift, reference_of
 from robocal_ros.thermal.session import ThermalSession
-
-# ---- what a simulated bag tells of the truth, on topics that are for judging only ---------------
-
 
 Array = NDArray[np.float64]
 Transforms = list[tuple[int, Array]]
@@ -243,7 +240,7 @@ def _add_changed(told: Transforms, stamp_ns: int, T: Array) -> None:
         told.append((stamp_ns, T))
 
 
-# ---- validating thermal -------------------------------------------------------------------------
+# ---- what the measurements of a thermal session say of it ---------------------------------------
 
 
 EVERYTHING = 1_000_000

@@ -148,7 +148,7 @@ def _listed(samples: list[str]) -> str:
     return ", ".join(samples[:MOST_LISTED]) + (" …" if len(samples) > MOST_LISTED else "")
 
 
-# ---- identify -----------------------------------------------------------------------------------
+# ---- robocal identify ---------------------------------------------------------------------------
 
 
 _HOLD_OUT = 0.5
@@ -277,7 +277,7 @@ def _save(
     document["output"] = str(path)
 
 
-# ---- identification -----------------------------------------------------------------------------
+# ---- from files to an identification ------------------------------------------------------------
 
 
 _OTHER_SET_UP = (

@@ -24,9 +24,6 @@ from robocal_ros.kinematics.robots import robot_folders
 from robocal_ros.session.events import Command
 from robocal_ros.tool.edges import EDGES
 
-# ---- a bag as a recording of a session: its inputs, its commands, its beginning -----------------
-
-
 MEASURED = (*MEASURING, EDGES, *SHOTS)
 UNASKED = "while this was recorded nobody gave its node a command"
 INPUTS = (JOINTS, *MEASURED, TEMPERATURES)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-# ---- replay view --------------------------------------------------------------------------------
+# ---- a replay for people ------------------------------------------------------------------------
 
 
 Document = dict[str, Any]
@@ -127,7 +127,7 @@ def _show_equality(console: "Console", document: Document) -> None:
         console.print(Text(f"Differs from the recording: {words}", style="red"), soft_wrap=True)
 
 
-# ---- replay -------------------------------------------------------------------------------------
+# ---- robocal replay -----------------------------------------------------------------------------
 
 
 _NO_ANSWER = (Code.RANK_DEFICIENT.name, Code.TOO_FEW_SAMPLES.name)

@@ -155,7 +155,7 @@ def _run(outcome: Outcome) -> Document:
     return {"stamp": seconds(outcome.command.stamp_ns), "run": number, **(outcome.document or {})}
 
 
-# ---- hand eye replaying -------------------------------------------------------------------------
+# ---- a hand-eye session -------------------------------------------------------------------------
 
 
 def replay_hand_eye(
@@ -190,7 +190,7 @@ def _sensor(head: Head) -> Document | None:
     return frames | transform_document(T) | {"revision": head.revision}
 
 
-# ---- replaying ----------------------------------------------------------------------------------
+# ---- a thermal session --------------------------------------------------------------------------
 
 
 Window = tuple[float, float]

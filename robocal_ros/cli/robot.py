@@ -1,4 +1,4 @@
-"""``robocal fk``: where the flange and the tool are at given joints."""
+"""Commands about a robot as such: ``robocal fk``, ``iso9283``, ``import-ur``."""
 
 import argparse
 import math
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     Array = NDArray[np.float64]
-
-
-# ---- ``robocal fk``: where the flange and the tool are at given joints --------------------------
 
 
 _VALUE = re.compile(r"\s*([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", re.IGNORECASE)

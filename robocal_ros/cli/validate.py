@@ -195,7 +195,7 @@ def _from_cluster(client: Any, jobs: "Sequence[Job]") -> "Iterator[Numbered]":
         future.release()
 
 
-# ---- validate -----------------------------------------------------------------------------------
+# ---- robocal validate ---------------------------------------------------------------------------
 
 
 TITLE = "Validation of recorded bags"

@@ -53,7 +53,7 @@ from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.seeding import is_thermal_session
 from robocal_ros.tool.session import is_tool_session
 
-# ---- validating cell ----------------------------------------------------------------------------
+# ---- the course of a simulated cell -------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -224,7 +224,7 @@ def shift_errors(cycles: Sequence[ReplayedCycle]) -> ShiftErrors | None:
     )
 
 
-# ---- validating parts ---------------------------------------------------------------------------
+# ---- parts of a session document ----------------------------------------------------------------
 
 
 Truth = Sequence[tuple[int, Array]]

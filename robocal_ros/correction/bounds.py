@@ -13,9 +13,6 @@ from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_E
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
 from robocal_ros.kinematics import SerialArm
 
-# ---- bounds of the joint correction, and what is checked against them ---------------------------
-
-
 Array = NDArray[np.float64]
 
 # What floating point adds to a value that lies on its bound.

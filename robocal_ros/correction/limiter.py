@@ -40,9 +40,6 @@ from robocal_ros.correction.solution import (
 )
 from robocal_ros.ground.compiled import kernel, lean
 
-# ---- limiter ------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 # rows of the limits (4, n) and of a limiter's state (5, n)

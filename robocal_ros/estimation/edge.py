@@ -24,9 +24,6 @@ from robocal_ros.estimation.surfaces import (
 )
 from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
 
-# ---- the feature of a straight-line target, an edge or a groove, from one profile ---------------
-
-
 Array = NDArray[np.float64]
 
 Kind = Literal["edge", "groove"]

@@ -13,9 +13,6 @@ from typing import Any
 
 from robocal_ros.ground.errors import ConflictError, InputError, StateLostError, StorageError
 
-# ---- small helpers that the readers and writers of files share ----------------------------------
-
-
 MOST_QUOTED = 60
 
 

@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# ---- rigid transforms as 4 x 4 arrays, batched in the leading dimensions ------------------------
-
-
 Array = NDArray[np.float64]
 
 GIMBAL_LOCK = 1e-8  # cosine of the pitch below which roll and yaw are one

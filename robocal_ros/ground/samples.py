@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError
 
-# ---- typed samples: what sensors and the robot deliver, whatever brought them -------------------
-
-
 Array = NDArray[np.float64]
 
 DEFAULT_TARGET = "tool"

@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import JointBlock, JointSample
 
-# ---- joint readings by time stamp: interpolation and the standstill check -----------------------
-
-
 Array = NDArray[np.float64]
 
 CLOCK_JUMP_NS = 1_000_000_000

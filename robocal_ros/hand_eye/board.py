@@ -15,9 +15,6 @@ from robocal_ros.hand_eye.camera_model import Mount, PosePairs, Shared
 from robocal_ros.hand_eye.tables import PoseTable
 from robocal_ros.kinematics.robots import read_fields
 
-# ---- a chessboard in images: its corners, the camera's intrinsics, and where the board is -------
-
-
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 

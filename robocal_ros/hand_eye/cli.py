@@ -1,4 +1,4 @@
-"""``robocal hand-eye sphere``, ``step`` and ``line``: a line laser from profiles of one target."""
+"""Commands of ``robocal hand-eye`` for a line laser, and export and check-plan of any sensor."""
 
 import argparse
 from dataclasses import replace
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-# ---- hand eye target ----------------------------------------------------------------------------
+# ---- what all targets have in common ------------------------------------------------------------
 
 
 METHODS = ("best", "classic")
@@ -124,7 +124,7 @@ def run_sphere(args: argparse.Namespace) -> CliResult:
     return run_target("sphere", args, args.radius_mm)
 
 
-# ---- hand eye step ------------------------------------------------------------------------------
+# ---- robocal hand-eye step ----------------------------------------------------------------------
 
 
 def add_step(parser: argparse.ArgumentParser) -> None:
@@ -138,7 +138,7 @@ def run_step(args: argparse.Namespace) -> CliResult:
     return run_target("step", args)
 
 
-# ---- hand eye line ------------------------------------------------------------------------------
+# ---- robocal hand-eye line ----------------------------------------------------------------------
 
 
 def add_line(parser: argparse.ArgumentParser) -> None:

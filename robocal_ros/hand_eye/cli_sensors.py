@@ -1,4 +1,4 @@
-"""``robocal hand-eye camera``: a camera's place, from images of a chessboard or board poses."""
+"""Commands of ``robocal hand-eye`` for other ways to place a sensor: camera, laser tracker."""
 
 import argparse
 from dataclasses import replace
@@ -192,7 +192,7 @@ def _paired(
     return pairs, alone
 
 
-# ---- hand eye camera ----------------------------------------------------------------------------
+# ---- robocal hand-eye camera --------------------------------------------------------------------
 
 
 CAMERA_METHODS = (

@@ -43,9 +43,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-# ---- options and files of a line laser that the actions of ``robocal hand-eye`` share -----------
-
-
 KINDS = ("sphere", "step", "line")
 FEATURES = ("edge", "groove")
 LIMIT_MM = 1.0

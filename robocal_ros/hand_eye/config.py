@@ -16,8 +16,6 @@ from robocal_ros.session.base import HistoryFollower
 from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command
 
-# ---- settings of the hand-eye session -----------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class HandEyeConfig:

@@ -14,9 +14,6 @@ from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE, Shot, profil
 from robocal_ros.hand_eye.targets import BoardTarget, target_of
 from robocal_ros.kinematics import SerialArm
 
-# ---- the data set of a hand-eye calibration: its target, and what was captured of it ------------
-
-
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 

@@ -19,9 +19,6 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
 from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
-# ---- files --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Parent = Literal["flange", "base"]
 

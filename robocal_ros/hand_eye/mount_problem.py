@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.target_models import COMPONENTS, Index, Sightings, TargetModel
 
-# ---- mount problem ------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 COMMON = 8  # errors that all sightings of one pose have in common

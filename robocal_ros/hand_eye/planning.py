@@ -31,9 +31,6 @@ from robocal_ros.hand_eye.target_models import (
 from robocal_ros.hand_eye.targets import StepTarget
 from robocal_ros.hand_eye.tasks import StepTask, require_marks
 
-# ---- will planned poses do? Rank, expected error and better poses, before the robot moves -------
-
-
 Array = NDArray[np.float64]
 
 VAGUE = 1.0  # m, rad: what is known without any measurement; an open direction has a large error

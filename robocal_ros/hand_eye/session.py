@@ -27,9 +27,6 @@ from robocal_ros.session.base import Handler, SessionBase, configured_with, reco
 from robocal_ros.session.decisions import History, seeded
 from robocal_ros.session.events import Command, Outcome
 
-# ---- session ------------------------------------------------------------------------------------
-
-
 _NO_SET = "no data set is open: call start, or load one"
 
 

@@ -60,9 +60,6 @@ from robocal_ros.hand_eye.tasks import (
     looked,
 )
 
-# ---- solve --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 

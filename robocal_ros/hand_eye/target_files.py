@@ -33,9 +33,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 from robocal_ros.kinematics.tables import POSITION, TableLayout, joint_texts, read_layout
 
-# ---- target files of a hand-eye calibration: YAML, in millimetres and degrees -------------------
-
-
 Array = NDArray[np.float64]
 Target = SphereTarget | StepTarget | LineTarget
 

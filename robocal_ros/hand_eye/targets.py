@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 from robocal_ros.ground.errors import InputError
 from robocal_ros.hand_eye.board import Chessboard, Intrinsics
 
-# ---- targets that a sensor is shown, as they are known before the calibration -------------------
-
-
 Array = NDArray[np.float64]
 
 CornerKind = Literal["convex", "concave", "both"]

@@ -47,9 +47,6 @@ from robocal_ros.hand_eye.target_models import (
 )
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
 
-# ---- tasks --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 

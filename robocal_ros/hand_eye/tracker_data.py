@@ -19,9 +19,6 @@ from robocal_ros.ground.errors import (
 from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.kinematics import SerialArm
 
-# ---- tracker data -------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 FACES = ("face_1", "face_2")

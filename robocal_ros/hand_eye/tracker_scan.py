@@ -13,9 +13,6 @@ from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
 from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.tracker_data import Cube, Plane, fit_plane, moment
 
-# ---- the scan of a cube and a sphere, built from profiles, and its parts ------------------------
-
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# ---- history records ----------------------------------------------------------------------------
-
-
 _COLUMNS = tuple(column.name for column in fields(Candidate))
 _SELECT = f"SELECT id, {', '.join(_COLUMNS)} FROM calibrations "
 _LARGEST_ID = 2**63 - 1

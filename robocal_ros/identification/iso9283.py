@@ -14,9 +14,6 @@ from robocal_ros.ground.errors import TooFewSamplesError
 from robocal_ros.ground.samples import DEFAULT_TARGET
 from robocal_ros.kinematics.tables import POSITION, check_plain
 
-# ---- iso9283 ------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 CYCLES = 30  # that the standard asks for

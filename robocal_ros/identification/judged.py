@@ -35,7 +35,7 @@ from robocal_ros.identification.solve import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document, parameters_document
 
-# ---- mismatch -----------------------------------------------------------------------------------
+# ---- why data do not fit a robot at all ---------------------------------------------------------
 
 
 Array = NDArray[np.float64]

@@ -114,7 +114,7 @@ def _aligned(points: Array, measured: Array) -> Array:
     return frames.transform(R, measured.mean(axis=0) - R @ points.mean(axis=0))
 
 
-# ---- priors -------------------------------------------------------------------------------------
+# ---- how far parameters may lie from the nominal ones -------------------------------------------
 
 
 # Spread of a new robot's parameters about the nominal ones: machining and mastering tolerances.
@@ -155,7 +155,7 @@ def fitted_prior(arm: SerialArm, found: Array, covariance: Array) -> Array:
     return np.asarray(prior * scale)
 
 
-# ---- solve --------------------------------------------------------------------------------------
+# ---- least squares, maximum a posteriori --------------------------------------------------------
 
 
 Part = Literal["base", "tool", "geometry"]

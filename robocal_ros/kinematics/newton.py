@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 from robocal_ros.ground.compiled import inlined, kernel, lean
 from robocal_ros.kinematics.kernels import turns_size, walk
 
-# ---- compiled parts of Newton's method on poses: residual, geometric Jacobian, solution ---------
-
-
 Array = NDArray[np.float64]
 
 # Pivots of J^T J (or J J^T) below this share of its largest: the pose is singular to rounding.

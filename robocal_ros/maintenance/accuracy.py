@@ -10,9 +10,6 @@ from robocal_ros.maintenance.memory import MaintenanceConfig, Memory, ToolRecord
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError, both_errors, offset_error
 from robocal_ros.thermal.accuracy_state import Accuracy
 
-# ---- accuracy -----------------------------------------------------------------------------------
-
-
 __all__ = ["Accuracy", "Drift", "accuracy_of"]
 
 NS = 1_000_000_000

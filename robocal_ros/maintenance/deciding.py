@@ -36,9 +36,6 @@ from robocal_ros.thermal.reference import commissioned_of
 from robocal_ros.tool.judging import KnownTool, change_between
 from robocal_ros.tool.laser_frame import LaserFrame
 
-# ---- decisions about thermal models and tools, and what may be accepted without a person --------
-
-
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
 SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser

@@ -11,9 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.ground.errors import Code, InputError, StateLostError, StorageError
 from robocal_ros.motion.cell import DrivingConfig
 
-# ---- what outlives a restart: ended cycles, the last check of the tool, a fault -----------------
-
-
 REMEMBERED = 200  # ended cycles
 VERSION = 2  # of the document; one without a version is the first, which knew no runs and stamps
 

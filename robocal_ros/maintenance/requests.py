@@ -10,8 +10,6 @@ import numpy as np
 from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.motion.plan import JointPlan
 
-# ---- what the session asks of whoever drives it, and what is answered ---------------------------
-
 
 @dataclass(frozen=True)
 class DriverRequest:

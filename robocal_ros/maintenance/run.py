@@ -18,9 +18,6 @@ from robocal_ros.maintenance.tool_part import ToolPart
 from robocal_ros.session.events import LEAVE, Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 
-# ---- one maintenance run: thermal measurement, tool, and what became of both --------------------
-
-
 UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
 
 

@@ -416,7 +416,7 @@ def corner_ride(cell: MotionCell, here: Array, there: Array) -> Ride:
     return Ride.within(way_m(cell, here, there), limits.tcp_speed_m_s, limits.tcp_acceleration_m_s2)
 
 
-# ---- loading ------------------------------------------------------------------------------------
+# ---- a robot at its station, from files ---------------------------------------------------------
 
 
 def load_motion(arm: SerialArm) -> None:

@@ -12,9 +12,6 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
 
-# ---- a motion of the joints over time, as a trajectory controller will interpolate it -----------
-
-
 Array = NDArray[np.float64]
 
 REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)

@@ -15,7 +15,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import DrivingConfig, MotionCell
 from robocal_ros.motion.plan import JointPlan, MotionLimits, start_near, stop
 
-# ---- speed scaling ------------------------------------------------------------------------------
+# ---- how fast the controller's clock runs -------------------------------------------------------
 
 
 TOLD_S = 1.0  # what was not told again for so long is not known
@@ -409,7 +409,7 @@ class RobotWatch:
         return readings[bisect_right(readings, first_s, key=itemgetter(0)) - 1 :]
 
 
-# ---- watched stop -------------------------------------------------------------------------------
+# ---- a stop that is watched until the robot stands ----------------------------------------------
 #
 # A controller has no order to stop: it drives on where it is sent nothing or a trajectory without
 # points, and the cancel of a goal is a dead stop from any speed. What stops it is a motion that

@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
 
-# ---- figures of reports, drawn without a display ------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 BEFORE, AFTER, OLDEST = "#c2603a", "#0f6f86", "#7fb6c3"

@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import summarise
 
-# ---- validation ---------------------------------------------------------------------------------
-
-
 Document = dict[str, Any]
 
 ERRORS = ("without", "in_force", "after")

@@ -7,8 +7,6 @@ from typing import Any
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.ros.endpoints import ERROR, WARN, EndpointNode, Health
 
-# ---- what time it is on the clock of the samples ------------------------------------------------
-
 
 class DataClock:
     """The samples' clock, read between them too: ROS time runs on where they pause."""
@@ -62,7 +60,7 @@ def _both() -> tuple[float, float]:
     return now_s, now_s - time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
-# ---- stamp watch --------------------------------------------------------------------------------
+# ---- stamps that do not fit the clock -----------------------------------------------------------
 
 
 AHEAD_S = 0.1  # hosts that NTP keeps are some ms apart; a busy host makes messages old, not early

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from robocal_ros.session.events import Outcome
 
 
-# ---- conversions --------------------------------------------------------------------------------
-
-
 NS = 1_000_000_000
 _ERRORS = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
 

@@ -23,9 +23,6 @@ from robocal_ros.session.events import (
     Outcome,
 )
 
-# ---- accept, reject, roll back and list, with their Trigger twins: the same at every node -------
-
-
 LIST_LIMIT = 50
 TWIN = "trigger"
 
@@ -116,12 +113,6 @@ def answer(response: Any, outcome: Outcome) -> Any:
     response.message = outcome.message
     response.status = int(outcome.status)
     return response
-
-
-# ---- session events -----------------------------------------------------------------------------
-
-
-# ---- command desk -------------------------------------------------------------------------------
 
 
 # ---- an action server whose goals are ended from any callback -----------------------------------

@@ -315,7 +315,7 @@ def _defect(error: Exception) -> str:
     return f"a defect of this software, please report it: {type(error).__name__}: {error}"
 
 
-# ---- diagnostics --------------------------------------------------------------------------------
+# ---- one diagnostic status per node -------------------------------------------------------------
 
 
 OK = DiagnosticStatus.OK

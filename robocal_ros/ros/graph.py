@@ -21,9 +21,6 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.parameters import Setting
 
-# ---- who else commands the robot: by who publishes and serves on the graph, never by name -------
-
-
 PREFIX = 12  # bytes of a gid
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
 KILLED = "one that was killed counts until DDS gives it up, after up to 20 s"
@@ -145,7 +142,7 @@ class CommandPath:
         return self.violation
 
 
-# ---- source guard -------------------------------------------------------------------------------
+# ---- joint states of a correction node are not the robot's --------------------------------------
 
 
 _STATUS = "robocal_msgs/msg/CorrectionStatus"  # who publishes it is a correction node

@@ -25,9 +25,6 @@ from robocal_ros.ground.streams import StandstillRule
 QOS_OVERRIDES = "qos_overrides."  # of topics, which are declared with their endpoints
 
 
-# ---- parameters ---------------------------------------------------------------------------------
-
-
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 
 

@@ -9,9 +9,6 @@ from typing import Any
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, JUMPS
 
-# ---- commands to a session and what came of them: the record that replay obeys ------------------
-
-
 CONFIGURE = "configure"
 CALIBRATE_SENSOR = "calibrate_sensor"
 CAPTURE_REFERENCE = "capture_reference"

@@ -13,9 +13,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.tracking import DriftTracker
 
-# ---- accuracy -----------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 HORIZON_S = 24.0 * 3600.0

@@ -1,4 +1,4 @@
-"""``robocal thermal calibrate-sensor``: where the sensor stands, and the sphere on the flange."""
+"""Commands of ``robocal thermal``: calibrate-sensor, identify, learn-prior."""
 
 import argparse
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-# ---- thermal sensor -----------------------------------------------------------------------------
+# ---- robocal thermal calibrate-sensor -----------------------------------------------------------
 
 
 def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:
@@ -200,7 +200,7 @@ def _require_sense(args: argparse.Namespace) -> None:
         raise InputError("--prior is for --method map: a subset is solved without one")
 
 
-# ---- thermal prior ------------------------------------------------------------------------------
+# ---- robocal thermal learn-prior ----------------------------------------------------------------
 
 
 def add_learn_prior(parser: argparse.ArgumentParser) -> None:
@@ -277,7 +277,7 @@ def _show_learn_prior(console: "Console", document: Document) -> None:
         console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
 
 
-# ---- thermal identification ---------------------------------------------------------------------
+# ---- visits from tables -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

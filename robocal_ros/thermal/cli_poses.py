@@ -1,4 +1,4 @@
-"""``robocal thermal plan-poses``: which poses a measuring cycle should visit."""
+"""Commands of ``robocal thermal`` about poses and parameters: plan-poses, screen."""
 
 import argparse
 import csv
@@ -34,9 +34,6 @@ from robocal_ros.thermal.sensor_calibration import read_sensor
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-
-# ---- ``robocal thermal plan-poses``: which poses a measuring cycle should visit -----------------
 
 
 POSES, CANDIDATES = 6, 1000
@@ -200,7 +197,7 @@ def _write(path: Path, document: Document) -> None:
     write_text(path, text.getvalue())
 
 
-# ---- thermal screen -----------------------------------------------------------------------------
+# ---- robocal thermal screen ---------------------------------------------------------------------
 
 
 WANTED = 8

@@ -29,9 +29,6 @@ from robocal_ros.thermal.identification import CycleDrift, visit_variance
 from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict
 
-# ---- thermal results as plain documents (JSON), in the units people read ------------------------
-
-
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 

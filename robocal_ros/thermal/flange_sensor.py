@@ -30,9 +30,6 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.solve import default_prior, fitted_prior, random_postures
 from robocal_ros.kinematics import SerialArm
 
-# ---- flange sensor ------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 

@@ -21,9 +21,6 @@ from robocal_ros.thermal.process import DriftProcess, HeatGains, drift_prior, le
 from robocal_ros.thermal.reference import ColdSpots, reference_of
 from robocal_ros.thermal.tracking import DriftTracker
 
-# ---- what drift to expect of one robot, learned from cycles that it has measured ----------------
-
-
 Array = NDArray[np.float64]
 
 FEWEST_CYCLES = 10

@@ -15,9 +15,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.identification import SETUP_SIGMA_M, visit_variance
 from robocal_ros.thermal.reference import ColdReference, ColdSpots
 
-# ---- how a robot's parameters drift in time: the prior of the tracker ---------------------------
-
-
 Array = NDArray[np.float64]
 
 SETUP_APPROACH_S = 1800.0
@@ -78,7 +75,7 @@ def _transition(step_s: float, approach_s: float, steady_s: float) -> tuple[Arra
     return F, long_run - F @ long_run @ F.T
 
 
-# ---- priors -------------------------------------------------------------------------------------
+# ---- how far parameters may lie from the nominal ones -------------------------------------------
 
 
 EXPANSION_PER_K = 12e-6  # steel and cast iron; aluminium links drift up to twice as much

@@ -16,9 +16,6 @@ from robocal_ros.thermal.identification import entangled, open_directions, subse
 from robocal_ros.thermal.learning import THRESHOLD_M, DriftHistory, share_within
 from robocal_ros.thermal.tracking import stationarity
 
-# ---- screening ----------------------------------------------------------------------------------
-
-
 Removal = Literal["best", "classic"]
 Test = Literal["autocorrelation", "ljung-box"]
 

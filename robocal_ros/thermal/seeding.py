@@ -21,8 +21,6 @@ from robocal_ros.thermal.observations import Observation
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.thermal.session import ThermalSession
 
-# ---- a session that starts where a recorded one started -----------------------------------------
-
 
 def session_as_recorded(
     nominal: SerialArm, history: History, configured: Command, software: str

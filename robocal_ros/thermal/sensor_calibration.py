@@ -27,9 +27,6 @@ from robocal_ros.identification.solve import identify, linear_start
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_made, write_made
 
-# ---- sensor calibration -------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 SensorMethod = Literal["ml", "classic"]
 

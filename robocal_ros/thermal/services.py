@@ -44,8 +44,6 @@ from robocal_ros.thermal.documents import placed_of
 from robocal_ros.thermal.planning import POSES, SensorField, plan_cycle
 from robocal_ros.thermal.proposing import SENSOR
 
-# ---- services -----------------------------------------------------------------------------------
-
 
 class ThermalServices:
     """Services and their Trigger twins.

@@ -38,9 +38,6 @@ from robocal_ros.thermal.process import (
 )
 from robocal_ros.thermal.reference import ColdSpots
 
-# ---- the model between measuring cycles: a Kalman filter over the parameters' drift -------------
-
-
 Array = NDArray[np.float64]
 
 FALSE_ALARM = 0.001  # chance that a sound cycle is not applied

@@ -1,6 +1,6 @@
-"""``robocal tool beams``: where two crossed beams are, from their sixteen edges.
+"""Commands of ``robocal tool``: beams, crossed, points, parallel, export.
 
-From one circle the place of its axis; from a whole run tip and axis (see ``tool_crossed_run``).
+``crossed`` gives of one circle the place of its axis, of a whole run tip and axis.
 """
 
 import argparse
@@ -61,9 +61,6 @@ from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel,
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-
-# ---- ``robocal tool beams``: where two crossed beams are, from their sixteen edges --------------
 
 
 def add_beams(parser: argparse.ArgumentParser) -> None:
@@ -189,7 +186,7 @@ def given_frame(args: argparse.Namespace) -> "NDArray[np.float64] | None":
     return None
 
 
-# ---- tool crossed run ---------------------------------------------------------------------------
+# ---- a whole run of robocal tool crossed --------------------------------------------------------
 
 
 NEEDED = ("joints", "robot", "laser")

@@ -33,9 +33,6 @@ from robocal_ros.tool.edges import (
 from robocal_ros.tool.flange_path import FlangePath, minimal_rotation
 from robocal_ros.tool.laser_frame import LaserFrame
 
-# ---- crossed model ------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 StepKind = Literal["circle", "plunge"]
 

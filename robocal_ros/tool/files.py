@@ -28,9 +28,6 @@ from robocal_ros.tool.flange_path import JointPath
 from robocal_ros.tool.measuring_plan import STEP_NAMES, step_kind
 from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height
 
-# ---- files --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 QUATERNION_TOLERANCE = 1e-3

@@ -12,9 +12,6 @@ from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamp
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.laser_frame import LaserFrame
 
-# ---- where the flange was, and how fast it moved, at the stamps of edges ------------------------
-
-
 Array = NDArray[np.float64]
 
 FEWEST_READINGS = 4

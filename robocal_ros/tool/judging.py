@@ -20,9 +20,6 @@ from robocal_ros.tool.crossed_run import ToolEstimate
 from robocal_ros.tool.flange_path import minimal_rotation
 from robocal_ros.tool.witness import SMALL_M, BendRule, Witness, bend_or_station
 
-# ---- is a measured tool good, in mm? Against the tool in force, within what may change ----------
-
-
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 

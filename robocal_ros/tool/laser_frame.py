@@ -20,9 +20,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, require_made_for, write_made
 from robocal_ros.tool.edges import BEAMS
 
-# ---- the frame of two crossed beams, calibrated with a cylinder on the flange -------------------
-
-
 Array = NDArray[np.float64]
 
 POINTS = ("A", "B", "C", "D")

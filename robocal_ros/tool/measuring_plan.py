@@ -16,9 +16,6 @@ from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge, debounced
 from robocal_ros.tool.flange_path import upright_pose
 from robocal_ros.tool.laser_frame import LaserFrame
 
-# ---- which circles and plunges measure a tool: each follows from what is known by then ----------
-
-
 Array = NDArray[np.float64]
 Mode = Literal["full", "quick"]
 

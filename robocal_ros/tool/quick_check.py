@@ -17,9 +17,6 @@ from robocal_ros.tool.judging import KnownTool, ToolChange, spread_between
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.touch_points import TouchFit
 
-# ---- quick check --------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Answer = Literal["pass", "recalibrate", "cannot tell"]
 

@@ -29,9 +29,6 @@ from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.measuring_plan import PlannedStep
 from robocal_ros.tool.results import FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE
 
-# ---- services -----------------------------------------------------------------------------------
-
-
 MODES = {
     MeasureTool.Goal.FULL: FULL,
     MeasureTool.Goal.QUICK: QUICK,

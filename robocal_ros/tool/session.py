@@ -27,9 +27,6 @@ from robocal_ros.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.tool.results import FULL, MODES, QUICK, ToolInForce, ToolResults
 from robocal_ros.tool.run import ToolConfig, ToolRun
 
-# ---- session ------------------------------------------------------------------------------------
-
-
 AHEAD_S = AHEAD_NS * 1e-9
 BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges themselves show
 STRAYS = 2

@@ -25,9 +25,6 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.tool.flange_path import minimal_rotation
 
-# ---- a tool frame from touches of one point (four or more) and two straight moves (seven) -------
-
-
 Array = NDArray[np.float64]
 EulerConvention = Literal["zxz", "zyx", "zyz"]
 
