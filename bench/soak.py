@@ -113,7 +113,7 @@ def _history_runs(count: int) -> int:
     from hypothesis import settings
     from hypothesis.stateful import run_state_machine_as_test
 
-    sys.path.insert(0, str(ROOT / "test" / "worlds"))
+    sys.path[:0] = [str(ROOT / "test" / folder) for folder in ("history", "worlds")]
     from test_history_rules import History
 
     plan = settings(max_examples=count, stateful_step_count=100, deadline=None, database=None)

@@ -29,9 +29,10 @@ MAY_IMPORT = {
     "cell_sim": ABOVE | {"report"},
     "cli": ABOVE | {"report", "cell_sim"},
 }
+COMMANDS = {"cli", "cli_poses", "cli_sensors", "cli_shots"}  # files of a room
 ROS_FILES = {
     "node", "node_motion", "messages", "action", "settings", "services", "outputs", "report",
-    "graph", "driver", "gap_sources", "controller", "replay_node", "replay_topics", "recorder_node",
+    "graph", "driver", "controller", "replay_node", "replay_topics", "recorder_node",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",
@@ -77,11 +78,16 @@ def test_imports_run_one_way(path):
             assert for_ros, f"{path} imports {name}: only what a node is made of may"
         if parts[0] == "robocal_ros" and len(parts) > 1 and own:
             allowed = MAY_IMPORT[own] | {own, "single_thread"}
-            if path.stem.startswith(
-                "cli"
-            ):  # a room's commands; the command line loads them by name
+            # A room's commands; the command line loads them by name, and nobody else.
+            if path.stem in COMMANDS:
                 allowed |= {"cli", "report"}
+            elif own in CAPABILITIES:
+                assert parts[2:3] == [] or parts[2] not in COMMANDS, f"{path} imports {name}"
             assert parts[1] in allowed, f"{own} imports {name}"
+
+
+def test_the_rules_name_files_that_are_there():
+    assert {path.stem for path in MODULES} >= ROS_FILES | COMMANDS
 
 
 def test_no_file_needs_itself():

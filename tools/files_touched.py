@@ -5,7 +5,8 @@
 Beam events to tool frames and spheres to models by ``robocal replay`` of the bags in bags/ (the
 command and the reading of a bag count too), a trajectory through a correction session, and
 ``robocal identify``. Counted are functions that ran (`sys.setprofile`), generators and lambdas
-too; compiled kernels and what a file does when it is imported are not. ``-v`` names the files.
+too; compiled kernels, other threads and what a file does when it is imported are not. ``-v``
+names the files.
 """
 
 import contextlib
@@ -55,7 +56,7 @@ def command(*words: str) -> None:
 
 
 def trajectory() -> Callable[[], object]:
-    """A warm arm's correction, settled; what is left is to correct one trajectory."""
+    """A drifted arm's correction, enabled; what is left is to correct one trajectory."""
     robot = load_description("kr150_r3100")
     arm = robot.arm
     config = CorrectionConfig(

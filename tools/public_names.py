@@ -1,10 +1,11 @@
-"""Everything of ours that others rely on by name, as one JSON document, to be compared with diff.
+"""What of ours others rely on by name, as one JSON document, to be compared with diff.
 
     tools/with_ros python tools/public_names.py >names.json
 
-Executables; parameters with default and bounds; private topics, services and actions (as the code
-has them); message definitions; help of all commands; JSON schemas; codes. It reads the tree in
-the working directory, so that one file serves to compare two commits.
+Executables; parameters with default and bounds; private topics, services and actions whose names
+stand whole in the code; message definitions; help of all commands; JSON schemas; codes. Not seen
+are names that are put together (the Trigger twins), relative inputs and launch arguments. It reads
+the tree in the working directory, so that one file serves to compare two commits.
 """
 
 import ast
@@ -41,7 +42,7 @@ def parameters(module: str) -> dict[str, Any]:
 
 
 def endpoints() -> list[str]:
-    """Names of private topics, services and actions, and of the inputs."""
+    """Names of private topics, services and actions that stand whole in the code."""
     found = set()
     for file in (ROOT / "robocal_ros").rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):

@@ -345,7 +345,7 @@ class CommandGate:
 
 
 PAGE = 128  # readings whose random numbers belong together
-KEPT_PAGES = 4  # pages
+KEPT_PAGES = 4
 
 
 class JointReadings:

@@ -223,7 +223,7 @@ class RobotProgram:
 
 SPEED_RAD_S = 1.5  # of the fastest joint at its peak
 POSE_REST_S = 0.5
-SHORTEST_MOTION_S = 0.5  # of a motion
+SHORTEST_MOTION_S = 0.5
 
 
 def programme(

@@ -9,6 +9,7 @@ import os
 import platform
 import signal
 import sys
+import threading
 import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 
 PATIENCE_S = 10  # with a cluster
+KILLED = "the process that replayed it was killed, for want of memory? Try --jobs 1"
 _PRELOADED = [
     "robocal_ros.cli.validating",
     # what a bag needs in the course of things
@@ -107,56 +109,83 @@ def validated(jobs: "Sequence[Job]", workers: int, scheduler: str | None) -> "It
 
 
 def _lost(job: "Job", error: BaseException) -> "Validated":
-    """A bag whose replay crashed, or whose worker was killed: the others go on."""
+    """A bag whose replay crashed, or that a cluster took with it: the others go on."""
+    traceback.print_exception(error)
+    return _not_validated(job, crash(error))
+
+
+def _not_validated(job: "Job", answer: Document) -> "Validated":
     from robocal_ros.cli.validating import Validated
 
-    traceback.print_exception(error)
-    return Validated({"bag": job.name, "path": job.path, "error": crash(error)["error"]})
+    return Validated({"bag": job.name, "path": job.path, "error": answer["error"]})
 
 
 class _Slots:
     """Places for one job each, with a process of its own: who dies takes no other's job along."""
 
     def __init__(self, count: int) -> None:
-        self.context = multiprocessing.get_context("forkserver")
-        self.pools = [self._pool() for _ in range(count)]
+        self._context = multiprocessing.get_context("forkserver")
+        self._others = set(multiprocessing.active_children())
+        self._pools = [self._pool() for _ in range(count)]
+        self._busy: dict[Future[Validated], tuple[int, int]] = {}  # slot and number of a job
 
     def __enter__(self) -> "_Slots":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:  # nobody wants the other bags any more
-            for child in multiprocessing.active_children():
+            for child in set(multiprocessing.active_children()) - self._others:
                 child.kill()
-        for pool in self.pools:
+        for pool in self._pools:
             pool.shutdown(cancel_futures=True)
 
-    def _pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, self.context)
-
     def validated(self, jobs: "Sequence[Job]") -> "Iterator[Numbered]":
-        from robocal_ros.cli.validating import validate_bag
-
         waiting = iter(enumerate(jobs))
-        busy: dict[Future[Validated], tuple[int, int]] = {}
-        free = list(range(len(self.pools)))
-        while True:
-            for slot, (number, job) in zip(tuple(free), waiting, strict=False):
-                busy[self.pools[slot].submit(validate_bag, job)] = slot, number
-                free.remove(slot)
-            if not busy:
-                return
-            for future in wait(busy, return_when=FIRST_COMPLETED).done:
-                slot, number = busy.pop(future)
-                free.append(slot)
+        for slot in range(len(self._pools)):
+            self._begin_next(slot, waiting)
+        while self._busy:
+            for future in wait(self._busy, return_when=FIRST_COMPLETED).done:
+                slot, number = self._busy.pop(future)
                 try:
                     result = future.result()
+                except BrokenProcessPool:
+                    self._renew(slot)
+                    result = _not_validated(jobs[number], refusal(Code.NONE, KILLED))
                 except Exception as error:
-                    if isinstance(error, BrokenProcessPool):  # killed: for want of memory?
-                        self.pools[slot].shutdown()
-                        self.pools[slot] = self._pool()
                     result = _lost(jobs[number], error)
+                self._begin_next(slot, waiting)
                 yield number, result
+
+    def _begin_next(self, slot: int, waiting: "Iterator[tuple[int, Job]]") -> None:
+        from robocal_ros.cli.validating import validate_bag
+
+        for number, job in waiting:
+            try:
+                future = self._pools[slot].submit(validate_bag, job)
+            except BrokenProcessPool:  # its process died while it had nothing to do
+                self._renew(slot)
+                future = self._pools[slot].submit(validate_bag, job)
+            self._busy[future] = slot, number
+            return
+
+    def _pool(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, self._context, _end_with_parent)
+
+    def _renew(self, slot: int) -> None:
+        self._pools[slot].shutdown()
+        self._pools[slot] = self._pool()
+
+
+def _end_with_parent() -> None:
+    """A worker holds its own queue open, and would wait for jobs for ever."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager

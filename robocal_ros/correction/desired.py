@@ -40,7 +40,7 @@ class DesiredOffset:
     ----------
     stage : the correction in use; None while nothing is to be corrected.
     known : the same as if it were on: a robot may show it that was corrected before.
-    figures : what is said of the messages, see `stepping`.
+    figures : what is said of the messages, see `limiter`.
     clamped, passed : how many messages were corrected in part, or not at all, for what bound.
     made : whether the last message was corrected with ``stage``.
     fast : whether `put_out` worked out the velocities too.
@@ -105,7 +105,7 @@ class DesiredOffset:
         active: Array,
         speeds: Array,
     ) -> float:
-        """Put one target (n,) with its velocities out by the limiter; see `stepping.step_out`.
+        """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
 
         In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`, and
         leaves the velocities to the caller.

@@ -1,7 +1,7 @@
 """The circle in which a laser plane cuts a reference sphere, from one profile.
 
 The profile may hold the table, the stem, gaps, spikes and double reflections. The start is the
-circle nearest to most points (`arc_search`); the answer is the maximum likelihood over the points
+circle nearest to most points (`find_circle`); the answer is the maximum likelihood over the points
 whose residual fits its own predicted variance. How the noise depends on the slope of the surface
 is estimated with it: sensors err along the beam, along the surface's normal, or in between.
 Source of the use: methods of the fixed sphere, where y = +-sqrt(R^2 - r^2).

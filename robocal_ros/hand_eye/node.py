@@ -134,10 +134,9 @@ class HandEyeNode(SessionNode[HandEyeSession]):
         if (command := session.silent(silent_s)) is not None:
             self._desk.ask(command)
 
-    def _poll(self) -> None:
-        if self._session is not None:
-            self._frames.look()
-        super()._poll()
+    def polled(self, session: HandEyeSession) -> None:
+        """Look at who else puts the sensor's frame onto tf."""
+        self._frames.look()
 
     # ---- outputs --------------------------------------------------------------------------------
 

@@ -269,7 +269,7 @@ def identify(
     method : ``map`` keeps every free parameter, with a Gaussian prior about the nominal one;
         ``lsq`` has no prior and holds parameters whose effect base or targets have too.
     prior_covariance : (k, k) of the arm's free parameters, SI; default: building tolerances,
-        scaled to what the data show (``priors.fitted_prior``).
+        scaled to what the data show (`fitted_prior`).
     start : known base and targets; where a part of them is not in ``fit`` it is held there.
 
     Raises

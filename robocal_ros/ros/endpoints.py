@@ -1,4 +1,4 @@
-"""Inputs, outputs, services and timers of a lifecycle node, with the manners of this house."""
+"""Inputs, outputs, services and timers of a lifecycle node; their QoS; its diagnostics."""
 
 import inspect
 import time

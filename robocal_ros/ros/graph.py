@@ -1,4 +1,4 @@
-"""Who else commands the robot: by who publishes and serves on the graph, never by name.
+"""Who else commands the robot, who opens the gap: by who publishes and serves, never by name.
 
 Names of nodes only make the words readable. Facts used, of rmw_fastrtps and Fast DDS:
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -19,10 +18,25 @@ from rclpy.parameter import Parameter
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.files import nearest, share_folders
+from robocal_ros.ground.files import nearest
 from robocal_ros.ground.streams import StandstillRule
 
 QOS_OVERRIDES = "qos_overrides."  # of topics, which are declared with their endpoints
+# Parameters that several nodes have, and what a launch file gives to all of its nodes: below /** of
+# a parameter file they reach nodes that have no use for them.
+SHARED = frozenset({
+    "autostart", "base_frame", "deviation_deg", "deviation_mm", "edge_noise_mm", "flange_frame",
+    "flange_radius_mm", "follow_joint_trajectory", "gap_bool", "gap_stale_s", "hard_stop_service",
+    "housing_depth_mm", "housing_reach_mm", "housing_top_mm", "input_jitter_ms",
+    "input_period_ms", "joint_acceleration_deg_s2", "joint_gap_s", "joint_velocity_deg_s",
+    "laser", "method", "motion_late_s", "motion_silence_s", "opening_radius_mm",
+    "repeatability_mm", "retract_mm", "robot", "seed", "sensor_frame", "serial",
+    "standstill_after_s", "standstill_before_s", "standstill_tolerance_deg", "state_dir",
+    "stop_deceleration_deg_s2", "target", "taught_quat_xyzw", "taught_xyz_mm",
+    "tcp_acceleration_mm_s2", "tcp_speed_mm_s", "tolerance_mm", "tool_frame", "tool_length_mm",
+    "tool_radius_mm", "topics",
+})  # fmt: skip
+LAUNCH_WIDE = frozenset({"robot_description", "robot_description_semantic"})
 
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
@@ -139,7 +153,9 @@ class ParameterTable:
     """The declared parameters of one node.
 
     A bad value given at the start does not stop the process: the default is declared in its
-    place, and `read` names the fault until the parameter is set to something valid.
+    place, and `read` names the fault until the parameter is set to something valid. A name that is
+    given and is none of the node's is a fault too, which only a new start mends: rclpy itself drops
+    it unsaid, and a misspelt limit would be the default.
     """
 
     def __init__(self, node: Node, settings: Sequence[Setting]) -> None:
@@ -150,6 +166,13 @@ class ParameterTable:
         self.changed: Callable[[], None] | None = None
         for setting in settings:
             self._declare(setting)
+        self._unknown = [
+            f"{name} is no parameter of this node{nearest(name, self._settings)}: correct it, or "
+            "give it in the section of the node that has it, and start the node anew"
+            for name in node._parameter_overrides
+            if not (name.startswith(QOS_OVERRIDES) or node.has_parameter(name))
+            and name not in SHARED | LAUNCH_WIDE
+        ]
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._after_set)
 
@@ -174,30 +197,14 @@ class ParameterTable:
         Raises
         ------
         InputError
-            When a parameter was given a bad value at the start, or is none of any node of ours;
-            names all of them.
+            When a parameter was given a bad value at the start, or is none of this node; names
+            all of them.
         """
-        faults = [*self._faults.values(), *self._unknown()]
+        faults = [*self._faults.values(), *self._unknown]
         if faults:
             raise InputError("; ".join(faults))
         values = {name: self._node.get_parameter(name).value for name in self._settings}
         return {name: _without_blanks(value) for name, value in values.items()}
-
-    def _unknown(self) -> list[str]:
-        """What is wrong with names that were given at the start; rclpy itself drops them unsaid."""
-        given = [
-            name
-            for name in self._node._parameter_overrides
-            if not name.startswith(QOS_OVERRIDES) and not self._node.has_parameter(name)
-        ]
-        # What all nodes of a cell are given (config/cell.yaml) need not be a parameter of each.
-        foreign = set(given) - _shipped_names() if given else ()
-        return [
-            f"{name} is no parameter{nearest(name, self._settings)}: correct its name, or give it "
-            "in a section of the node that has it"
-            for name in given
-            if name in foreign
-        ]
 
     def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -219,16 +226,6 @@ class ParameterTable:
             self._faults.pop(name, None)
         if ours and self.locked and self.changed is not None:
             self.changed()
-
-
-def _shipped_names() -> set[str]:
-    """Parameters of all nodes, as their files in config/ show them."""
-    names: set[str] = set()
-    for folder in share_folders("robocal_ros", "config", "config")[:1]:
-        for file in folder.glob("*_node.yaml"):
-            for section in yaml.load(file.read_bytes(), yaml.CSafeLoader).values():
-                names |= section["ros__parameters"].keys()
-    return names
 
 
 def _without_blanks(value: Any) -> Any:

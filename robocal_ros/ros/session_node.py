@@ -208,6 +208,9 @@ class SessionNode(HouseNode, Generic[SessionT]):
         """Give a message of the input ``kind`` to the session."""
         raise NotImplementedError
 
+    def polled(self, session: SessionT) -> None:
+        """Do what is due twice a second."""
+
     def show(self, outcome: Outcome) -> None:
         """Publish what came of a command; it is logged already."""
         raise NotImplementedError
@@ -278,9 +281,13 @@ class SessionNode(HouseNode, Generic[SessionT]):
         self._guard.look()
         if self._session is None:
             return
-        for outcome in self._session.poll():
-            self._show(outcome)
-        self.show_in_force()
+        try:
+            self.polled(self._session)
+            for outcome in self._session.poll():
+                self._show(outcome)
+            self.show_in_force()
+        except RobocalError as error:  # the history cannot be read: tried again at the next poll
+            self.get_logger().error(str(error), throttle_duration_sec=5.0)
 
     def _show(self, outcome: Outcome) -> None:
         words = f"{outcome.command.name}: {outcome.status.name} {outcome.message}"

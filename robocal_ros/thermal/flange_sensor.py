@@ -296,7 +296,7 @@ def identify_flange_sensor(
     """Solve hand-eye pose and centres, and with ``geometry`` all model parameters.
 
     The parameters have building tolerances as prior, scaled to what the data show
-    (``priors.fitted_prior``).
+    (`fitted_prior`).
 
     Raises
     ------

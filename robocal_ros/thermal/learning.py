@@ -45,7 +45,7 @@ def learn_drift(
 ) -> LearnedDrift:
     """Learn from cold visits and the cycles that followed each, all of one robot.
 
-    Each cycle is identified with the default prior; ``priors.learned_prior`` weighs what the
+    Each cycle is identified with the default prior; ``process.learned_prior`` weighs what the
     cycles show against it. What no cycle can show keeps its default.
 
     Raises

@@ -101,14 +101,10 @@ class ThermalNode(SessionNode[ThermalSession]):
             raise NotActiveError("no session: activate the node")
         return self._session.expected_drift()
 
-    def _poll(self) -> None:
-        try:
-            super()._poll()
-            session = self._session
-            if session is not None and (command := session.overdue()) is not None:
-                self._desk.ask(command)
-        except RobocalError as error:  # the history cannot be read: tried again at the next poll
-            self.get_logger().error(str(error), throttle_duration_sec=5.0)
+    def polled(self, session: ThermalSession) -> None:
+        """End a cycle that is overdue."""
+        if (command := session.overdue()) is not None:
+            self._desk.ask(command)
 
     # ---- outputs --------------------------------------------------------------------------------
 

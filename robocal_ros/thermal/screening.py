@@ -1,6 +1,6 @@
 """Which parameters a robot's drift needs: backward elimination by what it leaves at check points.
 
-Off line, from a shift that was recorded with many poses; see ``drift_history`` for lambda.
+Off line, from a shift that was recorded with many poses.
 """
 
 from collections.abc import Iterator

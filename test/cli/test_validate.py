@@ -432,7 +432,26 @@ class TestInParallel:
         killer.join()
         assert status == 3
         assert "1 of 4 bags could not be validated" in document["error"]["message"]
-        assert "terminated abruptly" in document["error"]["message"]
+        assert "was killed, for want of memory? Try --jobs 1" in document["error"]["message"]
+
+    @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+    def test_no_worker_outlives_the_command(self, tmp_path, how) -> None:
+        command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *40 * [str(EXCERPT)]]
+        process = subprocess.Popen(
+            [*command, "--jobs", "2", "--report", str(tmp_path / "report")], start_new_session=True
+        )
+        until(lambda: any((tmp_path / "report").glob("*.png")))
+        process.send_signal(how)
+        process.wait(timeout=60.0)
+
+        def group_is_gone() -> bool:
+            try:
+                os.killpg(process.pid, 0)
+            except ProcessLookupError:
+                return True
+            return False
+
+        until(group_is_gone)
 
     def test_ctrl_c_ends_all(self, tmp_path) -> None:
         command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *40 * [str(EXCERPT)]]

@@ -34,6 +34,7 @@ from trajectory_controllers import missing_packages  # noqa: E402
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 NO_CALL = SimpleNamespace(id="")  # of a test without parameters
 DEADLINE_S = 30.0  # of what takes a second, on a machine that is busy otherwise
+ENDS_WITHIN_S = 10.0
 DISCOVERY_S = 0.25
 
 
@@ -83,7 +84,7 @@ class Executable:
         if self.process.poll() is None:
             self.process.send_signal(by)
         try:
-            return self.process.wait(DEADLINE_S)
+            return self.process.wait(ENDS_WITHIN_S)
         except subprocess.TimeoutExpired:
             self.kill()
             pytest.fail(f"{self.name} did not end at {by.name}:\n{self.output}")

@@ -180,12 +180,12 @@ def test_a_parameter_that_no_node_has_is_named(graph: Any) -> None:
     node = graph.add(Doubler, {"facter": 4.0})
     assert state_of(graph) == "unconfigured"
     message = node._full_health().message
-    assert "facter is no parameter (did you mean 'factor'?)" in message
+    assert "facter is no parameter of this node (did you mean 'factor'?)" in message
 
 
 def test_what_is_given_to_all_nodes_need_not_be_a_parameter_of_each(graph: Any) -> None:
-    """Of config/cell.yaml, and what rclpy itself takes."""
-    shared = {"robot": "ur10", "laser": "", "use_sim_time": False}
+    """Of config/cell.yaml, what a launch file sets for all, and what rclpy itself takes."""
+    shared = {"robot": "ur10", "laser": "", "use_sim_time": False, "robot_description": "<robot/>"}
     graph.add(Doubler, shared | {"qos_overrides./number.subscription.depth": 7})
     assert state_of(graph) == "active"
 

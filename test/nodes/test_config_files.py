@@ -1,6 +1,7 @@
 """The parameter files show every parameter with its default, and a node starts with them."""
 
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.settings import MOTION
 from robocal_ros.ros.base import AUTOSTART, SERIAL
+from robocal_ros.ros.parameters import SHARED
 from robocal_ros.thermal.config import ThermalConfig
 from robocal_ros.thermal.node import INPUTS, ThermalNode
 from robocal_ros.tool.judging import ToolLimits
@@ -37,6 +39,7 @@ NODES = (
     CellSimNode,
     MaintenanceNode,
 )
+ALL_NODES = (*NODES, JointCorrectionNode)
 
 
 def shipped(node: type) -> dict[str, Any]:
@@ -48,6 +51,14 @@ def shipped(node: type) -> dict[str, Any]:
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)
 def test_the_file_shows_every_parameter_with_its_default(node):
     assert shipped(node) == {s.name: s.default for s in (AUTOSTART, SERIAL, *node.SETTINGS)}
+
+
+def test_what_several_nodes_have_may_be_given_to_all():
+    tables = [{s.name for s in (AUTOSTART, SERIAL, *node.SETTINGS)} for node in ALL_NODES]
+    counts = Counter(name for table in tables for name in table)
+    assert {name for name, count in counts.items() if count > 1} == SHARED
+    shared = yaml.safe_load((CONFIG / "cell.yaml").read_text())["/**"]["ros__parameters"]
+    assert shared.keys() <= SHARED
 
 
 def test_each_node_takes_over_what_another_one_gives_as_all_is_set():

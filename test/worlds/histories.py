@@ -17,7 +17,7 @@ BY = {"by": "Ada", "reason": "tested", "wall_ns": 1_700_000_002_000_000_000}
 
 
 def reopened(history: CalibrationHistory, **options: Any) -> CalibrationHistory:
-    return CalibrationHistory.open(SERIAL, state_dir=history.path.parent, **options)
+    return CalibrationHistory.open(history.serial, state_dir=history.path.parent, **options)
 
 
 def in_process(work: str, *arguments: object, timeout_s: float = 30.0) -> Any:
