@@ -56,6 +56,7 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Pat
     assert len(cell.sent) == stopped
 
 
+@pytest.mark.cell
 def test_calls_are_answered_at_once_while_the_robot_moves(graph: Any, tmp_path: Path) -> None:
     cell = LiveCell(graph, tmp_path)
     begun = graph.call(RunMaintenanceCycle, "/maintenance_node/run", cycle_id="c1", gap_s=GAP_S)
