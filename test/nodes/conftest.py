@@ -77,7 +77,7 @@ class Executable:
     def kill(self) -> None:
         """End it as a power cut would."""
         self.process.kill()
-        self.process.wait()
+        self.process.wait(DEADLINE_S)  # an error beats a run that hangs for good
 
     def stop(self, by: signal.Signals = signal.SIGINT) -> int:
         """Ask it to end, and return its exit status; one that stays is a failure."""
