@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tool_tables import PUBLISHED_MM
 
 from robocal_ros.cell_sim.beams import (
     BETA_RAD,
@@ -29,17 +30,6 @@ from robocal_ros.tool.flange_path import (
     upright_pose,
 )
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
-
-PUBLISHED_MM = {  # thesis table 5-3
-    "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),
-    "A3": (793.66, -139.26, 196.72), "A4": (793.68, -139.23, 191.76),
-    "B1": (805.58, -128.96, 207.46), "B2": (805.56, -124.01, 207.47),
-    "B3": (805.57, -139.27, 197.19), "B4": (805.55, -139.25, 192.24),
-    "C1": (796.99, -132.40, 207.44), "C2": (801.95, -132.43, 207.45),
-    "C3": (786.35, -132.42, 196.86), "C4": (786.31, -132.44, 191.92),
-    "D1": (796.87, -120.35, 207.47), "D2": (801.84, -120.34, 207.47),
-    "D3": (786.32, -120.36, 197.13), "D4": (786.35, -120.37, 192.19),
-}  # fmt: skip
 
 
 def published() -> dict[str, np.ndarray]:
