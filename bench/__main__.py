@@ -10,22 +10,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: the comparis
 import argparse
 import importlib
 import json
-import platform
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from datetime import UTC, datetime
 from pathlib import Path
 
-from bench.tables import Table, show
-
-ROOT = Path(__file__).resolve().parent.parent
-OUT = ROOT / "out" / "bench"
-KEPT = ROOT / "bench" / "results"  # the last figures that stand in the documents
-PAGES = ROOT / "docs" / "figures"  # the same to read
-
+from bench.tables import KEPT, OUT, PAGES, Table, about, show
 
 # Each part's module, which makes its ``tables()``; imported when asked for, since some load much.
 PARTS = {
@@ -82,33 +74,6 @@ def _all_made(parts: Sequence[str]) -> Iterator[tuple[str, Made]]:
     for part in parts:
         if part not in TOGETHER:
             yield part, _made(part)
-
-
-def _commit() -> str:
-    """The commit, with a mark when files differ from it."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    changed = git("status", "--porcelain", "--", "robocal_ros", "bench", "config")
-    return (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
-
-
-def about(seconds: float) -> dict[str, str]:
-    """Where and when figures were made."""
-    import numpy
-    import scipy
-
-    return {
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "commit": _commit(),
-        "python": platform.python_version(),
-        "numpy": numpy.__version__,
-        "scipy": scipy.__version__,
-        "machine": platform.machine(),
-        "duration_s": f"{seconds:.0f}",
-    }
 
 
 def _write(

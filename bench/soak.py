@@ -20,9 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from bench import monte_carlo
-from bench.__main__ import about
 from bench.closed_loop import tables as closed_loop
-from bench.tables import Goal, Table, show
+from bench.tables import Goal, Table, about, show
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT, KEPT = ROOT / "out" / "soak", ROOT / "docs" / "figures"

@@ -4,8 +4,7 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 
-from bench.__main__ import PAGES, about
-from bench.tables import Table, show
+from bench.tables import PAGES, Table, about, show
 
 HOUR_S = 3600.0
 

@@ -1,10 +1,19 @@
-"""Tables of results: on the terminal, as Markdown, as JSON."""
+"""Tables of results: on the terminal, as Markdown, as JSON; where they are kept, and of what."""
 
+import platform
+import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT = ROOT / "out" / "bench"
+KEPT = ROOT / "bench" / "results"  # the last figures that stand in the documents
+PAGES = ROOT / "docs" / "figures"  # the same to read
 
 Cell = str | float | int | None
 
@@ -108,3 +117,30 @@ def show(tables: Sequence[Table]) -> None:
             view.add_row(*texts, style="bold red" if missed else None)
         console.print(view)
         console.print()
+
+
+def commit() -> str:
+    """The commit of this tree, with a mark when files differ from it."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    changed = git("status", "--porcelain", "--", "robocal_ros", "bench", "config")
+    return (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
+
+
+def about(seconds: float) -> dict[str, str]:
+    """Where and when figures were made."""
+    import numpy
+    import scipy
+
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "commit": commit(),
+        "python": platform.python_version(),
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        "machine": platform.machine(),
+        "duration_s": f"{seconds:.0f}",
+    }

@@ -10,12 +10,15 @@ no more than one of them: 46. A size that is missed more often in the first few 
 others, nor is a smaller one: that can only withhold a proof, never give one.
 """
 
+import hashlib
+import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from bench.closed_loop.faults import (
     ENUMERATED,
@@ -33,7 +36,7 @@ from bench.closed_loop.faults import (
 )
 from bench.closed_loop.plant import equipped
 from bench.closed_loop.shift import ROBOT
-from bench.tables import Goal, Table
+from bench.tables import OUT, Goal, Table, commit
 from robocal_ros.cell_sim.cell import SimulatedCell
 from robocal_ros.cell_sim.cell_faults import Fault
 from robocal_ros.cell_sim.cell_plan import kr150_cell
@@ -198,15 +201,34 @@ def healthy_table(found: Sequence[Checked]) -> Table:
     return table
 
 
-def _all_checked(seed: int, sizes: Sizes) -> list[Checked]:
-    return list(checked(seed, sizes))
+def _kept_in(folder: Path, seed: int, sizes: Sizes) -> list[Checked]:
+    """All checks in the cell of a seed, read where they lie already: a run of hours may end."""
+    asked = sorted((fault, tuple(of_it)) for fault, of_it in sizes.items())
+    digest = hashlib.sha256(repr(asked).encode()).hexdigest()[:8]
+    file = folder / f"cell_{seed}_{digest}.json"
+    if file.exists():
+        rows = json.loads(file.read_text())
+    else:
+        rows = [
+            (one.trial.fault, one.trial.size, int(one.code), int(one.before), one.in_doubt)
+            for one in checked(seed, sizes)
+        ]
+        draft = file.with_suffix(".draft")
+        draft.write_text(json.dumps(rows))
+        draft.rename(file)
+    return [
+        Checked(Trial(fault, size, seed), Code(code), Code(before), doubt)
+        for fault, size, code, before, doubt in rows
+    ]
 
 
 def tables() -> Sequence[Table]:
-    """All checks, on all cores."""
+    """All checks, on all cores; what out/bench holds of this commit is not done again."""
+    folder = OUT / f"fault_checks_{commit()}"
+    folder.mkdir(parents=True, exist_ok=True)
     found: list[Checked] = []
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for seeds in SEEDS[:FIRST], SEEDS[FIRST:]:
-            cells = pool.map(partial(_all_checked, sizes=still_open(found)), seeds)
+            cells = pool.map(partial(_kept_in, folder, sizes=still_open(found)), seeds)
             found += [one for cell in cells for one in cell]
     return [power_table(found), healthy_table(found)]
