@@ -81,3 +81,23 @@ def test_a_folder_called_like_the_package_does_not_hide_it(tmp_path: Path) -> No
         check=False,
     )
     assert (found.stdout.strip(), found.stderr) == (robocal_ros.__version__, "")
+
+
+def anchors(page: Path) -> set[str]:
+    """Of its headings, as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    bare = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", head).replace("`", "") for head in heads)
+    return {re.sub(r"[^\w\- ]", "", head.strip().lower()).replace(" ", "-") for head in bare}
+
+
+PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_of_a_page_lead_to_what_is_there(page: Path) -> None:
+    for file, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)]*)\)", page.read_text()):
+        if not file.startswith("http"):
+            led_to = page.parent / file if file else page
+            assert led_to.exists(), file
+            assert not anchor or led_to.suffix != ".md" or anchor in anchors(led_to), (file, anchor)

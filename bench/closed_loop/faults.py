@@ -41,11 +41,11 @@ RIGHT: Mapping[Fault, Code] = {
     "frozen_clock": Code.TOO_FEW_SAMPLES,
     "frozen_encoder": Code.LIMIT_EXCEEDED,
 }
-"""What a PLC must read (docs/cell.md). Exchanged motor temperatures need none: they are only used
-where the drift was learned with them. Nor does a jump of the sensor's clock: the robot stands until
-the joint readings have passed a measurement's stamp, so it is taken at the same joints; one that is
-too large for that leaves poses unmeasured. Nor does a station that turns about the crossing of its
-beams: neither tip nor axis of the tool change with it."""
+"""What a PLC must read (docs/simulation.md). Exchanged motor temperatures need none: they are only
+used where the drift was learned with them. Nor does a jump of the sensor's clock: the robot stands
+until the joint readings have passed a measurement's stamp, so it is taken at the same joints; one
+that is too large for that leaves poses unmeasured. Nor does a station that turns about the crossing
+of its beams: neither tip nor axis of the tool change with it."""
 
 ONLY_BY: Mapping[Fault, str] = {"collision": "tool"}
 """Who must give the right code, where it means something else of others."""

@@ -1,4 +1,4 @@
-"""Records what a dispute needs, for as long as there is room (docs/recorder_node.md)."""
+"""Records what a dispute needs, for as long as there is room (docs/bags.md)."""
 
 import socket
 import time

@@ -1,4 +1,4 @@
-"""Plays a bag into the graph with /clock; tells what was not received (docs/replay_node.md)."""
+"""Plays a bag into the graph with /clock; tells what was not received (docs/bags.md)."""
 
 import json
 import os

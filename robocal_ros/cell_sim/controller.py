@@ -1,6 +1,6 @@
 """The simulated cell's trajectory controller on the graph: action, topic, state, speed scaling.
 
-As joint_trajectory_controller 4.42.1 offers them; docs/controllers.md tells where it is read.
+As joint_trajectory_controller 4.42.1 offers them; docs/cell_sim_node.md tells where it is read.
 """
 
 from array import array

@@ -1,7 +1,7 @@
 """A joint trajectory controller without a clock, as ros2_controllers' is.
 
 Follows joint_trajectory_controller 4.42.1 (joint_trajectory_controller.cpp, tolerances.hpp) with
-position commands; docs/controllers.md says which rule is taken from where. It sees what a drive
+position commands; docs/cell_sim_node.md says which rule is taken from where. It sees what a drive
 reports and gives what a drive is sent, cycle by cycle; cycles between two messages are computed
 together.
 

@@ -135,7 +135,7 @@ def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":
     Raises
     ------
     InputError
-        When there is no such robot, or its file is not as docs/robot_file.md says.
+        When there is no such robot, or its file is not as docs/files.md says.
     """
     from robocal_ros.kinematics.robots import load_description
 

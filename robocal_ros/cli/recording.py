@@ -180,7 +180,7 @@ def find_robot(name: str | None, warnings: list[str], configured: Command | None
     Raises
     ------
     InputError
-        Nothing says which robot it is, or its file is not as docs/robot_file.md says.
+        Nothing says which robot it is, or its file is not as docs/files.md says.
     WrongRobotError
         It is none of the shipped robots.
     """

@@ -3,7 +3,7 @@
 Each goal is corrected and forwarded; it ends as the controller ends it. Nothing here waits: goals
 are ended from callbacks, so that a cancel passes at once in whatever executor the node runs. No
 callback lets an exception out: in rclpy's events executor one of an action's client ends the
-process. docs/joint_correction_action.md tells it to users.
+process. docs/joint_correction.md tells it to users.
 """
 
 import functools

@@ -1,6 +1,6 @@
 """Tables of a hand-eye calibration: a shot in each row, and the profiles that they name.
 
-The contract is written in docs/hand_eye_sphere.md.
+The contract is written in docs/hand_eye.md.
 """
 
 from collections.abc import Mapping, Sequence

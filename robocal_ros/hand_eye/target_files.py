@@ -1,7 +1,6 @@
 """Target files of a hand-eye calibration: YAML, in millimetres and degrees.
 
-The contract is written in docs/hand_eye_sphere.md, hand_eye_step.md, hand_eye_line.md and, of a
-board, hand_eye_node.md.
+The contract is written in docs/hand_eye.md and, of a board, hand_eye_node.md.
 """
 
 from dataclasses import dataclass

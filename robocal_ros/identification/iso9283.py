@@ -79,7 +79,7 @@ def repeated(position: Array, commanded: Array | None = None) -> Repeated:
     )
 
 
-# ---- tables of attained positions (docs/iso9283.md) ---------------------------------------------
+# ---- tables of attained positions (docs/identify.md) ---------------------------------------------
 
 
 def read_positions(path: Path) -> dict[str, Array]:
@@ -88,7 +88,7 @@ def read_positions(path: Path) -> dict[str, Array]:
     Raises
     ------
     InputError
-        With file, row and column, when the table is not as docs/iso9283.md says.
+        With file, row and column, when the table is not as docs/identify.md says.
     """
     columns = POSITION["mm"]
     table = read_cells(path, lambda header, file: check_plain(header, file, columns, ("target",)))

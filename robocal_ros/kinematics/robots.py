@@ -1,4 +1,4 @@
-"""Robot files (YAML), described in docs/robot_file.md, and where the shipped ones are."""
+"""Robot files (YAML), described in docs/files.md, and where the shipped ones are."""
 
 import hashlib
 import math
@@ -157,7 +157,7 @@ def _kind(value: Any) -> str:
     return kinds.get(type(value), str(value))
 
 
-# ---- robot files (YAML), described in docs/robot_file.md, and where the shipped ones are --------
+# ---- robot files (YAML), described in docs/files.md, and where the shipped ones are --------
 
 
 Array = NDArray[np.float64]
@@ -204,7 +204,7 @@ def load_robot(name: str | Path) -> SerialArm:
     Raises
     ------
     InputError
-        Naming file, joint and key, when the file is not as docs/robot_file.md says.
+        Naming file, joint and key, when the file is not as docs/files.md says.
     """
     description = load_description(name)
     for note in description.notes:

@@ -1,4 +1,4 @@
-"""Measurements as CSV tables; the contract is written in docs/csv.md."""
+"""Measurements as CSV tables; the contract is written in docs/files.md."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -21,7 +21,7 @@ from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE
 
 # ---- columns of a measurement table: names, units, and what is missing or unknown ---------------
 #
-# The contract is written in docs/csv.md.
+# The contract is written in docs/files.md.
 
 
 Array = NDArray[np.float64]
@@ -271,7 +271,7 @@ def orientation_columns(place: Collection[str], file: str) -> tuple[str, ...] | 
     return begun[0]
 
 
-# ---- measurements as CSV tables; the contract is written in docs/csv.md -------------------------
+# ---- measurements as CSV tables; the contract is written in docs/files.md ------------------------
 
 
 LARGEST_STAMP_S = 9_000_000_000
@@ -292,7 +292,7 @@ def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
     Raises
     ------
     InputError
-        With file, row and column, when anything in the file is not as docs/csv.md says.
+        With file, row and column, when anything in the file is not as docs/files.md says.
     """
     return measurements_of(*read_table(Path(path), arm), arm)
 

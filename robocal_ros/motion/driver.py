@@ -2,7 +2,7 @@
 
 Motions go as goals of FollowJointTrajectory: a rejection, a violated tolerance and an end are then
 known. Where nobody serves that action they go on a topic, which tells nothing. Whoever moves the
-robot holds the cell's motion lease meanwhile (docs/tool_motion.md).
+robot holds the cell's motion lease meanwhile (docs/tool.md).
 """
 
 import time

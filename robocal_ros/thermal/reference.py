@@ -366,7 +366,7 @@ def _listed(names: tuple[str, ...]) -> str:
     return few if len(names) <= 6 else f"{few} and {len(names) - 6} more"
 
 
-# ---- tables of visits of named measuring poses (docs/csv.md) ------------------------------------
+# ---- tables of visits of named measuring poses (docs/files.md) -----------------------------------
 
 
 def read_visits(path: str | Path, arm: SerialArm) -> Visits:

@@ -1,4 +1,4 @@
-"""Motion of the tool node: it moves the robot, once armed (docs/tool_motion.md)."""
+"""Motion of the tool node: it moves the robot, once armed (docs/tool.md)."""
 
 import math
 from collections.abc import Callable, Mapping

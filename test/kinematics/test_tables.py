@@ -1,4 +1,4 @@
-"""Measurement tables: the contract of docs/csv.md, and every way to break it."""
+"""Measurement tables: the contract of docs/files.md, and every way to break it."""
 
 from pathlib import Path
 

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.cell
 
 ROOT = Path(__file__).parent.parent.parent
 LONGEST_S = 240.0
-WITHIN_MM = 0.3  # what docs/cell.md calls recovered
+WITHIN_MM = 0.3  # what docs/simulation.md calls recovered
 BENT_MM = 2.0
 NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what it was measured with
 

@@ -156,7 +156,7 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         own.order(stop=True, **how)
         stood = own.stopped()
         assert stood["failed"] == ""
-        # Once more where a busy computer hides for 20 ms that the robot slows down: it does no harm.
+        # Once more where a busy computer hides for 20 ms that it slows down: that does no harm.
         assert stood["sent"] - 1 - sum(how.values()) in (0, 1)
         paused_s = stood["sent"] * max(stood["longest_tick_s"] - 0.02, 0.0)  # a busy computer
         assert stood["took_s"] < longest * stood["planned_s"] + paused_s, (how, stood)

@@ -268,7 +268,7 @@ def test_waiting_for_what_is_not_played_is_refused(graph, tmp_path):
 
 def test_the_commands_of_the_page_run_as_typed(graph):
     """In the repository's root; those with exit_at_end tell by their status how it went."""
-    page = (ROOT / "docs" / "replay_node.md").read_text().replace("\\\n", " ")
+    page = (ROOT / "docs" / "bags.md").read_text().replace("\\\n", " ")
     blocks = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
     typed = [shlex.split(line, comments=True) for line in lines if "exit_at_end" in line]
