@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.programs import read_poses, readings
 from robocal_ros.cell_sim.robot import Effects, TrueRobot
-from robocal_ros.cell_sim.stations import SphereSensor
+from robocal_ros.cell_sim.sensors import SphereSensor
 from robocal_ros.cell_sim.thermal_shift import Shift, ShiftPlan, simulate
+from robocal_ros.cell_sim.tool_cell import read_poses, readings
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]

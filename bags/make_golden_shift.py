@@ -35,7 +35,7 @@ from bench.closed_loop.judging import Figures  # noqa: E402
 from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
 from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
 from robocal_ros.bags.bag_writer import BagWriter, ros_time  # noqa: E402
-from robocal_ros.cell_sim.cell_samples import Happened, Sample  # noqa: E402
+from robocal_ros.cell_sim.cell import Happened, Sample  # noqa: E402
 from robocal_ros.ground.samples import (  # noqa: E402
     JOINTS,
     REFERENCE_SPHERE,

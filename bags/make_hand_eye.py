@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.hand_eye_cell import (
     ArmRobot,
     HandEyeCell,
@@ -56,9 +56,9 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     step_shots,
     taught,
 )
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor, Scene, ball_on_table
-from robocal_ros.cell_sim.programs import SmoothPath, readings
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
+from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
+from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.tables import write_shots

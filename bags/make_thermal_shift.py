@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.stations import sphere_cloud
+from robocal_ros.cell_sim.sensors import sphere_cloud
 from robocal_ros.cell_sim.thermal_shift import MEASURING, Shift, ShiftPlan, poses, simulate
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot

@@ -35,8 +35,7 @@ from robocal_ros.cell_sim.beams import (
     bent,
     laser_of,
 )
-from robocal_ros.cell_sim.programs import RobotProgram, Sample
-from robocal_ros.cell_sim.tool_cell import ToolCell
+from robocal_ros.cell_sim.tool_cell import RobotProgram, Sample, ToolCell
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

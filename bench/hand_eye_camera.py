@@ -21,7 +21,7 @@ from bench.hand_eye_sets import (
     turned_tsai,
 )
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
+from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.hand_eye.board import boards_of_corners, see_boards
 from robocal_ros.hand_eye.camera import distances, rms
 from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs

@@ -24,9 +24,9 @@ from bench.hand_eye_worlds import (
 )
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.mount_problem import pivot_of

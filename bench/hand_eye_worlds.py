@@ -26,7 +26,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     sphere_shots,
     step_shots,
 )
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor, Scene
+from robocal_ros.cell_sim.sensors import ProfileSensor, Scene
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen

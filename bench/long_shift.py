@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from robocal_ros.bags.bag_types import encode
 from robocal_ros.bags.bag_writer import BagWriter, ros_time
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.programs import readings
-from robocal_ros.cell_sim.stations import sphere_cloud
+from robocal_ros.cell_sim.sensors import sphere_cloud
 from robocal_ros.cell_sim.thermal_shift import MEASURING, MOVE_S, Shift, ShiftPlan, poses, simulate
+from robocal_ros.cell_sim.tool_cell import readings
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from bench.tables import Goal, Table
 from bench.thermal_shifts import PARTS, SEEDS, SIGMA_M, Measured, cell_of
 from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.cell_sim.stations import CloudScene, sphere_cloud
+from robocal_ros.cell_sim.sensors import CloudScene, sphere_cloud
 from robocal_ros.cell_sim.thermal_shift import LENGTHS, MEASURING, DriftingCell, DriftPlan, record
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground.samples import Measurements

@@ -31,8 +31,8 @@ MAY_IMPORT = {
 }
 COMMANDS = {"cli", "cli_poses", "cli_sensors", "cli_shots"}  # files of a room
 ROS_FILES = {
-    "node", "node_motion", "messages", "action", "settings", "services", "outputs", "report",
-    "graph", "driver", "controller", "replay_node", "replay_topics", "recorder_node",
+    "node", "node_motion", "messages", "action", "settings", "services", "report",
+    "graph", "driver", "replay_node", "replay_topics", "recorder_node",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",

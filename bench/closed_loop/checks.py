@@ -37,9 +37,8 @@ from bench.closed_loop.faults import (
 from bench.closed_loop.plant import equipped
 from bench.closed_loop.shift import ROBOT
 from bench.tables import OUT, Goal, Table, commit
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_faults import Fault
-from robocal_ros.cell_sim.cell_plan import kr150_cell
+from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
+from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.results import FULL, QUICK

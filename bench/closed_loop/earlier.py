@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.thermal_shifts import Measured
-from robocal_ros.cell_sim.cell_plan import poses
+from robocal_ros.cell_sim.cell import poses
 from robocal_ros.cell_sim.robot import TrueRobot
 from robocal_ros.cell_sim.thermal_shift import PLANS, DriftingCell, DriftPlan, record
 from robocal_ros.kinematics import SerialArm

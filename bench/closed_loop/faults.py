@@ -7,7 +7,7 @@ from itertools import takewhile
 from bench.closed_loop.judging import Harm, harm
 from bench.closed_loop.plant import GapReport
 from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord
-from robocal_ros.cell_sim.cell_faults import FAULTS, SIZES, Fault
+from robocal_ros.cell_sim.faults import FAULTS, SIZES, Fault
 from robocal_ros.ground.errors import Code
 
 EVERY_S = 160.0  # a gap, then one pass of the programme

@@ -16,7 +16,7 @@ from bench.closed_loop.judging import harm
 from bench.closed_loop.shift import run_shift
 from bench.closed_loop.tables import FAULTY_RMS_M, MM
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.cell_faults import Fault
+from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.errors import Code
 
 STATION: tuple[Fault, ...] = ("station_knocked", "station_knocked_shift", "station_knocked_turn")

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from bench.closed_loop import setting
 from bench.closed_loop.suite import Clock, Record, Suite, unrecorded
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import poses
-from robocal_ros.cell_sim.cell_samples import CellSamples, Happened, Sample
-from robocal_ros.cell_sim.programs import programme
+from robocal_ros.cell_sim.cell import CellSamples, Happened, Sample, SimulatedCell, poses
+from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.correction.inputs import RefusedError, TrajectoryCommand
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -20,10 +20,8 @@ from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
 from bench.live.graph import LiveError
 from bench.startup import ROOT
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_faults import Fault
-from robocal_ros.cell_sim.cell_plan import kr150_cell
-from robocal_ros.cell_sim.cell_samples import CellSamples
+from robocal_ros.cell_sim.cell import CellSamples, SimulatedCell, kr150_cell
+from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, save_robot
 from robocal_ros.tool.laser_frame import LaserFile, write_laser

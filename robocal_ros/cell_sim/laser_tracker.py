@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.profile_sensor import Ball, ProfileSensor, ScannedBody, Scene, block
 from robocal_ros.cell_sim.robot import shift, turn
+from robocal_ros.cell_sim.sensors import Ball, ProfileSensor, ScannedBody, Scene, block
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.shots import Profile, profile_of
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise, TrackerTarget

@@ -1,25 +1,316 @@
-"""A simulated cell: robot, tool and beam station as one node (docs/cell_sim_node.md)."""
+"""Parameters of the simulated cell."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from robocal_msgs.msg import ToolStep
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import known_laser, worked_for
-from robocal_ros.cell_sim.controller import SimulatedController
-from robocal_ros.cell_sim.outputs import CellOutputs, planned_step, trajectory_of
-from robocal_ros.cell_sim.settings import SETTINGS, at_station, bent_tool, cell_plan, laser_pose
-from robocal_ros.cell_sim.stations import TICK_S
+from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
+from robocal_ros.cell_sim.cell import (
+    T_BASE_LASER,
+    CellPlan,
+    SimulatedCell,
+    known_laser,
+    kr150_cell,
+    poses,
+    rigid_robot,
+    worked_for,
+)
+from robocal_ros.cell_sim.faults import CONTROLLER_FAULTS, FAULTS
+from robocal_ros.cell_sim.messages import (
+    CellOutputs,
+    SimulatedController,
+    planned_step,
+    trajectory_of,
+)
+from robocal_ros.cell_sim.sensors import TICK_S
+from robocal_ros.cell_sim.trajectory_controller import LAG_S, ControllerOptions
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.files import write_text
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.endpoints import WARN, Health
+from robocal_ros.ros.parameters import Setting
 from robocal_ros.ros.run import run
 from robocal_ros.tool.measuring_plan import PlannedStep
+
+Array = NDArray[np.float64]
+
+MM, MS = 1e-3, 1e-3
+PIN_M = 0.15  # tip of the straight tool along the flange's z, where the robot file has no tool
+TAPER = 0.1  # of the cone
+NOZZLE_M = 3.5e-3  # by so much the torch's nozzle is wider than its wire
+TOOLS = ("cylinder", "cone", "torch")
+CELLS = ("tool", "kr150")
+KR150 = "kr150_r3100"
+
+
+def _numbers(count: int) -> Callable[[Any], str | None]:
+    return lambda values: None if len(values) == count else f"not {count} numbers"
+
+
+def _mm(name: str, default: float, what: str, high: float, low: float = 0.0) -> Setting:
+    return Setting(name, default, what, unit="mm", low=low, high=high)
+
+
+def _ms(name: str, default: float, what: str, high: float) -> Setting:
+    return Setting(name, default, what, unit="ms", low=0.0, high=high)
+
+
+SETTINGS = (
+    Setting(
+        "cell",
+        "tool",
+        "tool: a robot that stays cold, at a beam station, as the parameters describe it; kr150: a "
+        "whole cell with a KR 150 that warms up, a sphere sensor and a beam station",
+        choices=CELLS,
+    ),
+    Setting(
+        "robot",
+        "ur10",
+        "Robot type (config/robots) or path of a robot file; its tool is the straight one, 150 mm "
+        "along the flange's z where it has none",
+    ),
+    Setting(
+        "q_start_deg",
+        [2.3, -124.4, -70.9, 107.7, -91.1, 91.8],
+        "Where the robot stands first, tool above the station (sliding joint: mm)",
+        unit="deg",
+        low=-1e5,
+        high=1e5,
+    ),
+    Setting("rate_hz", 125.0, "Rate of joint_states", unit="Hz", low=1.0, high=1000.0),
+    Setting(
+        "velocities",
+        False,
+        "The robot reports velocities; false: they are NaN in joint_states and absent in "
+        "~/controller_state, as of hardware that has positions alone",
+    ),
+    Setting(
+        "limits",
+        False,
+        "Drives refuse a command that is more than 5 % faster than their greatest speed; nobody "
+        "behind a real controller does by default",
+    ),
+    Setting(
+        "lag_ms",
+        1e3 * LAG_S,
+        "By so much the drives are behind their command",
+        unit="ms",
+        low=0.0,
+        high=200.0,
+    ),
+    *(
+        Setting(name, getattr(ControllerOptions(), name), f"Of the controller: {what}")
+        for name, what in (
+            ("allow_partial_joints_goal", "take trajectories for some of the joints"),
+            ("allow_nonzero_velocity_at_trajectory_end", "take those that end in motion"),
+            ("interpolate_from_desired_state", "begin at the last command, not where the robot is"),
+        )
+    ),
+    *(
+        Setting(name, 0.0, f"Of the controller, of every joint: {what}", low=0.0, high=100.0)
+        for name, what in (
+            ("trajectory", "greatest error on the way, rad (sliding: m); 0: no check"),
+            ("goal", "greatest error at the end, rad (sliding: m); 0: no check"),
+            ("goal_time", "how long a goal may be out of that, s; 0: for ever"),
+        )
+    ),
+    _mm("arm_error_mm", 0.0, "Scatter of the true arm's lengths; angles err as much at 1 m", 5.0),
+    _mm("repeatability_mm", 0.03, "Scatter of a motion in each axis", 2.0),
+    _mm("edge_noise_mm", 0.01, "Further scatter at each edge", 2.0),
+    Setting("ripple", 0.02, "Relative ripple of the program's speed", low=0.0, high=0.5),
+    Setting(
+        "warm_h",
+        0.0,
+        "The kr150 has worked for so long when it begins",
+        unit="h",
+        low=0.0,
+        high=100.0,
+    ),
+    Setting("warm_up", 1.0, "Heat of the kr150, over the usual", low=0.0, high=10.0, live=True),
+    Setting(
+        "cloud_points",
+        2000,
+        "Of a sphere's cloud of the kr150; 0: its centre is told instead",
+        low=0,
+        high=100_000,
+    ),
+    Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
+    Setting("profile", False, "A line laser on the flange of the kr150"),
+    Setting("profile_frame", "profile_sensor", "Frame of the line laser"),
+    Setting("station", "station", "Name of the beam station: frame_id of its edges"),
+    Setting(
+        "laser_xyz_mm",
+        [799.4, -126.3, 194.5],
+        "True crossing of the beams in base",
+        unit="mm",
+        low=-1e5,
+        high=1e5,
+        check=_numbers(3),
+    ),
+    Setting(
+        "laser_rotation_deg",
+        [1.2, -2.3, 0.6],
+        "True rotation vector of the laser frame in base",
+        unit="deg",
+        low=-180.0,
+        high=180.0,
+        check=_numbers(3),
+    ),
+    Setting("beam_angle_deg", 92.2, "True angle of the beams", unit="deg", low=40.0, high=140.0),
+    _mm("beam_gap_mm", 0.058, "By so much the y-beam passes above the x-beam", 2.0, -2.0),
+    Setting(
+        "laser_csv",
+        "",
+        "File to which the robot's calibration of the station is written (robocal tool beams); "
+        "empty: none",
+    ),
+    Setting("tool", "cylinder", "Shape of the tool", choices=TOOLS),
+    _mm("tool_radius_mm", 2.5, "Of cylinder, cone's tip, or torch's wire", 20.0, 0.1),
+    Setting(
+        "tool_bend_mm",
+        [0.0, 0.0, 0.0],
+        "Shift of the true tip from the straight tool's, flange axes",
+        unit="mm",
+        low=-50.0,
+        high=50.0,
+        check=_numbers(3),
+        live=True,
+    ),
+    Setting(
+        "tool_tilt_deg",
+        [0.0, 0.0],
+        "Tilt of the true tool about the flange's x and y",
+        unit="deg",
+        low=-45.0,
+        high=45.0,
+        check=_numbers(2),
+        live=True,
+    ),
+    _ms("input_latency_ms", 4.0, "Constant delay of an edge's stamp", 1000.0),
+    _ms("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 10.0),
+    _ms("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 100.0),
+    _ms("input_bounce_ms", 0.0, "For how long a contact may bounce", 20.0),
+    Setting("run_program", False, "Drive each step that is announced on next_step"),
+    Setting("flange_frame", "tool0", "Parent frame of ~/truth"),
+    Setting("tool_frame", "true_tool", "Child frame of ~/truth"),
+    Setting("fault", "none", "What goes wrong", choices=(*FAULTS, *CONTROLLER_FAULTS), live=True),
+    Setting(
+        "fault_size",
+        0.0,
+        "Its size, in the unit that belongs to it; 0: the usual one",
+        low=-1e4,
+        high=1e4,
+        live=True,
+    ),
+    Setting("seed", 1, "Of everything that is random", low=0, high=2**31 - 1),
+)
+
+
+def straight_arm(name: str) -> SerialArm:
+    """The nominal robot with its straight tool."""
+    arm = load_robot(name)
+    if not np.array_equal(arm.T_flange_tool, np.eye(4)):
+        return arm
+    return replace(arm, T_flange_tool=frames.transform(np.eye(3), [0.0, 0.0, PIN_M]))
+
+
+def bent_tool(settings: Mapping[str, Any], plan: CellPlan) -> RoundTool:
+    """The tool as it is mounted."""
+    shift = np.array(settings["tool_bend_mm"]) * MM
+    tilt = np.radians([*settings["tool_tilt_deg"], 0.0])
+    return plan.tool.mounted(bent(plan.arm.T_flange_tool, shift, tilt))
+
+
+def laser_pose(settings: Mapping[str, Any]) -> Array:
+    """T_base_laser (4, 4), true."""
+    if settings["cell"] == "kr150":
+        return T_BASE_LASER
+    R = frames.exp_rotation(np.radians(settings["laser_rotation_deg"]))
+    return frames.transform(R, np.array(settings["laser_xyz_mm"]) * MM)
+
+
+def at_station(settings: Mapping[str, Any], plan: CellPlan) -> Array:
+    """Joints (n,) with which the robot stands above the beams."""
+    return poses("tool")[0] if settings["cell"] == "kr150" else plan.q_start
+
+
+def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
+    """The cell that the parameters describe.
+
+    Raises
+    ------
+    InputError
+        When ``q_start_deg`` has not a number for each joint.
+    """
+    seed = settings["seed"]
+    if settings["cell"] == "kr150":
+        plan = kr150_cell(
+            load_robot(KR150),
+            seed,
+            points=settings["cloud_points"],
+            profile=settings["profile"],
+        )
+    else:
+        plan = _tool_cell(settings)
+    source = TrueInput(
+        latency_s=settings["input_latency_ms"] * MS,
+        jitter_s=settings["input_jitter_ms"] * MS,
+        sample_period_s=settings["input_period_ms"] * MS,
+        bounce_s=settings["input_bounce_ms"] * MS,
+    )
+    return replace(
+        plan,
+        station=replace(plan.station, input=source),
+        rate_hz=settings["rate_hz"],
+        tool=bent_tool(settings, plan),
+        ripple=settings["ripple"],
+        limits=settings["limits"],
+        lag_s=settings["lag_ms"] * MS,
+        controller=ControllerOptions(
+            velocity_states=settings["velocities"],
+            **{of.name: settings[of.name] for of in fields(ControllerOptions)[1:]},
+        ),
+        seed=seed,
+    )
+
+
+def _tool_cell(settings: Mapping[str, Any]) -> CellPlan:
+    """A robot that stays cold, at a beam station."""
+    arm = straight_arm(settings["robot"])
+    given = np.array(settings["q_start_deg"], dtype=np.float64)
+    if given.shape != (arm.n,):
+        raise InputError(f"q_start_deg has {given.size} numbers, {arm.name} has {arm.n} joints")
+    gap_m, angle = settings["beam_gap_mm"] * MM, float(np.radians(settings["beam_angle_deg"]))
+    noise = TrueNoise(settings["repeatability_mm"] * MM, settings["edge_noise_mm"] * MM)
+    rng = np.random.default_rng([settings["seed"], 1])
+    return CellPlan(
+        robot=rigid_robot(arm, settings["arm_error_mm"] * MM, rng),
+        station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), noise=noise),
+        tool=_tool(settings, arm.T_flange_tool),
+        q_start=np.where(arm.prismatic, given * MM, np.radians(given)),
+        fastest=np.nan_to_num(load_description(settings["robot"]).max_velocity, nan=np.inf),
+    )
+
+
+def _tool(settings: Mapping[str, Any], T: Array) -> RoundTool:
+    """The straight tool."""
+    radius = settings["tool_radius_mm"] * MM
+    if settings["tool"] == "cone":
+        return RoundTool.cone(T, radius, TAPER)
+    if settings["tool"] == "torch":
+        return RoundTool.torch(T, radius, radius + NOZZLE_M)
+    return RoundTool.cylinder(T, radius)
+
 
 BEHIND_S = 1.0  # a longer pause of the process, or a jump of its clock, is none of the cell's
 
@@ -49,7 +340,10 @@ class CellSimNode(HouseNode):
             rng = np.random.default_rng([settings["seed"], 2])
             there = at_station(settings, plan)
             points = known_laser(plan, laser_pose(settings), there, rng)
-            rows = [f"{name},{_mm(place)}\n" for name, place in sorted(points.items())]
+            rows = [
+                f"{name},{','.join(f'{1e3 * x:.6f}' for x in place)}\n"
+                for name, place in sorted(points.items())
+            ]
             write_text(Path(settings["laser_csv"]), "point,x_mm,y_mm,z_mm\n" + "".join(rows))
         self._out = CellOutputs(self.add_output, settings, self._cell)
         self._controller.open(self._cell)
@@ -164,10 +458,6 @@ class CellSimNode(HouseNode):
         health.values = {"moving": cell.moving, "drive faults": cell.motion.faults}
         health.values |= {f"{topic} sent": count for topic, count in self._out.told.items()}
         return health
-
-
-def _mm(place: Any) -> str:
-    return ",".join(f"{1e3 * x:.6f}" for x in place)
 
 
 def main() -> None:

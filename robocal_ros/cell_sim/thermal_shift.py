@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.programs import COUNT_RAD, SmoothPath, read_poses
 from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot, Warmth, WarmUp
-from robocal_ros.cell_sim.stations import SphereSensor
+from robocal_ros.cell_sim.sensors import SphereSensor
+from robocal_ros.cell_sim.tool_cell import COUNT_RAD, SmoothPath, read_poses
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.learning import share_within

@@ -3,13 +3,11 @@
 Follows joint_trajectory_controller 4.42.1 (joint_trajectory_controller.cpp, tolerances.hpp) with
 position commands; docs/cell_sim_node.md says which rule is taken from where. It sees what a drive
 reports and gives what a drive is sent, cycle by cycle; cycles between two messages are computed
-together.
-
-As `Trajectory` of ros2_controllers' joint_trajectory_controller 4.42.1 does
-(joint_trajectory_controller/src/trajectory.cpp).
+together. `Trajectory` and `SampledPath` are as in its trajectory.cpp; `JointMotion` is the drives.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from typing import Any
@@ -19,14 +17,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import InputError
 
-# ---- a joint trajectory, and what a joint trajectory controller reads from it at a time ---------
-
-
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.int64]
 
 WITH_SPEED, WITH_BOTH, WITHOUT_SPEED = 1, 3, 2  # what both ends of a stretch have beside positions
+AT_REST = 1.2e-7  # greatest speed of a last point, rad/s (prismatic: m/s): float's epsilon
+CYCLE_S = 4e-3  # of controller and drives
+LAG_S = 14e-3  # ur_robot_driver's servoj_lookahead_time is 30 ms: the mean over eight cycles
+ROOM = 0.05  # above the greatest speed: a correction adds a little to the programme's
+BRAKES_S = 0.4  # from the greatest speed to rest
+KEPT = 25_000  # cycles that are known back from now, at least
+MOST = 1000  # cycles that are computed together
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,7 @@ class SampledPath:
         of = trajectory
         start_s = now_s if of.start_s is None else of.start_s
         self.start_s, self.count, self._points_s = start_s, len(of.time_s), start_s + of.time_s
+        self.end_s = float(self._points_s[-1])
         self._knots = np.append(now_s if before_s is None else before_s, self._points_s)
         zeros = np.zeros_like(q)
         begin = (q, zeros if qd is None else qd, zeros)
@@ -107,11 +110,6 @@ class SampledPath:
         long_s[0] = max(long_s[0], 1e-9)
         self._polynomials = _coefficients(long_s[:, None], rows, kind)
         self._last = np.stack([part[-1] for part in rows])
-
-    @property
-    def end_s(self) -> float:
-        """When its last point is due."""
-        return float(self._points_s[-1])
 
     def sample(self, time_s: Array) -> tuple[Array, Array, Array, Index]:
         """Positions, velocities, accelerations (m, n) at times (m,), and how many are past."""
@@ -150,9 +148,6 @@ def _coefficients(h: Array, rows: list[Array], kind: Index) -> Array:
     bend = (a1 - a0) * h**2
     c[5, quintic] = ((12.0 * way - 6.0 * (v0 + v1) * h + bend) / (2.0 * h**5))[quintic]
     return c
-
-
-# ---- a joint trajectory controller's parameters, its goals, and how they end --------------------
 
 
 class GoalState(Enum):
@@ -220,12 +215,6 @@ class ControllerOptions:
     goal_time: float = 0.0
 
 
-# ---- a joint trajectory controller without a clock, as ros2_controllers' is ---------------------
-
-
-AT_REST = 1.2e-7  # greatest speed of a last point, rad/s (prismatic: m/s): float's epsilon
-
-
 @dataclass(frozen=True, eq=False)
 class Cycles:
     """What the controller makes of some cycles: rows (k, n).
@@ -241,7 +230,7 @@ class Cycles:
     command: Array
     speed: Array
     past_s: Array
-    ended: NDArray[np.bool_]
+    ended: Flags
 
     def first(self, count: int) -> "Cycles":
         """The first ones."""
@@ -274,12 +263,11 @@ class TrajectoryController:
         self._sorted = self.q.copy()  # what the original wrote last when it sorted joints
         self._succeeded = False
         self._new: Trajectory | None = None
-        self._path = SampledPath(self._holding(self.q), -1.0, self.q, None)
+        here = Trajectory.of(self.names, [0.0], self.q[None])
+        self._path = SampledPath(here, -1.0, self.q, None)
         # Its time: so many steps of so much after a begin, however the cycles are cut.
         self._begin_s, self._steps, self._step_s = -1.0, -1, self.period_s
         self._is_holding, self._is_first, self._brakes = True, False, False
-
-    # ---- what comes in --------------------------------------------------------------------------
 
     def follow(self, trajectory: Trajectory, now_s: float) -> None:
         """Follow a trajectory from the next cycle on, as one that came on the topic.
@@ -318,7 +306,7 @@ class TrajectoryController:
 
     def hold(self, here: Array) -> None:
         """Stand ``here`` from the next cycle on: a hard stop."""
-        self._new, self._is_holding = self._holding(here), True
+        self._new, self._is_holding = Trajectory.of(self.names, [0.0], here[None]), True
 
     def deactivate(self, here: Array) -> None:
         """Stand, and abort what runs."""
@@ -357,8 +345,6 @@ class TrajectoryController:
             raise InputError(
                 f"rejected: times do not increase: {time[point]:g} and {time[point + 1]:g} s"
             )
-
-    # ---- cycles ---------------------------------------------------------------------------------
 
     def cycles(self, time_s: NDArray[Any], q: Array, qd: Array) -> Cycles:
         """Begin the cycles at times (k,), the drives being at ``q``, ``qd`` (n,) in the first."""
@@ -407,7 +393,14 @@ class TrajectoryController:
                 count = first + 1
                 cycles.command[first] = cycles.command[first - 1] if first else before
                 cycles.speed[first] = 0.0
-                self._violated(bool(lost[first]), float(over_s[first]), measured[first])
+                if lost[first]:
+                    text = "Aborted due to path tolerance violation"
+                    self._abort(GoalCode.PATH_TOLERANCE_VIOLATED, text)
+                else:
+                    text = "Aborted due to goal_time_tolerance exceeding by "
+                    text += f"{over_s[first]:f} seconds"
+                    self._abort(GoalCode.GOAL_TOLERANCE_VIOLATED, text)
+                self.hold(measured[first])
             elif reached[first] and self.active:
                 self.active.end(GoalState.SUCCEEDED, text="Goal successfully reached!")
                 self.active, self._is_holding = None, True
@@ -438,24 +431,10 @@ class TrajectoryController:
         """Where in the trajectory the last cycle was, on the clock of its begin."""
         return self._begin_s + self._steps * self._step_s
 
-    # ---- small parts ----------------------------------------------------------------------------
-
-    def _violated(self, on_way: bool, over_s: float, here: Array) -> None:
-        if on_way:
-            text = "Aborted due to path tolerance violation"
-            self._abort(GoalCode.PATH_TOLERANCE_VIOLATED, text)
-        else:
-            text = f"Aborted due to goal_time_tolerance exceeding by {over_s:f} seconds"
-            self._abort(GoalCode.GOAL_TOLERANCE_VIOLATED, text)
-        self.hold(here)
-
     def _abort(self, code: GoalCode, text: str) -> None:
         if self.active:
             self.active.end(GoalState.ABORTED, code, text)
             self.active = None
-
-    def _holding(self, here: Array) -> Trajectory:
-        return Trajectory.of(self.names, [0.0], here[None])
 
     def _ordered(self, given: Trajectory) -> Trajectory:
         """In the controller's order; of a joint that is named twice the last value counts.
@@ -475,3 +454,221 @@ class TrajectoryController:
         if self._is_holding and self._succeeded:
             self._sorted = np.zeros_like(self._sorted)
         return replace(given, names=self.names, q=q, qd=qd, qdd=qdd)
+
+
+class JointMotion:
+    """A trajectory controller and the drives that follow it, from time 0 on.
+
+    What is asked for a time happens up to then. A message after that counts from the cycle after
+    its own time on, and what was computed beyond it is done again.
+
+    Parameters
+    ----------
+    q : (n,) where the joints stand at time 0, rad (prismatic: m).
+    fastest : (n,) or one for all: the drives' greatest speeds, rad/s (prismatic: m/s).
+    limits : drives refuse what is faster by more than `ROOM`: a drive fault, the robot brakes.
+        Without, they follow: nobody behind a controller looks at its command.
+    lag_s : drives smooth their command: a mean that lags so much, in whole half cycles.
+
+    Attributes
+    ----------
+    controller : takes trajectories, see `TrajectoryController`.
+    peak : (n,) greatest speeds that were commanded, rad/s (prismatic: m/s).
+    faults : number of drive faults; ``fault``: what the last one was.
+    """
+
+    def __init__(
+        self,
+        q: ArrayLike,
+        fastest: ArrayLike = np.inf,
+        *,
+        names: tuple[str, ...] = (),
+        options: ControllerOptions | None = None,
+        limits: bool = False,
+        lag_s: float = 0.0,
+    ) -> None:
+        here = np.array(q, dtype=np.float64)
+        self._fastest = np.broadcast_to(np.asarray(fastest, dtype=np.float64), here.shape)
+        self._limits = limits
+        self.peak, self.faults, self.fault = np.zeros_like(here), 0, ""
+        names = names or tuple(f"joint_{i + 1}" for i in range(len(here)))
+        self.controller = TrajectoryController(names, here, CYCLE_S, options or ControllerOptions())
+        # Each row is a cycle: measured, sent and desired joints with their rates.
+        self._width = 1 + round(2.0 * lag_s / CYCLE_S)
+        self._sent = np.tile(np.stack([here, np.zeros_like(here)]), (self._width, 1, 1))
+        self._rows = np.empty((2 * KEPT, 7, len(here)))
+        self._past_s = np.empty(2 * KEPT)
+        self._begin = self._count = 0  # number of the first row's cycle, and of the next one
+        self._before = self._snapshot()
+
+    @property
+    def peak_share(self) -> float:
+        """The greatest speed that was commanded, over that of its drive."""
+        return float(np.max(self.peak / self._fastest))
+
+    @property
+    def end_s(self) -> float:
+        """When the joints come to rest; inf while they are halted on their way."""
+        lag = (self._width - 1) * CYCLE_S
+        return self.controller.end_s(self._count * CYCLE_S) + lag
+
+    @property
+    def here(self) -> Array:
+        """Joints and velocities (2, n) that the drives report next."""
+        return np.asarray(self._mean(self._sent[:0])[0])
+
+    def follow(
+        self,
+        now_s: float,
+        time_s: ArrayLike,
+        q: ArrayLike,
+        qd: ArrayLike | None = None,
+        qdd: ArrayLike | None = None,
+    ) -> None:
+        """Follow points at times (k,) of the motion's own clock, from the cycle after ``now_s`` on.
+
+        ``q``, ``qd``, ``qdd`` (k, n).
+
+        Raises
+        ------
+        InputError
+            When the controller rejects it; what runs goes on.
+        """
+        self.take(now_s, Trajectory.of(self.controller.names, time_s, q, qd, qdd, start_s=0.0))
+
+    def take(self, now_s: float, given: Trajectory | TrajectoryGoal) -> None:
+        """Follow a trajectory or a goal, see `TrajectoryController`, from the next cycle on.
+
+        Raises
+        ------
+        InputError
+            When the controller rejects it; what runs goes on.
+        """
+        self.pass_to(now_s)
+        if isinstance(given, Trajectory):
+            self.controller.follow(given, now_s)
+        else:
+            self.controller.accept(given, now_s)
+        self._before = self._snapshot()
+
+    def hold(self, now_s: float) -> None:
+        """Stand where the drives are, at once, and abort what runs: the controller is inactive."""
+        self.pass_to(now_s)
+        self.controller.deactivate(self.here[0])
+        self._before = self._snapshot()
+
+    def cancel(self, now_s: float, goal: TrajectoryGoal) -> None:
+        """Cancel a goal: where it is the one that runs, stand where the drives are."""
+        self.pass_to(now_s)
+        self.controller.cancel(goal, self.here[0])
+        self._before = self._snapshot()
+
+    def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
+        """Joints (k, n) and their velocities at times (k,), of which `KEPT` cycles are known."""
+        t = np.asarray(time_s, dtype=np.float64)
+        if len(t):
+            self._run(int(np.floor(np.max(t) / CYCLE_S * (1.0 + 1e-12))) + 1)
+        number = np.floor(t / CYCLE_S * (1.0 + 1e-12)).astype(np.int64)
+        number = np.clip(number, self._begin, self._count - 1)
+        first = int(np.min(number, initial=self._count - 1))
+        known = self._rows[first - self._begin : self._count - self._begin, :2]
+        rows, row = np.concatenate([known, self.here[None]]), number - first
+        s = np.clip(t / CYCLE_S - number, 0.0, 1.0)[:, None]
+        (q0, v0), (q1, v1) = (rows[row + i].transpose(1, 0, 2) for i in (0, 1))
+        # Drives interpolate between two cycles as the controller does between two points.
+        way, v0, v1 = q1 - q0, v0 * CYCLE_S, v1 * CYCLE_S
+        c2, c3 = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
+        qd = (v0 + s * (2.0 * c2 + s * 3.0 * c3)) / CYCLE_S
+        return q0 + s * (v0 + s * (c2 + s * c3)), qd
+
+    def joints(self, time_s: Array) -> Array:
+        """The joints (k, n) alone."""
+        return self.at(time_s)[0]
+
+    def last(self) -> tuple[float, Array]:
+        """Of the last cycle: its time in the trajectory, and rows (7, n).
+
+        Measured joints and velocities, sent ones, desired ones with accelerations.
+        """
+        row = self._count - 1 - self._begin
+        return float(self._past_s[row]), self._rows[row]
+
+    def pass_to(self, now_s: float) -> None:
+        """Let the cycles up to a time pass for good, and undo what was computed beyond it."""
+        count = int(np.floor(now_s / CYCLE_S * (1.0 + 1e-12))) + 1
+        if count < self._before[0]:
+            return
+        if self._count > count:
+            self._count, self.controller, self._sent = self._before
+        self._run(count)
+        self._before = self._snapshot()
+
+    def _snapshot(self) -> tuple[int, TrajectoryController, Array]:
+        return self._count, copy(self.controller), self._sent
+
+    def _run(self, count: int) -> None:
+        while self._count < count:
+            time = (self._count + np.arange(min(count - self._count, MOST))) * CYCLE_S
+            cycles = self.controller.cycles(time, *self.here)
+            allowed = self._allowed(cycles)
+            passed = 0
+            if allowed:
+                cycles = cycles.first(allowed)
+                passed = self.controller.judge(cycles, self._measured(cycles)[:-1, 0])
+                self._append(cycles.first(passed))
+            if passed == allowed < len(time):  # refused: all joints come to rest together
+                self.faults += 1
+                highest = (1.0 + ROOM) * self._fastest
+                speed = np.clip(self._sent[-1, 1], -highest, highest)
+                brakes_s = BRAKES_S * float(np.max(np.abs(speed) / self._fastest))
+                self.controller.brake(brakes_s, speed)
+
+    def _measured(self, cycles: Cycles) -> Array:
+        """What the drives report (k + 1, 2, n) in each of the cycles, and after them."""
+        return self._mean(np.stack([cycles.command, cycles.speed], axis=1))
+
+    def _mean(self, sent: Array) -> Array:
+        """Of what was sent and ``sent`` (k, 2, n) the means (k + 1, 2, n), to the last bit."""
+        rows, count = np.concatenate([self._sent, sent]), len(sent) + 1
+        total = rows[:count].copy()
+        for i in range(1, self._width):
+            total += rows[i : i + count]
+        return np.asarray(total / self._width)
+
+    def _append(self, cycles: Cycles) -> None:
+        count = len(cycles.command)
+        row = self._count - self._begin
+        if row + count > len(self._rows):
+            self._rows[:KEPT] = self._rows[row - KEPT : row]
+            self._past_s[:KEPT] = self._past_s[row - KEPT : row]
+            self._begin, row = self._count - KEPT, KEPT
+        rows = slice(row, row + count)
+        self._rows[rows, :2] = self._measured(cycles)[:-1]
+        for i, part in enumerate(
+            (cycles.command, cycles.speed, cycles.desired, cycles.desired_qd, cycles.desired_qdd)
+        ):
+            self._rows[rows, 2 + i] = part
+        self._past_s[rows] = cycles.past_s
+        sent = np.stack([cycles.command, cycles.speed], axis=1)
+        self._sent = np.concatenate([self._sent, sent])[-self._width :]
+        self._count += count
+
+    def _allowed(self, cycles: Cycles) -> int:
+        """How many of the cycles the drives take; they never take what is no number."""
+        way = np.diff(np.vstack([self._sent[-1:, 0], cycles.command]), axis=0)
+        speed = np.abs(way) / CYCLE_S
+        self.peak = np.fmax(self.peak, np.fmax.reduce(speed, axis=0))
+        bad = ~np.isfinite(speed)
+        if self._limits:
+            bad |= speed > (1.0 + ROOM) * self._fastest * (1.0 + 1e-9)
+        bad_row = np.any(bad, axis=1)
+        if not np.any(bad_row):
+            return len(bad)
+        first = int(np.argmax(bad_row))
+        joint = int(np.argmax(bad[first]))
+        self.fault = (
+            f"drive fault: joint {joint + 1} is sent at {speed[first, joint]:.3g} rad/s (sliding: "
+            f"m/s), its drive reaches {self._fastest[joint]:.3g}; the robot brakes: send a "
+            "trajectory that is slower and begins where the robot is"
+        )
+        return first

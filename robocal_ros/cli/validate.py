@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from robocal_ros.cli.validating import Job, Validated
-    from robocal_ros.report.validation_figures import Drawn
+    from robocal_ros.report.figures import Drawn
 
 
 # ---- many bags beside each other: in processes of this machine, or in a Dask cluster ------------
@@ -258,8 +258,8 @@ def run_validate(args: argparse.Namespace) -> CliResult:
     workers = min(args.jobs or len(os.sched_getaffinity(0)), len(args.bags))
     if workers > 1 and args.scheduler is None:
         warm_up()
+    from robocal_ros.report.page import page
     from robocal_ros.report.validation import summary_rows
-    from robocal_ros.report.validation_page import page
 
     args.report.mkdir(parents=True, exist_ok=True)
     jobs = _jobs(args.bags, args.robot)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
-from robocal_ros.cell_sim.cell_faults import SIZES
+from robocal_ros.cell_sim.faults import SIZES
 from robocal_ros.cli.bag_truth import (
     HAND_EYE,
     TOOL,
@@ -39,14 +39,8 @@ from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.hand_eye.session import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.report.figures import CellCourse, Drawn, cell_drawn, thermal_figures, tool_figures
 from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
-from robocal_ros.report.validation_figures import (
-    CellCourse,
-    Drawn,
-    cell_drawn,
-    thermal_figures,
-    tool_figures,
-)
 from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command
 from robocal_ros.thermal.config import ThermalConfig

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -9,10 +10,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
+from matplotlib.ticker import FormatStrFormatter, MultipleLocator
 from numpy.typing import NDArray
 
-from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
+from robocal_ros.report.validation import NO_FAULT, TOLERANCE_MM, ShiftErrors
 
 Array = NDArray[np.float64]
 
@@ -237,3 +238,297 @@ def draw_rounds(path: Path, document: dict[str, Any]) -> None:
         axes.set_ylabel("share, %")
         axes.set_title(f"Directions within {document['threshold_mm']:g} mm at check poses")
         figure.savefig(path, dpi=130)
+
+
+# ---- how accurate a simulated cell was: its figures, and the figure of its course ---------------
+
+
+Document = dict[str, Any]
+
+GOAL = 0.95  # of all directions
+MOST_TIMES = 2000  # drawn of a course
+LEAST_MM = 0.01  # shown
+
+
+@dataclass(frozen=True, eq=False)
+class CellCourse:
+    """True errors at the working poses over time; not a number where they are not told.
+
+    Attributes
+    ----------
+    topic : on which the truth was told.
+    hours : (t,) since the recording began.
+    without_mm, with_mm : (t,) rms without correction, and of what was commanded; at the same poses,
+        where some were visited.
+    p95_mm : (t,) 95 % of the poses are better, of what was commanded.
+    lambda_without, lambda_with : (t,) share of directions within `TOLERANCE_MM`.
+    bound_mm : (t,) what the line was told: 95 % of the errors are below.
+    tolerance_mm : error that the process allows; None where the line was told nothing.
+    faults : each with ``hours``, ``fault``, ``size`` (SI; 0: it ended) and ``told``, the size in
+        words.
+    """
+
+    topic: str
+    hours: Array
+    without_mm: Array
+    with_mm: Array
+    p95_mm: Array
+    lambda_without: Array
+    lambda_with: Array
+    bound_mm: Array
+    tolerance_mm: float | None
+    faults: Sequence[Document]
+
+    def document(self) -> Document:
+        """Figures of the whole, and of each hour."""
+        hour = self.hours.astype(int)
+        return {
+            "topic": self.topic,
+            **self._figures(np.ones(len(hour), dtype=bool)),
+            "tolerance_mm": self.tolerance_mm,
+            "faults": list(self.faults),
+            "by_hour": [{"hour": int(h) + 1, **self._figures(hour == h)} for h in np.unique(hour)],
+        }
+
+    def _figures(self, chosen: NDArray[np.bool_]) -> Document:
+        known = chosen & np.isfinite(self.bound_mm) & np.isfinite(self.p95_mm)
+        kept = self.p95_mm[known] <= self.bound_mm[known]
+        return {
+            "minutes": float(np.sum(chosen)) * self._period_h * 60.0,
+            "rms_without_mm": _rms(self.without_mm[chosen]),
+            "rms_with_mm": _rms(self.with_mm[chosen]),
+            "lambda_without": _mean(self.lambda_without[chosen]),
+            "lambda_with": _mean(self.lambda_with[chosen]),
+            "bound_mm": _mean(self.bound_mm[known]),
+            "p95_mm": _mean(self.p95_mm[known]),
+            "time_below_bound": _mean(kept.astype(np.float64)),
+        }
+
+    @property
+    def _period_h(self) -> float:
+        return float(np.median(np.diff(self.hours))) if len(self.hours) > 1 else 0.0
+
+
+def _rms(values: Array) -> float | None:
+    mean = _mean(values**2)
+    return None if mean is None else float(np.sqrt(mean))
+
+
+def _mean(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.mean(known)) if len(known) else None
+
+
+def cell_figure(course: CellCourse) -> Figure:
+    """The true error over time beside what was expected, and the share within tolerance."""
+    unit, per_hour = ("hours", 1.0) if course.hours[-1] > 1.0 else ("minutes", 60.0)
+    shares = bool(np.isfinite(course.lambda_with).any() or np.isfinite(course.lambda_without).any())
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 5.2 if shares else 3.6), layout="constrained")
+        ratios = (2.2, 1.0) if shares else (1.0,)
+        all_axes = figure.subplots(len(ratios), sharex=True, height_ratios=ratios, squeeze=False)
+        above, lowest = all_axes[0, 0], all_axes[-1, 0]
+        _errors(above, course, per_hour)
+        if shares:
+            _shares(lowest, course, per_hour)
+        for axes in all_axes[:, 0]:
+            for fault in course.faults:
+                axes.axvline(fault["hours"] * per_hour, color=BEFORE, lw=1.0, ls=(0, (1, 2)))
+        _name_faults(above, course, per_hour)
+        lowest.set(xlabel=f"{unit} of recording", xlim=(0.0, float(course.hours[-1]) * per_hour))
+        figure.align_ylabels(all_axes[:, 0])
+    return figure
+
+
+def _errors(axes: Axes, course: CellCourse, per_hour: float) -> None:
+    some = slice(None, None, max(len(course.hours) // MOST_TIMES, 1))
+    hours = course.hours[some] * per_hour
+    for values, color, width, style, label in (
+        (course.without_mm, BEFORE, 1.8, "-", "without correction"),
+        (course.with_mm, AFTER, 1.8, "-", "with correction"),
+        (course.bound_mm, INK, 1.0, (0, (2, 2)), "95 % bound told to the line"),
+    ):
+        if np.isfinite(values).any():
+            axes.plot(hours, values[some], color=color, lw=width, ls=style, label=label)
+    if course.tolerance_mm is not None:
+        axes.axhline(course.tolerance_mm, color=FAINT, lw=0.8, ls=(0, (4, 3)), label="tolerance")
+    axes.set(ylabel="rms error of the tool, mm", yscale="log")
+    axes.set_ylim(LEAST_MM, max(1.5 * axes.get_ylim()[1], 10.0 * LEAST_MM))
+    axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    titled(axes, "True error at the working poses (simulated)")
+
+
+def _name_faults(axes: Axes, course: CellCourse, per_hour: float) -> None:
+    for fault in course.faults:
+        words = fault["fault"].replace("_", " ") + ("" if fault["size"] else " ends")
+        axes.annotate(
+            words, (fault["hours"] * per_hour, 0.0), xycoords=("data", "axes fraction"),
+            rotation=90, xytext=(3, 4), textcoords="offset points", va="bottom", fontsize=8,
+            color=BEFORE,
+        )  # fmt: skip
+
+
+def _shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
+    """Of each hour; within the first one as it went."""
+    if course.hours[-1] <= 1.0:
+        for shares, color in ((course.lambda_without, BEFORE), (course.lambda_with, AFTER)):
+            axes.plot(course.hours * per_hour, 100.0 * shares, color=color, lw=1.8)
+    else:
+        _hourly_shares(axes, course, per_hour)
+    axes.axhline(100.0 * GOAL, color=FAINT, lw=0.8, ls=(0, (4, 3)))
+    axes.set(ylabel=f"directions within\n{TOLERANCE_MM:g} mm, %", ylim=(0.0, 103.0))
+
+
+def _hourly_shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
+    for row in course.document()["by_hour"]:
+        begin = row["hour"] - 1.0
+        ends = begin * per_hour, min(begin + 1.0, float(course.hours[-1])) * per_hour
+        for name, color in (("without", BEFORE), ("with", AFTER)):
+            share = row[f"lambda_{name}"]
+            if share is not None:
+                axes.plot(ends, (100.0 * share,) * 2, color=color, lw=2.4, solid_capstyle="butt")
+
+
+# ---- figures of a validated bag, from its document ----------------------------------------------
+
+
+MOST_NAMED = 8  # runs that have their name below the axis
+DRIFT_CAPTION = (
+    "The parameters that moved most in units of their own standard deviation; the band is two "
+    "standard deviations. Single parameters can trade with each other: the errors decide."
+)
+CELL_CAPTION = (
+    "Root mean square over the working poses of the programme, by the simulation's truth, against "
+    "the cold robot with the taught tool. Below: share of all directions, of each hour, in a "
+    "recording within one hour as it went; dashed: the goal of 95 %."
+)
+CYCLES_CAPTION = (
+    "Measured at each cycle's own poses, in which the sensor's noise is contained. In force: the "
+    "model from before, which never saw them. Candidate: each pose predicted from the others. "
+    "Bound: 95 % of the errors were expected below it before the cycle."
+)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure as it is shown and kept."""
+
+    name: str
+    caption: str
+    svg: str
+    png: bytes
+
+    @classmethod
+    def of(cls, name: str, caption: str, figure: Figure) -> "Drawn":
+        """Draw it."""
+        return cls(name, caption, svg(figure), png(figure))
+
+
+@dataclass(frozen=True, eq=False)
+class ModelDrift:
+    """How the models of a session's cycles moved; see `figures.Drifted`."""
+
+    hours: Array
+    parameter_names: Sequence[str]
+    drift: Array
+    sigma: Array
+
+
+def cell_drawn(course: CellCourse) -> Drawn:
+    """The figure of a cell's course."""
+    return Drawn.of("cell", CELL_CAPTION, cell_figure(course))
+
+
+def thermal_figures(
+    cycles: Sequence[Document], truth: ShiftErrors | None, mark: str = ""
+) -> list[Drawn]:
+    """Figures of a thermal session: errors, and how the model moved; ``mark`` ends their titles."""
+    found = []
+    if truth is not None:
+        caption = "True error at poses that were never measured"
+        found.append(Drawn.of("true_error", caption, drift_over_time(truth)))
+        found.append(Drawn.of("poses", "True error of each check pose", error_by_pose(truth)))
+    if not cycles:
+        return found
+    found.append(Drawn.of("cycles", CYCLES_CAPTION, accuracy_by_cycle(cycles, mark)))
+    names = list(cycles[0]["drift"])
+    moved = ModelDrift(
+        hours=np.array([cycle["hours"] for cycle in cycles]),
+        parameter_names=names,
+        drift=np.array([list(cycle["drift"].values()) for cycle in cycles]),
+        sigma=np.array([list(cycle["sigma"].values()) for cycle in cycles]),
+    )
+    found.append(Drawn.of("drift", DRIFT_CAPTION, parameter_drift(moved)))
+    return found
+
+
+def accuracy_by_cycle(cycles: Sequence[Document], mark: str = "") -> Figure:
+    """Rms errors of each cycle without correction, in force and candidate, and the bound."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.6), layout="constrained")
+        axes = figure.add_subplot()
+        hours = [cycle["hours"] for cycle in cycles]
+        for key, color, label in (
+            ("nominal", BEFORE, "without correction"),
+            ("in_force", OLDEST, "in force, before the cycle"),
+            ("candidate", AFTER, "candidate"),
+        ):
+            rms = [cycle[key]["rms_mm"] for cycle in cycles]
+            axes.plot(hours, rms, "o-", color=color, ms=4, lw=1.8, label=label)
+        known = [cycle for cycle in cycles if cycle["forecast"] is not None]
+        if known:
+            bound = [cycle["forecast"]["bound_mm"] for cycle in known]
+            axes.plot(
+                [cycle["hours"] for cycle in known], bound, color=INK, lw=1.0, ls=(0, (2, 2)),
+                label="95 % bound",
+            )  # fmt: skip
+        faults = [cycle for cycle in cycles if cycle["verdict"]["code"] not in NO_FAULT]
+        if faults:
+            axes.plot(
+                [cycle["hours"] for cycle in faults],
+                [cycle["candidate"]["rms_mm"] for cycle in faults],
+                "x", color=BEFORE, ms=9, mew=1.6, ls="none", label="refused",
+            )  # fmt: skip
+        xlabel = "hours since the cold reference"
+        if taken := [cycle["hours"] for cycle in cycles if cycle["revision"]]:
+            axes.plot(taken, [0.0] * len(taken), "^", color=AFTER, ms=5, clip_on=False, zorder=5)
+            xlabel += "   (triangle: a new model came into force)"
+        axes.axhline(TOLERANCE_MM, color=FAINT, lw=0.8, ls=(0, (4, 3)))
+        axes.set(xlabel=xlabel, ylabel="rms error, mm", ylim=(0.0, None))
+        titled(axes, f"Held-out error at each cycle's poses{mark}")
+    return figure
+
+
+def tool_figures(runs: Sequence[Document], mark: str = "") -> list[Drawn]:
+    """The history of a tool: by how much each run found it moved."""
+    known = [run for run in runs if run["change_mm"] is not None]
+    if not known:
+        return []
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.0), layout="constrained")
+        axes = figure.add_subplot()
+        few = len(known) <= MOST_NAMED
+        hours = [(run["stamp"] - known[0]["stamp"]) / 3600.0 for run in known]
+        places = list(range(len(known))) if few else hours
+        for accepted, color, label in (
+            (True, AFTER, "right, or measured anew"),
+            (False, BEFORE, "not right, or refused"),
+        ):
+            chosen = [i for i, run in enumerate(known) if run["verdict"]["accept"] is accepted]
+            if chosen:
+                change = np.array([known[i]["change_mm"] for i in chosen])
+                two_sigma = 2.0 * np.array([known[i]["sigma_mm"] or 0.0 for i in chosen])
+                axes.errorbar(
+                    [places[i] for i in chosen], change, [np.minimum(two_sigma, change), two_sigma],
+                    fmt="o", color=color, ms=5 if few else 3.5, capsize=3 if few else 0,
+                    clip_on=False, label=label,
+                )  # fmt: skip
+        axes.set(ylabel="change of the tip, mm", ylim=(0.0, None))
+        if few:
+            axes.set_xticks(places, [f"run {run['run']}\n{run['answer']}" for run in known])
+            axes.margins(x=0.1)
+        else:
+            axes.set_xlabel("hours since the first run")
+        titled(axes, f"Change of the tool that each run found{mark}")
+    caption = "Against the tool in force at the run, with two standard deviations."
+    return [Drawn.of("tool", caption, figure)]

@@ -15,11 +15,10 @@ from robocal_ros.cell_sim.beams import (
     TrueNoise,
     laser_of,
 )
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import known_laser
-from robocal_ros.cell_sim.joint_motion import CYCLE_S
-from robocal_ros.cell_sim.stations import TICK_S
+from robocal_ros.cell_sim.cell import SimulatedCell, known_laser
+from robocal_ros.cell_sim.sensors import TICK_S
 from robocal_ros.cell_sim.tool_cell import CYLINDER_M, point_sigma
+from robocal_ros.cell_sim.trajectory_controller import CYCLE_S
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.edges import BeamError, debounced

@@ -8,8 +8,8 @@ import pytest
 from kr150_shift import ABOVE, CYCLE, HOME, WORK, cell_of, first_circle, went
 
 from bench.closed_loop.faults import proven, rights_by_size, shown, smallest_held
-from robocal_ros.cell_sim.cell_faults import CONTROLLER_FAULTS, FAULTS, NEXT_MOTION, SIZES
-from robocal_ros.cell_sim.cell_plan import TAUGHT
+from robocal_ros.cell_sim.cell import TAUGHT
+from robocal_ros.cell_sim.faults import CONTROLLER_FAULTS, FAULTS, NEXT_MOTION, SIZES
 from robocal_ros.cell_sim.robot import Effects
 
 EFFECTS = replace(Effects(), outliers=False)

@@ -5,9 +5,8 @@ import pytest
 
 from bench.closed_loop.plant import BEAT_S, STEP_S, equipped
 from bench.closed_loop.setting import LIMITS
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import kr150_cell
-from robocal_ros.cell_sim.joint_motion import LAG_S
+from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
+from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.ground.errors import ConflictError
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.plan import JointPlan

@@ -20,7 +20,7 @@ from bench.closed_loop.checks import (
 from bench.closed_loop.faults import RIGHT, SWEEP, Report, Trial, least_power, proven
 from bench.closed_loop.judging import Harm
 from bench.closed_loop.tables import detection_table, faults_table
-from robocal_ros.cell_sim.cell_faults import SIZES
+from robocal_ros.cell_sim.faults import SIZES
 from robocal_ros.ground.errors import Code
 
 TRIED = (*SEEN_BY_CHECK, *SEEN_BY_FULL, *SEEN_BY_CYCLE)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.hand_eye_cell import (
     ArmRobot,
     HandEyeCell,
@@ -18,7 +18,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     step_shots,
     taught,
 )
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.kinematics.robots import load_robot

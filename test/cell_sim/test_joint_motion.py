@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.joint_motion import BRAKES_S, CYCLE_S, ROOM, JointMotion
-from robocal_ros.cell_sim.trajectory_controller import Trajectory
+from robocal_ros.cell_sim.trajectory_controller import (
+    BRAKES_S,
+    CYCLE_S,
+    ROOM,
+    JointMotion,
+    Trajectory,
+)
 from robocal_ros.ground.errors import InputError
 
 HOME = np.array([0.1, -0.4])

@@ -22,21 +22,21 @@ from kr150_shift import (
 )
 
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import (
+from robocal_ros.cell_sim.cell import (
     DUTY,
     SPIN_RAD,
     T_FLANGE_LASER,
     TARGET,
     TARGET_RADIUS_M,
     TAUGHT,
+    CellSamples,
+    SimulatedCell,
     kr150_cell,
     poses,
 )
-from robocal_ros.cell_sim.cell_samples import CellSamples
-from robocal_ros.cell_sim.joint_motion import LAG_S
-from robocal_ros.cell_sim.programs import programme
 from robocal_ros.cell_sim.robot import Effects, Warmth
+from robocal_ros.cell_sim.tool_cell import programme
+from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.thermal.learning import share_within
 from robocal_ros.tool.crossed_model import RobotNoise

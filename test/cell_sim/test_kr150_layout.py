@@ -7,7 +7,7 @@ import pytest
 from kr150_shift import ABOVE, ARM, CYCLE, HOME, WORK, cell_of, true_laser
 
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.cell_plan import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
+from robocal_ros.cell_sim.cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
 from robocal_ros.cell_sim.robot import Warmth, shift, turn
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody
 from robocal_ros.tool.driving import approach, measuring

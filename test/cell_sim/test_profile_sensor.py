@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.cell_sim.hand_eye_cell import view
-from robocal_ros.cell_sim.profile_sensor import (
+from robocal_ros.cell_sim.sensors import (
     ProfileSensor,
     Scene,
     ball_on_table,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from robocal_ros.cell_sim import thermal_shift
-from robocal_ros.cell_sim.programs import SmoothPath, readings
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.cell_sim.stations import SphereSensor
+from robocal_ros.cell_sim.sensors import SphereSensor
 from robocal_ros.cell_sim.thermal_shift import ShiftPlan, simulate
+from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.kinematics.robots import load_robot
 
 FLANGE = np.array([[1.0, 0, 0, 1.2], [0, 0, -1.0, 0.1], [0, 1.0, 0, 0.8], [0, 0, 0, 1.0]])

@@ -27,7 +27,7 @@ from hand_eye_tables import (
 from scipy.stats import chi2
 
 from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.hand_eye_cell import (
     DOWN,
     ArmRobot,
@@ -36,7 +36,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     sphere_shots,
     view,
 )
-from robocal_ros.cell_sim.profile_sensor import ball_on_table
+from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.files import read_flange_mount

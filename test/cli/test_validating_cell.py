@@ -14,7 +14,7 @@ from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth
 from robocal_ros.cli.validating import cell_courses
 from robocal_ros.ground.errors import InputError
-from robocal_ros.report.validation_figures import CellCourse
+from robocal_ros.report.figures import CellCourse
 
 NS = 1_000_000_000
 TOPIC = "/cell_sim_node/truth/state"

@@ -8,8 +8,13 @@ import pytest
 from builtin_interfaces.msg import Time
 from correction_robot import HOME, NAMES, NOMINAL, Robot
 
-from robocal_ros.cell_sim.joint_motion import CYCLE_S, LAG_S, JointMotion
-from robocal_ros.cell_sim.trajectory_controller import ControllerOptions, Trajectory
+from robocal_ros.cell_sim.trajectory_controller import (
+    CYCLE_S,
+    LAG_S,
+    ControllerOptions,
+    JointMotion,
+    Trajectory,
+)
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.cell_sim.stations import CloudScene, sphere_cloud
+from robocal_ros.cell_sim.sensors import CloudScene, sphere_cloud
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ResidualError, TooFewSamplesError

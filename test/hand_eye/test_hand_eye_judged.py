@@ -11,7 +11,7 @@ from hand_eye_driver import (
 )
 from hand_eye_laser import TARGETS
 
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.hand_eye.config import HandEyeConfig

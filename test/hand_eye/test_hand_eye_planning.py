@@ -22,7 +22,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     sphere_shots,
     step_shots,
 )
-from robocal_ros.cell_sim.profile_sensor import ball_on_table
+from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_problem import PoseNoise

@@ -18,7 +18,7 @@ from hand_eye_driver import (
 )
 from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import THERMAL, hand_eye_kind

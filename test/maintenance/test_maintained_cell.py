@@ -11,7 +11,7 @@ import yaml
 from maintained_cell import POSES, TOLERANCE_M, MaintainedCell
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
-from robocal_ros.cell_sim import cell_plan
+from robocal_ros.cell_sim import cell as simulated
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
@@ -153,9 +153,9 @@ def test_gaps_that_hold_half_of_the_poses_complete_a_cycle_as_all_is_set(history
 
 def test_a_cycle_that_pauses_drifts_no_more_than_a_measurement_scatters():
     """It counts as measured in its middle, half of the longest pause from its poses."""
-    arm, q = load_robot("kr150_r3100"), cell_plan.poses("cycle")
+    arm, q = load_robot("kr150_r3100"), simulated.poses("cycle")
     process = DriftProcess(drift_prior(arm))
-    rows = arm.parameter_jacobian(q, cell_plan.TAUGHT[:3, 3])[:, :3]
+    rows = arm.parameter_jacobian(q, simulated.TAUGHT[:3, 3])[:, :3]
     half_s = 0.5 * shipped("maintenance_node")["resume_within_s"]
     F, noise = process.transition(half_s)
     fastest = np.hypot(F[0, 1], np.sqrt(noise[0, 0]))  # of a cold robot that begins to work

@@ -6,7 +6,7 @@ from driven_robot import HOUSING, LAG_S, PERIOD_S, AheadMotion, Robot
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocal_ros.cell_sim.joint_motion import JointMotion
+from robocal_ros.cell_sim.trajectory_controller import JointMotion
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig

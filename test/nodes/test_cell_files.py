@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from robocal_ros.bags.recorder_node import RecorderNode
-from robocal_ros.cell_sim.cell_plan import SPIN_RAD, TAUGHT, poses
+from robocal_ros.cell_sim.cell import SPIN_RAD, TAUGHT, poses
 from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode

@@ -17,9 +17,8 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.cell_sim.beams import beams_of
-from robocal_ros.cell_sim.cell_plan import poses
-from robocal_ros.cell_sim.node import CellSimNode
-from robocal_ros.cell_sim.settings import SETTINGS, laser_pose, straight_arm
+from robocal_ros.cell_sim.cell import poses
+from robocal_ros.cell_sim.node import SETTINGS, CellSimNode, laser_pose, straight_arm
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground import frames
 from robocal_ros.ros import endpoints

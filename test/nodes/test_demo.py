@@ -14,7 +14,7 @@ from domains import free_domain
 from bench.live.cell import TRUTH
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.bags.bags import BagReader
-from robocal_ros.cell_sim.joint_motion import ROOM
+from robocal_ros.cell_sim.trajectory_controller import ROOM
 from robocal_ros.ground.errors import Code
 
 pytestmark = pytest.mark.cell

@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from bench.closed_loop.faults import RIGHT
 from bench.live.cell import TRUTH, set_fault
-from robocal_ros.cell_sim.cell_faults import Fault
+from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
 

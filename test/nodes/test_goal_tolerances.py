@@ -9,11 +9,11 @@ import pytest
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionServer
 
-from robocal_ros.cell_sim.joint_motion import JointMotion
-from robocal_ros.cell_sim.outputs import tolerances_of
+from robocal_ros.cell_sim.messages import tolerances_of
 from robocal_ros.cell_sim.trajectory_controller import (
     GoalCode,
     GoalState,
+    JointMotion,
     Tolerances,
     Trajectory,
     TrajectoryGoal,

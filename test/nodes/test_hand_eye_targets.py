@@ -17,7 +17,7 @@ from tf2_msgs.msg import TFMessage
 
 from robocal_ros.bags.hand_eye_bags import write_data_set
 from robocal_ros.cell_sim.hand_eye_cell import TrueStairs, edge_shots, step_shots
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.quality import HandEyeSettings

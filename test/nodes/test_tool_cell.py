@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.live.cell import set_fault
-from robocal_ros.cell_sim.joint_motion import LAG_S
+from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.ground.errors import Code
 from robocal_ros.motion.plan import SHORTEST_STOP_S, MotionLimits
 from robocal_ros.ros import endpoints

@@ -10,6 +10,14 @@ import numpy as np
 import pytest
 
 from robocal_ros.report import figures
+from robocal_ros.report.figures import (
+    CellCourse,
+    accuracy_by_cycle,
+    cell_drawn,
+    thermal_figures,
+    tool_figures,
+)
+from robocal_ros.report.page import page
 from robocal_ros.report.validation import (
     bags_table,
     cycles_table,
@@ -18,14 +26,6 @@ from robocal_ros.report.validation import (
     pooled_rms_mm,
     summary_rows,
 )
-from robocal_ros.report.validation_figures import (
-    CellCourse,
-    accuracy_by_cycle,
-    cell_drawn,
-    thermal_figures,
-    tool_figures,
-)
-from robocal_ros.report.validation_page import page
 
 
 def errors(rms_mm, share=None, n=6):

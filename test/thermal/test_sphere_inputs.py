@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from shift import Shift, built, postures, warmed
 
-from robocal_ros.cell_sim.stations import CloudScene, sphere_cloud
+from robocal_ros.cell_sim.sensors import CloudScene, sphere_cloud
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import (
     JOINTS,

@@ -7,7 +7,7 @@ import pytest
 from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
-from robocal_ros.cell_sim.cell_faults import Fault, Faults, size_of
+from robocal_ros.cell_sim.faults import Fault, Faults, size_of
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.proposals import TOOL, CalibrationState
 from robocal_ros.history.calibrations import CalibrationHistory

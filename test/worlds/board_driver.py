@@ -9,9 +9,15 @@ import numpy as np
 from hand_eye_driver import ARM, FRAME, Q_NEAR, Recorded
 
 from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose, true_pose
-from robocal_ros.cell_sim.cell_plan import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot
+from robocal_ros.cell_sim.cell import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import (
+    ArmRobot,
+    BoardCell,
+    BoardNoise,
+    TrueLens,
+    TruePose,
+    true_pose,
+)
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.hand_eye.shots import IMAGE
 

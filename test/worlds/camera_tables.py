@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, moving_flange
+from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, moving_flange
 from robocal_ros.hand_eye.tables import write_pose_table
 
 NOISE = BoardNoise(1e-4, 2e-4, (2e-4, 2e-4, 2e-4), (5e-4, 5e-4, 5e-4))

@@ -14,9 +14,7 @@ from robocal_ros.cell_sim.beams import (
     TrueNoise,
     bent,
 )
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import CellPlan, rigid_robot
-from robocal_ros.cell_sim.cell_samples import Happened
+from robocal_ros.cell_sim.cell import CellPlan, Happened, SimulatedCell, rigid_robot
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise
 from robocal_ros.tool.crossed_run import ToolEstimate, estimate_tool

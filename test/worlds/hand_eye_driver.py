@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots, sphere_shots
-from robocal_ros.cell_sim.profile_sensor import ProfileSensor
 from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message

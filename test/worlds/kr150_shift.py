@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from robocal_ros.cell_sim.beams import laser_of
-from robocal_ros.cell_sim.cell import SimulatedCell
-from robocal_ros.cell_sim.cell_plan import SPIN_RAD, TAUGHT, kr150_cell, poses
-from robocal_ros.cell_sim.cell_samples import Happened
-from robocal_ros.cell_sim.programs import programme
+from robocal_ros.cell_sim.cell import SPIN_RAD, TAUGHT, Happened, SimulatedCell, kr150_cell, poses
 from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.measuring_plan import MeasuringPlan

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from tool_driver import TAUGHT, Driver, noisy_cell
 
 from robocal_ros.cell_sim.beams import RoundTool
-from robocal_ros.cell_sim.outputs import planned_step
+from robocal_ros.cell_sim.messages import planned_step
 from robocal_ros.cell_sim.tool_cell import ToolCell
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.ros import endpoints

@@ -4,8 +4,7 @@ import numpy as np
 from beam_cell import make_cell
 
 from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, TrueInput, TrueNoise, bent
-from robocal_ros.cell_sim.programs import RobotProgram, Sample
-from robocal_ros.cell_sim.tool_cell import ToolCell
+from robocal_ros.cell_sim.tool_cell import RobotProgram, Sample, ToolCell
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.edges import InputRule

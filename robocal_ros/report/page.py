@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
+from robocal_ros.report.figures import Drawn
 from robocal_ros.report.validation import TOLERANCE_MM, Document, summary_rows
-from robocal_ros.report.validation_figures import Drawn
 
 # ---- parts of an HTML page that needs nothing else: no network, no script, no other file --------
 

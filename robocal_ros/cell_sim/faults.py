@@ -1,14 +1,25 @@
-"""What may go wrong in the simulated cell, and what faults of the input make of its edges."""
+"""What may go wrong in the simulated cell: in its beams' input, on the way to its controller, in
+its joint readings.
+"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
+from robocal_ros.cell_sim.robot import Draws, Stream
+from robocal_ros.cell_sim.tool_cell import COUNT_RAD
+from robocal_ros.cell_sim.trajectory_controller import (
+    JointMotion,
+    Trajectory,
+    TrajectoryGoal,
+)
 from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
 from robocal_ros.tool.edges import Beam, BeamEdge
 
 Array = NDArray[np.float64]
@@ -264,3 +275,167 @@ def _chattered(edge: BeamEdge) -> list[BeamEdge]:
         replace(edge, blocked=edge.blocked ^ bool(i % 2), time_s=t)
         for i, t in enumerate(times.tolist())
     ]
+
+
+# ---- what comes between commands and controller -------------------------------------------------
+
+
+class CommandGate:
+    """Passes trajectories and goals on to a motion, as the faults let them.
+
+    ``begun`` is called when one has been taken.
+
+    Attributes
+    ----------
+    scale : speed scaling that was asked for; 1 without.
+    """
+
+    def __init__(
+        self, motion: JointMotion, faults: Faults, draws: Draws, begun: Callable[[], None]
+    ) -> None:
+        self._motion, self._faults, self._draws, self._begun = motion, faults, draws, begun
+        self.scale = 1.0
+        self._late: list[tuple[float, Trajectory | TrajectoryGoal]] = []
+        self._messages = 0
+        self.fault_began(0.0)
+
+    def fault_began(self, now_s: float) -> None:
+        """Another fault is in force from now on, or none."""
+        self._lost, self._since_s = 0, now_s
+
+    def require_taken(self, trajectory: Trajectory, now_s: float) -> None:
+        """Raise where a trajectory is rejected.
+
+        Raises
+        ------
+        InputError
+            With the controller's reason, or with that of a fault.
+        """
+        if "commands_rejected" in self._faults:
+            raise InputError("rejected: simulated fault commands_rejected")
+        self._motion.controller.require_valid(trajectory, now_s)
+
+    def take(self, given: Trajectory | TrajectoryGoal, now_s: float) -> None:
+        """Pass one on, lose it, or let it wait.
+
+        Raises
+        ------
+        InputError
+            When it is rejected; what runs goes on.
+        """
+        goal = None if isinstance(given, Trajectory) else given
+        self.require_taken(given if isinstance(given, Trajectory) else given.trajectory, now_s)
+        if self._loses(goal is None, now_s):
+            if goal is not None:
+                self._motion.controller.accept(goal, now_s, lost=True)
+        elif "commands_late" in self._faults:
+            self._late.append((now_s + self._faults.size("commands_late"), given))
+        else:
+            self._motion.take(now_s, given)
+            self._begun()
+
+    def pass_time(self, now_s: float, to_s: float) -> float:
+        """Pass on what has waited until now, set the speed; up to when nothing changes."""
+        for due_s, given in [waiting for waiting in self._late if waiting[0] <= now_s]:
+            self._late.remove((due_s, given))
+            try:
+                self._motion.take(now_s, given)
+                self._begun()
+            except InputError:
+                pass  # ended in the past by now: dropped, as a controller drops it
+        scale, stop_s = self.scale, self._faults.size("protective_stop")
+        if "speed_scaling" in self._faults:
+            scale *= self._faults.size("speed_scaling")
+        if now_s < self._since_s + stop_s:
+            scale, to_s = 0.0, min(to_s, self._since_s + stop_s)
+        self._motion.controller.scale = scale
+        return min([to_s, *(due_s for due_s, _ in self._late)])
+
+    def _loses(self, of_topic: bool, now_s: float) -> bool:
+        """Whether one is lost: on the topic by chance, else where it replaces a motion."""
+        faults = self._faults
+        if "commands_lossy" in faults and of_topic:
+            self._messages += 1
+            rng = self._draws.of(Stream.LOST_COMMANDS, self._messages)
+            return bool(rng.random() < faults.size("commands_lossy"))
+        if self._lost < faults.size("commands_lost") and now_s < self._motion.end_s:
+            self._lost += 1
+            return True
+        return False
+
+
+# ---- joint readings at their own rate, and what faults make of them -----------------------------
+
+
+PAGE = 128  # readings whose random numbers belong together
+KEPT_PAGES = 4
+
+
+class JointReadings:
+    """Reads encoders at ``k / rate_hz``; ``noise_rad``: of a reading, 0 makes it exact."""
+
+    def __init__(
+        self, rate_hz: float, noise_rad: float, faults: Faults, draws: Draws, n: int
+    ) -> None:
+        self._rate, self._noise, self._n = rate_hz, noise_rad, n
+        self._faults, self._draws = faults, draws
+        self._next, self._stamp_s = 0, 0.0
+        self._stuck: float | None = None
+        self._page = lru_cache(KEPT_PAGES)(self._page_of)
+
+    def due(self, now_s: float) -> NDArray[np.int64]:
+        """Numbers of the readings since the last call."""
+        first = self._next
+        self._next = int(np.floor(now_s * self._rate * (1.0 + 1e-12))) + 1
+        return np.arange(first, self._next)
+
+    def read(self, number: NDArray[np.int64], motion: JointMotion) -> tuple[Array, Array, Array]:
+        """Stamps (k,), joints and velocities (k, n) of what is told of these readings."""
+        time = number / self._rate
+        q, qd = motion.at(time)
+        if self._noise > 0.0:
+            noise = self._paged(Stream.READINGS, number, self._n)
+            q = np.round((q + self._noise * noise) / COUNT_RAD) * COUNT_RAD
+        self._freeze(q, qd)
+        told = self._told(number)
+        return self._stamps(time)[told], q[told], qd[told]
+
+    def _told(self, number: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which readings get through."""
+        faults = self._faults
+        if "lost_messages" in faults:
+            chance = self._paged(Stream.LOST_READINGS, number, 1, uniform=True)[:, 0]
+            return np.asarray(chance >= faults.size("lost_messages"))
+        return np.full(len(number), "joints_silent" not in faults)
+
+    def _stamps(self, time_s: Array) -> Array:
+        if "frozen_clock" in self._faults:
+            return np.full(len(time_s), self._stamp_s)
+        if len(time_s):
+            self._stamp_s = float(time_s[-1])
+        return time_s + self._faults.size("clock_jump")
+
+    def _freeze(self, q: Array, qd: Array) -> None:
+        """One encoder shows what it showed when the fault began."""
+        joint = min(int(self._faults.size("frozen_encoder")), self._n) - 1
+        if joint < 0:
+            self._stuck = None
+        elif len(q):
+            if self._stuck is None:
+                self._stuck = float(q[0, joint])
+            q[:, joint], qd[:, joint] = self._stuck, 0.0
+
+    def _paged(
+        self, stream: Stream, number: NDArray[np.int64], width: int, uniform: bool = False
+    ) -> Array:
+        """Random numbers (k, width) that belong to these readings."""
+        rows = np.empty((len(number), width))
+        pages = number // PAGE
+        for page in np.unique(pages).tolist():
+            drawn = self._page(stream, page, width, uniform)
+            rows[pages == page] = drawn[number[pages == page] % PAGE]
+        return rows
+
+    def _page_of(self, stream: Stream, page: int, width: int, uniform: bool) -> Array:
+        rng, shape = self._draws.of(stream, page), (PAGE, width)
+        return rng.random(shape) if uniform else rng.standard_normal(shape)
