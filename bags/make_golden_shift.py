@@ -46,7 +46,7 @@ from robocal_ros.ground.samples import (  # noqa: E402
     TemperatureSample,
 )
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
-from robocal_ros.thermal import seeding  # noqa: E402
+from robocal_ros.thermal import session as thermal_session  # noqa: E402
 from robocal_ros.tool import session  # noqa: E402
 from robocal_ros.tool.edges import (  # noqa: E402
     BREAK,
@@ -138,7 +138,7 @@ class Recorder:
             "tool": (current.head.revision, current.thermal.revision, current.healthy.revision),
         }
         made = {
-            "thermal": lambda: seeding.configuration(thermal, THERMAL),
+            "thermal": lambda: thermal_session.configuration(thermal, THERMAL),
             "tool": lambda: session.configuration(tool, TOOL),
         }
         for node, state in shown.items():

@@ -10,7 +10,8 @@ from robocal_ros.estimation.assessment import summarise
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import Identification, identify
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.process import STEADY_TIME_S, drift_prior
+from robocal_ros.thermal.identification import drift_prior
+from robocal_ros.thermal.tracking import STEADY_TIME_S
 
 FIRST_H = 10.0
 BLOCK = 300  # poses, 1.1 hours of measuring

@@ -17,9 +17,15 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.planning import Design, PosePlan, SensorField, candidate_poses, plan_poses
-from robocal_ros.thermal.process import drift_prior
-from robocal_ros.thermal.sensor_calibration import calibrate_sensor
+from robocal_ros.thermal.cell_setup import (
+    Design,
+    PosePlan,
+    SensorField,
+    calibrate_sensor,
+    candidate_poses,
+    plan_poses,
+)
+from robocal_ros.thermal.identification import drift_prior
 
 Array = NDArray[np.float64]
 

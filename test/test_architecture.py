@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "cell_sim": ABOVE | {"report"},
     "cli": ABOVE | {"report", "cell_sim"},
 }
-COMMANDS = {"cli", "cli_poses", "cli_sensors", "cli_shots"}  # files of a room
+COMMANDS = {"cli", "cli_sensors", "cli_shots"}  # files of a room
 ROS_FILES = {
     "node", "node_motion", "messages", "action", "settings", "services", "report",
     "graph", "driver", "replay_node", "replay_topics", "recorder_node",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bench.closed_loop.plant import PASS_S, REST_S
 from bench.closed_loop.shift import HOUR_S, ShiftPlan, ShiftRecord
 from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.thermal.learning import THRESHOLD_M
+from robocal_ros.thermal.screening import THRESHOLD_M
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from robocal_ros.cell_sim.tool_cell import CYLINDER_M, point_sigma
 from robocal_ros.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import MotionLimits
-from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.tool.run import ToolConfig, rows_of
 

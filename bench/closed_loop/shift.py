@@ -21,8 +21,8 @@ from bench.closed_loop.suite import Record, unrecorded
 from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.accuracy_state import Accuracy
-from robocal_ros.thermal.config import Prior
+from robocal_ros.thermal.accuracy import Accuracy
+from robocal_ros.thermal.drift_following import Prior
 
 Array = NDArray[np.float64]
 

@@ -92,7 +92,7 @@ from robocal_ros.ground.samples import (
     TemperatureSample,
 )
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.learning import THRESHOLD_M
+from robocal_ros.thermal.screening import THRESHOLD_M
 from robocal_ros.tool.edges import BeamEdge, EdgeSample
 from robocal_ros.tool.measuring_plan import PlannedStep
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.cell_sim.faults import Faults
 from robocal_ros.cell_sim.robot import Draws, Effects, Stream
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.planning import SensorField
+from robocal_ros.thermal.cell_setup import SensorField
 
 # ---- profile targets ----------------------------------------------------------------------------
 

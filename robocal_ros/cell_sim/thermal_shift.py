@@ -20,7 +20,7 @@ from robocal_ros.cell_sim.sensors import SphereSensor
 from robocal_ros.cell_sim.tool_cell import COUNT_RAD, SmoothPath, read_poses
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.learning import share_within
+from robocal_ros.thermal.screening import share_within
 
 # ---- shift --------------------------------------------------------------------------------------
 

@@ -22,8 +22,13 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.report.validation import figures_of
-from robocal_ros.thermal.identification import measured_errors, true_errors
-from robocal_ros.thermal.reference import ColdReference, holds_drift, reference_of
+from robocal_ros.thermal.reference import (
+    ColdReference,
+    holds_drift,
+    measured_errors,
+    reference_of,
+    true_errors,
+)
 from robocal_ros.thermal.session import ThermalSession
 
 Array = NDArray[np.float64]

@@ -95,11 +95,11 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
                 "learn what drift to expect of a robot from tables of its measuring cycles",
             ),
             "screen": CliCommand(
-                "thermal.cli_poses:screen",
+                "thermal.cli:screen",
                 "find which parameters a drift needs, by what is left at check poses",
             ),
             "plan-poses": CliCommand(
-                "thermal.cli_poses:plan_poses",
+                "thermal.cli:plan_poses",
                 "choose the poses of a measuring cycle that say most about the tool, and how "
                 "much better",
             ),

@@ -30,15 +30,16 @@ from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
 from robocal_ros.session.base import SessionBase
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.seeding import (
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import (
+    ThermalSession,
     accepting,
     automatic_commands,
     is_thermal_session,
     session_as_recorded,
+    take_message,
     window_commands,
 )
-from robocal_ros.thermal.session import ThermalSession, take_message
 from robocal_ros.tool.session import (
     ToolSession,
     is_tool_session,

@@ -43,8 +43,8 @@ from robocal_ros.report.figures import CellCourse, Drawn, cell_drawn, thermal_fi
 from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
 from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command
-from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.seeding import is_thermal_session
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import is_thermal_session
 from robocal_ros.tool.session import is_tool_session
 
 # ---- the course of a simulated cell -------------------------------------------------------------

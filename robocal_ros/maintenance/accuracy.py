@@ -7,8 +7,13 @@ import numpy as np
 from robocal_ros.correction.status import ToldCorrection, uncorrected
 from robocal_ros.ground.proposals import Head
 from robocal_ros.maintenance.memory import MaintenanceConfig, Memory, ToolRecord
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError, both_errors, offset_error
-from robocal_ros.thermal.accuracy_state import Accuracy
+from robocal_ros.thermal.accuracy import (
+    Accuracy,
+    AccuracyLevel,
+    ToolError,
+    both_errors,
+    offset_error,
+)
 
 __all__ = ["Accuracy", "Drift", "accuracy_of"]
 

@@ -46,8 +46,7 @@ from robocal_ros.ros.graph import CommandPath, GapSources, SourceGuard
 from robocal_ros.ros.history_settings import open_history, warn_of_history
 from robocal_ros.ros.run import run
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.thermal.accuracy_state import Accuracy
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel
 
 TICK_S = 0.02
 SHOW_S, LOOK_S = 0.2, 0.5

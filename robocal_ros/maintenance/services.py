@@ -21,9 +21,7 @@ from robocal_ros.ros.decision_services import TWIN, DeferredActionServer
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.ros.session_node import SessionEvents
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.thermal.accuracy_state import Accuracy
-from robocal_ros.thermal.services import accuracy_message
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.tool.services import ANSWERS
 
 # ---- what the maintenance node says: its topics, and its results as messages --------------------
@@ -91,12 +89,11 @@ class MaintenanceOutputs:
     def accuracy(self, found: Accuracy, tolerance_m: float, now_ns: int) -> None:
         """Tell the line how accurate the cell is believed to be."""
         self._accuracy.publish(
-            accuracy_message(
-                found,
-                tolerance_m,
+            AccuracyState(
+                header=conversions.header(now_ns, self._base),
                 robot=self._robot,
                 serial=self._serial,
-                stamp=conversions.header(now_ns, self._base),
+                **found.document(tolerance_m),
             )
         )
 

@@ -1,8 +1,10 @@
 """How far the tool may be off by now, and when that is too much: from the tracker, at any time."""
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.tracking import DriftTracker
 
 Array = NDArray[np.float64]
+
 
 HORIZON_S = 24.0 * 3600.0
 DUE_WITHIN_S = 1.0  # to which the time that is left is found
@@ -135,9 +138,6 @@ class AccuracyForecast:
         return early
 
 
-# ---- two errors of the tool centre point at once: of the robot's drift, and of the tool ---------
-
-
 MOST_FREEDOM = 1e6  # more of it: as good as a fixed length
 HALVINGS = 60
 
@@ -188,3 +188,39 @@ def _square(error: ToolError) -> tuple[float, float]:
 def _over_mean(freedom: float) -> float:
     """95 % quantile of a chi-square over its mean; falls with the degrees of freedom."""
     return chi2_quantile(0.95, freedom) / freedom
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What the line reads.
+
+    Attributes
+    ----------
+    error : expected error of the tool; None where it is not known.
+    due_in_s : time until a measurement is due; negative when overdue, 0 where nothing is known.
+    """
+
+    level: AccuracyLevel
+    reason: str
+    error: ToolError | None = None
+    due_in_s: float = 0.0
+
+    def document(self, tolerance_m: float) -> dict[str, Any]:
+        """The fields of ``AccuracyState.msg``; -1 where the error is not known.
+
+        A figure that is not finite makes it a FAULT: the line must not go on with what it read
+        before.
+        """
+        error = self.error
+        told_mm = (-1.0, -1.0) if error is None else (error.rms_m * 1e3, error.bound_m * 1e3)
+        if not all(map(math.isfinite, (*told_mm, self.due_in_s))):
+            words = "a figure of the accuracy is not finite, please report it"
+            return Accuracy(AccuracyLevel.FAULT, words).document(tolerance_m)
+        return {
+            "state": int(self.level),
+            "predicted_error_mm": told_mm[0],
+            "bound_mm": told_mm[1],
+            "tolerance_mm": tolerance_m * 1e3,
+            "due_in_s": self.due_in_s,
+            "reason": self.reason,
+        }

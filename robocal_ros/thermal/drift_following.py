@@ -1,36 +1,86 @@
-"""The tracker of the cold reference in force: a function of it and of the cycles kept since.
-
-So it survives a restart: the history holds each cycle's measurements, and every so often the
-tracker's state, from which the later cycles are taken again.
-"""
+"""Settings of the thermal session."""
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground.errors import Code, ConflictError, InputError
 from robocal_ros.ground.proposals import REFERENCE, THERMAL, Entry
-from robocal_ros.ground.samples import Measurements
+from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
+from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.identification import Method
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.base import HistoryFollower
 from robocal_ros.session.decisions import History
 from robocal_ros.thermal.accuracy import AccuracyForecast, Work
-from robocal_ros.thermal.identification import FixedSphere
+from robocal_ros.thermal.identification import FixedSphere, drift_prior
 from robocal_ros.thermal.learning import LearnedProcess, process_of
-from robocal_ros.thermal.process import DriftProcess, Heat, drift_prior
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
-from robocal_ros.thermal.tracking import DriftState, TrackedCycle, track_cycle
-
-# ---- where a follower of the drift stands, in forms that are kept: bit for bit ------------------
-
+from robocal_ros.thermal.tracking import DriftProcess, DriftState, Heat, TrackedCycle, track_cycle
 
 Array = NDArray[np.float64]
+
+
+Prior = Literal["default", "learned"]
+METHODS: tuple[Method, ...] = ("map", "lsq")
+PRIORS: tuple[Prior, ...] = ("default", "learned")
+SPHERE_RADIUS_M = 0.01905  # 1.5 inches across, the usual reference sphere
+
+
+@dataclass(frozen=True)
+class ThermalConfig:
+    """Settings of a thermal session.
+
+    Attributes
+    ----------
+    method : estimator where a command names none.
+    prior : ``default``, or ``learned`` from the shifts in the history.
+    sigma_m : standard deviation of one measured coordinate in one visit of a pose.
+    drift_parameters : what ``lsq`` solves of a drift; empty: all, which takes many poses.
+    hold_out, seed : share of the poses kept to judge a calibration without reference.
+    cycle_timeout_s : a cycle ends when nothing was measured for so long.
+    tolerance_m, expires_after_s : error that the process allows, and age at which a measurement
+        says nothing any more.
+    work_poses, tip_m : where accuracy is judged: joints of the working poses, rad (prismatic: m),
+        and the tool's tip on the flange; empty: throughout the joint limits, and the target.
+    lateness_s : a command waits for joint readings this much newer, so that measurements
+        under way still count.
+    measuring_frame : frame of the measurements; empty: that of the first one used.
+    target : name of the target where the measurement's frame_id gives none.
+    sphere : what a sphere in a cloud must be like.
+    """
+
+    method: Method = "map"
+    prior: Prior = "default"
+    sigma_m: float = 3e-5
+    drift_parameters: tuple[str, ...] = ()
+    hold_out: float = 0.5
+    seed: int = 0
+    cycle_timeout_s: float = 660.0
+    tolerance_m: float = 3e-4
+    expires_after_s: float = 8.0 * 3600.0
+    work_poses: tuple[tuple[float, ...], ...] = ()
+    tip_m: tuple[float, ...] = ()
+    lateness_s: float = 0.2
+    measuring_frame: str = ""
+    target: str = DEFAULT_TARGET
+    standstill: StandstillRule = field(default_factory=StandstillRule)
+    sphere: SphereRule = field(default_factory=lambda: SphereRule(SPHERE_RADIUS_M))
+
+    @cached_property
+    def work(self) -> Work:
+        """Where accuracy is judged."""
+        q, tip = (np.array(given) if given else None for given in (self.work_poses, self.tip_m))
+        return Work(q, tip)
+
 
 HEAT = "tracker_heat"
 TIMES = "tracker_times"  # of a kept cycle: the tracker's, and that of the first refused one
@@ -126,9 +176,6 @@ def _array(text: str) -> Array:
     return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(np.float64)
 
 
-# ---- what the history has in force, followed while other processes decide in it too -------------
-
-
 class InForce(HistoryFollower):
     """The thermal model and the cold reference in force, as of the last look.
 
@@ -183,9 +230,6 @@ class InForce(HistoryFollower):
     def nominal(self) -> SerialArm:
         """The arm without any calibration."""
         return self._nominal
-
-
-# ---- drift following ----------------------------------------------------------------------------
 
 
 CHECKPOINT_EVERY = 32  # cycles between two kept states: a restart takes at most so many again

@@ -9,6 +9,7 @@ joint is seen only together with the sensor's mounting.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +20,25 @@ from robocal_ros.estimation.assessment import (
     gross,
     hold_out,
     judge,
+    judged_errors_document,
     pose_groups,
     summarise,
     too_narrow,
+    verdict_document,
 )
 from robocal_ros.estimation.estimation import describe
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.solve import default_prior, fitted_prior, random_postures
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import parameters_document
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Document = dict[str, Any]
+
 
 _HAND_EYE = (
     "sensor_x_mm",
@@ -224,9 +231,6 @@ def hand_eye_start(arm: SerialArm, data: Measurements) -> MeasuringRobot:
     return replace(start, centres=start.means(data))
 
 
-# ---- flange identification ----------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class FlangeSensorIdentification:
     """An identified measuring robot with its uncertainty.
@@ -401,3 +405,35 @@ def _doubt(result: FlangeSensorIdentification, current_rms_m: float) -> str:
     remedy = "look at the spheres from more sides, and turn every joint"
     error, change = result.workspace_rms(), result.workspace_change()
     return result.estimate.creeping or too_narrow(error, change, current_rms_m, remedy)
+
+
+def flange_sensor_document(judged: JudgedFlangeSensor) -> Document:
+    """A measuring robot in the form of ``identify``, with hand-eye pose and spheres."""
+    result = judged.identification
+    problem, seen = result.problem, result.estimate.observability
+    sigma = dict(
+        zip(problem.names, np.sqrt(np.diag(result.estimate.covariance)).tolist(), strict=True)
+    )
+    return {
+        "robot": result.nominal.name,
+        "model_hash": result.nominal.model_hash,
+        "method": "map",
+        **judged_errors_document(judged),
+        "parameters": parameters_document(result.nominal, result.cell.arm, sigma),
+        "T_flange_sensor": transform_document(result.cell.T_flange_sensor),
+        "spheres": {
+            name: {"xyz_mm": (centre * 1e3).tolist()}
+            for name, centre in zip(result.cell.spheres, result.cell.centres, strict=True)
+        },
+        "noise_mm": result.noise_m * 1e3,
+        "samples": len(result.problem.data),
+        "rank": seen.rank,
+        "unknowns": len(problem.names),
+        "condition": seen.condition,
+        "unobservable": list(result.unobservable),
+        "held": [],
+        "rejected": list(result.rejected),
+        "held_out_rejected": list(judged.held_out_rejected),
+        "converged": result.estimate.converged,
+        "verdict": verdict_document(judged.verdict),
+    }

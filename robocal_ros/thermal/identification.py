@@ -1,34 +1,75 @@
-"""The drift that one measuring cycle shows: maximum a posteriori, closed form.
-
-Drifts are so small that the model is linear in them (0.1 mrad over 3 m: the second order is
-30 nm). With y the displacement of the targets since the cold visit, ``y = A x + B s - b + v``:
-x the parameters' drift, s the set-up's shift, b the cold visit's noise and v the warm one's.
-"""
+"""How a robot's parameters drift in time: the prior of the tracker."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.assessment import (
+    SPREAD_POSES,
+    Judgement,
+    gross,
+    judge,
+    judged_errors_document,
+    summarise,
+    too_narrow,
+    verdict_document,
+)
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.estimation.estimation import Observability, describe, observability
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.judged import cell_document
+from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.reference import ColdReference, ColdSpots
-
-# ---- some of the parameters by least squares, the others held: the classic identification -------
-#
-# Many cycles at once: all visit the same poses, so that one decomposition serves them all.
-
+from robocal_ros.kinematics.arm import parameters_document
+from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots, visit_variance
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Document = dict[str, Any]
 
+
+EXPANSION_PER_K = 12e-6  # steel and cast iron; aluminium links drift up to twice as much
+PLAUSIBLE_WARMING_K = 20.0
+SMALLEST_LENGTH_M = 0.2  # a joint whose nominal length is zero still has a housing that grows
+DRIFT_ANGLE_RAD = float(np.radians(0.005))
+DEFAULT_WEIGHT = 10.0  # the default prior counts as so many identified drifts
+
+
+def drift_prior(arm: SerialArm) -> Array:
+    """Covariance (k, k), SI, of the free parameters' thermal drift before it is learned.
+
+    Lengths: link length times expansion coefficient times plausible warming; angles: a fixed
+    small value.
+    """
+    length = np.maximum(np.abs(arm.parameters.read(arm.mdh)), SMALLEST_LENGTH_M)
+    grown = length * EXPANSION_PER_K * PLAUSIBLE_WARMING_K
+    return np.diag(np.where(arm.parameters.is_length, grown, DRIFT_ANGLE_RAD) ** 2)
+
+
+def learned_prior(default: Array, drifts: Array, covariances: Array) -> Array:
+    """Covariance (k, k) of the drift from identified ones.
+
+    Parameters
+    ----------
+    default : (k, k) prior to start from.
+    drifts, covariances : (n, k) identified drifts against the cold reference and their
+        (n, k, k) covariances.
+
+    One expectation-maximisation step of a zero-mean Gaussian's covariance with the default as
+    its inverse-Wishart prior: the second moment of each drift is its square plus its covariance,
+    so that what the measurements never showed keeps its default.
+    """
+    moments = np.einsum("ni,nj->ij", drifts, drifts) + covariances.sum(axis=0)
+    return np.asarray((DEFAULT_WEIGHT * default + moments) / (DEFAULT_WEIGHT + len(drifts)))
+
+
+# Many cycles at once: all visit the same poses, so that one decomposition serves them all.
 _VISIBLE = 1e-6  # share of an undetermined direction that counts as being in it
-SETUP_SIGMA_M = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,12 +158,8 @@ def _null(rows: Array, chosen: Sequence[int]) -> Array:
     return observability(A).null * np.where(length > 0.0, length, 1.0)[:, None]
 
 
-# ---- agreement ----------------------------------------------------------------------------------
-#
 # With ``y ~ N(0, S)`` the error of forecasting part i from the rest is ``(S^-1)_ii^-1 (S^-1
 # y)_i``, and its covariance is ``(S^-1)_ii^-1`` (Rasmussen and Williams 2006, section 5.4.2).
-
-
 FALSE_SAMPLE = 0.001  # chance that a sound cycle loses a sample
 
 
@@ -167,9 +204,6 @@ def _parts(y: Array, S: Array) -> tuple[Array, Array]:
     blocks = inverse.reshape(count, 3, count, 3)
     each = np.arange(count)
     return np.asarray((inverse @ y).reshape(count, 3)), np.asarray(blocks[each, :, each])
-
-
-# ---- the drift that one measuring cycle shows: maximum a posteriori, closed form ----------------
 
 
 FEWEST_POSES = 2
@@ -332,20 +366,8 @@ def _forecasts(y: Array, basis: Array, variance: float) -> tuple[Array, Array]:
     return np.einsum("mij,mj->mi", own, residual), spread
 
 
-def visit_variance(
-    spots: ColdSpots, spot: NDArray[np.int64], warm: Measurements, sigma_m: float
-) -> Array:
-    """Variance (m,), m^2, of one coordinate of a displacement: warm and cold noise."""
-    sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
-    return np.asarray(sigma**2 + sigma_m**2 / spots.visits[spot])
-
-
-# ---- steps --------------------------------------------------------------------------------------
-#
 # A step that the drift cannot explain is compared with few simple causes, each a linear model of
 # the displacement; generalised least squares tells which of them leave no more than noise.
-
-
 SENSOR = "sensor"
 CHANCE = 0.01  # a cause is ruled out where it would leave so much in fewer cases than this
 FIXED_FALSE_ALARM = 0.001
@@ -466,42 +488,121 @@ def _explains(rows: Array, deviation: Array, covariance: Array) -> Array | None:
     return np.asarray(size)
 
 
-# ---- what models of a drifting arm leave of its errors: as measured, and in truth ---------------
+def cycle_document(
+    found: CycleDrift, judged: Judgement, spots: ColdSpots, nominal: SerialArm, method: str
+) -> Document:
+    """A cycle's drift in the form of ``identify``; the nominal model is the cold one here."""
+    names = nominal.parameters.names
+    sigma = dict(zip(names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+    solved = {name: value for name, value in sigma.items() if value > 0.0}
+    held = [name for name in names if name not in solved]
+    return {
+        "robot": nominal.name,
+        "model_hash": nominal.model_hash,
+        "method": method,
+        **judged_errors_document(judged),
+        "parameters": parameters_document(nominal, found.arm, solved),
+        **cell_document(spots.cell),
+        "noise_mm": found.noise_m * 1e3,
+        "samples": len(found.warm),
+        "cold_visits": int(spots.visits.sum()),
+        "rank": found.seen.rank,
+        "unknowns": len(names) - len(held),
+        "condition": found.seen.condition,
+        "unobservable": list(found.unobservable),
+        "held": held,
+        "rejected": [found.warm.sample[i] for i in np.flatnonzero(found.rejected)],
+        "held_out_rejected": list(judged.held_out_rejected),
+        "converged": True,
+        "verdict": verdict_document(judged.verdict),
+    }
 
 
-def measured_errors(
-    reference: ColdReference,
-    warm: Measurements,
-    models: Sequence[SerialArm],
+def judge_cycle(
+    found: CycleDrift,
+    spots: ColdSpots,
     *,
-    left_out: Sequence[str] = (),
+    in_force: SerialArm,
+    check: Measurements | None = None,
     sigma_m: float,
-) -> list[Array]:
-    """Errors (m, 3), m, in measuring axes, that each model leaves at the poses of a warm visit.
+) -> Judgement:
+    """Judge at the poses of ``check``, else at each pose of the cycle from the others.
 
-    Against the cold visit: the cold model itself leaves the whole drift. Visits of one pose are
-    averaged; the noise of both visits is in it. ``left_out``: names of averaged visits that no
-    model can fit. ``sigma_m``: of a coordinate of one visit.
-
-    Raises
-    ------
-    InputError
-        When a measurement has no cold counterpart.
+    ``in_force`` is an arm of the cold model's type. A drift that the cycle's poses do not show
+    throughout the workspace is refused, whatever the poses themselves say.
     """
-    spots, cold = reference.spots, reference.cell.arm
-    data = spots.average(warm, sigma_m)
-    data = data.take(~np.isin(data.sample, left_out))
-    moved = spots.drift(data)
-    rows = spots.rows(data.q, spots.target[spots.match(data)])[0]
-    return [moved - rows @ cold.parameters.read(model.mdh - cold.mdh) for model in models]
+    data = found.warm if check is None else check
+    spot = spots.match(data)
+    y = spots.drift(data)
+    A = spots.rows(data.q, spots.target[spot])[0]
+    chosen, cold = spots.cell.arm.parameters, spots.cell.arm
+    current = np.linalg.norm(y - A @ chosen.read(in_force.mdh - cold.mdh), axis=1)
+    if check is None:
+        after, spread = np.linalg.norm(found.left_out, axis=1), found.left_out_sigma
+        usable = ~found.rejected
+    else:
+        after = np.linalg.norm(y - A @ found.drift, axis=1)
+        noise = 3.0 * visit_variance(spots, spot, data, sigma_m)
+        spread = np.sqrt(np.einsum("mik,kl,mil->m", A, found.covariance, A) + noise)
+        usable = np.ones(len(data), dtype=np.bool_)
+    return conclude(
+        found, spots, data, in_force, after=after, current=current, spread=spread, usable=usable
+    )
 
 
-def true_errors(cold: SerialArm, model: SerialArm, q: Array, tool: Array, moved: Array) -> Array:
-    """Errors (m, 3), m, base, that a model leaves where the tool truly moved by ``moved`` (m, 3).
+def conclude(
+    found: CycleDrift,
+    spots: ColdSpots,
+    data: Measurements,
+    in_force: SerialArm,
+    *,
+    current: Array,
+    after: Array,
+    spread: Array,
+    usable: NDArray[np.bool_],
+) -> Judgement:
+    """Judge from the errors (m,) of the model in force and of the candidate at ``data``.
 
-    What joints corrected by the model miss: its own displacement of the tool (3,), flange, at the
-    joints (m, n) is corrected away. The second order, drift times correction, is left out.
+    ``spread`` (m,) is what the covariances expect of ``after``; ``usable`` (m,) what may judge.
     """
-    point = np.append(tool, 1.0)
-    told = (model.fk(q) - cold.fk(q)) @ point
-    return np.asarray(moved - told[:, :3])
+    chosen, cold, spot = spots.cell.arm.parameters, spots.cell.arm, spots.match(data)
+    A = spots.rows(data.q, spots.target[spot])[0]
+    sound = usable & ~gross(current, after)
+    rows = workspace_rows(spots)
+    moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
+    change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    doubt = _doubt(found, rows, summarise(current[sound]).rms_m, change)
+    return Judgement(
+        nominal=summarise(np.linalg.norm(spots.drift(data), axis=1)[sound]),
+        current=summarise(current[sound]),
+        candidate=summarise(after[sound]),
+        predicted_rms_m=_rms(A, found.covariance),
+        predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
+        workspace_rms_m=_rms(rows, found.covariance),
+        held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
+        verdict=judge(current[sound], after[sound], spot[sound], doubt),
+    )
+
+
+def _doubt(found: CycleDrift, rows: Array, current_rms_m: float, change_m: float) -> str:
+    """Say why the poses do not carry over to the workspace; empty when they do.
+
+    Poses that halve the prior's error there do, however small the change: the model in force came
+    from such poses too and is no better known elsewhere.
+    """
+    error = _rms(rows, found.covariance)
+    prior = found.prior_covariance
+    if prior is not None and error <= 0.5 * _rms(rows, prior):
+        return ""
+    return too_narrow(error, change_m, current_rms_m, SPREAD_POSES)
+
+
+def _rms(rows: Array, covariance: Array) -> float:
+    """Rms length, m, of what a covariance (k, k) does to points with rows (m, 3, k)."""
+    return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+
+
+def workspace_rows(spots: ColdSpots) -> Array:
+    """Displacement (p, 3, k) of the first target by the parameters, throughout the joint limits."""
+    q = random_postures(spots.cell.arm)
+    return spots.rows(q, np.zeros(len(q), dtype=np.int64))[0]

@@ -16,12 +16,13 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import Fields, read_made, write_made
 from robocal_ros.session.decisions import History
-from robocal_ros.thermal.identification import identify_cycle, subset_drift
-from robocal_ros.thermal.process import DriftProcess, HeatGains, drift_prior, learned_prior
+from robocal_ros.thermal.identification import drift_prior, identify_cycle, learned_prior
 from robocal_ros.thermal.reference import ColdSpots, reference_of
-from robocal_ros.thermal.tracking import DriftTracker
+from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, HeatGains
 
 Array = NDArray[np.float64]
+Document = dict[str, Any]
+
 
 FEWEST_CYCLES = 10
 
@@ -71,12 +72,8 @@ def learn_drift(
     return LearnedDrift(learned_prior(default, drifts, covariances), total)
 
 
-# ---- process learning ---------------------------------------------------------------------------
-#
 # Widths are chosen where earlier cycles are most likely, each shift judged by what the others
 # teach; of what is to be tracked nothing is used.
-
-
 SCALES = tuple(2.0**-i for i in range(6))
 APPROACH_S = (1800.0, 2400.0, 3600.0)
 WORK_TIME_S = 7200.0  # within which work, and so the steady state, is taken to change
@@ -311,114 +308,6 @@ def process_of(document: Mapping[str, Any]) -> LearnedProcess:
     )
 
 
-# ---- recorded cycles in which the spots and, apart from them, check points were measured --------
-
-
-THRESHOLD_M = 1e-4
-FEWEST_KNOWN = 21  # as many as the test of stationarity needs
-
-
-@dataclass(frozen=True, eq=False)
-class DriftHistory:
-    """Displacements since the cold visit in t cycles, in order of time.
-
-    Attributes
-    ----------
-    names : (k,) parameters.
-    displacement, rows : (t, 3m) at the spots, m, and (3m, k) the same by each parameter, in
-        measuring axes. They identify.
-    check, check_rows : (t, 3c) and (3c, k) at the check points, in axes of their own if need
-        be. They judge.
-    """
-
-    names: tuple[str, ...]
-    displacement: Array
-    rows: Array
-    check: Array
-    check_rows: Array
-
-    def __post_init__(self) -> None:
-        k, t = len(self.names), len(self.displacement)
-        shapes = ((self.displacement, self.rows), (self.check, self.check_rows))
-        if any(y.shape != (t, len(A)) or A.shape[1] != k for y, A in shapes):
-            raise ValueError("displacements must be (t, n) with rows (n, k) of the k names")
-
-    @classmethod
-    def of(
-        cls, spots: ColdSpots, cycles: Sequence[Measurements], checks: Sequence[Measurements]
-    ) -> "DriftHistory":
-        """Collect cycles: what each measured to identify, and what to judge by.
-
-        A cycle without one of the poses is left out. Visits of a spot in one cycle are averaged.
-
-        Raises
-        ------
-        InputError
-            When a sample has no cold counterpart, or serves both ends.
-        TooFewSamplesError
-            With fewer than 21 complete cycles.
-        """
-        seen = [_by_spot(spots, cycle) for cycle in cycles]
-        told = [_by_spot(spots, cycle) for cycle in checks]
-        own, other = (tuple(sorted(set().union(*group))) for group in (seen, told))
-        if set(own) & set(other):
-            raise InputError("a pose that identifies cannot judge: name check poses apart")
-        complete = [
-            i
-            for i, (a, b) in enumerate(zip(seen, told, strict=True))
-            if len(a) == len(own) and len(b) == len(other)
-        ]
-        if len(complete) < FEWEST_KNOWN or not own or not other:
-            raise TooFewSamplesError(
-                f"{len(complete)} of {len(seen)} cycles visited all {len(own)} poses and "
-                f"{len(other)} check poses: screening needs {FEWEST_KNOWN} such cycles"
-            )
-        return cls(
-            spots.cell.arm.parameters.names,
-            np.array([np.concatenate([seen[i][spot] for spot in own]) for i in complete]),
-            _rows(spots, own),
-            np.array([np.concatenate([told[i][spot] for spot in other]) for i in complete]),
-            _rows(spots, other),
-        )
-
-    def residual(self, chosen: Sequence[int]) -> Array:
-        """What is left (t, 3c) at the check points with some parameters (columns) identified.
-
-        Raises
-        ------
-        TooFewSamplesError, RankDeficientError
-            When the spots do not determine them.
-        """
-        if not len(chosen):
-            return self.check
-        found = subset_drift(self.displacement, self.rows, chosen, self.names)
-        return np.asarray(self.check - found.drift @ self.check_rows[:, found.chosen].T)
-
-
-def share_within(residual: Array, threshold_m: float = THRESHOLD_M) -> float:
-    """The share lambda of residual coordinates (any shape), m, below a threshold.
-
-    Each cycle, check point and axis (x, y, z apart) counts once. The source counts each axis of
-    each point once for all cycles (7.95 % is 7 of its 88 directions) and does not say how it
-    sums the cycles up; counted apart, none hides behind the others.
-    """
-    return float(np.mean(np.abs(residual) < threshold_m))
-
-
-def _by_spot(spots: ColdSpots, cycle: Measurements) -> dict[int, Array]:
-    """Mean displacement (3,) at each spot that a cycle visited."""
-    spot, drift = spots.match(cycle), spots.drift(cycle)
-    return {int(s): drift[spot == s].mean(axis=0) for s in np.unique(spot)}
-
-
-def _rows(spots: ColdSpots, own: tuple[int, ...]) -> Array:
-    index = np.array(own, dtype=np.int64)
-    return spots.rows(spots.q[index], spots.target[index])[0].reshape(3 * len(own), -1)
-
-
-# ---- how a robot is expected to drift, as the shifts in its own history teach -------------------
-
-
 LEARN_FROM = 2000
 MOST_SHIFTS = 5  # the newest; learning takes half a second each
 FEWEST_WITH_TEMPERATURES = 2  # shifts, so that what one motor does is not what all of them do
@@ -475,11 +364,6 @@ def earlier_shifts(nominal: SerialArm, history: History) -> list[EarlierShift]:
         )
     return shifts[::-1]
 
-
-# ---- files of expected drifts: what ``robocal thermal learn-prior`` writes ----------------------
-
-
-Document = dict[str, Any]
 
 KEYS = ("robot", "model_hash", "parameters", "covariance", "cycles")
 SYMMETRY = 1e-9  # of the largest element

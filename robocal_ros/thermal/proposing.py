@@ -16,28 +16,40 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session.decisions import History
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.config import METHODS, ThermalConfig
-from robocal_ros.thermal.documents import cycle_document, judge_cycle, sensor_document
+from robocal_ros.thermal.cell_setup import (
+    SensorMethod,
+    calibrate_sensor,
+    sensor_document,
+    sensor_verdict,
+)
 from robocal_ros.thermal.drift_following import (
     EXPECTED,
+    METHODS,
     DriftFollower,
     Following,
     InForce,
+    ThermalConfig,
     default_process,
 )
-from robocal_ros.thermal.identification import FixedSphere, fixed_sphere, identify_subset
+from robocal_ros.thermal.identification import (
+    FixedSphere,
+    cycle_document,
+    fixed_sphere,
+    identify_subset,
+    judge_cycle,
+)
 from robocal_ros.thermal.learning import expected_drift, process_document
 from robocal_ros.thermal.observations import Beside
-from robocal_ros.thermal.process import drift_share, drift_size_m
 from robocal_ros.thermal.reference import (
     COMMISSIONED,
     ColdReference,
     capture_reference,
+    drift_share,
+    drift_size_m,
     reference_document,
 )
-from robocal_ros.thermal.sensor_calibration import SensorMethod, calibrate_sensor, sensor_verdict
 
-# ---- results into the history, with all that a later look at them needs -------------------------
+Array = NDArray[np.float64]
 
 
 class CandidateStore:
@@ -93,12 +105,6 @@ class CandidateStore:
         """Bring a step of the set-up into force: it moves nothing."""
         by = str(command.arguments.get("by", ""))
         self._history.accept(chosen, by=by, reason=reason, expected_head=None, wall_ns=wall_ns)
-
-
-# ---- from the measurements of a command to a proposal in the history ----------------------------
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -231,9 +237,6 @@ class Proposer:
         )
         model = identified_model_document(judged.identification)
         return _Solution(identification_document(judged), model, judged.verdict)
-
-
-# ---- the set-up of a cell: where the sensor stands, and the cold reference ----------------------
 
 
 SENSOR = "sensor"

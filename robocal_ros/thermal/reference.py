@@ -1,5 +1,7 @@
 """The cold reference: base, targets and static errors, from one visit of the measuring poses."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -7,8 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.assessment import LARGEST_RMS_M, pose_groups, summarise
-from robocal_ros.ground.errors import InputError, ResidualError
+from robocal_ros.estimation.assessment import FEWEST_GROUPS, LARGEST_RMS_M, pose_groups, summarise
+from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import (
+    InputError,
+    ResidualError,
+)
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel, make_layout
@@ -17,11 +24,9 @@ from robocal_ros.identification.solve import identify
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import measurements_of, read_table
 
-# ---- the measuring poses of a cold reference, and what a warm visit shows against them ----------
-
-
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
 
 SAME_VISIT_RAD = float(np.radians(0.5))
 FEWEST_TO_JUDGE = 3  # visits of a spot, so that the others outvote a wrong one
@@ -178,9 +183,6 @@ def _consistent(error: Array, spot: Index) -> NDArray[np.bool_]:
     return np.asarray(~judged | (away <= CONTRADICTION * np.median(away[judged])))
 
 
-# ---- reference ----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ColdReference:
     """Cold visit of the measuring poses.
@@ -293,9 +295,6 @@ def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
     )
 
 
-# ---- visits of named measuring poses: the cold ones, and the warm ones of each cycle ------------
-
-
 ONLY_CYCLE = "1"
 
 
@@ -366,9 +365,6 @@ def _listed(names: tuple[str, ...]) -> str:
     return few if len(names) <= 6 else f"{few} and {len(names) - 6} more"
 
 
-# ---- tables of visits of named measuring poses (docs/files.md) -----------------------------------
-
-
 def read_visits(path: str | Path, arm: SerialArm) -> Visits:
     """Read a table of visits of named poses: as ``read_measurements``, with a column ``pose``.
 
@@ -387,3 +383,165 @@ def read_visits(path: str | Path, arm: SerialArm) -> Visits:
     data = measurements_of(table, layout, arm)
     cycle = table.words("cycle") or (ONLY_CYCLE,) * len(data)
     return Visits(data, table.words("pose"), cycle)
+
+
+# At the poses of a cold reference the arm's static errors are known and cancel. What is left is
+# compared with either answer: first as if sensor and target stood still, then, where neither
+# answer explains it so, with both moved anywhere, which takes more or better poses to tell.
+
+
+# Noise makes the wrong answer so much likelier in one case of as many (Wald 1945).
+LIKELIER = 1000.0
+MOST_LEFT = 0.25  # share of the drift that an answer may leave, to be missing in all later models
+FALSE_ALARM = 0.001  # chance that a set-up that stands still looks moved
+
+
+@dataclass(frozen=True)
+class DriftShare:
+    """How much of a drift is in a visit: 0 for the cold robot, 1 for one as warm as the drift.
+
+    Attributes
+    ----------
+    share, sigma : its estimate and standard deviation; infinite where the visit shows nothing.
+    """
+
+    share: float = 0.5
+    sigma: float = math.inf
+
+    @property
+    def told(self) -> bool:
+        """Whether the visit tells one answer from the other.
+
+        The chi-squares of the two fits differ by (1 - 2 share) / sigma^2, which is twice the
+        logarithm of their likelihoods' ratio.
+        """
+        return abs(1.0 - 2.0 * self.share) >= 2.0 * math.log(LIKELIER) * self.sigma**2
+
+    @property
+    def between(self) -> bool:
+        """Whether neither answer is near: the robot warms up or cools down."""
+        return MOST_LEFT < self.share < 1.0 - MOST_LEFT
+
+    @property
+    def warm(self) -> bool:
+        """Whether the drift fits better than the cold robot."""
+        return self.share > 0.5
+
+
+def drift_size_m(visit: ColdReference, warm: SerialArm) -> float:
+    """Rms of one coordinate, m, by which a drift moves the targets at a visit's poses."""
+    moved = replace(visit.cell, arm=warm).residual(visit.data) - visit.cell.residual(visit.data)
+    return float(np.sqrt(np.mean(moved**2)))
+
+
+def drift_share(
+    reference: ColdReference, visit: ColdReference, warm: SerialArm, sigma_m: float
+) -> DriftShare:
+    """Tell how much of the drift from ``visit``'s arm to ``warm`` a visit shows.
+
+    Parameters
+    ----------
+    reference : the one in force, for the static errors at its poses; other poses tell nothing.
+    visit : the new visit, placed with the cold arm.
+    warm : the arm with the drift.
+    sigma_m : standard deviation of one coordinate of one visit.
+    """
+    spots, cold = reference.spots, visit.cell.arm
+    again = spots.common(visit.used)
+    again = again.take(~np.isin(again.sample, visit.spots.rejected))
+    if len(spots.visited(again.q)) < FEWEST_GROUPS:
+        return DriftShare()
+    still, explained = _compared(spots, again, cold, warm, sigma_m, moved=False)
+    if explained:
+        return still
+    T = reference.cell.T_frame_base @ frames.invert(visit.cell.T_frame_base)
+    seen = replace(again, position=again.position @ T[:3, :3].T + T[:3, 3])
+    return _compared(spots, seen, cold, warm, sigma_m, moved=True)[0]
+
+
+def _compared(
+    spots: ColdSpots,
+    again: Measurements,
+    cold: SerialArm,
+    warm: SerialArm,
+    sigma_m: float,
+    *,
+    moved: bool,
+) -> tuple[DriftShare, bool]:
+    """The share, and whether the better answer leaves no more than noise.
+
+    Least squares over the set-up: sensor and target held to their usual wander, or free in
+    position and turn. A fit that is worse than the noise widens sigma by as much.
+    """
+    again = spots.average(again, sigma_m)
+    spot, parameters = spots.match(again), spots.cell.arm.parameters
+    rows, setup = spots.rows(again.q, spots.target[spot])
+    known = parameters.read(cold.mdh - spots.cell.arm.mdh)
+    pair = [rows @ parameters.read(warm.mdh - cold.mdh), spots.drift(again) - rows @ known]
+    if moved:
+        turn = -frames.skew(again.position - again.position.mean(axis=0))
+        setup = np.concatenate([setup, turn], axis=2)
+    sigma = np.repeat(np.sqrt(visit_variance(spots, spot, again, sigma_m)), 3)[:, None]
+    G = setup.reshape(len(sigma), -1) / sigma
+    both = np.column_stack([one.ravel() for one in pair]) / sigma
+    if not moved:
+        held = np.eye(G.shape[1]) / SETUP_SIGMA_M
+        G, both = np.vstack([G, held]), np.vstack([both, np.zeros((len(held), 2))])
+    solved, _, rank, _ = np.linalg.lstsq(G, both, rcond=None)
+    drift, shown = (both - G @ solved).T
+    square, freedom = float(drift @ drift), len(G) - int(rank)
+    if freedom < 1 or square <= 0.0:
+        return DriftShare(), False
+    chi2 = min(float(shown @ shown), float(np.sum((shown - drift) ** 2)))
+    sigma_share = float(np.sqrt(max(1.0, chi2 / freedom) / square))
+    explained = chi2 <= chi2_quantile(1.0 - FALSE_ALARM, freedom)
+    return DriftShare(float(drift @ shown) / square, sigma_share), explained
+
+
+SETUP_SIGMA_M = 1e-5
+
+
+def visit_variance(
+    spots: ColdSpots, spot: NDArray[np.int64], warm: Measurements, sigma_m: float
+) -> Array:
+    """Variance (m,), m^2, of one coordinate of a displacement: warm and cold noise."""
+    sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
+    return np.asarray(sigma**2 + sigma_m**2 / spots.visits[spot])
+
+
+def measured_errors(
+    reference: ColdReference,
+    warm: Measurements,
+    models: Sequence[SerialArm],
+    *,
+    left_out: Sequence[str] = (),
+    sigma_m: float,
+) -> list[Array]:
+    """Errors (m, 3), m, in measuring axes, that each model leaves at the poses of a warm visit.
+
+    Against the cold visit: the cold model itself leaves the whole drift. Visits of one pose are
+    averaged; the noise of both visits is in it. ``left_out``: names of averaged visits that no
+    model can fit. ``sigma_m``: of a coordinate of one visit.
+
+    Raises
+    ------
+    InputError
+        When a measurement has no cold counterpart.
+    """
+    spots, cold = reference.spots, reference.cell.arm
+    data = spots.average(warm, sigma_m)
+    data = data.take(~np.isin(data.sample, left_out))
+    moved = spots.drift(data)
+    rows = spots.rows(data.q, spots.target[spots.match(data)])[0]
+    return [moved - rows @ cold.parameters.read(model.mdh - cold.mdh) for model in models]
+
+
+def true_errors(cold: SerialArm, model: SerialArm, q: Array, tool: Array, moved: Array) -> Array:
+    """Errors (m, 3), m, base, that a model leaves where the tool truly moved by ``moved`` (m, 3).
+
+    What joints corrected by the model miss: its own displacement of the tool (3,), flange, at the
+    joints (m, n) is corrected away. The second order, drift times correction, is left out.
+    """
+    point = np.append(tool, 1.0)
+    told = (model.fk(q) - cold.fk(q)) @ point
+    return np.asarray(moved - told[:, :3])

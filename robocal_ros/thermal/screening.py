@@ -1,9 +1,6 @@
-"""Which parameters a robot's drift needs: backward elimination by what it leaves at check points.
+"""What drift to expect of one robot, learned from cycles that it has measured."""
 
-Off line, from a shift that was recorded with many poses.
-"""
-
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations, islice
 from typing import Literal
@@ -11,14 +8,201 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.samples import Measurements
 from robocal_ros.thermal.identification import entangled, open_directions, subset_drift
-from robocal_ros.thermal.learning import THRESHOLD_M, DriftHistory, share_within
-from robocal_ros.thermal.tracking import stationarity
+from robocal_ros.thermal.reference import ColdSpots
+
+Array = NDArray[np.float64]
+
+
+THRESHOLD_M = 1e-4
+FEWEST_KNOWN = 21  # as many as the test of stationarity needs
+
+
+@dataclass(frozen=True, eq=False)
+class DriftHistory:
+    """Displacements since the cold visit in t cycles, in order of time.
+
+    Attributes
+    ----------
+    names : (k,) parameters.
+    displacement, rows : (t, 3m) at the spots, m, and (3m, k) the same by each parameter, in
+        measuring axes. They identify.
+    check, check_rows : (t, 3c) and (3c, k) at the check points, in axes of their own if need
+        be. They judge.
+    """
+
+    names: tuple[str, ...]
+    displacement: Array
+    rows: Array
+    check: Array
+    check_rows: Array
+
+    def __post_init__(self) -> None:
+        k, t = len(self.names), len(self.displacement)
+        shapes = ((self.displacement, self.rows), (self.check, self.check_rows))
+        if any(y.shape != (t, len(A)) or A.shape[1] != k for y, A in shapes):
+            raise ValueError("displacements must be (t, n) with rows (n, k) of the k names")
+
+    @classmethod
+    def of(
+        cls, spots: ColdSpots, cycles: Sequence[Measurements], checks: Sequence[Measurements]
+    ) -> "DriftHistory":
+        """Collect cycles: what each measured to identify, and what to judge by.
+
+        A cycle without one of the poses is left out. Visits of a spot in one cycle are averaged.
+
+        Raises
+        ------
+        InputError
+            When a sample has no cold counterpart, or serves both ends.
+        TooFewSamplesError
+            With fewer than 21 complete cycles.
+        """
+        seen = [_by_spot(spots, cycle) for cycle in cycles]
+        told = [_by_spot(spots, cycle) for cycle in checks]
+        own, other = (tuple(sorted(set().union(*group))) for group in (seen, told))
+        if set(own) & set(other):
+            raise InputError("a pose that identifies cannot judge: name check poses apart")
+        complete = [
+            i
+            for i, (a, b) in enumerate(zip(seen, told, strict=True))
+            if len(a) == len(own) and len(b) == len(other)
+        ]
+        if len(complete) < FEWEST_KNOWN or not own or not other:
+            raise TooFewSamplesError(
+                f"{len(complete)} of {len(seen)} cycles visited all {len(own)} poses and "
+                f"{len(other)} check poses: screening needs {FEWEST_KNOWN} such cycles"
+            )
+        return cls(
+            spots.cell.arm.parameters.names,
+            np.array([np.concatenate([seen[i][spot] for spot in own]) for i in complete]),
+            _rows(spots, own),
+            np.array([np.concatenate([told[i][spot] for spot in other]) for i in complete]),
+            _rows(spots, other),
+        )
+
+    def residual(self, chosen: Sequence[int]) -> Array:
+        """What is left (t, 3c) at the check points with some parameters (columns) identified.
+
+        Raises
+        ------
+        TooFewSamplesError, RankDeficientError
+            When the spots do not determine them.
+        """
+        if not len(chosen):
+            return self.check
+        found = subset_drift(self.displacement, self.rows, chosen, self.names)
+        return np.asarray(self.check - found.drift @ self.check_rows[:, found.chosen].T)
+
+
+def share_within(residual: Array, threshold_m: float = THRESHOLD_M) -> float:
+    """The share lambda of residual coordinates (any shape), m, below a threshold.
+
+    Each cycle, check point and axis (x, y, z apart) counts once. The source counts each axis of
+    each point once for all cycles (7.95 % is 7 of its 88 directions) and does not say how it
+    sums the cycles up; counted apart, none hides behind the others.
+    """
+    return float(np.mean(np.abs(residual) < threshold_m))
+
+
+def _by_spot(spots: ColdSpots, cycle: Measurements) -> dict[int, Array]:
+    """Mean displacement (3,) at each spot that a cycle visited."""
+    spot, drift = spots.match(cycle), spots.drift(cycle)
+    return {int(s): drift[spot == s].mean(axis=0) for s in np.unique(spot)}
+
+
+def _rows(spots: ColdSpots, own: tuple[int, ...]) -> Array:
+    index = np.array(own, dtype=np.int64)
+    return spots.rows(spots.q[index], spots.target[index])[0].reshape(3 * len(own), -1)
+
+
+LEVEL = 0.05  # chance that white noise passes for a drift
+LAGS = 7  # a drift shows in the first lags; with 7 the count's own chance is 4.4 %, next to LEVEL
+BOUND = 1.96  # of a white series' autocorrelation, times the root of its length
+FEWEST = 3 * LAGS
+
+
+@dataclass(frozen=True, eq=False)
+class Stationarity:
+    """Tests of k series, each against white noise about a level.
+
+    Attributes
+    ----------
+    autocorrelation : (LAGS, k) at lags 1 ... LAGS.
+    bound : half width of the interval that holds 95 % of a white series' autocorrelations.
+    outside : (k,) how many lags lie outside it; ``allowed`` of them is what chance allows.
+    p_value : (k,) of Ljung and Box's test.
+    """
+
+    autocorrelation: Array
+    bound: float
+    outside: NDArray[np.int64]
+    allowed: int
+    p_value: Array
+
+    @property
+    def by_count(self) -> NDArray[np.bool_]:
+        """(k,) stationary, because no more lags lie outside than chance allows."""
+        return np.asarray(self.outside <= self.allowed)
+
+    @property
+    def by_ljung_box(self) -> NDArray[np.bool_]:
+        """(k,) stationary, because white noise has such autocorrelations often enough."""
+        return np.asarray(self.p_value >= LEVEL)
+
+
+def stationarity(series: Array) -> Stationarity:
+    """Test the columns of equally spaced series (t, k), in whatever unit.
+
+    The lags of a white series are nearly independent and each is outside with chance 5 %, so
+    that their number is binomial. Ljung and Box (1978) sum their squares instead, which is
+    chi-square with as many degrees of freedom as there are lags. Either finds a white series
+    drifting in about 5 % of cases (the count, being whole, in a little less).
+
+    Raises
+    ------
+    TooFewSamplesError
+        With fewer than 21 times.
+    """
+    from scipy.special import gammaincc
+
+    n = len(series)
+    if n < FEWEST:
+        raise TooFewSamplesError(
+            f"{n} cycles are too few to tell a drift from chance: at least {FEWEST}"
+        )
+    r = autocorrelation(series)
+    bound = BOUND / float(np.sqrt(n))
+    left = n - np.arange(1, LAGS + 1)
+    squared = n * (n + 2.0) * np.sum(r**2 / left[:, None], axis=0)
+    return Stationarity(
+        autocorrelation=r,
+        bound=bound,
+        outside=np.sum(np.abs(r) > bound, axis=0),
+        allowed=_allowed(),
+        p_value=np.asarray(gammaincc(0.5 * LAGS, 0.5 * squared)),
+    )
+
+
+def autocorrelation(series: Array) -> Array:
+    """Sample autocorrelation (LAGS, k) of the columns of (t, k); zero for a constant column."""
+    x = series - series.mean(axis=0)
+    power = np.sum(x**2, axis=0)
+    power = np.where(power > 0.0, power, 1.0)
+    return np.array([np.sum(x[lag:] * x[:-lag], axis=0) / power for lag in range(1, LAGS + 1)])
+
+
+def _allowed() -> int:
+    """Most lags outside that chance exceeds in no more than 5 % of white series."""
+    from scipy.special import bdtrc
+
+    return next(count for count in range(LAGS + 1) if bdtrc(count, LAGS, LEVEL) <= LEVEL)
+
 
 Removal = Literal["best", "classic"]
 Test = Literal["autocorrelation", "ljung-box"]
-
 WANTED = 8
 CLASSIC_ORDER = ("theta", "alpha", "d", "a", "beta")  # in which the source lists its set S
 UNDETERMINED = -1.0  # orders a set that the poses do not determine below any share
@@ -217,16 +401,10 @@ def _classic_place(name: str) -> int:
     return CLASSIC_ORDER.index(kind) if kind in CLASSIC_ORDER else len(CLASSIC_ORDER)
 
 
-# ---- best subset --------------------------------------------------------------------------------
-#
 # C_p weighs the sum of all squared residuals against the number of parameters, so that a few bad
 # points can hide in it. The search goes through every subset of the size, a million for 8 or 9 of
 # 24: the many that explain about the same would leave a branch-and-bound search little to skip.
-
-
-Array = NDArray[np.float64]
 Branch = tuple[tuple[int, ...], tuple[int, ...]]
-
 _AT_ONCE = 20_000
 
 

@@ -1,16 +1,16 @@
 """The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.sphere import cloud_sample
-from robocal_ros.ground.errors import Code, ConflictError, RobocalError, StorageError
-from robocal_ros.ground.proposals import Head
+from robocal_ros.estimation.sphere import SphereRule, cloud_sample
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StorageError
+from robocal_ros.ground.proposals import REFERENCE, THERMAL, Head
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -31,25 +31,40 @@ from robocal_ros.ground.samples import (
     pose_sample,
     temperature_sample,
 )
+from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.decisions import History, decide, outside_decision
-from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
-from robocal_ros.thermal.accuracy_state import Accuracy, MotorTemperatures, accuracy_of
-from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.drift_following import DriftFollower, Following, InForce
+from robocal_ros.session.decisions import (
+    NEWEST,
+    History,
+    decide,
+    outside_decision,
+    require_robot,
+    seeded,
+)
+from robocal_ros.session.events import CONFIGURE, Command, Outcome, joints_awaited_ns, reached
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel
+from robocal_ros.thermal.drift_following import (
+    DriftFollower,
+    FollowerState,
+    Following,
+    InForce,
+    ThermalConfig,
+)
 from robocal_ros.thermal.observations import (
     TIME_OUT,
     Beside,
+    MotorTemperatures,
+    Observation,
     ObservationDesk,
     OpenCycle,
     Windows,
     ended,
 )
 from robocal_ros.thermal.proposing import CandidateStore, Proposer, SetUp
-from robocal_ros.thermal.reference import ColdReference
+from robocal_ros.thermal.reference import SAME_VISIT_RAD, ColdReference
 
-# ---- bounds -------------------------------------------------------------------------------------
+Array = NDArray[np.float64]
 
 
 SAME_CLOCK_NS = 1_000_000_000
@@ -105,13 +120,7 @@ class Bounds:
         return marks
 
 
-# ---- the thermal session: samples and commands in, judged proposals out. No clock, no ROS -------
-
-
 __all__ = ["ThermalConfig", "ThermalSession"]
-
-Array = NDArray[np.float64]
-
 _NO_REFERENCE = "no cold reference: capture it before the first cycle"
 
 
@@ -364,9 +373,6 @@ class ThermalSession:
         return [outside_decision(decision, self.desk.marks) for decision in self._current.look()]
 
 
-# ---- messages into the thermal session: the same for live topics and for recorded ones ----------
-
-
 def take_message(session: ThermalSession, kind: str, message: Any) -> None:
     """Give a message to the session; one that cannot be used is counted with its reason.
 
@@ -385,3 +391,203 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
             session.add(pose_sample(message, session.config.target))
     except RobocalError as error:
         session.refuse(kind, error)
+
+
+DUE_AHEAD_S = 300.0  # a measurement is due so long before the bound reaches the tolerance
+
+
+def accuracy_of(
+    following: Following,
+    current: InForce,
+    config: ThermalConfig,
+    temperatures: MotorTemperatures,
+    stamp_ns: int,
+) -> Accuracy:
+    """Judge the model in force at a stamp, with the motors' temperatures."""
+    if current.fault:
+        return Accuracy(AccuracyLevel.FAULT, current.fault)
+    try:
+        follower = following.follower
+        if follower is None:
+            words = "no cold reference: how far the robot has drifted is not known; capture one"
+            return Accuracy(AccuracyLevel.EXPIRED, words)
+        with follower.looking_ahead(temperatures.between(follower.read_ns, stamp_ns)):
+            return _judged(follower, current, config, stamp_ns)
+    except RobocalError as error:
+        return Accuracy(AccuracyLevel.FAULT, str(error))
+
+
+def _judged(
+    follower: DriftFollower, current: InForce, config: ThermalConfig, stamp_ns: int
+) -> Accuracy:
+    time_s = follower.time_s(stamp_ns)
+    forecast = follower.forecast(current.arm)
+    error, tolerance_mm = forecast.at(time_s), config.tolerance_m * 1e3
+    age_s = time_s - follower.state.tracker.time_s
+    left_s = config.expires_after_s - age_s
+    due_in_s = min(forecast.due_in_s(time_s, config.tolerance_m), left_s) - DUE_AHEAD_S
+    bound = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
+    allowed = f"of {tolerance_mm:.2f} mm allowed"
+    if follower.state.moved:
+        return Accuracy(AccuracyLevel.FAULT, follower.state.moved, error, due_in_s)
+    if left_s <= 0.0:
+        words = f"last measured {age_s / 3600.0:.1f} h ago: measure a cycle"
+        return Accuracy(AccuracyLevel.EXPIRED, words, error, due_in_s)
+    if error.bound_m > config.tolerance_m:
+        words = f"{bound}, {allowed}: measure a cycle, accept its model"
+        return Accuracy(AccuracyLevel.DEGRADED, words, error, due_in_s)
+    if due_in_s <= 0.0:
+        return Accuracy(AccuracyLevel.DUE, f"{bound}, {allowed}: measure a cycle", error, due_in_s)
+    return Accuracy(AccuracyLevel.OK, f"{bound}, {allowed}", error, due_in_s)
+
+
+def session_as_recorded(
+    nominal: SerialArm, history: History, configured: Command, software: str
+) -> ThermalSession:
+    """Make a session with the recorded settings; an empty history gets what was in force.
+
+    Raises
+    ------
+    WrongRobotError
+        The recording was made with another nominal model.
+    InputError
+        The configuration cannot be read.
+    """
+    require_robot(nominal, configured)
+    arguments = configured.arguments
+    try:
+        model, reference = arguments["model"], arguments["reference"]
+        tracker = arguments["tracker"]
+    except KeyError as error:
+        raise InputError(f"the recorded configuration lacks {error}") from error
+    config = config_of(arguments)
+    state = None if tracker is None else FollowerState.of_document(tracker)
+    in_force = {THERMAL: model, REFERENCE: reference}
+    fresh = seeded(history, nominal, in_force, software)
+    session = ThermalSession(nominal, history, config, software)
+    if fresh and state is not None and session.follower is not None:
+        session.follower.go_on_from(state)
+    return session
+
+
+OWN = "tracker"  # only a thermal session's configuration has it
+
+
+def configuration(session: ThermalSession, topics: Mapping[str, str] | None = None) -> Command:
+    """The session's settings and what is in force, so that replay can start from the same.
+
+    Recorded at the start and after each change of what is in force: a recording that begins
+    later has it too. ``topics``: name of each input's topic.
+    """
+    return Command(
+        CONFIGURE,
+        {
+            "robot": session.nominal.name,
+            "model_hash": session.nominal.model_hash,
+            "topics": dict(topics or {}),
+            "config": asdict(session.config),
+            "model": session.in_force.model,
+            "reference": session.reference_model,
+            OWN: None if session.follower is None else session.follower.state.document(),
+        },
+        session.desk.newest_ns.get(JOINTS, 0),
+        session.desk.marks,
+    )
+
+
+def is_thermal_session(configured: Command | None) -> bool:
+    """Whether a configuration was recorded by a thermal session."""
+    return configured is not None and OWN in configured.arguments
+
+
+def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
+    """Read the settings back from a configuration record.
+
+    Raises
+    ------
+    InputError
+        When the record has other settings than this version knows.
+    """
+    try:
+        values = dict(arguments["config"])
+        rule = StandstillRule(**values.pop("standstill"))
+        sphere = SphereRule(**values.pop("sphere"))
+        for name in ("drift_parameters", "tip_m"):
+            values[name] = tuple(values.get(name, ()))
+        values["work_poses"] = tuple(tuple(q) for q in values.get("work_poses", ()))
+        return ThermalConfig(standstill=rule, sphere=sphere, **values)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"the recorded configuration cannot be read: {error}") from error
+
+
+LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
+
+
+def window_commands(
+    cold: tuple[int, int] | None, warm: Sequence[tuple[int, int]]
+) -> list[tuple[Command, Mapping[str, Any]]]:
+    """Commands for time windows (from, to; ns): the cold reference, then one cycle each."""
+    commands: list[tuple[Command, Mapping[str, Any]]] = []
+    if cold is not None:
+        arguments = {"from_ns": cold[0], "by": "replay"}
+        commands.append((Command(events.CAPTURE_REFERENCE, arguments, cold[1]), {}))
+    for number, (start, end) in enumerate(warm, start=1):
+        arguments = {"from_ns": start, "cycle_id": f"window-{number}"}
+        commands.append((Command(events.IDENTIFY, arguments, end), {}))
+    return commands
+
+
+def automatic_commands(
+    observations: Sequence[Observation],
+) -> list[tuple[Command, Mapping[str, Any]]]:
+    """Find the cycles of a recording without commands.
+
+    Poses that recur from cycle to cycle: the first visit is the cold reference, each later one
+    a warm cycle. Otherwise everything is one calibration.
+
+    Raises
+    ------
+    InputError
+        When nothing was observed.
+    """
+    if not observations:
+        raise InputError("no measurement at standstill in this recording")
+    starts = _cycle_starts(observations)
+    end = observations[-1].stamp_ns
+    if len(starts) < 2:
+        return window_commands(None, [(observations[0].stamp_ns, end)])
+    edges = [observations[i].stamp_ns for i in starts]
+    last = [observations[i - 1].stamp_ns for i in starts[1:]] + [end]
+    windows = list(zip(edges, last, strict=True))
+    return window_commands(windows[0], windows[1:])
+
+
+def accepting(
+    commands: Iterable[tuple[Command, Mapping[str, Any]]], by: str
+) -> list[tuple[Command, Mapping[str, Any]]]:
+    """The same commands, with each candidate accepted where its own verdict accepts it."""
+    found: list[tuple[Command, Mapping[str, Any]]] = []
+    for command, outcome in commands:
+        found.append((command, outcome))
+        if command.name == events.IDENTIFY:
+            arguments = {"choose": NEWEST, "by": by, "reason": "its verdict accepts"}
+            found.append((Command(events.ACCEPT, arguments, command.stamp_ns), {}))
+    return found
+
+
+def _cycle_starts(observations: Sequence[Observation]) -> list[int]:
+    """Index of the first observation of each cycle; one alone when poses do not recur."""
+
+    def same(a: Observation, b: Observation) -> bool:
+        near = np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD
+        return a.target == b.target and bool(near)
+
+    first = observations[0]
+    limit = min(len(observations), LARGEST_CYCLE + 1)
+    length = next((i for i in range(1, limit) if same(first, observations[i])), None)
+    if length is None:
+        return [0]
+    starts = [i for i, o in enumerate(observations) if same(first, o)]
+    known = observations[:length]
+    recurring = sum(any(same(o, k) for k in known) for o in observations[length:])
+    return starts if recurring >= 0.9 * len(observations[length:]) else [0]

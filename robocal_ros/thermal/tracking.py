@@ -1,11 +1,4 @@
-"""The model between measuring cycles: a Kalman filter over the parameters' drift.
-
-State: drift of the k parameters and its steady state, the gains of the motors' temperatures where
-those are given, the error of each cold spot (the noise of the cold visit is in every later
-comparison), and the set-up's six coordinates with their steady state. Absolute: the drift is
-against the cold model, whatever is in force. A cycle that the process cannot explain is not
-applied.
-"""
+"""How a robot's parameters drift in time: the prior of the tracker."""
 
 from dataclasses import dataclass, replace
 
@@ -18,27 +11,191 @@ from robocal_ros.estimation.estimation import describe, observability
 from robocal_ros.ground.errors import Code, InputError, StaleError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.documents import conclude
 from robocal_ros.thermal.identification import (
     FEWEST_POSES,
+    PLAUSIBLE_WARMING_K,
     CycleDrift,
     FixedSphere,
     agreeing,
+    conclude,
+    drift_prior,
     possible_causes,
     step_words,
 )
-from robocal_ros.thermal.process import (
-    PLAUSIBLE_WARMING_K,
-    SOURCES,
-    DriftProcess,
-    Heat,
-    HeatGains,
-    joints_of,
-    swing_k,
-)
-from robocal_ros.thermal.reference import ColdSpots
+from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
 
 Array = NDArray[np.float64]
+
+
+SETUP_APPROACH_S = 1800.0
+APPROACH_S = 3600.0  # a link follows what heats it
+STEADY_TIME_S = 8.0 * 3600.0  # what heats it changes with the work
+
+
+@dataclass(frozen=True, eq=False)
+class DriftProcess:
+    """A drift that begins at zero and approaches a steady state, and a set-up never quite still.
+
+    ``approach_s dx/dt = u - x`` for each parameter x; its steady state u is a first-order process
+    that forgets what it was within ``steady_s``: work changes. The set-up (sensor, and sphere on
+    the flange) does the same in its own small way: sensors warm up and stems expand, and neither
+    may pass for a drift of the arm.
+
+    Attributes
+    ----------
+    covariance : (k, k) of the parameters' steady state, SI.
+    approach_s, steady_s : time constants; the first one is the shorter.
+    setup_sigma_m, setup_approach_s : standard deviation of the steady state of each of the
+        set-up's six coordinates, and how fast they approach it.
+
+    Raises
+    ------
+    InputError
+        When the steady state is forgotten before it is approached.
+    """
+
+    covariance: Array
+    approach_s: float = APPROACH_S
+    steady_s: float = STEADY_TIME_S
+    setup_sigma_m: float = SETUP_SIGMA_M
+    setup_approach_s: float = SETUP_APPROACH_S
+
+    def __post_init__(self) -> None:
+        if not 0.0 < max(self.approach_s, self.setup_approach_s) < self.steady_s:
+            raise InputError(
+                f"approach within {self.approach_s:g} s (set-up: {self.setup_approach_s:g} s) must "
+                f"be shorter than the {self.steady_s:g} s after which the steady state is forgotten"
+            )
+
+    def transition(self, step_s: float) -> tuple[Array, Array]:
+        """Transition (2, 2) of a drift and its steady state, and its noise for variance 1."""
+        return _transition(step_s, self.approach_s, self.steady_s)
+
+    def setup_transition(self, step_s: float) -> tuple[Array, Array]:
+        """The same of a coordinate of the set-up."""
+        return _transition(step_s, self.setup_approach_s, self.steady_s)
+
+
+def _transition(step_s: float, approach_s: float, steady_s: float) -> tuple[Array, Array]:
+    near, far = np.exp(-step_s / approach_s), np.exp(-step_s / steady_s)
+    share = steady_s / (steady_s - approach_s)
+    F = np.array([[near, share * (far - near)], [0.0, far]])
+    reached = steady_s / (steady_s + approach_s)
+    long_run = np.array([[reached, reached], [reached, 1.0]])
+    return F, long_run - F @ long_run @ F.T
+
+
+# A motor and its gear move their own joint's parameters at once. The link that follows the joint
+# lies between its motor and the next one, and follows both with a lag.
+SOURCES = 3  # of each parameter: its joint's motor, the same lagged, the next motor lagged
+SWING_K = 20.0  # where a temperature may go once it is no longer read
+SWING_TIME_S = 3600.0
+
+
+@dataclass(frozen=True, eq=False)
+class Heat:
+    """Motor temperatures above those at the cold visit, K: as last read, and lagged.
+
+    Attributes
+    ----------
+    time_s : of the last reading.
+    motor, lagged : (n,).
+    lag_s : time constant of the lag.
+    """
+
+    time_s: float
+    motor: Array
+    lagged: Array
+    lag_s: float
+
+    @classmethod
+    def cold(cls, n: int, time_s: float, lag_s: float) -> "Heat":
+        """At the cold visit."""
+        return cls(time_s, np.zeros(n), np.zeros(n), lag_s)
+
+    def read(self, temperature: Array, time_s: float) -> "Heat":
+        """After a reading (n,), the course since the last one taken as straight.
+
+        Raises
+        ------
+        InputError
+            When it is not one finite temperature for each joint, or older than the last.
+        """
+        given = np.asarray(temperature, dtype=np.float64)
+        if given.shape != self.motor.shape or not np.all(np.isfinite(given)):
+            raise InputError(
+                f"motor temperatures must be {len(self.motor)} numbers, one per joint, not {given}"
+            )
+        step = time_s - self.time_s
+        if not step >= 0.0:
+            raise InputError(
+                f"the motor temperatures of {time_s:.0f} s are older than the last ones: give "
+                "them in order"
+            )
+        if step == 0.0:
+            return replace(self, motor=given)
+        fade, behind = np.exp(-step / self.lag_s), (given - self.motor) / step * self.lag_s
+        lagged = given - behind + fade * (self.lagged - self.motor + behind)
+        return Heat(time_s, given, lagged, self.lag_s)
+
+    def held(self, time_s: float) -> "Heat":
+        """At a later time, the motors as last read; an earlier one changes nothing."""
+        return self if time_s <= self.time_s else self.read(self.motor, time_s)
+
+    def array(self) -> Array:
+        """Everything in one array (2 + 2n,), for keeping."""
+        return np.concatenate([[self.time_s, self.lag_s], self.motor, self.lagged])
+
+    @classmethod
+    def of_array(cls, kept: Array) -> "Heat":
+        """Read back what ``array`` gave."""
+        motor, lagged = kept[2:].reshape(2, -1)
+        return cls(float(kept[0]), motor, lagged, float(kept[1]))
+
+    def rows(self, joint: NDArray[np.int64]) -> Array:
+        """Drift (k, 3k) of parameters of these joints (k,) by the gains."""
+        next_lagged = np.append(self.lagged[1:], 0.0)
+        rows = np.zeros((len(joint), len(joint), SOURCES))
+        own = np.arange(len(joint))
+        rows[own, own] = np.column_stack([self.motor, self.lagged, next_lagged])[joint]
+        return rows.reshape(len(joint), -1)
+
+
+def swing_k(silent_s: float) -> float:
+    """Standard deviation, K, of a motor's temperature so long after it was read."""
+    return float(SWING_K * (1.0 - np.exp(-max(silent_s, 0.0) / SWING_TIME_S)))
+
+
+@dataclass(frozen=True, eq=False)
+class HeatGains:
+    """Change of each parameter per kelvin of each of its sources.
+
+    Attributes
+    ----------
+    mean, covariance : (3k,) and (3k, 3k), SI per K; parameter by parameter.
+    lag_s : how slowly links follow the motors.
+    """
+
+    mean: Array
+    covariance: Array
+    lag_s: float
+
+    @classmethod
+    def expected(cls, arm: SerialArm, lag_s: float, length: float, angle: float) -> "HeatGains":
+        """Before any is learned: none, within the default drift per plausible warming.
+
+        ``length``, ``angle``: what the gains of either kind are of that.
+        """
+        scale = np.where(arm.parameters.is_length, length, angle) / PLAUSIBLE_WARMING_K
+        sigma = np.sqrt(np.diag(drift_prior(arm))) * scale
+        variance = np.repeat(sigma**2, SOURCES) / SOURCES
+        return cls(np.zeros(len(variance)), np.diag(variance), lag_s)
+
+
+def joints_of(arm: SerialArm) -> NDArray[np.int64]:
+    """Joint (k,), from 0, of each free parameter."""
+    return np.array([joint for joint, _ in arm.parameters.index], dtype=np.int64)
+
 
 FALSE_ALARM = 0.001  # chance that a sound cycle is not applied
 FEWEST_SHARE = 0.5  # of a cycle's samples that must agree
@@ -292,9 +449,6 @@ class DriftTracker:
         return spots.drift(cycle).ravel(), H.reshape(3 * m, -1), noise
 
 
-# ---- tracked cycle ------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class TrackedCycle:
     """A cycle that the tracker took or refused.
@@ -434,89 +588,3 @@ def _refusal(
         f"the measured positions are {rms_mm:.2f} mm rms off, where drift and noise explain "
         f"{expected_mm:.2f} mm; the model stays as it was; {step_words(causes, fixed)}",
     )
-
-
-# ---- whether a parameter fluctuates about a level or drifts: tests of its autocorrelation -------
-
-
-LEVEL = 0.05  # chance that white noise passes for a drift
-LAGS = 7  # a drift shows in the first lags; with 7 the count's own chance is 4.4 %, next to LEVEL
-BOUND = 1.96  # of a white series' autocorrelation, times the root of its length
-FEWEST = 3 * LAGS
-
-
-@dataclass(frozen=True, eq=False)
-class Stationarity:
-    """Tests of k series, each against white noise about a level.
-
-    Attributes
-    ----------
-    autocorrelation : (LAGS, k) at lags 1 ... LAGS.
-    bound : half width of the interval that holds 95 % of a white series' autocorrelations.
-    outside : (k,) how many lags lie outside it; ``allowed`` of them is what chance allows.
-    p_value : (k,) of Ljung and Box's test.
-    """
-
-    autocorrelation: Array
-    bound: float
-    outside: NDArray[np.int64]
-    allowed: int
-    p_value: Array
-
-    @property
-    def by_count(self) -> NDArray[np.bool_]:
-        """(k,) stationary, because no more lags lie outside than chance allows."""
-        return np.asarray(self.outside <= self.allowed)
-
-    @property
-    def by_ljung_box(self) -> NDArray[np.bool_]:
-        """(k,) stationary, because white noise has such autocorrelations often enough."""
-        return np.asarray(self.p_value >= LEVEL)
-
-
-def stationarity(series: Array) -> Stationarity:
-    """Test the columns of equally spaced series (t, k), in whatever unit.
-
-    The lags of a white series are nearly independent and each is outside with chance 5 %, so
-    that their number is binomial. Ljung and Box (1978) sum their squares instead, which is
-    chi-square with as many degrees of freedom as there are lags. Either finds a white series
-    drifting in about 5 % of cases (the count, being whole, in a little less).
-
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer than 21 times.
-    """
-    from scipy.special import gammaincc
-
-    n = len(series)
-    if n < FEWEST:
-        raise TooFewSamplesError(
-            f"{n} cycles are too few to tell a drift from chance: at least {FEWEST}"
-        )
-    r = autocorrelation(series)
-    bound = BOUND / float(np.sqrt(n))
-    left = n - np.arange(1, LAGS + 1)
-    squared = n * (n + 2.0) * np.sum(r**2 / left[:, None], axis=0)
-    return Stationarity(
-        autocorrelation=r,
-        bound=bound,
-        outside=np.sum(np.abs(r) > bound, axis=0),
-        allowed=_allowed(),
-        p_value=np.asarray(gammaincc(0.5 * LAGS, 0.5 * squared)),
-    )
-
-
-def autocorrelation(series: Array) -> Array:
-    """Sample autocorrelation (LAGS, k) of the columns of (t, k); zero for a constant column."""
-    x = series - series.mean(axis=0)
-    power = np.sum(x**2, axis=0)
-    power = np.where(power > 0.0, power, 1.0)
-    return np.array([np.sum(x[lag:] * x[:-lag], axis=0) / power for lag in range(1, LAGS + 1)])
-
-
-def _allowed() -> int:
-    """Most lags outside that chance exceeds in no more than 5 % of white series."""
-    from scipy.special import bdtrc
-
-    return next(count for count in range(LAGS + 1) if bdtrc(count, LAGS, LEVEL) <= LEVEL)

@@ -7,7 +7,7 @@ from bench.thermal import SEEDS
 from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.cell_sim.thermal_shift import UNCORRECTED, drifting_cell, poses
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.learning import share_within
+from robocal_ros.thermal.screening import share_within
 
 
 @pytest.mark.parametrize("seed", [3, 7])

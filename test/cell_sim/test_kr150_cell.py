@@ -38,7 +38,7 @@ from robocal_ros.cell_sim.robot import Effects, Warmth
 from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
-from robocal_ros.thermal.learning import share_within
+from robocal_ros.thermal.screening import share_within
 from robocal_ros.tool.crossed_model import RobotNoise
 
 SILENT = replace(Effects(), noise=False, outliers=False)

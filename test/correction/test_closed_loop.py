@@ -15,7 +15,8 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession
 
 POSES = 8
 FAR = 0.3  # singular value; nearer to a singularity joints turn by degrees to move the tool

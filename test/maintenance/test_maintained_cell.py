@@ -20,8 +20,10 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.thermal.process import DriftProcess, drift_prior
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.identification import drift_prior
+from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal.tracking import DriftProcess
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.session import ToolSession
 

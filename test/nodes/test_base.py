@@ -317,5 +317,5 @@ def test_what_every_node_imports_brings_no_session_and_no_kernels(module: str) -
     told = subprocess.run(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, check=True, text=True
     )
-    heavy = {"numba", "scipy", "robocal_ros.thermal.session", "robocal_ros.thermal.accuracy_state"}
+    heavy = {"numba", "scipy", "robocal_ros.thermal.session", "robocal_ros.thermal.tracking"}
     assert heavy.isdisjoint(told.stdout.split())

@@ -16,8 +16,7 @@ from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros.base import AUTOSTART, SERIAL
-from robocal_ros.thermal.node import ThermalNode
-from robocal_ros.thermal.settings import session_config
+from robocal_ros.thermal.node import ThermalNode, session_config
 from robocal_ros.tool.node import TcfNode
 
 ROOT = Path(__file__).parents[2]

@@ -23,7 +23,7 @@ from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.settings import MOTION
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.parameters import SHARED
-from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.node import INPUTS, ThermalNode
 from robocal_ros.tool.judging import ToolLimits
 from robocal_ros.tool.node import INPUTS as TCF_INPUTS

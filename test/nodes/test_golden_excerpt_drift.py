@@ -39,9 +39,7 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
-from robocal_ros.thermal.seeding import session_as_recorded
-from robocal_ros.thermal.session import take_message
-
+from robocal_ros.thermal.session import session_as_recorded, take_message
 
 EVERY = 5  # joint readings at 50 Hz are enough to see where the robot stands
 

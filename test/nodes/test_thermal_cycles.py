@@ -14,7 +14,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.conversions import time_message
-from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.drift_following import ThermalConfig
 
 POSES = 6
 WARM_K = 15.0

@@ -40,8 +40,7 @@ from robocal_ros.ros.endpoints import Health
 from robocal_ros.ros.history_settings import history_notice
 from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.thermal.node import ThermalNode
-from robocal_ros.thermal.seeding import config_of
-from robocal_ros.thermal.session import ThermalSession, take_message
+from robocal_ros.thermal.session import ThermalSession, config_of, take_message
 
 POSES = 8
 NS = 1_000_000_000

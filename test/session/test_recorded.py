@@ -18,10 +18,9 @@ from robocal_ros.hand_eye.session import HandEyeSession
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
-from robocal_ros.thermal import seeding
-from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.seeding import session_as_recorded
-from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal import session as thermal_session
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession, session_as_recorded
 from robocal_ros.tool import session as tool_session
 from robocal_ros.tool.session import ToolSession
 
@@ -29,7 +28,7 @@ NS = 1_000_000_000
 KINDS = {
     "thermal": (
         lambda history: ThermalSession(ARM, history, ThermalConfig(), "test"),
-        seeding.configuration,
+        thermal_session.configuration,
         session_as_recorded,
     ),
     "tool": (

@@ -32,13 +32,15 @@ from robocal_ros.session.events import (
     outcome_text,
     read_command,
 )
-from robocal_ros.thermal.seeding import (
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import (
+    ThermalSession,
     automatic_commands,
     config_of,
     configuration,
+    take_message,
     window_commands,
 )
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession, take_message
 
 NS = 1_000_000_000
 POSES = 8

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.thermal.accuracy_state import Accuracy
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 
 
 def test_the_document_is_in_millimetres():

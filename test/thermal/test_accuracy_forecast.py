@@ -9,9 +9,9 @@ from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.accuracy import HORIZON_S, AccuracyForecast, Work
-from robocal_ros.thermal.process import DriftProcess, drift_prior
+from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.tracking import DriftTracker
+from robocal_ros.thermal.tracking import DriftProcess, DriftTracker
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,12 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.identification import measured_errors, true_errors
-from robocal_ros.thermal.reference import ColdReference, capture_reference
+from robocal_ros.thermal.reference import (
+    ColdReference,
+    capture_reference,
+    measured_errors,
+    true_errors,
+)
 
 TOOL = np.array([0.1, 0.05, 0.2])
 T_SENSOR_BASE = frames.transform(frames.exp_rotation(np.array([0.3, -0.2, 1.0])), [2.0, 1.0, -0.5])

@@ -16,8 +16,8 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.thermal.drift_following import CHECKPOINT_EVERY
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.drift_following import CHECKPOINT_EVERY, ThermalConfig
+from robocal_ros.thermal.session import ThermalSession
 
 NS = 1_000_000_000
 POSES = 8

@@ -18,9 +18,8 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.config import ThermalConfig
-from robocal_ros.thermal.seeding import automatic_commands
-from robocal_ros.thermal.session import ThermalSession, take_message
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession, automatic_commands, take_message
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "demo_shift.mcap"

@@ -9,9 +9,12 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground.errors import Code, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.documents import judge_cycle
-from robocal_ros.thermal.identification import identify_cycle, identify_subset
-from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.identification import (
+    drift_prior,
+    identify_cycle,
+    identify_subset,
+    judge_cycle,
+)
 from robocal_ros.thermal.reference import ColdSpots
 
 

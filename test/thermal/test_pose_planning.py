@@ -12,8 +12,7 @@ from robocal_ros.ground.errors import LimitError, TooFewSamplesError
 from robocal_ros.identification.cell import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.identification import SETUP_SIGMA_M, identify_cycle
-from robocal_ros.thermal.planning import (
+from robocal_ros.thermal.cell_setup import (
     Design,
     SensorField,
     candidate_poses,
@@ -21,8 +20,8 @@ from robocal_ros.thermal.planning import (
     plan_poses,
     shortest_way,
 )
-from robocal_ros.thermal.process import drift_prior
-from robocal_ros.thermal.reference import ColdSpots
+from robocal_ros.thermal.identification import drift_prior, identify_cycle
+from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
 
 FIELD = SensorField()
 

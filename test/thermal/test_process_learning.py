@@ -9,9 +9,10 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.learning import EarlierShift, learn_gains, learn_process, visit_noise
-from robocal_ros.thermal.process import DriftProcess, drift_prior
 from robocal_ros.thermal.reference import ColdSpots
+from robocal_ros.thermal.tracking import DriftProcess
 
 PERIOD_S, CYCLES = 300.0, 40
 

@@ -14,8 +14,8 @@ from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel
-from robocal_ros.thermal.seeding import configuration, session_as_recorded
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession, configuration, session_as_recorded
 
 POSES, KELVIN, NIGHT_H = 8, 15.0, 12.0
 STILL = np.eye(4)

@@ -12,9 +12,8 @@ from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import entangled, subset_drift
-from robocal_ros.thermal.learning import DriftHistory, share_within
 from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.screening import Screening, best_subset, screen
+from robocal_ros.thermal.screening import DriftHistory, Screening, best_subset, screen, share_within
 
 ARM = load_robot("kr150_r3100")
 NAMES = ARM.parameters.names

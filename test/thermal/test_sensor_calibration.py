@@ -9,7 +9,7 @@ from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.sensor_calibration import calibrate_sensor
+from robocal_ros.thermal.cell_setup import calibrate_sensor
 
 SIGMA = 2e-5
 T_SENSOR_BASE, BALL = thermal_shift.T_SENSOR_BASE, thermal_shift.BALL

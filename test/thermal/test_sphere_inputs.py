@@ -20,7 +20,8 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession, take_message
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession, take_message
 
 NS = 1_000_000_000
 POSES = 8

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import TooFewSamplesError
-from robocal_ros.thermal.tracking import LAGS, autocorrelation, stationarity
+from robocal_ros.thermal.screening import LAGS, autocorrelation, stationarity
 
 CYCLES, SERIES = 90, 20_000
 

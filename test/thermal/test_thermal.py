@@ -11,9 +11,13 @@ from robocal_ros.ground.errors import Code, InputError, ResidualError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.documents import judge_cycle
-from robocal_ros.thermal.identification import CycleDrift, identify_cycle
-from robocal_ros.thermal.process import drift_prior, learned_prior
+from robocal_ros.thermal.identification import (
+    CycleDrift,
+    drift_prior,
+    identify_cycle,
+    judge_cycle,
+    learned_prior,
+)
 from robocal_ros.thermal.reference import ColdReference, capture_reference
 
 SIGMA_M = 2e-5

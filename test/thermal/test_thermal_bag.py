@@ -20,7 +20,7 @@ from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.session import ThermalSession, take_message
 
 BAGS = Path(__file__).parents[2] / "bags"

@@ -11,10 +11,14 @@ from robocal_ros.ground.errors import Code, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.identification import FixedSphere, fixed_sphere, possible_causes
-from robocal_ros.thermal.process import DriftProcess, drift_prior
+from robocal_ros.thermal.identification import (
+    FixedSphere,
+    drift_prior,
+    fixed_sphere,
+    possible_causes,
+)
 from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.tracking import DriftTracker, TrackedCycle, track_cycle
+from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, TrackedCycle, track_cycle
 
 PERIOD_S = 300.0
 POSES = 6

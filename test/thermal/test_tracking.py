@@ -13,9 +13,9 @@ from robocal_ros.ground.errors import InputError, StaleError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.process import DriftProcess, Heat, HeatGains, drift_prior, joints_of
+from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.tracking import DriftTracker
+from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, Heat, HeatGains, joints_of
 
 PERIOD_S = 300.0
 

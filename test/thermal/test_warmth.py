@@ -9,8 +9,8 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.process import DriftShare, drift_prior, drift_share
-from robocal_ros.thermal.reference import capture_reference
+from robocal_ros.thermal.identification import drift_prior
+from robocal_ros.thermal.reference import DriftShare, capture_reference, drift_share
 
 POSES, ROUNDS, TRIALS = 10, 3, 100
 KNOCK = frames.transform(frames.exp_rotation([0.0, 0.02, 0.01]), [6e-3, 0.0, -3e-3])

@@ -9,7 +9,7 @@ from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.process import drift_prior
+from robocal_ros.thermal.identification import drift_prior
 
 ROBOT = "kr150_r3100"
 SIGMA = 2e-5

@@ -17,7 +17,8 @@ from robocal_ros.ground.samples import JointSample, PointSample
 from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession
 from robocal_ros.motion.cell import DrivingConfig, joint_way
 from robocal_ros.session.events import CAPTURE_REFERENCE, Command, Outcome
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession
 
 TICKS = 2  # of the robot, between two looks of the maintenance
 OFFSETS_DEG = [

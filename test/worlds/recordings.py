@@ -16,8 +16,8 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, arguments_text, outcome_text
-from robocal_ros.thermal.seeding import configuration
-from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession, configuration
 
 NS = 1_000_000_000
 START_NS = 1_700_000_000 * NS

@@ -1,29 +1,282 @@
-"""Which poses a measuring cycle should visit: those that say most about the tool where it works.
+"""Where a fixed sensor stands and where the sphere sits on the flange, from one cold visit.
 
-Candidates are reachable poses that hold the sphere in the sensor's field. Of them those are chosen
-that leave the smallest predicted error at the working poses after one cycle (A-optimal on the
-prediction; Fedorov 1972): greedily, then by exchange until no exchange helps.
+``p_sensor = T_sensor_base T_base_flange(q) p_flange`` over n >= 5 poses that turn the flange about
+two axes or more.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.assessment import (
+    LARGEST_RMS_M,
+    Verdict,
+    errors_document,
+    summarise,
+    verdict_document,
+)
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import LimitError, TooFewSamplesError
+from robocal_ros.ground.errors import (
+    Code,
+    InputError,
+    LimitError,
+    RankDeficientError,
+    ResidualError,
+    TooFewSamplesError,
+)
+from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel
-from robocal_ros.identification.solve import random_postures
+from robocal_ros.identification.judged import require_match
+from robocal_ros.identification.solve import identify, linear_start, random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.identification import SETUP_SIGMA_M
-from robocal_ros.thermal.reference import ColdSpots
-
-# ---- pose planning ------------------------------------------------------------------------------
-
+from robocal_ros.kinematics.robots import read_made, write_made
+from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Document = dict[str, Any]
+
+
+SensorMethod = Literal["ml", "classic"]
+FEWEST_POSES = 5
+PENALTY = 1e3  # of the orthogonality constraints, against equations in metres
+
+
+NAMES = (
+    "base_x_mm", "base_y_mm", "base_z_mm", "base_rx_deg", "base_ry_deg", "base_rz_deg",
+    "sphere_x_mm", "sphere_y_mm", "sphere_z_mm",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SensorCalibration:
+    """A placed sensor.
+
+    Attributes
+    ----------
+    T_sensor_base : (4, 4) the robot's base in the sensor's frame.
+    sphere_in_flange : (3,) centre of the sphere in the flange frame, m.
+    covariance : (9, 9), SI, of ``NAMES``: shift of the base and turn about it (sensor axes), and
+        the sphere (flange axes); None for the classic method, which has no noise model.
+    residual : (m, 3) predicted minus measured centre, sensor axes, m.
+    left_out : (m,) distance at each pose of a calibration from the others, m.
+    rejected : names of the samples that do not fit the others.
+    """
+
+    method: SensorMethod
+    T_sensor_base: Array
+    sphere_in_flange: Array
+    covariance: Array | None
+    residual: Array
+    left_out: Array
+    rejected: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Array | None:
+        """Standard deviations (9,) of ``NAMES``, m and rad."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+
+def sensor_verdict(found: SensorCalibration) -> Verdict:
+    """Decide whether a placed sensor can be used.
+
+    Drifts are compared pose by pose, so that an arm's static errors of a millimetre or two do no
+    harm; a placement that misses its own poses by more belongs to another robot or mistake.
+    """
+    judged = found.left_out[np.isfinite(found.left_out)]
+    if len(judged) < len(found.left_out):
+        open_poses = len(found.left_out) - len(judged)
+        return Verdict(
+            Code.TOO_FEW_SAMPLES,
+            f"without any of {open_poses} poses the others place nothing: measure more poses",
+        )
+    rms_m = float(np.sqrt(np.mean(judged**2)))
+    words = f"each pose from the others: {rms_m * 1e3:.3f} mm rms"
+    if rms_m > LARGEST_RMS_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words}, more than any robot's static error ({LARGEST_RMS_M * 1e3:.0f} mm): check "
+            "robot file, units, joint signs and which sphere was measured",
+        )
+    return Verdict(Code.ACCEPT, words)
+
+
+def calibrate_sensor(
+    arm: SerialArm, data: Measurements, method: SensorMethod = "ml"
+) -> SensorCalibration:
+    """Place sensor and sphere with the cold model ``arm``.
+
+    ``ml`` is robust maximum likelihood over (R, t, p) on the manifold, weighted by the samples'
+    sigma, from the linear start; ``classic`` solves the pose differences for nine free elements
+    of R and p with an orthogonality penalty, then t as the mean over the poses.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        When the poses cannot place them; the message names the missing motion.
+    InputError, ResidualError
+        When the data miss the arm by a mistake that can be named, or R comes out reflected.
+    """
+    if len(data) < FEWEST_POSES:
+        raise TooFewSamplesError(
+            f"{len(data)} poses cannot place sensor and sphere: at least {FEWEST_POSES} are needed"
+        )
+    if len(data.targets) > 1:
+        raise TooFewSamplesError(
+            f"{len(data.targets)} targets ({', '.join(data.targets)}) in one visit: give one sphere"
+        )
+    require_match(arm, data, base=True, tool=True)
+    cell, covariance, rejected = _place(arm, data, method)
+    return SensorCalibration(
+        method=method,
+        T_sensor_base=cell.T_frame_base,
+        sphere_in_flange=cell.T_flange_target[0, :3, 3],
+        covariance=covariance,
+        residual=cell.residual(data),
+        left_out=_left_out(arm, data, method, rejected),
+        rejected=tuple(data.sample[i] for i in np.flatnonzero(rejected)),
+    )
+
+
+def _place(
+    arm: SerialArm, data: Measurements, method: SensorMethod
+) -> tuple[CellModel, Array | None, NDArray[np.bool_]]:
+    if method == "classic":
+        return _classic(arm, data), None, np.zeros(len(data), dtype=np.bool_)
+    placed = identify(arm, data, fit=("base", "tool"), method="lsq")
+    return placed.cell, placed.estimate.covariance, placed.estimate.rejected
+
+
+def _left_out(
+    arm: SerialArm, data: Measurements, method: SensorMethod, rejected: NDArray[np.bool_]
+) -> Array:
+    """Distance (m,) at each pose of what the others give; not a number where they give nothing."""
+    error = np.full(len(data), np.nan)
+    for i in range(len(data)):
+        others = ~rejected
+        others[i] = False
+        try:
+            cell = _place(arm, data.take(others), method)[0]
+        except (TooFewSamplesError, RankDeficientError):
+            continue
+        error[i] = np.linalg.norm(cell.residual(data.take(np.array([i]))))
+    return error
+
+
+def _classic(arm: SerialArm, data: Measurements) -> CellModel:
+    """Thesis eq. 3-14 to 3-19 with the sign of the right block of B corrected."""
+    from scipy.optimize import least_squares
+
+    start = linear_start(arm, data, base=True, tool=True)  # refuses where the rank is too low
+    T = arm.fk(data.q)
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    measured = data.position[1:] - data.position[0]
+    B = np.zeros((len(measured), 3, 12))
+    for axis in range(3):  # the unknowns are the rows of R_base_sensor, then the sphere
+        B[:, axis, 3 * axis : 3 * axis + 3] = measured
+    B[:, :, 9:] = -(R[1:] - R[0])
+    rows, right = B.reshape(-1, 12), (t[1:] - t[0]).ravel()
+    upper = np.triu_indices(3)
+
+    def residual(unknowns: Array) -> Array:
+        M = unknowns[:9].reshape(3, 3)
+        orthogonality = (M @ M.T - np.eye(3))[upper]
+        return np.concatenate([rows @ unknowns - right, PENALTY**0.5 * orthogonality])
+
+    first = np.linalg.lstsq(rows, right, rcond=None)[0]
+    found = least_squares(residual, first, method="lm", x_scale="jac").x
+    M, sphere = found[:9].reshape(3, 3), found[9:]
+    if np.linalg.det(M) < 0.0:
+        raise ResidualError(
+            "the classic method found a reflection in place of a rotation (det -1): the noise is "
+            "too large for these poses; turn the flange further, or use the method ml"
+        )
+    R_sensor_base = frames.nearest_rotation(M).T
+    in_base = t + R @ sphere
+    shift = np.mean(data.position - in_base @ R_sensor_base.T, axis=0)
+    tools = start.T_flange_target.copy()
+    tools[0, :3, 3] = sphere
+    return CellModel(arm, frames.transform(R_sensor_base, shift), start.targets, tools)
+
+
+KEYS = ("T_sensor_base", "sphere_in_flange_mm", "covariance", "robot", "model_hash")
+QUATERNION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSensor:
+    """A sensor file: ``T_sensor_base`` (4, 4), and ``sphere_in_flange`` (3,), m."""
+
+    T_sensor_base: Array
+    sphere_in_flange: Array
+
+
+def write_sensor(path: Path, document: Document) -> None:
+    """Write the parts of a sensor's document that place it; the file appears whole or not."""
+    write_made(path, document, KEYS, "thermal calibrate-sensor")
+
+
+def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
+    """Read a sensor file for ``arm``.
+
+    Raises
+    ------
+    InputError
+        Naming file and key, when it is not as docs/thermal.md says.
+    WrongRobotError
+        When it was made for another nominal model.
+    """
+    top = read_made(path, arm, KEYS, "sensor file", "calibrate the sensor")
+    pose = top.below("T_sensor_base")
+    quat = np.array(pose.numbers("quat_xyzw", 4))
+    if abs(float(np.linalg.norm(quat)) - 1.0) > QUATERNION_TOLERANCE:
+        raise InputError("T_sensor_base: the quaternion is not of unit length", file=str(path))
+    xyz = np.array(pose.numbers("xyz_mm", 3)) * 1e-3
+    sphere = np.array(top.numbers("sphere_in_flange_mm", 3)) * 1e-3
+    return PlacedSensor(frames.transform_from_quat(xyz, quat), sphere)
+
+
+def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
+    """A placed sensor: where, how well, and whether to trust it.
+
+    ``covariance`` is in SI, of ``covariance_of``.
+    """
+    covariance, sigma = found.covariance, found.sigma
+    to_display = np.array([1e3 if name.endswith("_mm") else np.degrees(1.0) for name in NAMES])
+    fitted = np.linalg.norm(found.residual, axis=1)
+    judged = found.left_out[np.isfinite(found.left_out)]
+    return {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "method": found.method,
+        "T_sensor_base": transform_document(found.T_sensor_base),
+        "sphere_in_flange_mm": (found.sphere_in_flange * 1e3).tolist(),
+        "covariance_of": list(NAMES),
+        "covariance": None if covariance is None else covariance.tolist(),
+        "sigma": None
+        if sigma is None
+        else dict(zip(NAMES, (sigma * to_display).tolist(), strict=True)),
+        "residual": errors_document(summarise(fitted)),
+        "left_out": errors_document(summarise(judged)) if len(judged) else None,
+        "samples": len(fitted),
+        "rejected": list(found.rejected),
+        "verdict": verdict_document(sensor_verdict(found)),
+    }
+
+
+def placed_of(document: Mapping[str, Any]) -> tuple[Array, Array]:
+    """T_sensor_base (4, 4) and the sphere in the flange's frame (3,), m, of a sensor's document."""
+    pose = document["T_sensor_base"]
+    xyz = np.array(pose["xyz_mm"]) * 1e-3
+    T_sensor_base = frames.transform_from_quat(xyz, pose["quat_xyzw"])
+    return T_sensor_base, np.array(document["sphere_in_flange_mm"]) * 1e-3
+
 
 MARGIN_RAD = float(np.radians(5.0))  # from a joint's limit (prismatic: m, a tenth of it)
 CLEAR_RAD = float(np.radians(60.0))  # between the stem and the way from sphere to sensor
@@ -288,9 +541,6 @@ def shortest_way(q: Array) -> tuple[int, ...]:
     orders = np.array(list(permutations(range(len(q)))))
     way = travel[orders[:, :-1], orders[:, 1:]].sum(axis=1)
     return tuple(orders[int(np.argmin(way))].tolist())
-
-
-# ---- poses for a measuring cycle of one cell, and how much better they are than others ----------
 
 
 POSES = 6
