@@ -6,8 +6,8 @@ from bench.closed_loop import setting
 from robocal_ros.correction.inputs import OfferedModel, OfferedTool
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.status import ToldCorrection
-from robocal_ros.maintenance.accuracy import Drift
-from robocal_ros.maintenance.requests import DriverAnswer
+from robocal_ros.maintenance.memory import Drift
+from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.session import ThermalSession
 from robocal_ros.tool.session import ToolSession

@@ -20,10 +20,9 @@ from robocal_ros.bags.bag_recording import (
 from robocal_ros.bags.replay_topics import DIAGNOSTICS, TOPICS, RecordedTopic, RecordedTopics
 from robocal_ros.ground.errors import Code, ConflictError, StorageError
 from robocal_ros.history.history_file import state_folder
-from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, trigger_text
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.ros.run import run
 
 LOOK_S = 0.5
 ROOM_S = 5.0

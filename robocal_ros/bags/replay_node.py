@@ -18,11 +18,10 @@ from robocal_ros.bags.replay_topics import CLOCK, ReplayTopics, chosen_topics
 from robocal_ros.ground.errors import ConflictError, InputError, RobocalError
 from robocal_ros.ground.files import share_folders
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.endpoints import ERROR, LOG_EVERY_S, WARN, Health
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.ros.run import run
 
 TICK_S = 0.002
 BATCH = 200

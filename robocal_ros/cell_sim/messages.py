@@ -37,8 +37,7 @@ from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD, stamp_ns
 from robocal_ros.hand_eye.shots import PROFILE
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import NS, header, transform_message
-from robocal_ros.ros.decision_services import DeferredActionServer
-from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 from robocal_ros.thermal.screening import THRESHOLD_M
 from robocal_ros.tool.crossed_model import StepKind
 from robocal_ros.tool.edges import BeamEdge

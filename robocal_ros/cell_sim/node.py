@@ -36,10 +36,9 @@ from robocal_ros.ground.files import write_text
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import WARN, Health
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.ros.run import run
 from robocal_ros.tool.measuring_plan import PlannedStep
 
 Array = NDArray[np.float64]

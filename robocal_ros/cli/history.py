@@ -26,7 +26,7 @@ from robocal_ros.ground.proposals import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge, damaged_files, known_serials, state_folder
-from robocal_ros.session.decisions import measured_with
+from robocal_ros.session.events import measured_with
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -27,8 +27,7 @@ from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.samples import TAUGHT
-from robocal_ros.ros.decision_services import DeferredActionServer
-from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 
 Result = FollowJointTrajectory.Result
 

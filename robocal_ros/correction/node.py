@@ -46,14 +46,13 @@ from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
-from robocal_ros.motion.messages import StatedController
+from robocal_ros.motion.driver import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.robot_watch import SpeedScaling
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode, run
 from robocal_ros.ros.endpoints import Health, trigger_text
 from robocal_ros.ros.graph import SourceGuard
-from robocal_ros.ros.run import run
 
 Array = NDArray[np.float64]
 

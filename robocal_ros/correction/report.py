@@ -27,7 +27,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros.base import NO_SERIAL
 from robocal_ros.ros.conversions import header, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health
-from robocal_ros.ros.history_settings import acknowledge_history, history_notice, open_history
+from robocal_ros.ros.session_node import acknowledge_history, history_notice, open_history
 
 TELL_S = 1.0  # the status goes out at least so often
 LOOK_S = 0.1  # between two looks at what has changed

@@ -20,8 +20,8 @@ from robocal_ros.kinematics.robots import (
     robot_file_hash,
 )
 from robocal_ros.ros.base import NO_SERIAL
-from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.session_node import STATE_DIR
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,7 @@ from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.base import HistoryFollower
-from robocal_ros.session.decisions import History
-from robocal_ros.session.events import Command
+from robocal_ros.session.events import Command, History
 
 
 @dataclass(frozen=True)

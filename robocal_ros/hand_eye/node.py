@@ -24,13 +24,11 @@ from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.decision_services import DecisionServices
+from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
-from robocal_ros.ros.frame_watch import FrameWatch
-from robocal_ros.ros.run import run
-from robocal_ros.ros.session_node import SessionNode
-from robocal_ros.session.decisions import named
-from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome
+from robocal_ros.ros.graph import FrameWatch
+from robocal_ros.ros.session_node import DecisionServices, SessionNode
+from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome, named
 
 WATCH_S = 0.1
 INPUTS = {

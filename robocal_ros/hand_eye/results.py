@@ -27,8 +27,7 @@ from robocal_ros.hand_eye.result import HandEyeResult, Method, hand_eye_document
 from robocal_ros.hand_eye.shots import IMAGE, Profile, target_poses
 from robocal_ros.hand_eye.targets import target_of
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.session.decisions import History
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Command, History, Outcome
 
 # ---- which estimator answers for which target ---------------------------------------------------
 #

@@ -51,10 +51,9 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import StaticTf, pose_message, transform_message
-from robocal_ros.ros.decision_services import answer, twin
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
 from robocal_ros.ros.parameters import given_pose
-from robocal_ros.ros.session_node import SessionEvents
+from robocal_ros.ros.session_node import SessionEvents, answer, twin
 from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 
 if TYPE_CHECKING:

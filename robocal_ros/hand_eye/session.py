@@ -24,8 +24,7 @@ from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Shot, ShotLog, shot_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.base import Handler, SessionBase, configured_with, recorded_arguments
-from robocal_ros.session.decisions import History, seeded
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Command, History, Outcome, seeded
 
 _NO_SET = "no data set is open: call start, or load one"
 

@@ -17,7 +17,7 @@ from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget, target_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
-from robocal_ros.session.decisions import History
+from robocal_ros.session.events import History
 
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.planning import PlannedTarget, PlanReport, SensorRange

@@ -13,8 +13,8 @@ from robocal_ros.hand_eye.results import METHODS, MOUNTS, WITHOUT_FILE
 from robocal_ros.hand_eye.target_files import KINDS as DESCRIBED
 from robocal_ros.hand_eye.target_files import read_target
 from robocal_ros.hand_eye.targets import KIND_OF, Document, target_document
-from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import STANDSTILL, Setting, length, pose_settings, standstill_rule
+from robocal_ros.ros.session_node import STATE_DIR
 
 
 def _range_fault(values: list[float]) -> str | None:

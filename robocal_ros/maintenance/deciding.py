@@ -27,11 +27,19 @@ from robocal_ros.ground.proposals import (
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.maintenance.hands import Hands
 from robocal_ros.maintenance.memory import MaintenanceConfig
-from robocal_ros.maintenance.requests import Script
-from robocal_ros.session.decisions import History, decide, measured_with
-from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
+from robocal_ros.maintenance.robot_interface import Hands, Script
+from robocal_ros.session.events import (
+    ACCEPT,
+    REJECT,
+    ROLLBACK,
+    WITHHOLD,
+    Command,
+    History,
+    Outcome,
+    decide,
+    measured_with,
+)
 from robocal_ros.thermal.reference import commissioned_of
 from robocal_ros.tool.judging import KnownTool, change_between
 from robocal_ros.tool.laser_frame import LaserFrame
@@ -220,8 +228,6 @@ class Decider:
         outcome = decide(self._history, command, revision, wall_ns, kind)
         return replace(outcome, revision=outcome.revision or revision)
 
-    # ---- without a person -----------------------------------------------------------------------
-
     def withheld(self, calibration_id: int) -> str:
         """Why a candidate waits for a person; empty where it may be accepted without one."""
         bounds = self._config.bounds
@@ -294,9 +300,6 @@ def withholding(kind: str, calibration_id: int, why: str) -> Outcome:
     """A candidate is left to a person, for the record."""
     words = f"{kind} candidate {calibration_id} waits for a decision: {why}"
     return Outcome(Command(WITHHOLD, {"id": calibration_id, "kind": kind}), Code.ACCEPT, words)
-
-
-# ---- settling -----------------------------------------------------------------------------------
 
 
 HELD_S = 2.0  # another process's change is a matter of milliseconds

@@ -21,8 +21,6 @@ from robocal_ros.motion.robot_watch import (
 )
 from robocal_ros.tool.driving import least_s
 
-# ---- ways ---------------------------------------------------------------------------------------
-#
 # Home and the measuring poses are a ring: home is 0, the poses are 1 to k in their order, and a
 # straight joint line leads from each to the next, from the last one home. Nothing else is driven.
 
@@ -172,9 +170,6 @@ class Ways:
         return Route(joined(plans), tuple(lines), tuple(ends.tolist()))
 
 
-# ---- one motion of the robot at a time, supervised; whatever is odd is a reason to stop ---------
-
-
 class FaultError(RobocalError):
     """Something at which the robot must stop, and a person must look."""
 
@@ -309,8 +304,6 @@ class Mover:
     def _require_near(self, away: Array, allowed: Array, what: str) -> None:
         if words := self._off(away, allowed):
             raise FaultError(Code.LIMIT_EXCEEDED, f"robot is not {what}: {words}")
-
-    # ---- motions --------------------------------------------------------------------------------
 
     def start(self, route: Route, now_s: float) -> None:
         """A route was sent."""

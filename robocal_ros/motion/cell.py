@@ -22,9 +22,6 @@ from robocal_ros.motion.plan import (
     stop_time,
 )
 
-# ---- the housing of a beam station, and the tool and flange that must stay clear of it ----------
-
-
 Array = NDArray[np.float64]
 
 
@@ -152,9 +149,6 @@ class ToolBody:
         }
 
 
-# ---- settings of a driven tool measurement ------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class DrivingConfig:
     """What a driven measurement may do.
@@ -178,9 +172,6 @@ class DrivingConfig:
     silence_s: float = 0.1
     late_s: float = 0.15
     armed_s: float = 60.0
-
-
-# ---- a robot with its tool at a station, and the check of a motion along its whole way ----------
 
 
 ROUNDING = 1e-6  # relative, of a speed that is driven at its limit
@@ -307,9 +298,6 @@ class _Sampled:
     speed_m_s: Array
 
 
-# ---- ways between taught poses: straight in the joints, and home from a beam station ------------
-
-
 SHORTEST_WAY_M = 1e-6  # a shorter part of an approach is left out
 SAME_POSTURE_RAD = 0.05  # as the inverse may end beside the taught pose
 
@@ -414,9 +402,6 @@ def corner_ride(cell: MotionCell, here: Array, there: Array) -> Ride:
     """The fastest within the tip's limits."""
     limits = cell.limits
     return Ride.within(way_m(cell, here, there), limits.tcp_speed_m_s, limits.tcp_acceleration_m_s2)
-
-
-# ---- a robot at its station, from files ---------------------------------------------------------
 
 
 def load_motion(arm: SerialArm) -> None:

@@ -1,34 +1,329 @@
-"""Sends the motions of a node to the robot's controller, and says what it makes of them.
+"""Sends the motions of a node to the robot's controller, and reports what it makes of them.
 
 Motions go as goals of FollowJointTrajectory: a rejection, a violated tolerance and an end are then
 known. Where nobody serves that action they go on a topic, which tells nothing. Whoever moves the
 robot holds the cell's motion lease meanwhile (docs/tool.md).
+
+A stop is a plan that first goes on as the robot moves now (`REACTION_S`). Where the controller
+tells its reference, the message is stamped with the controller's own time of the plan's begin: then
+the command goes on along the plan without a step, whatever the hardware tells and however it lags,
+and a stop that comes after its end is rejected. Else it begins when it arrives, where the robot is
+measured; as lines, where the hardware tells no velocities: the controller would begin cubics with
+a speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers 4.42.1).
 """
 
 import time
 import traceback
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Duration, Time
 from control_msgs.action import FollowJointTrajectory
-from control_msgs.msg import JointTrajectoryControllerState
+from control_msgs.msg import JointTolerance, JointTrajectoryControllerState
+from numpy.typing import ArrayLike, NDArray
 from rclpy.action import ActionClient
 from rclpy.task import Future
 from robocal_msgs.msg import MotionLease
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.motion.messages import StatedController
-from robocal_ros.motion.plan import REACTION_S, JointPlan
-from robocal_ros.motion.robot_watch import MotionReport, RobotWatch, SpeedScaling
-from robocal_ros.motion.settings import trajectory_message
+from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.motion.cell import DrivingConfig, Housing
+from robocal_ros.motion.plan import LEAD_S, REACTION_S, JointPlan, MotionLimits
+from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport, RobotWatch, SpeedScaling
 from robocal_ros.ros import conversions, endpoints
+from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
-from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.parameters import Setting, length
+
+Array = NDArray[np.float64]
+
+LINES_S = 0.01  # between points for a controller that has no velocities
+STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
+SPOKEN_S = 1.0  # a controller whose state is newer tells whether there are velocities
+BESIDE = 1e-3  # rad (m); a plan that passes the controller's reference further off is not of it
+GRID_S = 1e-3  # instants of a plan that a reference is looked for at
+PACE_S = 0.01  # of two instants as near to it the one counts that is as fast
+AT_REST = 5e-3  # rad/s (m/s); slower references move nothing
+
+
+class StatedController:
+    """What a controller says of itself; times of a steady clock.
+
+    Attributes
+    ----------
+    velocities : whether the hardware has any, as far as it is told.
+    held_s : when one that pauses was last seen to give up a motion: its reference came to rest.
+    """
+
+    def __init__(self) -> None:
+        self._heard_s, self._ahead_s = -np.inf, np.inf
+        self._stated: tuple[int, tuple[str, ...], Array, Array] | None = None
+        self._paused_speed = 0.0  # of the reference, in a pause
+        self.velocities, self.held_s = True, -np.inf
+
+    def take(self, message: Any, scaling: float | None, now_s: float) -> None:
+        """Take a ``JointTrajectoryControllerState``; ``scaling``: None where nobody tells it."""
+        names, reference = tuple(message.joint_names), message.reference
+        self._tells(np.array(message.feedback.velocities, dtype=np.float64), len(names))
+        at_ns, before_s = stamp_ns(message.header.stamp), self._ahead_s
+        self._heard_s, self._ahead_s, self._stated = now_s, at_ns / NS - now_s, None
+        if len(reference.positions) != len(names) or len(reference.velocities) != len(names):
+            return  # a controller that holds may leave them out
+        q, qd = np.array(reference.positions), np.array(reference.velocities)
+        if not (np.isfinite(q).all() and np.isfinite(qd).all()):
+            return
+        if abs(self._ahead_s - before_s) < STATED_S:
+            self._stated = at_ns, names, q, qd
+        before, self._paused_speed = self._paused_speed, 0.0
+        if scaling == 0.0:
+            self._paused_speed = float(np.max(np.abs(qd), initial=0.0))
+            if self._paused_speed < AT_REST <= before:
+                self.held_s = now_s
+
+    def hear(self, velocity: ArrayLike, count: int, now_s: float) -> None:
+        """Take velocities of ``count`` joint states: they count where the controller is silent.
+
+        Some hardware says 0 in motion; a stop of a robot that stands may be of either kind.
+        """
+        if now_s - self._heard_s > SPOKEN_S:
+            self._tells(np.asarray(velocity, dtype=np.float64), count)
+
+    def _tells(self, speeds: Array, count: int) -> None:
+        self.velocities = bool(len(speeds) == count and np.isfinite(speeds).all() and speeds.any())
+
+    def reference(
+        self, names: Sequence[str], now_s: float, scaling: float | None
+    ) -> tuple[Array, Array] | None:
+        """Joints and unscaled velocities (k,) where the controller is now; None: not known."""
+        if (found := self._find(names, now_s)) is None:
+            return None
+        _, q, qd = found
+        gone_s = (now_s - self._heard_s) * (1.0 if scaling is None else scaling)
+        return q + qd * gone_s, qd
+
+    def _find(self, names: Sequence[str], now_s: float) -> tuple[int, Array, Array] | None:
+        if self._stated is None or now_s - self._heard_s > STATED_S:
+            return None
+        at_ns, of, q, qd = self._stated
+        if not set(names) <= set(of):
+            return None
+        index = [of.index(name) for name in names]
+        return at_ns, q[index], qd[index]
+
+    def stop_message(
+        self,
+        plan: JointPlan,
+        names: Sequence[str],
+        now_s: float,
+        scaling: float | None,
+        *,
+        at_s: float = 0.0,
+        first_s: float = LEAD_S,
+        trusted: bool = True,
+    ) -> JointTrajectory:
+        """A stop by a plan that is at its time ``at_s`` now, and still goes on for `REACTION_S`.
+
+        ``first_s``: first point of a message that is not stamped, ahead of its arrival;
+        ``trusted``: whether it may be stamped.
+        """
+        begin_ns = self._begin_ns(plan, names, now_s, scaling, at_s) if trusted else None
+        if begin_ns is not None:
+            message = joint_trajectory(names, plan.time_s, plan.q, plan.qd)
+            message.header.stamp = Time(sec=begin_ns // NS, nanosec=begin_ns % NS)
+            return message
+        since_s = at_s + REACTION_S
+        last_s = plan.duration_s - since_s
+        first_s = min(first_s, last_s)
+        if self.velocities:
+            ahead = plan.time_s - since_s
+            times = np.append(first_s, ahead[ahead > first_s + 1e-4])
+        else:
+            times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / LINES_S)) + 1)
+        q, qd = plan.at(times + since_s)
+        qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest
+        return joint_trajectory(names, times, q, qd if self.velocities else None)
+
+    def _begin_ns(
+        self,
+        plan: JointPlan,
+        names: Sequence[str],
+        now_s: float,
+        scaling: float | None,
+        at_s: float,
+    ) -> int | None:
+        """When the controller is where the plan begins, by its own clock; None: not known.
+
+        Where the plan, before its begin at the speed of its begin, passes the reference. A scaled
+        clock counts from a stamp on as if it were not.
+        """
+        found = self._find(names, now_s)
+        if found is None or scaling not in (None, 1.0):
+            return None
+        stated_ns, q, qd = found
+        times = np.arange(-STATED_S, at_s + STATED_S, GRID_S)
+        places, speeds = plan.at(np.maximum(times, 0.0))
+        places = places + np.minimum(times, 0.0)[:, None] * plan.qd[0]
+        away = np.sum((places - q) ** 2 + (PACE_S * (speeds - qd)) ** 2, axis=1)
+        k = int(np.argmin(away))
+        way, speed = q - places[k], speeds[k]
+        if not (qd @ qd > 0.0 and speed @ speed > 0.0):
+            return None
+        after_s = float(way @ speed) / float(speed @ speed)
+        if abs(after_s) > GRID_S or np.max(np.abs(way - after_s * speed)) > BESIDE:
+            return None
+        return stated_ns - round((times[k] + after_s) * NS)
+
+
+def joint_trajectory(
+    names: Sequence[str], times: Array, q: Array, qd: Array | None
+) -> JointTrajectory:
+    """Points at times (k,) with joints (k, n), and velocities where there are any."""
+    message = JointTrajectory(joint_names=list(names))
+    for i, ns in enumerate(np.round(times * NS).astype(np.int64).tolist()):
+        point = JointTrajectoryPoint(positions=array("d", q[i].tobytes()))
+        if qd is not None:
+            point.velocities = array("d", qd[i].tobytes())
+        point.time_from_start = Duration(sec=ns // NS, nanosec=ns % NS)
+        message.points.append(point)
+    return message
+
+
+GOAL_TIME_S = 12  # the nodes wait less for a robot that does not come to rest where a motion ends
+
+
+def _of_joints(name: str, default: float, what: str, unit: str) -> Setting:
+    words = f"{what}; one for all joints or one for each"
+    return Setting(name, [default], words, unit=unit, low=1e-3, high=1e4)
+
+
+MOTION = (
+    _of_joints("joint_velocity_deg_s", 57.0, "Largest velocity", "deg/s"),
+    _of_joints("joint_acceleration_deg_s2", 286.0, "Largest acceleration", "deg/s^2"),
+    _of_joints("stop_deceleration_deg_s2", 573.0, "Deceleration of a stop", "deg/s^2"),
+    Setting("tcp_speed_mm_s", 50.0, "Largest speed of the tip", unit="mm/s", low=1.0, high=250.0),
+    Setting(
+        "tcp_acceleration_mm_s2",
+        1200.0,
+        "Largest acceleration of the tip on its path",
+        unit="mm/s^2",
+        low=1.0,
+        high=10000.0,
+    ),
+    length("opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3),
+    length("housing_top_mm", 30.0, "Height of the housing above the beams", 0.0, 1e3),
+    length("housing_depth_mm", 120.0, "Depth of the opening below the beams", 1.0, 1e3),
+    length("housing_reach_mm", 0.0, "Radius of the housing; 0: it never ends", 0.0, 1e4),
+    length("retract_mm", 50.0, "Height of the tip above the beams on its way", 1.0, 2e3),
+    length("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
+    length("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
+    length("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
+    length("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
+    Setting(
+        "deviation_deg",
+        0.5,
+        "A joint so far from its plan stops the robot; the tip, see deviation_mm",
+        unit="deg",
+        low=0.01,
+        high=10.0,
+    ),
+    Setting(
+        "motion_silence_s",
+        0.1,
+        "Joint states may pause for so long while the robot moves",
+        unit="s",
+        low=0.02,
+        high=0.5,
+    ),
+    Setting(
+        "motion_late_s",
+        0.15,
+        "The robot lags at most so far behind its trajectory",
+        unit="s",
+        low=0.01,
+        high=1.0,
+    ),
+)
+
+
+def driving_config(settings: Mapping[str, Any], **plunge: float) -> DrivingConfig:
+    """Settings of what moves, in SI; ``plunge``: further limits of `MotionLimits`.
+
+    Raises
+    ------
+    InputError
+        When sizes contradict each other.
+    """
+    return DrivingConfig(
+        housing=Housing(
+            clear_radius_m=settings["opening_radius_mm"] * 1e-3,
+            top_m=settings["housing_top_mm"] * 1e-3,
+            floor_m=-settings["housing_depth_mm"] * 1e-3,
+            retract_m=settings["retract_mm"] * 1e-3,
+            reach_m=settings["housing_reach_mm"] * 1e-3 or np.inf,
+        ),
+        tool_length_m=settings["tool_length_mm"] * 1e-3,
+        tool_radius_m=settings["tool_radius_mm"] * 1e-3,
+        flange_radius_m=settings["flange_radius_mm"] * 1e-3,
+        limits=MotionLimits(
+            joint_velocity=np.radians(settings["joint_velocity_deg_s"]),
+            joint_acceleration=np.radians(settings["joint_acceleration_deg_s2"]),
+            stop_deceleration=np.radians(settings["stop_deceleration_deg_s2"]),
+            tcp_speed_m_s=settings["tcp_speed_mm_s"] * 1e-3,
+            tcp_acceleration_m_s2=settings["tcp_acceleration_mm_s2"] * 1e-3,
+            **plunge,
+        ),
+        deviation_m=settings["deviation_mm"] * 1e-3,
+        deviation_rad=float(np.radians(settings["deviation_deg"])),
+        silence_s=settings["motion_silence_s"],
+        late_s=settings["motion_late_s"],
+    )
+
+
+def require_limits(arm: SerialArm, config: DrivingConfig) -> None:
+    """Refuse to move a robot whose limits are not known.
+
+    Raises
+    ------
+    InputError
+        When a limit is given for another number of joints, or the robot has none.
+    """
+    config.limits.of_joints(arm)
+    if not np.all(np.isfinite([arm.lower, arm.upper])):
+        raise InputError(f"{arm.name} has joints without limits: add them to the robot file")
+
+
+def goal_tolerances(arm: SerialArm, config: DrivingConfig) -> dict[str, Any]:
+    """Tolerances of what moves, as fields of a FollowJointTrajectory goal; wider than `RobotWatch`.
+
+    A controller compares places of one instant: a robot that lags as much as is allowed is beside
+    its place by that way. They do not go by a plan's speeds, as joint_trajectory_controller 4.42.1
+    judges what comes on its topic later by those of the last goal.
+    """
+    near = np.where(arm.prismatic, config.deviation_m, config.deviation_rad)
+    lag = config.limits.of_joints(arm)[0] * (config.late_s + UNSAID_S)
+
+    def of_joints(allowed: NDArray[np.float64]) -> list[JointTolerance]:
+        named = zip(arm.joint_names, allowed.tolist(), strict=True)
+        return [JointTolerance(name=name, position=position) for name, position in named]
+
+    return {
+        "path_tolerance": of_joints(near + lag),
+        "goal_tolerance": of_joints(near),
+        "goal_time_tolerance": Duration(sec=GOAL_TIME_S),
+    }
+
+
+def trajectory_message(plan: JointPlan, names: Sequence[str]) -> JointTrajectory:
+    """A plan for a trajectory controller, which begins when it arrives."""
+    return joint_trajectory(names, *plan.points())
+
 
 CONTROLLER = (
     Setting(
@@ -101,8 +396,6 @@ class MotionDriver:
         if self._client is not None:
             self._client.destroy()
         self._client = None
-
-    # ---- motions --------------------------------------------------------------------------------
 
     def send(self, plan: JointPlan, *, stop: bool) -> None:
         """Send a motion, which takes the place of what the controller drives.
@@ -180,8 +473,6 @@ class MotionDriver:
 
         client.call_async(Trigger.Request()).add_done_callback(guarded(self._node, told))
 
-    # ---- what the controller says ---------------------------------------------------------------
-
     def _take_state(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()
         names = tuple(message.joint_names)
@@ -255,3 +546,36 @@ class LeaseHolder:
                 purpose=purpose,
             )
         )
+
+
+class SteadyClock:
+    """Seconds that no setting of the clock changes, those of a suspended host included.
+
+    What was heard before it was suspended is old when it wakes. A motion is not: the controller of
+    the same host stood still with it.
+
+    Parameters
+    ----------
+    slept : takes for how long the host was suspended, before a time of afterwards is given out.
+    """
+
+    def __init__(self, slept: Callable[[float], None]) -> None:
+        self._slept = slept
+        self._asleep_s = _both()[1]
+
+    def now_s(self) -> float:
+        """What it shows."""
+        now_s, asleep_s = _both()
+        if asleep_s > self._asleep_s:
+            for_s, self._asleep_s = asleep_s - self._asleep_s, asleep_s
+            self._slept(for_s)
+        return now_s
+
+
+def _both() -> tuple[float, float]:
+    """The time, and how much of it the host was asleep, at least.
+
+    The second clock is read later: what passes in between makes it less, never more.
+    """
+    now_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return now_s, now_s - time.clock_gettime(time.CLOCK_MONOTONIC)

@@ -120,9 +120,6 @@ def joined(plans: Sequence[JointPlan]) -> JointPlan:
     )
 
 
-# ---- a way over time: from rest to a constant speed and back to rest, smoothly ------------------
-
-
 SHORTEST_RAMP_S = 0.07  # a controller smooths over some of its cycles
 SPACING_S = 0.01  # of points; the cubic between two of a circle of 12 mm misses by nanometres
 MOST_POINTS = 200  # of one phase
@@ -190,9 +187,6 @@ class Ride:
 def ramp_of(speed_m_s: float, acceleration_m_s2: float) -> float:
     """Duration of a ramp up to a speed, s."""
     return max(SHORTEST_RAMP_S, 1.5 * speed_m_s / acceleration_m_s2)
-
-
-# ---- paths of a tool's tip over time: straight lines, circles, plunges --------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,9 +267,6 @@ def _shifted(T: Array, time: Array, shift: Array, velocity: Array, acceleration:
     return TipPath(time, poses, np.hstack([velocity, still]), np.hstack([acceleration, still]))
 
 
-# ---- what a measuring motion may demand of robot and tool ---------------------------------------
-
-
 # How far from where a step begins each joint may stand.
 START_NEAR_RAD = float(np.radians(0.02))
 START_NEAR_M = 5e-5  # prismatic
@@ -329,9 +320,6 @@ class MotionLimits:
 def start_near(arm: SerialArm) -> Array:
     """How far (n,) from where a motion begins each joint may stand, rad (m)."""
     return np.where(arm.prismatic, START_NEAR_M, START_NEAR_RAD)
-
-
-# ---- stops after a fault: how long they take is known before ------------------------------------
 
 
 # A controller lags or leads its readings by some of its cycles: a shorter stop would throw it back.

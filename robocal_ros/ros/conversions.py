@@ -182,9 +182,6 @@ def pose_message(T: Any) -> Pose:
     return message
 
 
-# ---- joint poses as parameters: a text of numbers for each, in degrees --------------------------
-
-
 Array = NDArray[np.float64]
 
 MM = 1e-3
@@ -224,9 +221,6 @@ def _pose(arm: SerialArm, text: str, name: str) -> Array:
     except ValueError as error:
         raise InputError(f"{name}: '{text}' is no list of numbers") from error
     return joints_of(arm, numbers, name)
-
-
-# ---- transforms onto ``/tf_static``, where this machine has its message -------------------------
 
 
 class StaticTf:

@@ -8,8 +8,11 @@ from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
+from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State
+from rclpy.action import ActionServer
+from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -22,8 +25,6 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.session.base import MOST_REASONS, kind_of
-
-# ---- the named QoS profiles of all nodes, and the policies that a user may override -------------
 
 
 def _profile(
@@ -66,9 +67,6 @@ def own(profile: QoSProfile) -> QoSProfile:
 def overridable() -> QoSOverridingOptions:
     """Let a user set history, depth and reliability (parameters ``qos_overrides.<topic>.…``)."""
     return QoSOverridingOptions.with_default_policies()
-
-
-# ---- endpoints ----------------------------------------------------------------------------------
 
 
 LOG_EVERY_S = 5.0
@@ -315,9 +313,6 @@ def _defect(error: Exception) -> str:
     return f"a defect of this software, please report it: {type(error).__name__}: {error}"
 
 
-# ---- one diagnostic status per node -------------------------------------------------------------
-
-
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
@@ -369,3 +364,42 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+
+RESULT_KEPT_S = 60  # for callers that ask late
+
+
+class DeferredActionServer(ActionServer):
+    """A goal begins with ``goal.execute()`` and goes on until `end`: no coroutine waits for it.
+
+    ``callbacks`` go to rclpy; ``handle_accepted_callback`` takes the place of an execute callback.
+    """
+
+    def __init__(self, node: EndpointNode, kind: Any, name: str, **callbacks: Any) -> None:
+        self._host = node
+        unused = kind.Result
+        super().__init__(node, kind, name, unused, result_timeout=RESULT_KEPT_S, **callbacks)
+
+    def notify_execute(
+        self, goal_handle: ServerGoalHandle, execute_callback: Callable[..., Any] | None
+    ) -> None:
+        """Let rclpy run a callback whose return ends the goal; without one the goal goes on."""
+        if execute_callback is not None and self._host.executor is not None:
+            super().notify_execute(goal_handle, execute_callback)
+
+    def end(self, goal: ServerGoalHandle, status: int, result: Any) -> None:
+        """End a goal with a status of `GoalStatus`; one that its caller did not cancel, aborted.
+
+        Without an executor, when the process ends, nobody is told: the action goes anyway.
+        """
+
+        def finish(goal: ServerGoalHandle) -> Any:
+            if status == GoalStatus.STATUS_SUCCEEDED:
+                goal.succeed()
+            elif status == GoalStatus.STATUS_CANCELED and goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+            return result
+
+        self.notify_execute(goal, finish)

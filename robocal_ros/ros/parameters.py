@@ -234,9 +234,6 @@ def _without_blanks(value: Any) -> Any:
     return [item for item in value if item != ""]
 
 
-# ---- a pose as two parameters: millimetres and a quaternion -------------------------------------
-
-
 ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 
 
@@ -276,9 +273,6 @@ def given_pose(settings: Mapping[str, Any], name: str) -> NDArray[np.float64] | 
     if abs(norm - 1.0) > 1e-3:
         raise InputError(f"{name}_quat_xyzw has length {norm:.6g}, not 1")
     return frames.transform_from_quat(1e-3 * np.array(xyz_mm), np.array(quat) / norm)
-
-
-# ---- parameters of the nodes that measure at standstill -----------------------------------------
 
 
 STANDSTILL = (

@@ -1,28 +1,207 @@
-"""A node that drives a session with live messages and calls."""
+"""A node that drives a session with live messages and calls: its history, clocks and services."""
 
+import json
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from robocal_msgs.msg import SessionEvent
+from robocal_msgs.srv import Decide, ListCalibrations
+from std_srvs.srv import Trigger
 
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError, WrongRobotError
+from robocal_ros.ground.files import StateFile
 from robocal_ros.ground.proposals import Head
-from robocal_ros.ground.samples import JOINTS
+from robocal_ros.ground.samples import JOINTS, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_file import acknowledge, damage_notice, history_path, state_folder
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.ros.base import POLL_S, HouseNode
-from robocal_ros.ros.clocks import StampWatch
-from robocal_ros.ros.conversions import time_message
-from robocal_ros.ros.endpoints import ERROR, EndpointNode, Health, NotActiveError
+from robocal_ros.kinematics.robots import robot_file_hash
+from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.ros.conversions import summary_message, time_message
+from robocal_ros.ros.endpoints import (
+    ERROR,
+    WARN,
+    EndpointNode,
+    Health,
+    NotActiveError,
+    trigger_text,
+)
 from robocal_ros.ros.graph import SourceGuard
-from robocal_ros.ros.history_settings import open_history, warn_of_history
+from robocal_ros.ros.parameters import Setting
 from robocal_ros.session.base import Ignored
-from robocal_ros.session.events import CONFIGURE, Command, Outcome, arguments_text, outcome_text
+from robocal_ros.session.events import (
+    ACCEPT,
+    CONFIGURE,
+    NEWEST,
+    ONLY,
+    REJECT,
+    ROLLBACK,
+    Command,
+    Outcome,
+    arguments_text,
+    outcome_text,
+)
+
+
+class DataClock:
+    """The samples' clock, read between them too: ROS time runs on where they pause."""
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self._read_ns = 0
+
+    def at(self, newest_ns: int | None, now_ns: int) -> int:
+        """Time of the samples' clock at ROS time ``now_ns``; that itself before the first."""
+        if newest_ns is None:
+            return now_ns
+        if newest_ns != self._newest_ns:
+            self._newest_ns, self._read_ns = newest_ns, now_ns
+        return newest_ns + max(now_ns - self._read_ns, 0)
+
+
+AHEAD_S = 0.1  # hosts that NTP keeps are some ms apart; a busy host makes messages old, not early
+SILENT_S = 5.0
+
+
+class StampWatch:
+    """Judges inputs by receive time, beside the sessions, which go by the stamps alone.
+
+    An input is ahead where every message since the last look was: one wrong stamp is the sessions'
+    to leave out. With simulated time the stamps are the clock, and only silence is judged.
+
+    Parameters
+    ----------
+    node : its clock is what stamps are compared with.
+    needed : the topic whose silence is worth a warning once it has been heard.
+    """
+
+    def __init__(self, node: EndpointNode, needed: str) -> None:
+        self._node, self._needed = node, needed
+        self._simulated = bool(node.get_parameter("use_sim_time").value)
+        self._least_ns: dict[str, int] = {}  # smallest lead of the stamps since the last look
+        self._ahead_ns: dict[str, int] = {}  # as the last look found it
+        self._heard_s: dict[str, float] = {}  # steady clock
+
+    def note(self, topic: str, message: Any) -> None:
+        """Take notice of a message that has come in."""
+        self._heard_s[topic] = time.monotonic()
+        if not self._simulated:
+            lead = stamp_ns(message.header.stamp) - self._node.now_ns()
+            self._least_ns[topic] = min(lead, self._least_ns.get(topic, lead))
+
+    def judge(self, health: Health) -> dict[str, object]:
+        """Add what is wrong to a node's health; returns figures of each input."""
+        self._ahead_ns |= self._least_ns
+        self._least_ns.clear()
+        for topic, lead in self._ahead_ns.items():
+            if lead > AHEAD_S * 1e9:
+                health.worsen(
+                    ERROR,
+                    f"{topic} is stamped {lead * 1e-9:.2f} s ahead of this host's clock: set the "
+                    "clocks of both (NTP or PTP)",
+                )
+        now = time.monotonic()
+        silent = {topic: now - heard for topic, heard in self._heard_s.items()}
+        if silent.get(self._needed, 0.0) > SILENT_S:
+            health.worsen(
+                WARN, f"{self._needed} is silent for {silent[self._needed]:.0f} s: check its driver"
+            )
+        return {f"{topic} last received s ago": f"{s:.1f}" for topic, s in silent.items()}
+
+
+STATE_DIR = Setting(
+    "state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"
+)
+
+
+def open_history(
+    settings: Mapping[str, Any], nominal: SerialArm, sole_user: str = "", *, owner: bool = True
+) -> tuple[str, CalibrationHistory]:
+    """The serial in use and its history; ``sole_user``: a node of which a robot has one at most.
+
+    ``owner``: a damaged history is set aside; who only adds to it is refused.
+
+    Raises
+    ------
+    RobocalError
+        As `CalibrationHistory.open`; also where no serial is set and the history was begun with
+        another robot file: nothing else tells two robots of one type apart.
+    """
+    serial, state_dir = settings["serial"] or NO_SERIAL, _folder(settings)
+    history = CalibrationHistory.open(
+        serial,
+        model_hash=nominal.model_hash,
+        state_dir=state_dir,
+        sole_user=sole_user,
+        owner=owner,
+    )
+    if serial == NO_SERIAL:
+        try:
+            _require_robot_file(history, nominal, settings["robot"])
+        except BaseException:
+            history.close()
+            raise
+    return serial, history
+
+
+def _require_robot_file(history: CalibrationHistory, nominal: SerialArm, robot: str) -> None:
+    """Refuse a nameless history that was begun with another robot file than this one."""
+    kept = StateFile(history.path, "robot_file")
+    own, known = {"robot": nominal.name, "robot_file_hash": robot_file_hash(robot)}, kept.load()
+    if known is None:
+        kept.save(own)
+    elif known != own:
+        raise WrongRobotError(
+            f"no serial is set, and {history.path} was begun with another robot file (hash "
+            f"{known.get('robot_file_hash')} of robot '{known.get('robot')}', this is "
+            f"{own['robot_file_hash']} of '{nominal.name}'): set the serial of each robot; if it "
+            f"is the same robot with its file changed, remove the folder {kept.path.parent}"
+        )
+
+
+def history_notice(settings: Mapping[str, Any]) -> str:
+    """Tell of a damaged history that nobody has acknowledged; empty without one.
+
+    For a node that does not hold the history open.
+    """
+    folder = _folder(settings) or state_folder()
+    return damage_notice(history_path(settings["serial"] or NO_SERIAL, folder))
+
+
+def acknowledge_history(settings: Mapping[str, Any], by: str) -> None:
+    """Write down that somebody knows of a damaged history.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be written.
+    """
+    folder = _folder(settings) or state_folder()
+    acknowledge(history_path(settings["serial"] or NO_SERIAL, folder), by, time.time_ns())
+
+
+def _folder(settings: Mapping[str, Any]) -> Path | None:
+    folder = settings[STATE_DIR.name]
+    return Path(folder) if folder else None
+
+
+def warn_of_history(health: Health, history: CalibrationHistory) -> None:
+    """Tell of a damaged history that nobody has acknowledged, and that no serial is set."""
+    if notice := damage_notice(history.path):
+        health.worsen(WARN, notice)
+    if history.serial == NO_SERIAL:
+        health.worsen(
+            WARN,
+            f"no serial is set: the history is kept as '{NO_SERIAL}', and only the robot file "
+            "tells this robot from another one of its type",
+        )
+
 
 # A recorder that comes later still gets the events.
 EVENTS = QoSProfile(
@@ -177,9 +356,6 @@ class CommandDesk:
         self.step(force=True)
 
 
-# ---- the node -----------------------------------------------------------------------------------
-
-
 SessionT = TypeVar("SessionT", bound=Session)
 
 
@@ -197,8 +373,6 @@ class SessionNode(HouseNode, Generic[SessionT]):
         super().__init__(**options)
         self._session: SessionT | None = None
         self._history: CalibrationHistory | None = None
-
-    # ---- what a node fills in -------------------------------------------------------------------
 
     def new_session(self, history: CalibrationHistory) -> SessionT:
         """The session of an active node."""
@@ -221,8 +395,6 @@ class SessionNode(HouseNode, Generic[SessionT]):
 
     def report(self, session: SessionT, history: CalibrationHistory, health: Health) -> None:
         """Add to ``health`` what is of this node alone."""
-
-    # ---- what it opens and closes ---------------------------------------------------------------
 
     def open_session(
         self, command_s: float = COMMAND_S, *, sole: bool = True
@@ -261,8 +433,6 @@ class SessionNode(HouseNode, Generic[SessionT]):
         if self._history is not None:
             self._history.close()
         self._history = None
-
-    # ---- samples, commands, outcomes ------------------------------------------------------------
 
     def _taker(self, kind: str) -> Callable[[Any], None]:
         def take(message: Any) -> None:
@@ -309,3 +479,95 @@ class SessionNode(HouseNode, Generic[SessionT]):
             health.worsen(ERROR, fault)
         warn_of_history(health, history)
         return health
+
+
+LIST_LIMIT = 50
+TWIN = "trigger"
+
+AddService = Callable[[type, str, Callable[[Any, Any], Any]], None]
+Ask = Callable[[Command], Awaitable[Outcome]]
+
+
+class DecisionServices:
+    """Services about the calibrations of one kind.
+
+    Parameters
+    ----------
+    add : creates a service.
+    ask : gives a command to the session and awaits its outcome.
+    """
+
+    def __init__(self, add: AddService, ask: Ask, history: CalibrationHistory, kind: str) -> None:
+        self._ask, self._history, self._kind = ask, history, kind
+        add(ListCalibrations, "~/list", self._list)
+        add(Trigger, "~/list_trigger", self._list_twin)
+        for name in (ACCEPT, REJECT, ROLLBACK):
+            add(Decide, f"~/{name}", self._decide(name))
+        add(Trigger, "~/accept_trigger", twin(ask, ACCEPT, {"choose": ONLY}))
+        add(Trigger, "~/reject_trigger", self._reject_twin)
+        add(Trigger, "~/rollback_trigger", twin(ask, ROLLBACK, {"previous": True}))
+
+    def _decide(self, name: str) -> Callable[[Any, Any], Any]:
+        async def decide(request: Any, response: Any) -> Any:
+            if name != ROLLBACK and request.id == 0:
+                raise InputError(f"{name} needs the id of a calibration; look at the list")
+            arguments = {"id": request.id, "by": request.by, "reason": request.reason}
+            outcome = await self._ask(Command(name, arguments))
+            response.revision = outcome.revision
+            return answer(response, outcome)
+
+        return decide
+
+    def _list(self, request: Any, response: Any) -> Any:
+        entries = self._history.list(request.limit or LIST_LIMIT)
+        response.calibrations = [summary_message(entry) for entry in entries]
+        response.success, response.status = True, int(Code.ACCEPT)
+        return response
+
+    def _list_twin(self, request: Any, response: Any) -> Any:
+        lines = [
+            {
+                "id": entry.id,
+                "revision": entry.revision,
+                "kind": entry.kind,
+                "state": entry.state.value,
+                "code": entry.code.name,
+                "cycle_id": entry.cycle_id,
+                "candidate_rms_mm": entry.candidate_rms_mm,
+            }
+            for entry in self._history.list(LIST_LIMIT)
+        ]
+        response.success, response.message = True, json.dumps(lines, allow_nan=False)
+        return response
+
+    async def _reject_twin(self, request: Any, response: Any) -> Any:
+        """Reject all that is pending: a PLC's way out when the accept twin may not choose."""
+        reject_one = twin(self._ask, REJECT, {"choose": NEWEST})
+        await reject_one(request, response)
+        while response.success and self._history.pending(self._kind):
+            await reject_one(request, response)
+        return response
+
+
+def twin(ask: Ask, name: str, arguments: Mapping[str, Any]) -> Callable[..., Any]:
+    """A Trigger that gives one command; its message is `trigger_text`."""
+
+    async def trigger(request: Any, response: Any) -> Any:
+        try:
+            outcome = await ask(Command(name, {"by": TWIN, **arguments}))
+        except RobocalError as error:  # deactivated meanwhile
+            response.message = trigger_text(0, error.code, str(error))
+            return response
+        response.success = outcome.done
+        response.message = trigger_text(outcome.calibration_id, outcome.status, outcome.message)
+        return response
+
+    return trigger
+
+
+def answer(response: Any, outcome: Outcome) -> Any:
+    """Put an outcome into a response with ``success``, ``message`` and ``status``."""
+    response.success = outcome.done
+    response.message = outcome.message
+    response.status = int(outcome.status)
+    return response

@@ -13,17 +13,19 @@ from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample
 from robocal_ros.ground.streams import JointStream
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.decisions import (
+from robocal_ros.session.events import (
     BY,
+    CONFIGURE,
+    Command,
     History,
+    Outcome,
     bring_into_force,
     decide,
+    joints_awaited_ns,
     outside_decision,
+    reached,
     require_robot,
 )
-from robocal_ros.session.events import CONFIGURE, Command, Outcome, joints_awaited_ns, reached
-
-# ---- followed -----------------------------------------------------------------------------------
 
 
 class HistoryFollower:
@@ -71,9 +73,6 @@ class HistoryFollower:
         return [d for d in decided if d.kind == self._kind and d.wall_ns != own_wall_ns]
 
 
-# ---- what a session did not use, by topic and reason --------------------------------------------
-
-
 MOST_REASONS = 30
 _NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
 
@@ -113,9 +112,6 @@ class Ignored(dict[str, Counter[str]]):
             for topic, counter in self.items()
         ]
         return f"ignored: {', '.join(parts)}" if parts else ""
-
-
-# ---- a session's commands in their turn, and the joint readings whose stamps they go by ---------
 
 
 WHILE = "in force while this was recorded"
@@ -262,9 +258,6 @@ class SessionBase:
         else:
             bring_into_force(self._history, THERMAL, self.nominal, model, __version__, WHILE)
         return Outcome(command, Code.ACCEPT, f"thermal model {WHILE}")
-
-
-# ---- what the configuration records of all commanded sessions have in common --------------------
 
 
 Document = Mapping[str, Any]

@@ -1,13 +1,20 @@
-"""Commands to a session and what came of them: the record that replay obeys."""
+"""Commands to a session and what came of them: the record that replay obeys.
+
+Decisions about calibrations are commands to the history.
+"""
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
-from robocal_ros.ground.errors import Code, InputError, RobocalError
+from numpy.typing import NDArray
+
+from robocal_ros.ground.errors import Code, InputError, RobocalError, WrongRobotError
+from robocal_ros.ground.proposals import BEFORE_ANY, THERMAL, TOOL, Decision, Entry, Head, Proposal
 from robocal_ros.ground.samples import JOINTS, JUMPS
+from robocal_ros.kinematics import SerialArm
 
 CONFIGURE = "configure"
 CALIBRATE_SENSOR = "calibrate_sensor"
@@ -116,9 +123,6 @@ def joints_awaited_ns(marks: Mapping[str, int], newest_ns: Mapping[str, int]) ->
     return wanted if newest_ns.get(JOINTS, -1) < wanted else None
 
 
-# ---- commands and outcomes as the texts of ``robocal_msgs/SessionEvent``, and back --------------
-
-
 VERSION = 1
 
 
@@ -172,3 +176,231 @@ def read_command(name: str, stamp_ns: int, arguments: str) -> Command:
         return Command(name, dict(record["arguments"]), stamp_ns, marks)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"session event '{name}' cannot be read: {error}") from error
+
+
+class History(Protocol):
+    """The part of ``history.calibrations.CalibrationHistory`` that sessions use."""
+
+    serial: str
+
+    def propose(self, proposal: Proposal) -> int:
+        """Keep a candidate and return its id."""
+
+    def accept(
+        self,
+        calibration_id: int,
+        *,
+        by: str,
+        reason: str,
+        expected_head: int | None,
+        wall_ns: int,
+        with_heads: Mapping[str, int] | None = ...,
+    ) -> Head:
+        """Bring a candidate into force; ``with_heads``: only beside these revisions, by kind."""
+
+    def reject(self, calibration_id: int, *, by: str, reason: str, wall_ns: int) -> None:
+        """Refuse a candidate for good."""
+
+    def rollback(
+        self,
+        to: int | None,
+        *,
+        by: str,
+        reason: str,
+        expected_head: int | None,
+        wall_ns: int,
+        kind: str = ...,
+    ) -> Head:
+        """Return to an earlier calibration, or to nominal."""
+
+    def head(self, kind: str = ...) -> Head:
+        """What is in force."""
+
+    def pending(self, kind: str = ..., limit: int = ...) -> Sequence[Entry]:
+        """Candidates that wait for a decision, newest first; ``limit``: so many at the most."""
+
+    def decisions(self, after_seq: int = ..., newest: int = ...) -> Sequence[Decision]:
+        """Decisions after a sequence number, oldest first; ``newest``: so many at the most."""
+
+    def list(self, limit: int = ...) -> Sequence[Entry]:
+        """The latest calibrations, newest first."""
+
+    def get(self, calibration_id: int) -> Entry:
+        """A calibration by its id."""
+
+    def model(self, calibration_id: int) -> dict[str, Any]:
+        """A calibration's model in full precision."""
+
+    def document(self, calibration_id: int) -> dict[str, Any]:
+        """A calibration's JSON document."""
+
+    def inputs(self, calibration_id: int) -> dict[str, NDArray[Any]]:
+        """The arrays that a calibration was solved from."""
+
+    def data_version(self) -> Any:
+        """A value that changes when the history does."""
+
+
+BY = "replay"
+
+
+WHY = "in force when the recording began"
+
+
+def require_robot(nominal: SerialArm, configured: Command) -> None:
+    """Refuse a robot that the recording was not made with.
+
+    Raises
+    ------
+    WrongRobotError
+        Always then; the message names both models.
+    """
+    recorded = str(configured.arguments.get("model_hash", ""))
+    if recorded != nominal.model_hash:
+        raise WrongRobotError(
+            f"this was recorded with robot '{configured.arguments.get('robot', '')}' of nominal "
+            f"model {recorded}; '{nominal.name}' is {nominal.model_hash}"
+        )
+
+
+def seeded(
+    history: History,
+    nominal: SerialArm,
+    in_force: Mapping[str, Mapping[str, Any] | None],
+    software: str,
+) -> bool:
+    """Bring what was in force, by its kind, into an empty history; whether it was empty.
+
+    Called once all else of the recording was read: what is left in a history after a failure would
+    be taken for the user's own at the next try.
+    """
+    if history.list(1):
+        return False
+    for kind, model in in_force.items():
+        bring_into_force(history, kind, nominal, model, software)
+    return True
+
+
+def bring_into_force(
+    history: History,
+    kind: str,
+    nominal: SerialArm,
+    model: Mapping[str, Any] | None,
+    software: str,
+    why: str = WHY,
+) -> None:
+    """Accept what was in force when, or while, a recording was made; None: nothing was."""
+    if model is None:
+        return
+    calibration_id = history.propose(
+        Proposal(
+            kind=kind,
+            model_hash=nominal.model_hash,
+            based_on=history.head(kind).revision,
+            cycle_id="",
+            stamp_ns=0,
+            created_ns=0,
+            software=software,
+            method="",
+            code=Code.ACCEPT,
+            reason=why,
+            document={},
+            model=model,
+        )
+    )
+    history.accept(calibration_id, by=BY, reason=why, expected_head=None, wall_ns=0)
+
+
+FIRST = {THERMAL: "identify", TOOL: "measure"}  # what gives a candidate of a kind
+ONLY, NEWEST = "only", "newest"  # which pending candidate a command without an id is about
+
+
+def decide(
+    history: History, command: Command, expected: int, wall_ns: int, kind: str = THERMAL
+) -> Outcome:
+    """Accept, reject or roll back a calibration of a kind whose revision in force is ``expected``.
+
+    A command with ``choose`` (`ONLY`, `NEWEST`) in place of an id is about a candidate that is
+    pending now, not when it was given. The outcome's command says which: replay obeys that.
+
+    Raises
+    ------
+    RobocalError
+        When the history refuses.
+    """
+    command = named(history, command, kind)
+    arguments = command.arguments
+    if "refused" in arguments:
+        return Outcome(command, Code.CONFLICT, str(arguments["refused"]))
+    chosen = int(arguments.get("id", 0))
+    by, why = str(arguments.get("by", "")), str(arguments.get("reason", ""))
+    try:
+        if command.name != ROLLBACK and (own := history.get(chosen).kind) != kind:
+            raise InputError(f"calibration {chosen} is of kind {own}, not {kind}")
+        if command.name == REJECT:
+            history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
+            return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
+        if command.name == ACCEPT:
+            head = history.accept(
+                chosen,
+                by=by,
+                reason=why,
+                expected_head=expected,
+                wall_ns=wall_ns,
+                with_heads=measured_with(history, history.get(chosen)),
+            )
+        else:
+            head = history.rollback(
+                None if arguments.get("previous", False) else chosen,
+                by=by,
+                reason=why,
+                expected_head=expected,
+                wall_ns=wall_ns,
+                kind=kind,
+            )
+    except RobocalError as error:
+        return Outcome(command, error.code, str(error))
+    chosen = head.calibration_id or 0
+    what = f"calibration {chosen}" if chosen else BEFORE_ANY.get(kind, "nothing")
+    message = f"revision {head.revision}: {what} in force"
+    return Outcome(command, Code.ACCEPT, message, None, chosen, head.revision)
+
+
+def measured_with(history: History, entry: Entry) -> dict[str, int]:
+    """Revisions, by kind, beside which alone a calibration may come into force.
+
+    A tool's flange poses came from a thermal model: with another one, what the drift did to the
+    flange would stay in the tool, and be corrected a second time.
+    """
+    if entry.kind != TOOL:
+        return {}
+    return {THERMAL: int(history.model(entry.id)["thermal_revision"])}
+
+
+def named(history: History, command: Command, kind: str) -> Command:
+    """Put the candidate's id, or why there is none (``refused``), in place of ``choose``."""
+    if "choose" not in command.arguments:
+        return command
+    arguments = dict(command.arguments)
+    pending = [entry.id for entry in history.pending(kind)]
+    choose = arguments.pop("choose")
+    if not pending:
+        first = FIRST.get(kind, "calibrate")
+        arguments["refused"] = f"no fresh candidate is pending: {first} first"
+    elif choose == ONLY and len(pending) > 1:
+        found = ", ".join(map(str, pending))
+        arguments["refused"] = (
+            f"exactly one fresh candidate must be pending, found {found}: decide by id"
+        )
+    else:
+        arguments["id"] = pending[0]
+    return replace(command, arguments=arguments)
+
+
+def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:
+    """Put another process's decision as a command that was carried out, for the record."""
+    chosen = decision.calibration_id or 0
+    arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
+    command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
+    message = f"revision {decision.head_after}: decided outside this node"
+    return Outcome(command, Code.ACCEPT, message, None, chosen, decision.head_after, outside=True)

@@ -19,7 +19,7 @@ from robocal_ros.identification import Method
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.base import HistoryFollower
-from robocal_ros.session.decisions import History
+from robocal_ros.session.events import History
 from robocal_ros.thermal.accuracy import AccuracyForecast, Work
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
 from robocal_ros.thermal.learning import LearnedProcess, process_of

@@ -15,7 +15,7 @@ from robocal_ros.ground.proposals import REFERENCE, THERMAL, CalibrationState, E
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import Fields, read_made, write_made
-from robocal_ros.session.decisions import History
+from robocal_ros.session.events import History
 from robocal_ros.thermal.identification import drift_prior, identify_cycle, learned_prior
 from robocal_ros.thermal.reference import ColdSpots, reference_of
 from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, HeatGains

@@ -41,14 +41,21 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import conversions, endpoints
-from robocal_ros.ros.clocks import DataClock
+from robocal_ros.ros.base import run
 from robocal_ros.ros.conversions import MM, joint_poses, transform_message
-from robocal_ros.ros.decision_services import AddService, Ask, DecisionServices, answer, twin
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
-from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import ORIGIN, STANDSTILL, Setting, count_fault, standstill_rule
-from robocal_ros.ros.run import run
-from robocal_ros.ros.session_node import SessionEvents, SessionNode
+from robocal_ros.ros.session_node import (
+    STATE_DIR,
+    AddService,
+    Ask,
+    DataClock,
+    DecisionServices,
+    SessionEvents,
+    SessionNode,
+    answer,
+    twin,
+)
 from robocal_ros.session.events import (
     BEGIN_CYCLE,
     CALIBRATE_SENSOR,

@@ -26,8 +26,7 @@ from robocal_ros.ground.samples import (
 from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.session import events
 from robocal_ros.session.base import Ignored
-from robocal_ros.session.decisions import History
-from robocal_ros.session.events import Command
+from robocal_ros.session.events import Command, History
 from robocal_ros.thermal.drift_following import InForce, ThermalConfig
 
 Array = NDArray[np.float64]

@@ -14,8 +14,7 @@ from robocal_ros.identification import Method, identify_and_hold_out
 from robocal_ros.identification.judged import identification_document, identified_model_document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.session.decisions import History
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Command, History, Outcome
 from robocal_ros.thermal.cell_setup import (
     SensorMethod,
     calibrate_sensor,

@@ -34,15 +34,19 @@ from robocal_ros.ground.samples import (
 from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.decisions import (
+from robocal_ros.session.events import (
+    CONFIGURE,
     NEWEST,
+    Command,
     History,
+    Outcome,
     decide,
+    joints_awaited_ns,
     outside_decision,
+    reached,
     require_robot,
     seeded,
 )
-from robocal_ros.session.events import CONFIGURE, Command, Outcome, joints_awaited_ns, reached
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel
 from robocal_ros.thermal.drift_following import (
     DriftFollower,

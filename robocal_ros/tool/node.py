@@ -15,8 +15,8 @@ from robocal_ros.ground.streams import Silence
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import endpoints
+from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
-from robocal_ros.ros.run import run
 from robocal_ros.ros.session_node import SessionNode
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool import node_motion

@@ -10,13 +10,20 @@ from std_srvs.srv import SetBool
 from robocal_ros.ground.errors import ConflictError, InputError
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.motion.driver import CONTROLLER, LeaseHolder, MotionDriver
-from robocal_ros.motion.gap import Gap
+from robocal_ros.motion.driver import (
+    CONTROLLER,
+    MOTION,
+    LeaseHolder,
+    MotionDriver,
+    SteadyClock,
+    driving_config,
+    goal_tolerances,
+    require_limits,
+)
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.robot_watch import MotionReport
-from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances, require_limits
+from robocal_ros.motion.robot_watch import Gap, MotionReport
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.clocks import SteadyClock
+from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.ros.parameters import Setting, length

@@ -14,8 +14,7 @@ from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, H
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.base import HistoryFollower
-from robocal_ros.session.decisions import History
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Command, History, Outcome
 from robocal_ros.tool.crossed_model import Held
 from robocal_ros.tool.crossed_run import RunTraits
 from robocal_ros.tool.judging import (

@@ -21,9 +21,8 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import StaticTf, header, pose_message, transform_message
-from robocal_ros.ros.decision_services import DecisionServices
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
-from robocal_ros.ros.session_node import SessionEvents
+from robocal_ros.ros.session_node import DecisionServices, SessionEvents
 from robocal_ros.session.events import Outcome
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.measuring_plan import PlannedStep

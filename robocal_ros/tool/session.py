@@ -12,8 +12,7 @@ from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.base import Handler, SessionBase, configured_with, recorded_arguments
-from robocal_ros.session.decisions import History, seeded
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Command, History, Outcome, seeded
 from robocal_ros.tool.edges import (
     AHEAD_NS,
     EDGES,

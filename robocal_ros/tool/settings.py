@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.ros.history_settings import STATE_DIR
 from robocal_ros.ros.parameters import Setting, given_pose, length, pose_settings
+from robocal_ros.ros.session_node import STATE_DIR
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.crossed_run import TraitLimits
 from robocal_ros.tool.edges import InputRule

@@ -20,7 +20,7 @@ from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.messages import StatedController
+from robocal_ros.motion.driver import StatedController
 from robocal_ros.motion.plan import MotionLimits, stop
 from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch, WatchedStop
 

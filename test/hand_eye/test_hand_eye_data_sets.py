@@ -21,8 +21,7 @@ from robocal_ros.hand_eye.session import configuration, hand_eye_session_as_reco
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
-from robocal_ros.session.decisions import bring_into_force
-from robocal_ros.session.events import Command, digest
+from robocal_ros.session.events import Command, bring_into_force, digest
 
 
 def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):

@@ -26,8 +26,7 @@ from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.quality import HandEyeSettings
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
-from robocal_ros.session.decisions import bring_into_force
-from robocal_ros.session.events import digest
+from robocal_ros.session.events import bring_into_force, digest
 
 KIND = hand_eye_kind(FRAME)
 LIMIT_M = 5e-4  # at the working distance

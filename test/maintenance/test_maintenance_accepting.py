@@ -38,10 +38,9 @@ from robocal_ros.ground.proposals import THERMAL, TOOL, Action, Decision, Head
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import insert_decision
 from robocal_ros.maintenance import AcceptBounds
-from robocal_ros.maintenance.requests import DriverAnswer
-from robocal_ros.motion.gap import STALL_S
-from robocal_ros.session.decisions import decide
-from robocal_ros.session.events import ACCEPT, WITHHOLD, Command, Outcome
+from robocal_ros.maintenance.robot_interface import DriverAnswer
+from robocal_ros.motion.robot_watch import STALL_S
+from robocal_ros.session.events import ACCEPT, WITHHOLD, Command, Outcome, decide
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.tool.run import rows_of
 

@@ -8,8 +8,8 @@ from maintenance_cell import LONG_S, POSES, REFUSED, SILENT, Cell, config_of, ki
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.maintenance import MaintenanceState
-from robocal_ros.maintenance import requests as ask
-from robocal_ros.maintenance.requests import DriverAnswer
+from robocal_ros.maintenance import robot_interface as ask
+from robocal_ros.maintenance.robot_interface import DriverAnswer
 
 UNKNOWN = set(Code) - {
     Code.NONE,

@@ -25,11 +25,10 @@ from maintenance_cell import (
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.maintenance import AcceptBounds, MaintenanceState
-from robocal_ros.maintenance.hands import DEAF_S
-from robocal_ros.maintenance.requests import Stop
-from robocal_ros.maintenance.run import UNSAVED_S
-from robocal_ros.motion.gap import DRAIN_S
+from robocal_ros.maintenance.robot_interface import DEAF_S, Stop
+from robocal_ros.maintenance.session import UNSAVED_S
 from robocal_ros.motion.plan import SHORTEST_STOP_S
+from robocal_ros.motion.robot_watch import DRAIN_S
 from robocal_ros.tool.driving import SETTLED_S
 
 PAUSES_S = (0.3, 0.6, 3.0)

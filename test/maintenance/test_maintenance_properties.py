@@ -41,8 +41,7 @@ from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.proposals import Action
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.maintenance import AcceptBounds, MaintenanceState
-from robocal_ros.maintenance.hands import DEAF_S
-from robocal_ros.maintenance.requests import DriverAnswer
+from robocal_ros.maintenance.robot_interface import DEAF_S, DriverAnswer
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.tool.driving import SETTLED_S

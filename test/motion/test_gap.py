@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robocal_ros.motion.gap import BEAT_S, DRAIN_S, MOST_BEAT, Gap
+from robocal_ros.motion.robot_watch import BEAT_S, DRAIN_S, MOST_BEAT, Gap
 
 TICK_S, STALE_S = 0.02, 0.5
 LATE_S = 0.05  # after a pause, until the last beat that waited is delivered

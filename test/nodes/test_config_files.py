@@ -20,7 +20,7 @@ from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
-from robocal_ros.motion.settings import MOTION
+from robocal_ros.motion.driver import MOTION
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.parameters import SHARED
 from robocal_ros.thermal.drift_following import ThermalConfig

@@ -21,10 +21,9 @@ from robocal_ros.cell_sim.trajectory_controller import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import MotionDriver
+from robocal_ros.motion.driver import MotionDriver, goal_tolerances
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport
-from robocal_ros.motion.settings import goal_tolerances
 from robocal_ros.ros.endpoints import EndpointNode
 
 ARM = load_robot("ur10")

@@ -29,8 +29,7 @@ from robocal_ros.ground.samples import JOINTS
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session import events
-from robocal_ros.session.decisions import ONLY
-from robocal_ros.session.events import Command
+from robocal_ros.session.events import ONLY, Command
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
 from robocal_ros.tool.session import take_tool_message, tool_session_as_recorded

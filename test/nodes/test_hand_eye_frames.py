@@ -16,7 +16,7 @@ from tf2_msgs.msg import TFMessage
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import ERROR
-from robocal_ros.ros.frame_watch import FRESH_S
+from robocal_ros.ros.graph import FRESH_S
 from robocal_ros.session.events import ACCEPT, Command
 
 

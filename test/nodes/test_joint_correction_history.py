@@ -27,7 +27,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import CALIBRATED, CorrectionRecord
 from robocal_ros.history.history_records import NOMINAL as AS_NOMINAL
 from robocal_ros.kinematics.robots import load_description, save_robot
-from robocal_ros.ros.history_settings import history_notice
+from robocal_ros.ros.session_node import history_notice
 
 
 def kept(graph: Any, serial: str = "s1") -> list[CorrectionRecord]:

@@ -26,7 +26,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import endpoints
-from robocal_ros.session.decisions import bring_into_force
+from robocal_ros.session.events import bring_into_force
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 

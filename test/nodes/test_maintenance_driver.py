@@ -9,8 +9,8 @@ from std_msgs.msg import Float64
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance.driver import MaintenanceDriver
-from robocal_ros.maintenance.requests import Move
+from robocal_ros.maintenance.node import MaintenanceDriver
+from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits

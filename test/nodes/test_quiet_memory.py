@@ -5,7 +5,7 @@ import weakref
 
 import pytest
 
-from robocal_ros.ros.run import QuietMemory
+from robocal_ros.ros.base import QuietMemory
 
 
 class Knot:

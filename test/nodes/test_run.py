@@ -11,7 +11,7 @@ SCRIPT = """
 import sys
 from std_srvs.srv import Trigger
 from robocal_ros.ros.base import HouseNode
-from robocal_ros.ros.run import run
+from robocal_ros.ros.base import run
 
 class Sleeper(HouseNode):
     NAME = "sleeper"

@@ -11,9 +11,9 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros.ground.errors import WrongRobotError
 from robocal_ros.kinematics.robots import find_robot, load_robot, robot_file_hash
-from robocal_ros.ros import clocks, endpoints
+from robocal_ros.ros import endpoints, session_node
 from robocal_ros.ros.conversions import time_message
-from robocal_ros.ros.history_settings import open_history
+from robocal_ros.ros.session_node import open_history
 from robocal_ros.thermal.node import ThermalNode
 
 NAMES = load_robot("kr150_r3100").joint_names
@@ -64,14 +64,14 @@ def test_one_wrong_stamp_among_right_ones_is_no_fault_of_the_clock(graph: Any) -
         message = JointState()
         message.header.stamp = time_message(reader.node.now_ns() + ahead_ns)
         watch.note("joint_states", message)
-    health = clocks.Health()
+    health = session_node.Health()
     watch.judge(health)
     assert health.message == "ok"
 
 
 def test_silence_is_counted_by_receive_time(graph: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stamps that lie in the future do not keep a dead controller alive."""
-    monkeypatch.setattr(clocks, "SILENT_S", 0.5)
+    monkeypatch.setattr(session_node, "SILENT_S", 0.5)
     reader = Reader(graph)
     reader.until("ok", 0)
     status = reader.until("joint_states is silent")

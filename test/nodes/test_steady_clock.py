@@ -2,7 +2,7 @@
 
 import time
 
-from robocal_ros.ros.clocks import SteadyClock
+from robocal_ros.motion.driver import SteadyClock
 
 PREEMPTED_S = 0.01  # between the reads of its two clocks, at most in one of a thousand
 

@@ -37,8 +37,7 @@ from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.endpoints import Health
-from robocal_ros.ros.history_settings import history_notice
-from robocal_ros.ros.session_node import EVENTS
+from robocal_ros.ros.session_node import EVENTS, history_notice
 from robocal_ros.thermal.node import ThermalNode
 from robocal_ros.thermal.session import ThermalSession, config_of, take_message
 

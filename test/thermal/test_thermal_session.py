@@ -18,8 +18,7 @@ from robocal_ros.ground.streams import StandstillRule
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.decisions import NEWEST, ONLY
-from robocal_ros.session.events import Command, Outcome, digest
+from robocal_ros.session.events import NEWEST, ONLY, Command, Outcome, digest
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.session import ThermalSession
 

@@ -12,8 +12,14 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.session.decisions import bring_into_force
-from robocal_ros.session.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
+from robocal_ros.session.events import (
+    ACCEPT,
+    BREAK_OFF,
+    ROLLBACK,
+    TOOL_STEP,
+    Command,
+    bring_into_force,
+)
 from robocal_ros.tool.edges import BeamEdge, EdgeSample
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.run import ToolConfig, rows_of

@@ -10,8 +10,8 @@ from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.cell_sim.trajectory_controller import JointMotion
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.session.events import MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.tool.driving import DrivePhase, ToolDriver
 from robocal_ros.tool.edges import EdgeSample

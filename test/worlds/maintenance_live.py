@@ -21,9 +21,9 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody, joint_way
+from robocal_ros.motion.driver import trajectory_message
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import REST_RAD
-from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS
 

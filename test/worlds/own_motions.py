@@ -19,14 +19,19 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.memory import MaintenanceConfig
 from robocal_ros.maintenance.mover import FaultError, Mover, Route, Ways
 from robocal_ros.motion.cell import joint_way, load_motion
-from robocal_ros.motion.driver import CONTROLLER, MotionDriver
+from robocal_ros.motion.driver import (
+    CONTROLLER,
+    MOTION,
+    MotionDriver,
+    SteadyClock,
+    driving_config,
+    goal_tolerances,
+)
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
-from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import HouseNode
-from robocal_ros.ros.clocks import SteadyClock
-from robocal_ros.ros.run import run
+from robocal_ros.ros.base import HouseNode, run
+from robocal_ros.ros.conversions import NS
 
 ARM = load_robot("ur10")
 HOME = np.radians([2.3, -124.4, -70.9, 107.7, -91.1, 91.8])

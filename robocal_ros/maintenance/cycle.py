@@ -1,22 +1,192 @@
-"""The tool part of a run: quick check, full measurement where it is needed, verification."""
+"""A maintenance cycle: the thermal measurement, the tool, and what became of both."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ground.proposals import TOOL
+from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
-from robocal_ros.maintenance.hands import Hands
-from robocal_ros.maintenance.memory import Memory, ToolRecord
-from robocal_ros.maintenance.mover import FaultError
-from robocal_ros.maintenance.requests import DriverAnswer, Script, SilentError
-from robocal_ros.maintenance.thermal_part import ThermalCycle
-from robocal_ros.session.events import ROLLBACK, Command, Outcome
-from robocal_ros.thermal.accuracy import ToolError
+from robocal_ros.maintenance.memory import CycleResult, Drift, Memory, ToolRecord
+from robocal_ros.maintenance.mover import HOME, FaultError
+from robocal_ros.maintenance.robot_interface import (
+    BeginCycle,
+    DriverAnswer,
+    EndCycle,
+    Hands,
+    Script,
+    SilentError,
+)
+from robocal_ros.session.events import LEAVE, ROLLBACK, Command, Outcome
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
 from robocal_ros.tool.results import FULL, QUICK
 
-# ---- one measurement of the tool, and what it tells of it ---------------------------------------
+Array = NDArray[np.float64]
+
+NODE = "thermal node"
+MEASUREMENT = "thermal measurement"
+NONE_BETTER = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
+FOUND = (Code.ACCEPT, *NONE_BETTER)  # verdicts that tell the drift; any other one leaves it unknown
+
+
+@dataclass
+class ThermalCycle:
+    """The thermal cycle that is open; over several gaps where one is too short."""
+
+    id: str = ""  # empty: none
+    visited: set[int] = field(default_factory=set)  # poses that are done, from 1; measured or not
+    unmeasured: set[int] = field(default_factory=set)  # of these, with too few measurements
+    last_s: float = -np.inf  # when the last one was
+    moved: bool = False  # the last cycle that ended found that the sensor or the robot has moved
+
+    def forget(self) -> None:
+        """No cycle is open."""
+        self.id, self.visited, self.unmeasured, self.last_s = "", set(), set(), -np.inf
+
+
+class ThermalPart:
+    """Measures the drift; what does not fit is done in the next gap."""
+
+    def __init__(self, hands: Hands, book: ThermalCycle) -> None:
+        self._hands, self._book = hands, book
+        self._times = hands.config.times
+
+    def worst_s(self) -> float:
+        """The longest first step of a gap, before it is planned: one pose, with its way home."""
+        ways = self._hands.ways
+        homes = max((ways.home_s(i) for i in range(1, ways.count + 1)), default=0.0)
+        return self._first_s(ways.longest_line_s(), homes)
+
+    def drop_old(self) -> str:
+        """Give up an open cycle whose last pose is too old, and say so; empty: there is none."""
+        book, within_s = self._book, self._hands.config.resume_within_s
+        age_s = self._hands.now_s - book.last_s
+        if not book.id or age_s <= within_s:
+            return ""
+        words = (
+            f"cycle '{book.id}' with {len(book.visited)} of {self._hands.ways.count} poses is "
+            f"dropped and begins anew: its last pose is {age_s:.0f} s old (resume_within_s = "
+            f"{within_s:g} s)"
+        )
+        book.forget()
+        return words
+
+    def script(self, cycle_id: str) -> Script[tuple[DriverAnswer | None, str]]:
+        """The answer of the cycle's end, None where it is not reached, and what is left.
+
+        Raises
+        ------
+        SilentError
+            The thermal node did not answer; the robot may be away from home.
+        """
+        hands, book = self._hands, self._book
+        todo = [i for i in range(1, hands.ways.count + 1) if i not in book.visited]
+        if todo:
+            way_s = hands.ways.to((HOME, HOME), hands.config.home, todo[0]).plan.duration_s
+            if not hands.fits(self._first_s(way_s, hands.ways.home_s(todo[0]))):
+                return None, f"{MEASUREMENT}, {len(todo)} poses"
+            begun = yield from self._begin(cycle_id)
+            if not begun.done:
+                return begun, MEASUREMENT
+            left = yield from self._visit(todo)
+            yield from hands.go_home()
+            if left:
+                return None, f"{MEASUREMENT}, {left} poses"
+        if not hands.fits(self._times.solve_s):
+            return None, "end of the thermal cycle"
+        unmeasured, measured = ", ".join(map(str, sorted(book.unmeasured))), self._places()
+        answer = yield from self._end()
+        if answer.code not in FOUND:
+            return answer, MEASUREMENT
+        lacking = [f"{MEASUREMENT} at pose {unmeasured}"] if unmeasured else []
+        if answer.visited is not None and answer.visited < measured:
+            # it was started anew meanwhile, its clock jumped, or they are not of the cold reference
+            has = f"of which the thermal node has {answer.visited}"
+            lacking.append(f"{MEASUREMENT} at {measured} poses, {has}")
+        return answer, "; ".join(lacking)
+
+    def _places(self) -> int:
+        """At how many places this cycle measured; the thermal node takes near ones for one."""
+        found: list[Array] = []
+        for pose in sorted(self._book.visited - self._book.unmeasured):
+            q = self._hands.config.poses[pose - 1]
+            if all(np.max(np.abs(q - other)) >= SAME_VISIT_RAD for other in found):
+                found.append(q)
+        return len(found)
+
+    def _begin(self, cycle_id: str) -> Script[DriverAnswer]:
+        book, hands = self._book, self._hands
+        hands.doing = "thermal cycle begins"
+        name = book.id or cycle_id
+        answer = yield from hands.ask(self._times.answer_s, NODE, BeginCycle, name)
+        if answer.done:
+            book.id, book.last_s = name, hands.now_s
+        return answer
+
+    def _visit(self, todo: list[int]) -> Script[int]:
+        """How many poses did not fit."""
+        hands = self._hands
+        yield from hands.stand(STANDS_S)
+        for done, pose in enumerate(todo):
+            q = yield from hands.stand()
+            route = hands.ways.to(hands.robot.place, q, pose)
+            worst_s = self._step_s(route.plan.duration_s, hands.ways.home_s(pose))
+            if not hands.fits(worst_s):
+                return len(todo) - done
+            hands.doing = f"on its way to measuring pose {pose} of {hands.ways.count}"
+            yield from hands.drive(route, worst_s)
+            q = yield from hands.stand()
+            hands.doing = f"measuring pose {pose} of {hands.ways.count}"
+            if not (yield from self._measured(q)):
+                self._book.unmeasured.add(pose)
+            self._book.visited.add(pose)
+            self._book.last_s = hands.now_s
+        return 0
+
+    def _measured(self, q: Array) -> Script[bool]:
+        """Stand at joints (n,) until the measurements are there; False: their time is over."""
+        hands, times = self._hands, self._times
+        from_s = hands.robot.newest_s + times.settle_s
+        until_s = hands.now_s + times.measure_s
+        hands.measured.clear()
+        while hands.now_s < until_s:
+            hands.robot.require_at(q)
+            fresh = sorted(stamp for stamp in hands.measured if stamp >= from_s)
+            enough = fresh[: hands.config.measurements]  # more may come, faster than the stay ends
+            if (
+                len(enough) == hands.config.measurements
+                and hands.robot.newest_s >= enough[-1] + times.stay_s
+            ):
+                return True
+            yield
+        return False
+
+    def _end(self) -> Script[DriverAnswer]:
+        book, hands = self._book, self._hands
+        hands.doing = "thermal cycle ends"
+        name = book.id
+        book.forget()
+        try:
+            answer = yield from hands.ask(self._times.solve_s, NODE, EndCycle, name)
+        except SilentError as error:
+            return DriverAnswer(Code.CONFLICT, str(error))
+        book.moved = answer.code is Code.SENSOR_OR_ROBOT_MOVED
+        return answer
+
+    def _first_s(self, way_s: float, home_s: float) -> float:
+        """The cycle begins before it."""
+        return 2.0 * self._times.answer_s + STANDS_S + self._step_s(way_s, home_s)
+
+    def _step_s(self, way_s: float, home_s: float) -> float:
+        """At the most: a rest at each arrival, before the measurement and after it.
+
+        What stands before a pose that does not fit need not stand again before its way home.
+        """
+        return way_s + home_s + 4.0 * self._times.rest_s + self._times.measure_s
 
 
 FAILED = (  # without a result they say that something is wrong with the tool, or its measurement
@@ -75,18 +245,7 @@ class ToolOutcome:
 
 
 class ToolMeasuring:
-    """Measures the tool, from home and back.
-
-    Parameters
-    ----------
-    drift : error of the thermal model in force now; None: not known.
-
-    Attributes
-    ----------
-    outcome : of the run, as far as it has come.
-    revision : of the tool that the last measurement was about.
-    wall_ns : of the tick.
-    """
+    """Measures the tool, from home and back."""
 
     def __init__(
         self,
@@ -197,27 +356,13 @@ class ToolMeasuring:
         return None
 
 
-# ---- tool part ----------------------------------------------------------------------------------
-
-
 NS = 1_000_000_000
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 LATE = "its check does not fit this gap any more, and it is accepted in a gap where that fits"
 
 
 class ToolPart:
-    """Keeps the tool right; what does not fit is done in the next gap.
-
-    Parameters
-    ----------
-    decided : told of each decision that was made without a person.
-    unsure : why a tool that was measured now waits for a person; empty: it need not.
-    drift : error of the thermal model in force now; None: not known.
-
-    Attributes
-    ----------
-    outcome : as far as it has come.
-    """
+    """Keeps the tool right; what does not fit is done in the next gap."""
 
     def __init__(
         self,
@@ -308,8 +453,6 @@ class ToolPart:
             return
         yield from self._settle(cycle_id)
 
-    # ---- what was measured ----------------------------------------------------------------------
-
     def _found_waiting(self, number: int, cycle_id: str) -> Script[None]:
         """A candidate of an earlier gap: it waits for a person, or for a gap with time enough."""
         record = self._memory.tool
@@ -391,3 +534,162 @@ class ToolPart:
 
     def _age_s(self, wall_ns: int) -> float:
         return (self._measuring.wall_ns - wall_ns) / NS
+
+
+UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
+
+
+class CycleRun:
+    """The script of a cycle, and its result as it grows."""
+
+    def __init__(
+        self,
+        result: CycleResult,
+        hands: Hands,
+        book: ThermalCycle,
+        decider: Decider,
+        memory: Memory,
+        decided: Callable[[Outcome], None],
+        drift: Callable[[], Drift | None],
+    ) -> None:
+        self.result = result
+        self._hands, self._decider, self._decided = hands, decider, decided
+        self._drift = drift
+        self._thermal = ThermalPart(hands, book)
+        self._tool = ToolPart(
+            hands, book, decider, memory, decided, self._unsure, self._drift_error
+        )
+        self.wall_ns = 0
+        self._words: list[str] = []
+
+    def at(self, wall_ns: int) -> None:
+        """Tell the time, for what is kept."""
+        self.wall_ns = wall_ns
+        self._tool.at(wall_ns)
+
+    @property
+    def owes(self) -> str:
+        """An accepted tool that failed its check is still in force, in words; empty: none is."""
+        return self._tool.outcome.fault
+
+    def take_back(self) -> str:
+        """Do it where the script did not come to it, at home; in words what came of it."""
+        self._tool.take_back()
+        return self.owes or self._tool.outcome.told
+
+    def ended(self, code: Code, message: str) -> CycleResult:
+        """The result, at its end."""
+        self._fold()
+        self.result = replace(self.result, code=code, message=message, stamp_ns=self.wall_ns)
+        return self.result
+
+    def script(self) -> Script[None]:
+        """Everything that fits, in its order; ends at home."""
+        if self._hands.ways.count:
+            yield from self._measure_thermal()
+        yield from self._measure_tool()
+        words = "; ".join(self._words) or "nothing was due"
+        left = self.result.left
+        self.result = replace(
+            self.result,
+            code=Code.ACCEPT,
+            complete=not left,
+            message=words + (f"; left for the next gap: {', '.join(left)}" if left else ""),
+        )
+
+    def _measure_thermal(self) -> Script[None]:
+        if dropped := self._thermal.drop_old():
+            self._tell(f"thermal: {dropped}")
+        try:
+            answer, left = yield from self._thermal.script(self.result.cycle_id)
+        except SilentError as error:
+            answer, left = DriverAnswer(Code.CONFLICT, str(error)), MEASUREMENT
+            yield from self._hands.go_home()
+        if left:
+            self._left(left)
+        if answer is None:
+            return
+        self._tell(f"thermal: {answer.message}")
+        if answer.missing:
+            poses = ", ".join(map(str, answer.missing))
+            self._tell(f"without pose {poses} of the cold reference")
+        self.result = replace(self.result, thermal_code=answer.code, thermal_id=answer.candidate_id)
+        if not (answer.done and answer.candidate_id):
+            return
+        # EXPIRED was said before this measurement, and must not keep its result waiting.
+        found = yield from settled(
+            self._hands,
+            self._decider,
+            THERMAL,
+            answer.candidate_id,
+            lambda: self._unsound(AccuracyLevel.FAULT),
+            self.wall_ns,
+        )
+        self._decided(found)
+        self._tell(found.message)
+        if is_accepted(found):
+            self._accepted(answer.candidate_id)
+
+    def _measure_tool(self) -> Script[None]:
+        yield from self._tool.script(self.result.cycle_id)
+        found = self._tool.outcome
+        if found.left:
+            self._left(found.left)
+        for words in found.words():
+            self._tell(f"tool: {words}")
+        if told := self._hands.home_told():
+            self._tell(told)
+        if found.fault:
+            raise FaultError(Code.CONFLICT, found.fault)
+
+    def _fold(self) -> None:
+        """The tool part into the result, also where it was broken off."""
+        found = self._tool.outcome
+        self.result = replace(
+            self.result,
+            tool_found_code=found.found_code,
+            tool_code=found.last.code if found.last else Code.NONE,
+            tool_id=found.candidate_id,
+            tool_answer=found.checked,
+        )
+        if found.accepted:
+            self._accepted(found.candidate_id)
+
+    def _unsure(self) -> str:
+        """Why a tool that was measured now waits for a person; empty: it need not.
+
+        By now the thermal node has heard of the cycle: what is EXPIRED still has no cold reference.
+        """
+        expired = AccuracyLevel.EXPIRED if self._hands.ways.count else AccuracyLevel.FAULT
+        return self._unsound(expired) or UNSURE * (not self._drift_is_known())
+
+    def _unsound(self, worst: AccuracyLevel) -> str:
+        """Why the drift, from a level on, leaves a decision to a person; else empty."""
+        drift = self._drift()
+        if drift is None:  # a cell without measuring poses need not have a thermal node
+            return "the thermal node is silent" if self._hands.ways.count else ""
+        return f"the drift is {drift.level.name}: {drift.reason}" if drift.level >= worst else ""
+
+    def _drift_error(self) -> ToolError | None:
+        """Of the thermal model in force; without poses nobody asks."""
+        drift = self._drift() if self._hands.ways.count else None
+        return None if drift is None else drift.error
+
+    def _drift_is_known(self) -> bool:
+        """Whether this cycle found the model in force, or none better; else it may be wrong."""
+        code, found = self.result.thermal_code, self.result.thermal_id
+        if not self._hands.ways.count or code in NONE_BETTER:
+            return True
+        return code is Code.ACCEPT and found > 0 and self._decider.in_force(THERMAL, found)
+
+    def _accepted(self, calibration_id: int) -> None:
+        self.result = replace(self.result, accepted=(*self.result.accepted, calibration_id))
+
+    def _left(self, what: str) -> None:
+        self.result = replace(self.result, left=(*self.result.left, what))
+        left_s = max(self._hands.gap.left_s(self._hands.now_s), 0.0)
+        words = f"{what}: left for the next gap, {left_s:.1f} s before the end of this one"
+        self._decided(Outcome(Command(LEAVE, {"what": what, "left_s": left_s}), Code.ACCEPT, words))
+
+    def _tell(self, words: str) -> None:
+        self._words.append(words)
