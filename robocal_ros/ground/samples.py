@@ -74,10 +74,10 @@ class JointBlock:
 
 @dataclass(frozen=True, slots=True)
 class PointSample:
-    """A target's position (3,) in the measuring frame, in m.
+    """A target's position (3,) in the measuring frame, in m, and its orientation where measured.
 
     ``topic``: the input that it came from. ``sigma_m``: rms standard deviation of a coordinate
-    from its own measurement, 0 where that is not known.
+    from its own measurement, 0 where that is not known. ``rotation``: R_frame_target (3, 3).
     """
 
     stamp_ns: int
@@ -86,16 +86,7 @@ class PointSample:
     position_m: Array
     topic: str = MEASURED_POINT
     sigma_m: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class PoseSample:
-    """A target's pose ``T_frame_target`` (4, 4) in the measuring frame."""
-
-    stamp_ns: int
-    frame: str
-    target: str
-    T_frame_target: Array
+    rotation: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +251,7 @@ def temperature_sample(message: Any) -> TemperatureSample:
     return TemperatureSample(at_ns, message.header.frame_id, float(celsius[0]))
 
 
-def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSample:
+def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PointSample:
     """Build a sample from a ``geometry_msgs/PoseStamped`` (frame_id ``frame[/target]``).
 
     Raises
@@ -277,7 +268,14 @@ def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSampl
     norm = float(np.linalg.norm(quat))
     if abs(norm - 1.0) > 1e-3:
         raise InputError(f"measured orientation has a quaternion of length {norm:.6g}, not 1")
-    return PoseSample(stamp_ns(message.header.stamp), frame, target, transform_from_quat(xyz, quat))
+    return PointSample(
+        stamp_ns(message.header.stamp),
+        frame,
+        target,
+        xyz,
+        MEASURED_POSE,
+        rotation=transform_from_quat(xyz, quat)[:3, :3],
+    )
 
 
 # ---- points of a ``sensor_msgs/PointCloud2``, whatever brought the message ----------------------

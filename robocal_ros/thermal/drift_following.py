@@ -1,4 +1,9 @@
-"""Settings of the thermal session."""
+"""Settings, what is in force, and the tracker of the cold reference in force.
+
+The tracker is a function of the reference and of the cycles kept since, so it survives a restart:
+the history holds each cycle's measurements, and every so often the tracker's state, from which
+the later cycles are taken again.
+"""
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,11 +33,16 @@ from robocal_ros.thermal.tracking import DriftProcess, DriftState, Heat, Tracked
 
 Array = NDArray[np.float64]
 
-
 Prior = Literal["default", "learned"]
 METHODS: tuple[Method, ...] = ("map", "lsq")
 PRIORS: tuple[Prior, ...] = ("default", "learned")
 SPHERE_RADIUS_M = 0.01905  # 1.5 inches across, the usual reference sphere
+HEAT = "tracker_heat"
+TIMES = "tracker_times"  # of a kept cycle: the tracker's, and that of the first refused one
+STATE = ("tracker_mean", "tracker_covariance", "tracker_clock")
+CHECKPOINT_EVERY = 32  # cycles between two kept states: a restart takes at most so many again
+LOOK_BACK = 100
+EXPECTED = "expected"  # of a reference's model: the learned process, None for the default
 
 
 @dataclass(frozen=True)
@@ -80,11 +90,6 @@ class ThermalConfig:
         """Where accuracy is judged."""
         q, tip = (np.array(given) if given else None for given in (self.work_poses, self.tip_m))
         return Work(q, tip)
-
-
-HEAT = "tracker_heat"
-TIMES = "tracker_times"  # of a kept cycle: the tracker's, and that of the first refused one
-STATE = ("tracker_mean", "tracker_covariance", "tracker_clock")
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,23 +182,20 @@ def _array(text: str) -> Array:
 
 
 class InForce(HistoryFollower):
-    """The thermal model and the cold reference in force, as of the last look.
+    """The thermal model (``head``) and the cold reference in force, as of the last look.
 
-    Attributes
-    ----------
-    head : head of the thermal models.
-    reference, reference_id, reference_model : the cold reference, its calibration, and what is
-        kept of it; or None.
+    ``reference``, ``reference_id``, ``reference_model``: the cold reference, its calibration, and
+    what is kept of it; or None. ``nominal``: the arm without any calibration.
     """
 
     def __init__(self, history: History, nominal: SerialArm) -> None:
-        self._nominal = nominal
+        self.nominal = nominal
         super().__init__(history, THERMAL)
 
     def _read(self) -> None:
         super()._read()
         head = self._history.head(REFERENCE)
-        reference = None if head.model is None else reference_of(head.model, self._nominal)
+        reference = None if head.model is None else reference_of(head.model, self.nominal)
         self.reference: ColdReference | None = reference
         self.reference_id, self.reference_model = head.calibration_id, head.model
 
@@ -201,7 +203,7 @@ class InForce(HistoryFollower):
     def arm(self) -> SerialArm:
         """The arm with the model in force."""
         model = self.head.model
-        return self._nominal if model is None else arm_of(model, self._nominal)
+        return self.nominal if model is None else arm_of(model, self.nominal)
 
     @property
     def drifted(self) -> bool:
@@ -224,17 +226,7 @@ class InForce(HistoryFollower):
                 "the model in force holds a drift, but there is no cold reference any more: roll "
                 "the thermal model back to the one without it"
             )
-        return commissioned_of(self.reference_model, self._nominal)
-
-    @property
-    def nominal(self) -> SerialArm:
-        """The arm without any calibration."""
-        return self._nominal
-
-
-CHECKPOINT_EVERY = 32  # cycles between two kept states: a restart takes at most so many again
-LOOK_BACK = 100
-EXPECTED = "expected"  # of a reference's model: the learned process, None for the default
+        return commissioned_of(self.reference_model, self.nominal)
 
 
 class DriftFollower:
@@ -370,8 +362,17 @@ class DriftFollower:
                 self.go_on_from(FollowerState.of_arrays(arrays, times, moved))
                 break
             waiting.append((arrays, moved))
+        tracker = self._tracker
         for arrays, moved in reversed(waiting):
-            self._take_again(arrays, moved)
+            cycle = Measurements.of_arrays(arrays)
+            if HEAT in arrays:
+                tracker.heat = Heat.of_array(arrays[HEAT])
+            time_s, moved_s = arrays[TIMES].tolist()
+            if not moved:
+                tracker.take(tracker.spots.average(cycle, tracker.sigma_m), time_s)
+            self._count(cycle.middle_ns, moved)
+            if moved:
+                self.state = replace(self.state, moved_s=moved_s)
 
     def _kept(self, history: History, reference_id: int) -> Iterator[Entry]:
         """Cycles of this reference, newest first; all of them came after it."""
@@ -400,17 +401,6 @@ class DriftFollower:
     def _anchored_s(self, stamp_ns: int) -> float:
         return self.state.tracker.time_s + 1e-9 * (stamp_ns - self.state.anchor_ns)
 
-    def _take_again(self, arrays: Mapping[str, NDArray[Any]], moved: str) -> None:
-        tracker, cycle = self._tracker, Measurements.of_arrays(arrays)
-        if HEAT in arrays:
-            tracker.heat = Heat.of_array(arrays[HEAT])
-        time_s, moved_s = arrays[TIMES].tolist()
-        if not moved:
-            tracker.take(tracker.spots.average(cycle, tracker.sigma_m), time_s)
-        self._count(cycle.middle_ns, moved)
-        if moved:
-            self.state = replace(self.state, moved_s=moved_s)
-
 
 def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
     """What to expect of a robot of which nothing is known; ``sigma_m`` of one visit."""
@@ -418,14 +408,10 @@ def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
 
 
 class Following:
-    """The follower of the cold reference in force, made anew where another one comes into force.
+    """The follower of the cold reference in force, made anew where another one comes into force."""
 
-    ``sigma_m``: of one visit, where none was learned; ``work``: where the robot works.
-    """
-
-    def __init__(self, history: History, current: InForce, sigma_m: float, work: Work) -> None:
-        self._history, self._current = history, current
-        self._sigma_m, self._work = sigma_m, work
+    def __init__(self, history: History, current: InForce, config: ThermalConfig) -> None:
+        self._history, self._current, self._config = history, current, config
         self._followed: tuple[int | None, DriftFollower] | None = None
 
     @property
@@ -434,7 +420,7 @@ class Following:
         kept = (self._current.reference_model or {}).get(EXPECTED)
         if kept is not None:
             return process_of(kept)
-        return default_process(self._current.nominal, self._sigma_m)
+        return default_process(self._current.nominal, self._config.sigma_m)
 
     @property
     def follower(self) -> DriftFollower | None:
@@ -449,7 +435,7 @@ class Following:
         if current.reference is None:
             return None
         if self._followed is None or self._followed[0] != current.reference_id:
-            follower = DriftFollower(current.reference, self.expected, self._work)
+            follower = DriftFollower(current.reference, self.expected, self._config.work)
             follower.catch_up(self._history, current.reference_id or 0)
             self._followed = (current.reference_id, follower)
         return self._followed[1]

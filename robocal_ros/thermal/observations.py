@@ -1,4 +1,8 @@
-"""Measurements paired with the joints of the same instant, whatever order they arrive in."""
+"""Measurements paired with the joints of the same instant, whatever order they arrive in.
+
+On its way to the model a measurement is a `PointSample` as it was read, an `Observation` with the
+joints of its instant, and a row of the `Measurements` that an estimator takes.
+"""
 
 from bisect import bisect_right, insort
 from collections import Counter, deque
@@ -8,8 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.errors import ConflictError, InputError, TooFewSamplesError
-from robocal_ros.ground.proposals import THERMAL, Entry
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -20,39 +23,37 @@ from robocal_ros.ground.samples import (
     JointSample,
     Measurements,
     PointSample,
-    PoseSample,
     TemperatureSample,
 )
 from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.session import events
 from robocal_ros.session.base import Ignored
-from robocal_ros.session.events import Command, History
+from robocal_ros.session.events import Command
 from robocal_ros.thermal.drift_following import InForce, ThermalConfig
 
 Array = NDArray[np.float64]
 
+MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
+MOST_KEPT = 20000  # observations that no command has used
+LEAD_NS = 1_000_000_000  # a topic is at most so far ahead of another where the clock jumps
+FAR_AHEAD_NS = 60_000_000_000  # a measurement stamped so much after the joints is an error
+EVERY_NS = 10_000_000_000  # of a motor's temperatures within ten seconds the first one counts
+SILENT_NS = 900_000_000_000  # a temperature says nothing any more after a quarter of an hour
+MOST_INTERVALS = 20_000  # of those ten seconds: more than two days
+TIME_OUT = "time-out"
+OTHER_POSE = "measured at a pose that the cold reference lacks"
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A measured target with the joints at that instant.
+    """A measured target with the joints ``q`` (n,) at that instant.
 
-    ``ready_ns``: stamp of the joint reading that completed it; ``rotation`` None for a point.
+    ``ready_ns``: stamp of the joint reading that completed it.
     """
 
-    stamp_ns: int
-    ready_ns: int
-    topic: str
-    frame: str
-    target: str
+    sample: PointSample
     q: Array
-    position: Array
-    rotation: Array | None
-    source: PointSample | PoseSample
-
-    @property
-    def sigma_m(self) -> float:
-        """Standard deviation of a coordinate from the measurement itself; 0 where not known."""
-        return self.source.sigma_m if isinstance(self.source, PointSample) else 0.0
+    ready_ns: int
 
 
 def one_per_visit(observations: Sequence[Observation], same_rad: float) -> list[Observation]:
@@ -67,22 +68,18 @@ def one_per_visit(observations: Sequence[Observation], same_rad: float) -> list[
         if first is None or np.max(np.abs(one.q - first.q)) > same_rad:
             first = one
             visits.append({})
-        visits[-1].setdefault(one.target, []).append(one)
-    return [_averaged(several) for visit in visits for several in visit.values()]
-
-
-def _averaged(several: Sequence[Observation]) -> Observation:
-    last = several[-1]
-    if len(several) == 1:
-        return last
-    position = np.mean([o.position for o in several], axis=0)
-    sigma_m = float(np.sqrt(np.mean([o.sigma_m**2 for o in several]) / len(several)))
-    return replace(
-        last,
-        q=np.mean([o.q for o in several], axis=0),
-        position=position,
-        source=PointSample(last.stamp_ns, last.frame, last.target, position, last.topic, sigma_m),
-    )
+        visits[-1].setdefault(one.sample.target, []).append(one)
+    found = []
+    for several in (several for visit in visits for several in visit.values()):
+        last = several[-1]
+        if len(several) > 1:
+            samples = [o.sample for o in several]
+            sigma_m = float(np.sqrt(np.mean([s.sigma_m**2 for s in samples]) / len(samples)))
+            position_m = np.mean([s.position_m for s in samples], axis=0)
+            sample = replace(last.sample, position_m=position_m, sigma_m=sigma_m)
+            last = replace(last, q=np.mean([o.q for o in several], axis=0), sample=sample)
+        found.append(last)
+    return found
 
 
 def as_measurements(
@@ -93,30 +90,19 @@ def as_measurements(
     ``sigma_m``: standard deviation of a coordinate of one visit, to which each measurement's own
     is added; None where the noise is to be found.
     """
-    rotations = [o.rotation for o in observations if o.rotation is not None]
-    complete = bool(observations) and len(rotations) == len(observations)
-    several = len({o.target for o in observations}) > 1
+    samples = [o.sample for o in observations]
+    rotations = [s.rotation for s in samples if s.rotation is not None]
+    complete = bool(samples) and len(rotations) == len(samples)
+    several = len({s.target for s in samples}) > 1
     return Measurements(
         q=np.array([o.q for o in observations]),
-        position=np.array([o.position for o in observations]),
-        target=tuple(o.target for o in observations),
-        sample=tuple(
-            f"{o.stamp_ns}/{o.target}" if several else str(o.stamp_ns) for o in observations
-        ),
+        position=np.array([s.position_m for s in samples]),
+        target=tuple(s.target for s in samples),
+        sample=tuple(f"{s.stamp_ns}/{s.target}" if several else str(s.stamp_ns) for s in samples),
         rotation=np.array(rotations) if complete else None,
-        sigma=None if sigma_m is None else np.hypot(sigma_m, [o.sigma_m for o in observations]),
-        stamp_ns=np.array([o.stamp_ns for o in observations], dtype=np.int64),
+        sigma=None if sigma_m is None else np.hypot(sigma_m, [s.sigma_m for s in samples]),
+        stamp_ns=np.array([s.stamp_ns for s in samples], dtype=np.int64),
     )
-
-
-MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
-MOST_KEPT = 20000  # observations that no command has used
-LEAD_NS = 1_000_000_000  # a topic is at most so far ahead of another where the clock jumps
-FAR_AHEAD_NS = 60_000_000_000  # a measurement stamped so much after the joints is an error
-
-
-def _topic(sample: PointSample | PoseSample) -> str:
-    return sample.topic if isinstance(sample, PointSample) else MEASURED_POSE
 
 
 @dataclass
@@ -146,10 +132,10 @@ class ObservationDesk:
     ignored: Ignored = field(default_factory=Ignored)
     _complete_ns: int | None = None
     _left_ns: int | None = None
-    _behind: deque[tuple[int, PointSample | PoseSample]] = field(
+    _behind: deque[tuple[int, PointSample]] = field(
         default_factory=lambda: deque(maxlen=MOST_WAITING)
     )
-    _pending: list[PointSample | PoseSample] = field(default_factory=list)
+    _pending: list[PointSample] = field(default_factory=list)
     _observed: list[Observation] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -209,7 +195,9 @@ class ObservationDesk:
             self._begin(added.began_ns, left)
         if self.stream.newest_ns is not None:
             self.newest_ns[JOINTS] = self.stream.newest_ns
-            self._settle()
+            waiting = enumerate(self._pending)
+            ready = next((i for i, s in waiting if not self._pair(s)), len(self._pending))
+            del self._pending[:ready]
 
     def take_plain(self, block: JointBlock, start: int, before_ns: int | None) -> int:
         """Take the readings from ``start`` on with which nothing happens: how many these are.
@@ -227,12 +215,6 @@ class ObservationDesk:
             self.newest_ns[JOINTS] = int(block.stamp_ns[start + count - 1])
         return count
 
-    def _settle(self) -> None:
-        """Make observations of the waiting measurements whose joints are complete."""
-        waiting = enumerate(self._pending)
-        ready = next((i for i, sample in waiting if not self._pair(sample)), len(self._pending))
-        del self._pending[:ready]
-
     def _begin(self, first_ns: int, left_ns: int | None) -> None:
         """Start at the first joint reading; what an earlier clock stamped means nothing now.
 
@@ -243,8 +225,8 @@ class ObservationDesk:
             return
         early = [sample for at_ns, sample in self._behind if at_ns > left_ns - LEAD_NS]
         known = {id(sample) for sample in early}
-        lost = [o.source for o in self._observed if id(o.source) not in known] + self._pending
-        for topic, count in Counter(map(_topic, lost)).items():
+        lost = [o.sample for o in self._observed if id(o.sample) not in known] + self._pending
+        for topic, count in Counter(sample.topic for sample in lost).items():
             self.ignored.add(topic, "the clock jumped back", count)
         self._observed.clear()
         self._behind.clear()
@@ -253,67 +235,51 @@ class ObservationDesk:
         self.used_ns = -1
         self._pending = sorted(early, key=lambda sample: sample.stamp_ns)
 
-    def add_measurement(self, sample: PointSample | PoseSample) -> None:
+    def add_measurement(self, sample: PointSample) -> None:
         """Take a measured point or pose; its joints may come before or after it."""
-        topic = _topic(sample)
+        topic, stamp_ns = sample.topic, sample.stamp_ns
         self.received[topic] += 1
-        if sample.stamp_ns <= 0:
+        if stamp_ns <= 0:
             self.ignored.add(topic, "no time stamp")
             return
         if self.frame is not None and sample.frame != self.frame:
-            self._ignore_frame(topic, sample.frame)
+            self._ignore_frame(sample)
             return
-        if self._of_the_clock_left(sample.stamp_ns):
-            self.ignored.add(topic, "the clock jumped back")
+        newest, left = self.newest_ns.get(JOINTS), self._left_ns
+        jumped = newest is not None and left is not None and newest <= left - 2 * LEAD_NS
+        if jumped and left is not None and abs(stamp_ns - left) <= LEAD_NS:
+            self.ignored.add(topic, "the clock jumped back")  # late, from just before that
             return
-        newest = self.newest_ns.get(JOINTS)
-        if newest is not None and sample.stamp_ns < newest - LEAD_NS:
+        if newest is not None and stamp_ns < newest - LEAD_NS:
             self._behind.append((newest, sample))
         if not self._pair(sample):
             insort(self._pending, sample, key=lambda waiting: waiting.stamp_ns)
         if len(self._pending) > MOST_WAITING:
             # The latest: one stamped far ahead must not displace those whose joints come next.
-            self.ignored.add(_topic(self._pending.pop()), "no joint readings came")
+            self.ignored.add(self._pending.pop().topic, "no joint readings came")
 
-    def _of_the_clock_left(self, stamp_ns: int) -> bool:
-        """Whether a late stamp is from just before the clock jumped back."""
-        newest, left = self.newest_ns.get(JOINTS), self._left_ns
-        if newest is None or left is None or newest > left - 2 * LEAD_NS:
-            return False
-        return abs(stamp_ns - left) <= LEAD_NS
+    def _ignore_frame(self, sample: PointSample) -> None:
+        words = f"frame '{sample.frame}' is not the measuring frame '{self.frame}'"
+        self.ignored.add(sample.topic, words)
 
-    def _ignore_frame(self, topic: str, frame: str) -> None:
-        self.ignored.add(topic, f"frame '{frame}' is not the measuring frame '{self.frame}'")
-
-    def _pair(self, sample: PointSample | PoseSample) -> bool:
+    def _pair(self, sample: PointSample) -> bool:
         """Settle a measurement; False while its joints are to come."""
-        topic = _topic(sample)
+        topic, stamp_ns = sample.topic, sample.stamp_ns
+        refused = ""
         try:
-            reading = self.stream.standstill(sample.stamp_ns, self.rule)
+            reading = self.stream.standstill(stamp_ns, self.rule)
         except NotStillError as error:
-            self._came(topic, sample.stamp_ns)
-            self.ignored.add(topic, str(error))
-            return True
-        if reading is None:
+            reading, refused = None, str(error)
+        if reading is None and not refused:
             return False
-        self._came(topic, sample.stamp_ns)
-        if isinstance(sample, PointSample):
-            position, rotation = sample.position_m, None
-        else:
-            T = sample.T_frame_target
-            position, rotation = T[:3, 3], T[:3, :3]
-        self._observed.append(
-            Observation(
-                sample.stamp_ns, reading.ready_ns, topic, sample.frame, sample.target,
-                reading.q, position, rotation, sample,
-            )
-        )  # fmt: skip
-        if len(self._observed) > MOST_KEPT:
-            self.ignored.add(self._observed.pop(0).topic, "no command used it")
-        return True
-
-    def _came(self, topic: str, stamp_ns: int) -> None:
         self.newest_ns[topic] = max(stamp_ns, self.newest_ns.get(topic, stamp_ns))
+        if reading is None:
+            self.ignored.add(topic, refused)
+            return True
+        self._observed.append(Observation(sample, reading.q, reading.ready_ns))
+        if len(self._observed) > MOST_KEPT:
+            self.ignored.add(self._observed.pop(0).sample.topic, "no command used it")
+        return True
 
     def drop_far_ahead(self) -> None:
         """Give up waiting measurements stamped a minute or more after the newest joints."""
@@ -322,10 +288,8 @@ class ObservationDesk:
             ahead_ns = self._pending[-1].stamp_ns - newest
             if ahead_ns < FAR_AHEAD_NS:
                 return
-            topic = _topic(self._pending.pop())
-            self.ignored.add(
-                topic, f"stamped {ahead_ns * 1e-9:.0f} s after the newest joint reading"
-            )
+            words = f"stamped {ahead_ns * 1e-9:.0f} s after the newest joint reading"
+            self.ignored.add(self._pending.pop().topic, words)
 
     def window(self, after_ns: int, until_ns: int, marks: Mapping[str, int]) -> list[Observation]:
         """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``.
@@ -337,92 +301,56 @@ class ObservationDesk:
         found = [
             o
             for o in self._observed
-            if after_ns < o.stamp_ns <= until_ns
+            if after_ns < o.sample.stamp_ns <= until_ns
             and o.ready_ns <= joints
-            and o.stamp_ns <= marks.get(o.topic, -1)
+            and o.sample.stamp_ns <= marks.get(o.sample.topic, -1)
         ]
-        found.sort(key=lambda o: (o.stamp_ns, o.target, o.topic != MEASURED_POSE))
+        found.sort(
+            key=lambda o: (o.sample.stamp_ns, o.sample.target, o.sample.topic != MEASURED_POSE)
+        )
         if found and self.frame is None:
-            self.frame = found[0].frame
-            for other in [o for o in self._observed if o.frame != self.frame]:
-                self._ignore_frame(other.topic, other.frame)
-            self._observed = [o for o in self._observed if o.frame == self.frame]
+            self.frame = found[0].sample.frame
+            for other in [o.sample for o in self._observed if o.sample.frame != self.frame]:
+                self._ignore_frame(other)
+            self._observed = [o for o in self._observed if o.sample.frame == self.frame]
         once: dict[tuple[int, str], Observation] = {}
         for observation in found:
-            if observation.frame == self.frame:
-                once.setdefault((observation.stamp_ns, observation.target), observation)
+            sample = observation.sample
+            if sample.frame == self.frame:
+                once.setdefault((sample.stamp_ns, sample.target), observation)
         return list(once.values())
-
-    @property
-    def latest_ns(self) -> int:
-        """Stamp of the latest unused observation; 0 without."""
-        return max((o.stamp_ns for o in self.unused(self.from_ns)), default=0)
 
     def unused(self, from_ns: int) -> list[Observation]:
         """Observations of targets on the flange, from a stamp on, that no command has used."""
-        return [o for o in self._observed if o.stamp_ns >= from_ns and o.topic != REFERENCE_SPHERE]
+        return [
+            o
+            for o in self._observed
+            if o.sample.stamp_ns >= from_ns and o.sample.topic != REFERENCE_SPHERE
+        ]
 
     def last_run_ns(self, pause_ns: int) -> int:
         """Stamp from which the unused observations follow each other without so long a pause."""
-        stamps = sorted(o.stamp_ns for o in self.unused(self.from_ns))
+        stamps = sorted(o.sample.stamp_ns for o in self.unused(self.from_ns))
         pauses = [i for i in range(1, len(stamps)) if stamps[i] - stamps[i - 1] > pause_ns]
         return stamps[pauses[-1]] if pauses else self.from_ns
 
     def use(self, until_ns: int) -> None:
         """Drop observations up to a stamp: they were used."""
         self.used_ns = max(self.used_ns, until_ns)
-        self._observed = [o for o in self._observed if o.stamp_ns > until_ns]
-
-
-TIME_OUT = "time-out"
-REMEMBERED = 200  # calibrations back to which a cycle's id is known
+        self._observed = [o for o in self._observed if o.sample.stamp_ns > until_ns]
 
 
 @dataclass
 class OpenCycle:
-    """The open cycle.
+    """The measuring cycle that is open; ``id`` is empty while none is.
 
-    Attributes
-    ----------
-    id : its name; empty while none is open.
-    begun_ns : stamp at which it began.
-    postponed_ns : stamp at which it could not be kept; its time-out begins anew there.
+    ``begun_ns``: stamp at which it began; ``postponed_ns``: at which it could not be kept, and its
+    time-out begins anew.
     """
 
     id: str = ""
     begun_ns: int = 0
     postponed_ns: int = 0
-
-    def begin(self, cycle_id: str, stamp_ns: int, history: History) -> str:
-        """Open a cycle and say so; one that is open already goes on, another one is broken off.
-
-        Raises
-        ------
-        ConflictError
-            When a cycle of this id has ended.
-        """
-        if self.id == cycle_id:
-            return f"cycle '{cycle_id}' is open already"
-        if ended(cycle_id, history) is not None:
-            raise ConflictError(
-                f"cycle '{cycle_id}' has ended already: give each cycle an id of its own"
-            )
-        broken = f"; cycle '{self.id}' is broken off" if self.id else ""
-        self.id, self.begun_ns = cycle_id, stamp_ns
-        return f"cycle '{cycle_id}' is open{broken}"
-
-    def close(self) -> None:
-        """No cycle is open any more."""
-        self.id = ""
-
-
-def ended(cycle_id: str, history: History) -> Entry | None:
-    """The calibration that a cycle of this id gave, the latest of them; None without."""
-    entries = (e for e in history.list(REMEMBERED) if e.kind == THERMAL and e.cycle_id == cycle_id)
-    return next(entries, None)
-
-
-OTHER_POSE = "measured at a pose that the cold reference lacks"
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,7 +368,7 @@ class Beside:
 
 
 class Windows:
-    """Takes the observations of a command from the desk."""
+    """Which observations belong to a command, and when a cycle ends by itself."""
 
     def __init__(
         self, desk: ObservationDesk, cycle: OpenCycle, current: InForce, config: ThermalConfig
@@ -448,12 +376,14 @@ class Windows:
         self._desk, self._cycle, self._current, self._config = desk, cycle, current, config
         self._pause_ns = int(config.cycle_timeout_s * 1e9)
 
+    def _cycle_ns(self) -> int:
+        """Stamp from which measurements belong to a cycle: it holds no pause of its time-out."""
+        return self._desk.from_ns if self._cycle.id else self._desk.last_run_ns(self._pause_ns)
+
     def from_ns(self, command: Command) -> int:
-        """Stamp of the first measurement that counts: a cycle holds no pause of its time-out."""
+        """Stamp of the first measurement that counts."""
         calibrates = self._current.reference is None or command.name in events.SET_UP
-        if calibrates or self._cycle.id:
-            return self._desk.from_ns
-        return self._desk.last_run_ns(self._pause_ns)
+        return self._desk.from_ns if calibrates else self._cycle_ns()
 
     def of(self, command: Command) -> tuple[Measurements, Array]:
         """Targets on the flange, and centres (n, 3) of a sphere fixed in the cell.
@@ -465,21 +395,30 @@ class Windows:
         InputError
             When a cycle holds no pose of the cold reference.
         """
-        desk, sets_up = self._desk, command.name in events.SET_UP
+        desk, reference = self._desk, self._current.reference
         desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", desk.from_ns)) - 1
         observed = desk.window(after, command.stamp_ns or 0, command.marks or {})
-        fixed = [o.position for o in observed if o.topic == REFERENCE_SPHERE]
-        found = [o for o in observed if o.topic != REFERENCE_SPHERE]
+        fixed = [o.sample.position_m for o in observed if o.sample.topic == REFERENCE_SPHERE]
+        found = [o for o in observed if o.sample.topic != REFERENCE_SPHERE]
         if not found:
             raise TooFewSamplesError(desk.why_nothing())
-        drift = self._current.reference is not None and not sets_up
-        if drift or sets_up:
+        sets_up = command.name in events.SET_UP
+        if reference is not None or sets_up:
             found = one_per_visit(found, self._config.standstill.tolerance_rad)
-        if drift:
-            found = self._at_cold_poses(found)
+        sigma_m = None  # a calibration finds its noise itself
+        if reference is not None and not sets_up:
+            sigma_m = self._config.sigma_m
+            known = reference.spots.knows(np.array([o.q for o in found]))
+            for other in (o for o, at_one in zip(found, known, strict=True) if not at_one):
+                desk.ignored.add(other.sample.topic, OTHER_POSE)
+            if not np.any(known):
+                raise InputError(
+                    f"none of the {len(found)} measured poses was measured in the cold reference: "
+                    "visit the reference poses, or capture a new reference"
+                )
+            found = [o for o, at_one in zip(found, known, strict=True) if at_one]
         last = int(command.arguments.get("samples", 0))
-        sigma_m = self._config.sigma_m if drift else None  # a calibration finds its noise itself
         data = as_measurements(found[-last:] if last else found, sigma_m)
         return data, np.array(fixed).reshape(-1, 3)
 
@@ -490,53 +429,30 @@ class Windows:
         of the cold reference's poses or more.
         """
         desk, cycle = self._desk, self._cycle
-        last_ns = max(desk.latest_ns, cycle.begun_ns if cycle.id else 0)
+        last_ns = max((o.sample.stamp_ns for o in desk.unused(desk.from_ns)), default=0)
+        last_ns = max(last_ns, cycle.begun_ns if cycle.id else 0)
         due_ns = max(last_ns, cycle.postponed_ns) + self._pause_ns
         if not last_ns or desk.newest_ns.get(JOINTS, 0) <= due_ns:
             return None
-        if not cycle.id and not self._half_visited():
-            return None
+        if not cycle.id:
+            visited, poses = self.progress()
+            if poses == 0 or 2 * visited < poses:
+                return None
         return Command(events.END_CYCLE, {"by": TIME_OUT}, due_ns)
 
     def progress(self) -> tuple[int, int]:
         """How many poses of the cold reference were visited in this cycle, and of how many."""
-        reference, desk = self._current.reference, self._desk
+        reference = self._current.reference
         if reference is None:
             return 0, 0
-        start = desk.from_ns if self._cycle.id else desk.last_run_ns(self._pause_ns)
-        q = [o.q for o in desk.unused(start)]
+        q = [o.q for o in self._desk.unused(self._cycle_ns())]
         return len(reference.spots.visited(np.array(q))), reference.spots.poses
-
-    def _half_visited(self) -> bool:
-        visited, poses = self.progress()
-        return poses > 0 and 2 * visited >= poses
-
-    def _at_cold_poses(self, found: list[Observation]) -> list[Observation]:
-        """Those at a pose of the cold reference; that of another pose shows no drift."""
-        if self._current.reference is None:
-            return found
-        known = self._current.reference.spots.knows(np.array([o.q for o in found]))
-        for other in (o for o, at_one in zip(found, known, strict=True) if not at_one):
-            self._desk.ignored.add(other.topic, OTHER_POSE)
-        if not np.any(known):
-            raise InputError(
-                f"none of the {len(found)} measured poses was measured in the cold reference: "
-                "visit the reference poses, or capture a new reference"
-            )
-        return [o for o, at_one in zip(found, known, strict=True) if at_one]
-
-
-EVERY_NS = 10_000_000_000  # of a joint's samples within ten seconds the first one counts
-SILENT_NS = 900_000_000_000  # a temperature says nothing any more after a quarter of an hour
-MOST_INTERVALS = 20_000  # of those ten seconds: more than two days
 
 
 class MotorTemperatures:
     """All joints' temperatures, whatever order they arrive in.
 
-    Attributes
-    ----------
-    newest_ns : newest stamp; None before the first.
+    ``newest_ns``: newest stamp; None before the first.
     """
 
     def __init__(self, names: tuple[str, ...]) -> None:

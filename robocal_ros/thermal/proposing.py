@@ -1,6 +1,6 @@
 """From the measurements of a command to a proposal in the history."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,11 @@ from robocal_ros.thermal.drift_following import (
     EXPECTED,
     METHODS,
     DriftFollower,
-    Following,
     InForce,
     ThermalConfig,
     default_process,
 )
 from robocal_ros.thermal.identification import (
-    FixedSphere,
     cycle_document,
     fixed_sphere,
     identify_subset,
@@ -49,32 +47,41 @@ from robocal_ros.thermal.reference import (
 )
 
 Array = NDArray[np.float64]
+Document = dict[str, Any]
+
+SENSOR = "sensor"
+SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")
 
 
-class CandidateStore:
-    """Puts candidates of one session into the history.
+class Proposer:
+    """Solves what a command asks for, against what is in force, and keeps the result.
 
     Parameters
     ----------
+    software : version that makes the candidates.
     current : what is in force, followed by the session.
-    software : version that made the candidates.
     """
 
     def __init__(
-        self, nominal: SerialArm, history: History, software: str, current: InForce
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: ThermalConfig,
+        software: str,
+        current: InForce,
     ) -> None:
-        self._nominal, self._history = nominal, history
+        self._nominal, self._history, self._config = nominal, history, config
         self._software, self._current = software, current
 
-    def propose(
+    def _propose(
         self,
         kind: str,
         command: Command,
         wall_ns: int,
         method: str,
         verdict: Verdict,
-        document: dict[str, Any],
-        model: dict[str, Any],
+        document: Document,
+        model: Document,
         inputs: dict[str, NDArray[Any]],
     ) -> int:
         """Keep a candidate and return its id."""
@@ -100,43 +107,10 @@ class CandidateStore:
             )
         )
 
-    def accept(self, chosen: int, command: Command, reason: str, wall_ns: int) -> None:
+    def _accept(self, chosen: int, command: Command, reason: str, wall_ns: int) -> None:
         """Bring a step of the set-up into force: it moves nothing."""
         by = str(command.arguments.get("by", ""))
         self._history.accept(chosen, by=by, reason=reason, expected_head=None, wall_ns=wall_ns)
-
-
-@dataclass(frozen=True)
-class _Solution:
-    """A judged identification as it is kept."""
-
-    document: dict[str, Any]
-    model: dict[str, Any]
-    verdict: Verdict
-
-
-class Proposer:
-    """Solves what a command asks for, against what is in force, and keeps the result.
-
-    Parameters
-    ----------
-    current : what is in force, followed by the session.
-    following : follows the drift since the cold reference in force.
-    """
-
-    def __init__(
-        self,
-        nominal: SerialArm,
-        config: ThermalConfig,
-        current: InForce,
-        following: Following,
-        keeper: CandidateStore,
-    ) -> None:
-        self._nominal = nominal
-        self._config = config
-        self._current = current
-        self._following = following
-        self._keeper = keeper
 
     def method(self, command: Command) -> Method:
         """Tell the estimator that a command names, else the configured one.
@@ -153,38 +127,47 @@ class Proposer:
         raise InputError(f"method '{named}' is not one of {', '.join(METHODS)}")
 
     def identify(
-        self, command: Command, data: Measurements, beside: Beside, method: Method, wall_ns: int
+        self,
+        command: Command,
+        data: Measurements,
+        beside: Beside,
+        method: Method,
+        follower: DriftFollower | None,
+        wall_ns: int,
     ) -> Outcome:
         """Identify a model from these measurements, judge it and propose it.
+
+        ``follower``: of the drift since the cold reference in force; None without one.
 
         Raises
         ------
         RobocalError
             When they cannot answer, or the history refuses.
         """
-        reference, follower = self._current.reference, self._following.follower
+        reference = self._current.reference
         if reference is None or follower is None:
-            return self._keep(command, self._calibration(data, method), method, data, {}, wall_ns)
+            solution = self._calibration(data, method)
+            return self._keep(command, *solution, method, data, {}, wall_ns)
         with follower.attempt():
             solution = self._drift(follower, reference, data, beside, method)
             kept = follower.kept(beside.temperature)
-            return self._keep(command, solution, method, data, kept, wall_ns)
+            return self._keep(command, *solution, method, data, kept, wall_ns)
 
     def _keep(
         self,
         command: Command,
-        solution: _Solution,
+        document: Document,
+        model: Document,
+        verdict: Verdict,
         method: Method,
         data: Measurements,
         beside: dict[str, NDArray[Any]],
         wall_ns: int,
     ) -> Outcome:
-        verdict, inputs = solution.verdict, data.arrays() | beside
         cycle_id = str(command.arguments.get("cycle_id", ""))
-        document = solution.document | {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
-        chosen = self._keeper.propose(
-            THERMAL, command, wall_ns, method, verdict, document, solution.model, inputs
-        )
+        document = document | {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
+        inputs = data.arrays() | beside
+        chosen = self._propose(THERMAL, command, wall_ns, method, verdict, document, model, inputs)
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
 
     def _drift(
@@ -194,11 +177,14 @@ class Proposer:
         data: Measurements,
         beside: Beside,
         method: Method,
-    ) -> _Solution:
+    ) -> tuple[Document, Document, Verdict]:
         """Since the cold visit, against the cold model: never a step on what is in force."""
         config, spots, in_force = self._config, reference.spots, self._current.arm
+        fixed = None
+        if len(reference.fixed) and len(beside.fixed):
+            fixed = fixed_sphere(reference.fixed, beside.fixed, config.sigma_m)
         follower.read(beside.temperatures)
-        tracked = follower.take(data, in_force, self._fixed(reference, beside.fixed))
+        tracked = follower.take(data, in_force, fixed)
         found, judged = tracked.found, tracked.judged
         if method == "lsq" and not follower.state.moved:
             names = config.drift_parameters or self._nominal.parameters.names
@@ -217,14 +203,11 @@ class Proposer:
                 "missing": [n for n in range(1, spots.poses + 1) if n not in visited],
             }
         }
-        return _Solution(document, model, judged.verdict)
+        return document, model, judged.verdict
 
-    def _fixed(self, reference: ColdReference, now: Array) -> FixedSphere | None:
-        if not len(reference.fixed) or not len(now):
-            return None
-        return fixed_sphere(reference.fixed, now, self._config.sigma_m)
-
-    def _calibration(self, data: Measurements, method: Method) -> _Solution:
+    def _calibration(
+        self, data: Measurements, method: Method
+    ) -> tuple[Document, Document, Verdict]:
         current = self._current
         judged = identify_and_hold_out(
             self._nominal,
@@ -235,26 +218,7 @@ class Proposer:
             in_force=current.arm if current.head.model is not None else None,
         )
         model = identified_model_document(judged.identification)
-        return _Solution(identification_document(judged), model, judged.verdict)
-
-
-SENSOR = "sensor"
-SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")
-
-
-class SetUp:
-    """Solves the steps of the set-up; what its verdict accepts is in force at once."""
-
-    def __init__(
-        self,
-        nominal: SerialArm,
-        history: History,
-        config: ThermalConfig,
-        current: InForce,
-        keeper: CandidateStore,
-    ) -> None:
-        self._nominal, self._history, self._config = nominal, history, config
-        self._current, self._keeper = current, keeper
+        return identification_document(judged), model, judged.verdict
 
     def capture(
         self, command: Command, data: Measurements, beside: Beside, wall_ns: int
@@ -269,7 +233,7 @@ class SetUp:
         RobocalError
             When they cannot be one, or the history refuses.
         """
-        visit, told = self._visit(data)
+        visit, which_arm = self._visit(data)
         reference = replace(visit, fixed=beside.fixed, temperature=beside.temperature)
         rms_mm = summarise(reference.cell.residual(reference.used)).rms_m * 1e3
         message = (
@@ -281,17 +245,17 @@ class SetUp:
                 f"{', '.join(reference.rejected)}"
             )
         command, expected, from_what = self._expected(command)
-        message += told + from_what
+        message += which_arm + from_what
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
         verdict = Verdict(Code.ACCEPT, message)
         model = reference_document(reference) | {
             EXPECTED: expected,
             COMMISSIONED: self._current.commissioned.mdh.tolist(),
         }
-        chosen = self._keeper.propose(
+        chosen = self._propose(
             REFERENCE, command, wall_ns, "lsq", verdict, document, model, data.arrays()
         )
-        self._keeper.accept(chosen, command, "captured", wall_ns)
+        self._accept(chosen, command, "captured", wall_ns)
         return Outcome(command, Code.ACCEPT, message, calibration_id=chosen, samples=len(data))
 
     def _visit(self, data: Measurements) -> tuple[ColdReference, str]:
@@ -300,41 +264,37 @@ class SetUp:
         A robot that has cooled is the commissioned one; after a knock of the sensor it is as warm
         as before, and with the cold arm its drift would be lost.
         """
-        current = self._current
+        current, sigma_m = self._current, self._config.sigma_m
         visit, reference = capture_reference(current.commissioned, data), current.reference
         if reference is None or not current.drifted:
             return visit, ""
-        sigma_m = self._config.sigma_m
         if (size_m := drift_size_m(visit, current.arm)) <= sigma_m:
             return visit, f"; the drift in force is within the noise ({size_m * 1e3:.3f} mm)"
         found = drift_share(reference, visit, current.arm, sigma_m)
         shown = f"{found.share:.0%} of the drift in force"
+        nominal = np.array_equal(current.commissioned.mdh, self._nominal.mdh)
+        which = "id 0, the nominal model" if nominal else "the id of the calibration before it"
+        remedy = f"roll the drift back (~/rollback, {which})"
         if not found.told:
             raise TooFewSamplesError(
                 "these poses do not tell whether the robot is cold or as warm as the model in "
-                f"force: if it is cold, {self._back()} and capture again; if it is warm, measure "
+                f"force: if it is cold, {remedy} and capture again; if it is warm, measure "
                 "the poses of the cold reference in three rounds, or capture when it is cold"
             )
         if found.between:
             raise ConflictError(
                 f"the measurements show {shown}: the robot is neither cold nor as warm as the "
-                f"model in force; capture when it has cooled, or {self._back()} if it is cold"
+                f"model in force; capture when it has cooled, or {remedy} if it is cold"
             )
         if found.warm:
             visit = capture_reference(current.arm, data)
             return visit, f"; the robot is as warm as the model in force ({shown})"
         return visit, (
             f"; the robot is cold ({shown}), and the model in force still holds that drift: "
-            f"measure a cycle and accept its model, or {self._back()}"
+            f"measure a cycle and accept its model, or {remedy}"
         )
 
-    def _back(self) -> str:
-        """What rids the model in force of its drift."""
-        nominal = np.array_equal(self._current.commissioned.mdh, self._nominal.mdh)
-        which = "id 0, the nominal model" if nominal else "the id of the calibration before it"
-        return f"roll the drift back (~/rollback, {which})"
-
-    def _expected(self, command: Command) -> tuple[Command, dict[str, Any], str]:
+    def _expected(self, command: Command) -> tuple[Command, Document, str]:
         """The drift to expect from now on; the command carries it for replay."""
         default = default_process(self._nominal, self._config.sigma_m)
         if self._config.prior == "default":
@@ -344,8 +304,8 @@ class SetUp:
             kept = process_document(found or default)
             arguments = {**command.arguments, EXPECTED: kept, "expected_from": words}
             command = replace(command, arguments=arguments)
-        told = f"; expected drift: {command.arguments['expected_from']}"
-        return command, command.arguments[EXPECTED], told
+        from_what = f"; expected drift: {command.arguments['expected_from']}"
+        return command, command.arguments[EXPECTED], from_what
 
     def place_sensor(
         self, command: Command, data: Measurements, frame: str, wall_ns: int
@@ -364,9 +324,7 @@ class SetUp:
         found = calibrate_sensor(self._current.arm, data, method)
         verdict, document = sensor_verdict(found), sensor_document(found, self._nominal)
         inputs, model = data.arrays(), document | {"frame": frame}
-        chosen = self._keeper.propose(
-            SENSOR, command, wall_ns, method, verdict, document, model, inputs
-        )
+        chosen = self._propose(SENSOR, command, wall_ns, method, verdict, document, model, inputs)
         if verdict.accept:
-            self._keeper.accept(chosen, command, "placed", wall_ns)
+            self._accept(chosen, command, "placed", wall_ns)
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StorageError
-from robocal_ros.ground.proposals import REFERENCE, THERMAL, Head
+from robocal_ros.ground.proposals import REFERENCE, THERMAL, Entry, Head
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -24,7 +24,6 @@ from robocal_ros.ground.samples import (
     JointSample,
     Measurements,
     PointSample,
-    PoseSample,
     TemperatureSample,
     joint_sample,
     point_sample,
@@ -63,69 +62,18 @@ from robocal_ros.thermal.observations import (
     ObservationDesk,
     OpenCycle,
     Windows,
-    ended,
 )
-from robocal_ros.thermal.proposing import CandidateStore, Proposer, SetUp
+from robocal_ros.thermal.proposing import Proposer
 from robocal_ros.thermal.reference import SAME_VISIT_RAD, ColdReference
 
 Array = NDArray[np.float64]
 
-
 SAME_CLOCK_NS = 1_000_000_000
-
-
-class Bounds:
-    """Gives commands what replay needs to find the same samples."""
-
-    def __init__(
-        self, desk: ObservationDesk, cycle: OpenCycle, windows: Windows, config: ThermalConfig
-    ) -> None:
-        self._desk, self._cycle, self._windows, self._config = desk, cycle, windows, config
-
-    def stamped(self, command: Command, clock_ns: int | None) -> Command:
-        """Return the command with a stamp: its own, the clock's, or the newest known."""
-        if command.stamp_ns is None:
-            newest = self._desk.clock_ns
-            near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
-            command = replace(command, stamp_ns=clock_ns if near else newest)
-        return command
-
-    def named(self, command: Command) -> Command:
-        """Name a cycle: as the open one, else by its time."""
-        begins = command.name == events.BEGIN_CYCLE
-        if command.arguments.get("cycle_id") or not (begins or command.name in events.CYCLE):
-            return command
-        by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
-        name = by_time if begins else self._cycle.id or by_time
-        return replace(command, arguments={**command.arguments, "cycle_id": name})
-
-    def marked(self, command: Command) -> Command:
-        """Return the command with the bounds of its samples, for the record."""
-        marks, arguments = self._desk.marks, dict(command.arguments)
-        if command.name in events.MEASURED:
-            arguments.setdefault("from_ns", self._windows.from_ns(command))
-        return replace(command, marks=marks, arguments=arguments)
-
-    def ready(self, command: Command) -> bool:
-        """Whether its samples are complete."""
-        return reached(self._wanted(command), self._desk.newest_ns, self._desk.jumps)
-
-    def joints_awaited_ns(self, command: Command) -> int | None:
-        """Stamp of the joint reading that it waits for; None when it waits for none."""
-        return joints_awaited_ns(self._wanted(command), self._desk.newest_ns)
-
-    def _wanted(self, command: Command) -> Mapping[str, int]:
-        """Marks up to which samples must have come."""
-        if command.marks is not None:
-            return command.marks
-        marks = {JUMPS: self._desk.jumps}
-        if command.name in events.MEASURED:
-            marks[JOINTS] = (command.stamp_ns or 0) + int(self._config.lateness_s * 1e9)
-        return marks
-
-
-__all__ = ["ThermalConfig", "ThermalSession"]
-_NO_REFERENCE = "no cold reference: capture it before the first cycle"
+REMEMBERED = 200  # calibrations back to which a cycle's id is known
+DUE_AHEAD_S = 300.0  # a measurement is due so long before the bound reaches the tolerance
+OWN = "tracker"  # only a thermal session's configuration has it
+LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
+NO_REFERENCE = "no cold reference: capture it before the first cycle"
 
 
 class ThermalSession:
@@ -142,14 +90,9 @@ class ThermalSession:
     """
 
     def __init__(
-        self,
-        nominal: SerialArm,
-        history: History,
-        config: ThermalConfig,
-        software: str,
+        self, nominal: SerialArm, history: History, config: ThermalConfig, software: str
     ) -> None:
-        self.nominal = nominal
-        self.config = config
+        self.nominal, self.config = nominal, config
         self.desk = ObservationDesk(
             nominal.joint_names, config.standstill, config.measuring_frame or None
         )
@@ -160,11 +103,8 @@ class ThermalSession:
         self.temperatures = MotorTemperatures(nominal.joint_names)
         self.cycle = OpenCycle()
         self.windows = Windows(self.desk, self.cycle, self._current, config)
-        self._bounds = Bounds(self.desk, self.cycle, self.windows, config)
-        self._following = Following(history, self._current, config.sigma_m, config.work)
-        keeper = CandidateStore(nominal, history, software, self._current)
-        self._set_up = SetUp(nominal, history, config, self._current, keeper)
-        self._proposer = Proposer(nominal, config, self._current, self._following, keeper)
+        self._following = Following(history, self._current, config)
+        self._proposer = Proposer(nominal, history, config, software, self._current)
 
     @property
     def in_force(self) -> Head:
@@ -205,19 +145,28 @@ class ThermalSession:
         """The cold reference as it is kept, or None."""
         return self._current.reference_model
 
+    @property
+    def follower(self) -> DriftFollower | None:
+        """What follows the drift since the cold reference; None without one."""
+        return self._following.follower
+
     def expected_drift(self) -> Array:
         """Covariance (k, k), SI, of the drift that a shift may bring."""
         if self.follower is not None:
             return self.follower.expected_drift()
         return self._following.expected.process.covariance
 
-    def add(self, sample: JointSample | PointSample | PoseSample | TemperatureSample) -> None:
+    def add(self, sample: JointSample | PointSample | TemperatureSample) -> None:
         """Take a sample."""
         if isinstance(sample, JointSample):
             jumps = self.desk.jumps
             self.desk.add_joints(sample)
-            if self.desk.jumps > jumps:
-                self._clock_jumped(sample.stamp_ns)
+            if self.desk.jumps > jumps:  # what an earlier clock stamped cannot be compared any more
+                self.temperatures = MotorTemperatures(self.nominal.joint_names)
+                self.cycle.begun_ns = sample.stamp_ns
+                with suppress(RobocalError):  # said by `accuracy`
+                    if self.follower is not None:
+                        self.follower.clock_jumped(sample.stamp_ns)
         elif isinstance(sample, TemperatureSample):
             self.temperatures.add(sample)
             self.desk.newest_ns[TEMPERATURES] = self.temperatures.newest_ns or 0
@@ -229,16 +178,10 @@ class ThermalSession:
 
         As `add` of each, many times faster. The reading after them is for `add`.
         """
-        awaited_ns = self._bounds.joints_awaited_ns(self._queue[0]) if self._queue else None
+        awaited_ns = None
+        if self._queue:
+            awaited_ns = joints_awaited_ns(self._wanted(self._queue[0]), self.desk.newest_ns)
         return self.desk.take_plain(block, start, awaited_ns)
-
-    def _clock_jumped(self, stamp_ns: int) -> None:
-        """Nothing that an earlier clock stamped can be compared any more."""
-        self.temperatures = MotorTemperatures(self.nominal.joint_names)
-        self.cycle.begun_ns = stamp_ns
-        with suppress(RobocalError):  # said by `accuracy`
-            if self.follower is not None:
-                self.follower.clock_jumped(stamp_ns)
 
     def submit(self, command: Command, clock_ns: int | None = None) -> None:
         """Queue a command; ``advance`` carries it out when its samples are complete.
@@ -246,7 +189,11 @@ class ThermalSession:
         A command without a stamp gets ``clock_ns`` where that is on the samples' clock (within
         a second after the newest of them), else the newest stamp known.
         """
-        self._queue.append(self._bounds.stamped(command, clock_ns))
+        if command.stamp_ns is None:
+            newest = self.desk.clock_ns
+            near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
+            command = replace(command, stamp_ns=clock_ns if near else newest)
+        self._queue.append(command)
 
     @property
     def waiting(self) -> int:
@@ -264,21 +211,37 @@ class ThermalSession:
             outcomes += done
         return outcomes
 
+    def _wanted(self, command: Command) -> Mapping[str, int]:
+        """Marks up to which samples must have come for a command."""
+        if command.marks is not None:
+            return command.marks
+        marks = {JUMPS: self.desk.jumps}
+        if command.name in events.MEASURED:
+            marks[JOINTS] = (command.stamp_ns or 0) + int(self.config.lateness_s * 1e9)
+        return marks
+
     def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
-        """Carry out one command, as ``advance``: what was decided outside before it, and it."""
-        if not self._queue or not (force or self._bounds.ready(self._queue[0])):
+        """Carry out one command, as ``advance``: what was decided outside before it, and it.
+
+        For the record the command gets a cycle's name, the marks of its samples, and the stamp of
+        the first of them.
+        """
+        desk = self.desk
+        if not self._queue:
             return []
-        command = self._bounds.named(self._queue.pop(0))
+        if not force and not reached(self._wanted(self._queue[0]), desk.newest_ns, desk.jumps):
+            return []
+        command = self._queue.pop(0)
+        arguments, begins = dict(command.arguments), command.name == events.BEGIN_CYCLE
+        if (begins or command.name in events.CYCLE) and not arguments.get("cycle_id"):
+            by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
+            arguments["cycle_id"] = by_time if begins else self.cycle.id or by_time
+            command = replace(command, arguments=arguments)
         outside = self.poll()
         if command.marks is None:
-            command = self._bounds.marked(command)
-        outcome = self._carry_out(command, wall_ns)
-        outside += [
-            outside_decision(decision, self.desk.marks) for decision in self._current.look(wall_ns)
-        ]
-        return [*outside, replace(outcome, revision=self.in_force.revision)]
-
-    def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
+            if command.name in events.MEASURED:
+                arguments.setdefault("from_ns", self.windows.from_ns(command))
+            command = replace(command, marks=desk.marks, arguments=arguments)
         handlers: dict[str, Callable[[Command, int], Outcome]] = {
             events.CALIBRATE_SENSOR: self._calibrate_sensor,
             events.CAPTURE_REFERENCE: self._capture_reference,
@@ -289,17 +252,19 @@ class ThermalSession:
             events.REJECT: self._decide,
             events.ROLLBACK: self._decide,
         }
-        return events.carried_out(handlers, command, wall_ns)
+        outcome = events.carried_out(handlers, command, wall_ns)
+        outside += [outside_decision(d, desk.marks) for d in self._current.look(wall_ns)]
+        return [*outside, replace(outcome, revision=self.in_force.revision)]
 
     def _calibrate_sensor(self, command: Command, wall_ns: int) -> Outcome:
         """Place the sensor; the samples stay, for the cold reference."""
         data, _ = self.windows.of(command)
-        return self._set_up.place_sensor(command, data, self.desk.frame or "", wall_ns)
+        return self._proposer.place_sensor(command, data, self.desk.frame or "", wall_ns)
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         data, fixed = self.windows.of(command)
-        reference = self._beside(command, data, fixed)
-        outcome = self._set_up.capture(command, data, reference, wall_ns)
+        beside = self._beside(command, data, fixed)
+        outcome = self._proposer.capture(command, data, beside, wall_ns)
         self._close_cycle(command)
         return outcome
 
@@ -307,44 +272,54 @@ class ThermalSession:
         method = self._proposer.method(command)
         data, fixed = self.windows.of(command)
         beside = self._beside(command, data, fixed)
-        outcome = self._proposer.identify(command, data, beside, method, wall_ns)
+        outcome = self._proposer.identify(command, data, beside, method, self.follower, wall_ns)
         self._close_cycle(command)
         return outcome
 
     def _beside(self, command: Command, data: Measurements, fixed: Array) -> Beside:
         """With the motor temperatures up to the middle of what was measured."""
-        newest = (command.marks or {}).get(TEMPERATURES, -1)
-        until_ns = min(data.middle_ns, newest)
-        follower = self.follower
-        after_ns = 0 if follower is None else follower.read_ns
+        until_ns = min(data.middle_ns, (command.marks or {}).get(TEMPERATURES, -1))
+        after_ns = 0 if self.follower is None else self.follower.read_ns
         readings = self.temperatures.between(after_ns, until_ns)
         return Beside(fixed, readings, self.temperatures.at(until_ns))
 
     def _close_cycle(self, command: Command) -> None:
-        self.cycle.close()
+        self.cycle.id = ""
         self.desk.use(command.stamp_ns or 0)
 
+    def _ended(self, cycle_id: str) -> Entry | None:
+        """The calibration that a cycle of this id gave, the latest of them; None without."""
+        entries = self._history.list(REMEMBERED)
+        return next((e for e in entries if e.kind == THERMAL and e.cycle_id == cycle_id), None)
+
     def _begin_cycle(self, command: Command, wall_ns: int) -> Outcome:
+        """Open a cycle; one that is open already goes on, another one is broken off."""
         if self.reference is None:
-            raise ConflictError(_NO_REFERENCE)
-        cycle_id, stamp_ns = str(command.arguments["cycle_id"]), command.stamp_ns or 0
-        going_on = self.cycle.id == cycle_id
-        message = self.cycle.begin(cycle_id, stamp_ns, self._history)
-        if not going_on:
-            self.desk.use(stamp_ns)
-        return Outcome(command, Code.ACCEPT, message, repeated=going_on)
+            raise ConflictError(NO_REFERENCE)
+        cycle, cycle_id = self.cycle, str(command.arguments["cycle_id"])
+        if cycle.id == cycle_id:
+            message = f"cycle '{cycle_id}' is open already"
+            return Outcome(command, Code.ACCEPT, message, repeated=True)
+        if self._ended(cycle_id) is not None:
+            raise ConflictError(
+                f"cycle '{cycle_id}' has ended already: give each cycle an id of its own"
+            )
+        broken = f"; cycle '{cycle.id}' is broken off" if cycle.id else ""
+        cycle.id, cycle.begun_ns = cycle_id, command.stamp_ns or 0
+        self.desk.use(cycle.begun_ns)
+        return Outcome(command, Code.ACCEPT, f"cycle '{cycle_id}' is open{broken}")
 
     def _end_cycle(self, command: Command, wall_ns: int) -> Outcome:
         """Identify from the cycle; when that fails it stays open, unless its time has run out."""
         cycle_id = str(command.arguments["cycle_id"])
         if self.cycle.id != cycle_id:
-            if (before := ended(cycle_id, self._history)) is not None:
+            if (before := self._ended(cycle_id)) is not None:
                 message = f"cycle '{cycle_id}' has ended already: {before.reason}"
                 return Outcome(command, before.code, message, None, before.id, repeated=True)
             if self.cycle.id:
                 raise ConflictError(f"cycle '{self.cycle.id}' is open, not '{cycle_id}'")
         if self.reference is None:
-            raise ConflictError(_NO_REFERENCE)
+            raise ConflictError(NO_REFERENCE)
         try:
             return self._identify(command, wall_ns)
         except StorageError:
@@ -363,18 +338,47 @@ class ThermalSession:
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
         return decide(self._history, command, self.in_force.revision, wall_ns)
 
-    @property
-    def follower(self) -> DriftFollower | None:
-        """What follows the drift since the cold reference; None without one."""
-        return self._following.follower
-
-    def accuracy(self, stamp_ns: int) -> Accuracy:
-        """How far the tool may be off at a stamp with the model in force."""
-        return accuracy_of(self._following, self._current, self.config, self.temperatures, stamp_ns)
-
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""
         return [outside_decision(decision, self.desk.marks) for decision in self._current.look()]
+
+    def accuracy(self, stamp_ns: int) -> Accuracy:
+        """How far the tool may be off at a stamp with the model in force.
+
+        The tracker is told the motors' temperatures until then, and forgets them again.
+        """
+        if self.fault:
+            return Accuracy(AccuracyLevel.FAULT, self.fault)
+        try:
+            follower = self.follower
+            if follower is None:
+                words = "no cold reference: how far the robot has drifted is not known; capture one"
+                return Accuracy(AccuracyLevel.EXPIRED, words)
+            with follower.looking_ahead(self.temperatures.between(follower.read_ns, stamp_ns)):
+                return self._judged(follower, stamp_ns)
+        except RobocalError as error:
+            return Accuracy(AccuracyLevel.FAULT, str(error))
+
+    def _judged(self, follower: DriftFollower, stamp_ns: int) -> Accuracy:
+        config, time_s = self.config, follower.time_s(stamp_ns)
+        forecast = follower.forecast(self._current.arm)
+        error = forecast.at(time_s)
+        age_s = time_s - follower.state.tracker.time_s
+        left_s = config.expires_after_s - age_s
+        due_in_s = min(forecast.due_in_s(time_s, config.tolerance_m), left_s) - DUE_AHEAD_S
+        words = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
+        words += f", of {config.tolerance_m * 1e3:.2f} mm allowed"
+        level = AccuracyLevel.OK
+        if follower.state.moved:
+            level, words = AccuracyLevel.FAULT, follower.state.moved
+        elif left_s <= 0.0:
+            words = f"last measured {age_s / 3600.0:.1f} h ago: measure a cycle"
+            level = AccuracyLevel.EXPIRED
+        elif error.bound_m > config.tolerance_m:
+            level, words = AccuracyLevel.DEGRADED, f"{words}: measure a cycle, accept its model"
+        elif due_in_s <= 0.0:
+            level, words = AccuracyLevel.DUE, f"{words}: measure a cycle"
+        return Accuracy(level, words, error, due_in_s)
 
 
 def take_message(session: ThermalSession, kind: str, message: Any) -> None:
@@ -382,67 +386,20 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
 
     ``kind`` is the input that the message belongs to; other kinds are left alone.
     """
+    config = session.config
     try:
         if kind == JOINTS:
             session.add(joint_sample(message))
         elif kind in (MEASURED_POINT, SPHERE_CENTER, REFERENCE_SPHERE):
-            session.add(point_sample(message, session.config.target, kind))
+            session.add(point_sample(message, config.target, kind))
         elif kind == SPHERE_CLOUD:
-            session.add(cloud_sample(message, session.config.sphere, session.config.target))
+            session.add(cloud_sample(message, config.sphere, config.target))
         elif kind == TEMPERATURES:
             session.add(temperature_sample(message))
         elif kind == MEASURED_POSE:
-            session.add(pose_sample(message, session.config.target))
+            session.add(pose_sample(message, config.target))
     except RobocalError as error:
         session.refuse(kind, error)
-
-
-DUE_AHEAD_S = 300.0  # a measurement is due so long before the bound reaches the tolerance
-
-
-def accuracy_of(
-    following: Following,
-    current: InForce,
-    config: ThermalConfig,
-    temperatures: MotorTemperatures,
-    stamp_ns: int,
-) -> Accuracy:
-    """Judge the model in force at a stamp, with the motors' temperatures."""
-    if current.fault:
-        return Accuracy(AccuracyLevel.FAULT, current.fault)
-    try:
-        follower = following.follower
-        if follower is None:
-            words = "no cold reference: how far the robot has drifted is not known; capture one"
-            return Accuracy(AccuracyLevel.EXPIRED, words)
-        with follower.looking_ahead(temperatures.between(follower.read_ns, stamp_ns)):
-            return _judged(follower, current, config, stamp_ns)
-    except RobocalError as error:
-        return Accuracy(AccuracyLevel.FAULT, str(error))
-
-
-def _judged(
-    follower: DriftFollower, current: InForce, config: ThermalConfig, stamp_ns: int
-) -> Accuracy:
-    time_s = follower.time_s(stamp_ns)
-    forecast = follower.forecast(current.arm)
-    error, tolerance_mm = forecast.at(time_s), config.tolerance_m * 1e3
-    age_s = time_s - follower.state.tracker.time_s
-    left_s = config.expires_after_s - age_s
-    due_in_s = min(forecast.due_in_s(time_s, config.tolerance_m), left_s) - DUE_AHEAD_S
-    bound = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
-    allowed = f"of {tolerance_mm:.2f} mm allowed"
-    if follower.state.moved:
-        return Accuracy(AccuracyLevel.FAULT, follower.state.moved, error, due_in_s)
-    if left_s <= 0.0:
-        words = f"last measured {age_s / 3600.0:.1f} h ago: measure a cycle"
-        return Accuracy(AccuracyLevel.EXPIRED, words, error, due_in_s)
-    if error.bound_m > config.tolerance_m:
-        words = f"{bound}, {allowed}: measure a cycle, accept its model"
-        return Accuracy(AccuracyLevel.DEGRADED, words, error, due_in_s)
-    if due_in_s <= 0.0:
-        return Accuracy(AccuracyLevel.DUE, f"{bound}, {allowed}: measure a cycle", error, due_in_s)
-    return Accuracy(AccuracyLevel.OK, f"{bound}, {allowed}", error, due_in_s)
 
 
 def session_as_recorded(
@@ -460,21 +417,17 @@ def session_as_recorded(
     require_robot(nominal, configured)
     arguments = configured.arguments
     try:
-        model, reference = arguments["model"], arguments["reference"]
-        tracker = arguments["tracker"]
+        in_force = {THERMAL: arguments["model"], REFERENCE: arguments["reference"]}
+        tracker = arguments[OWN]
     except KeyError as error:
         raise InputError(f"the recorded configuration lacks {error}") from error
     config = config_of(arguments)
     state = None if tracker is None else FollowerState.of_document(tracker)
-    in_force = {THERMAL: model, REFERENCE: reference}
     fresh = seeded(history, nominal, in_force, software)
     session = ThermalSession(nominal, history, config, software)
     if fresh and state is not None and session.follower is not None:
         session.follower.go_on_from(state)
     return session
-
-
-OWN = "tracker"  # only a thermal session's configuration has it
 
 
 def configuration(session: ThermalSession, topics: Mapping[str, str] | None = None) -> Command:
@@ -483,20 +436,16 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
     Recorded at the start and after each change of what is in force: a recording that begins
     later has it too. ``topics``: name of each input's topic.
     """
-    return Command(
-        CONFIGURE,
-        {
-            "robot": session.nominal.name,
-            "model_hash": session.nominal.model_hash,
-            "topics": dict(topics or {}),
-            "config": asdict(session.config),
-            "model": session.in_force.model,
-            "reference": session.reference_model,
-            OWN: None if session.follower is None else session.follower.state.document(),
-        },
-        session.desk.newest_ns.get(JOINTS, 0),
-        session.desk.marks,
-    )
+    arguments = {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "topics": dict(topics or {}),
+        "config": asdict(session.config),
+        "model": session.in_force.model,
+        "reference": session.reference_model,
+        OWN: None if session.follower is None else session.follower.state.document(),
+    }
+    return Command(CONFIGURE, arguments, session.newest_joints_ns, session.desk.marks)
 
 
 def is_thermal_session(configured: Command | None) -> bool:
@@ -522,9 +471,6 @@ def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
         return ThermalConfig(standstill=rule, sphere=sphere, **values)
     except (KeyError, TypeError) as error:
         raise InputError(f"the recorded configuration cannot be read: {error}") from error
-
-
-LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
 
 
 def window_commands(
@@ -556,12 +502,21 @@ def automatic_commands(
     """
     if not observations:
         raise InputError("no measurement at standstill in this recording")
-    starts = _cycle_starts(observations)
-    end = observations[-1].stamp_ns
-    if len(starts) < 2:
-        return window_commands(None, [(observations[0].stamp_ns, end)])
-    edges = [observations[i].stamp_ns for i in starts]
-    last = [observations[i - 1].stamp_ns for i in starts[1:]] + [end]
+
+    def same(a: Observation, b: Observation) -> bool:
+        near = np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD
+        return a.sample.target == b.sample.target and bool(near)
+
+    first, stamps = observations[0], [o.sample.stamp_ns for o in observations]
+    limit = min(len(observations), LARGEST_CYCLE + 1)
+    length = next((i for i in range(1, limit) if same(first, observations[i])), None)
+    known, later = observations[:length], observations[length or len(observations) :]
+    recurring = sum(any(same(o, k) for k in known) for o in later)
+    if length is None or recurring < 0.9 * len(later):
+        return window_commands(None, [(stamps[0], stamps[-1])])
+    starts = [i for i, o in enumerate(observations) if same(first, o)]
+    edges = [stamps[i] for i in starts]
+    last = [stamps[i - 1] for i in starts[1:]] + [stamps[-1]]
     windows = list(zip(edges, last, strict=True))
     return window_commands(windows[0], windows[1:])
 
@@ -577,21 +532,3 @@ def accepting(
             arguments = {"choose": NEWEST, "by": by, "reason": "its verdict accepts"}
             found.append((Command(events.ACCEPT, arguments, command.stamp_ns), {}))
     return found
-
-
-def _cycle_starts(observations: Sequence[Observation]) -> list[int]:
-    """Index of the first observation of each cycle; one alone when poses do not recur."""
-
-    def same(a: Observation, b: Observation) -> bool:
-        near = np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD
-        return a.target == b.target and bool(near)
-
-    first = observations[0]
-    limit = min(len(observations), LARGEST_CYCLE + 1)
-    length = next((i for i in range(1, limit) if same(first, observations[i])), None)
-    if length is None:
-        return [0]
-    starts = [i for i, o in enumerate(observations) if same(first, o)]
-    known = observations[:length]
-    recurring = sum(any(same(o, k) for k in known) for o in observations[length:])
-    return starts if recurring >= 0.9 * len(observations[length:]) else [0]

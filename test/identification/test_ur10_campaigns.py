@@ -64,10 +64,10 @@ def test_table_and_bag_say_the_same(campaign: Measurements, tmp_path: Path) -> N
     assert np.all(np.diff(stamps) > 0)
     assert not desk.ignored
     observed = desk._observed
-    assert [o.stamp_ns for o in observed] == list(table.stamp_ns)
+    assert [o.sample.stamp_ns for o in observed] == list(table.stamp_ns)
     np.testing.assert_allclose([o.q for o in observed], table.q, atol=1e-11)
-    np.testing.assert_allclose([o.position for o in observed], table.position, atol=1e-11)
-    np.testing.assert_allclose([o.rotation for o in observed], table.rotation, atol=1e-11)
+    np.testing.assert_allclose([o.sample.position_m for o in observed], table.position, atol=1e-11)
+    np.testing.assert_allclose([o.sample.rotation for o in observed], table.rotation, atol=1e-11)
 
 
 @pytest.mark.data

@@ -103,7 +103,7 @@ class Desk:
             return []
         command = self.queue.pop(0)
         found = desk.window(-1, command.stamp_ns or 0, marks | {MEASURED_POINT: 2**62})
-        self.told.append((wall_ns, [o.stamp_ns for o in found], desk.marks, state_of(desk)))
+        self.told.append((wall_ns, [o.sample.stamp_ns for o in found], desk.marks, state_of(desk)))
         desk.use(command.stamp_ns or 0)
         return [Outcome(command, Code.ACCEPT, "")]
 
@@ -120,7 +120,7 @@ def of_stream(stream: JointStream) -> tuple[Any, ...]:
 
 
 def state_of(desk: ObservationDesk) -> tuple[Any, ...]:
-    observed = [(o.stamp_ns, o.ready_ns, o.q.tobytes(), id(o.source)) for o in desk._observed]
+    observed = [(o.ready_ns, o.q.tobytes(), id(o.sample)) for o in desk._observed]
     behind = [(at_ns, id(sample)) for at_ns, sample in desk._behind]
     waiting = [id(sample) for sample in desk._pending]
     counted = dict(desk.received), dict(desk.ignored), dict(desk.ignored._last)

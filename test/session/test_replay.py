@@ -311,7 +311,7 @@ def test_the_configured_target_names_measurements_that_name_none(nominal, visits
     middle = visits[0][75].stamp_ns  # at rest
     take_message(session, MEASURED_POINT, point_message(middle, "sensor", 1.0, 2.0, 3.0))
     (found,) = session.desk.window(-1, 2**62, {JOINTS: 2**62, MEASURED_POINT: 2**62})
-    assert found.target == "cube"
+    assert found.sample.target == "cube"
 
 
 def test_cycles_are_found_where_no_command_was_recorded(nominal, visits, tmp_path):
@@ -335,8 +335,8 @@ def test_poses_that_never_recur_are_one_calibration(nominal, visits, tmp_path):
     found = scout.desk.window(-1, 2**62, {JOINTS: 2**62, MEASURED_POINT: 2**62})
     ((command, outcome),) = automatic_commands(found)
     assert command.name == events.IDENTIFY
-    assert command.arguments["from_ns"] == found[0].stamp_ns
-    assert command.stamp_ns == found[-1].stamp_ns
+    assert command.arguments["from_ns"] == found[0].sample.stamp_ns
+    assert command.stamp_ns == found[-1].sample.stamp_ns
     assert outcome == {}
 
 

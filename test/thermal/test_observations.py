@@ -10,7 +10,6 @@ from robocal_ros.ground.samples import (
     MEASURED_POSE,
     JointSample,
     PointSample,
-    PoseSample,
 )
 from robocal_ros.ground.streams import JointStream, Reading, StandstillRule
 from robocal_ros.session.base import MOST_REASONS
@@ -30,8 +29,8 @@ def point(ms: int, x: float = 1.0, frame: str = "sensor", target: str = "ball") 
     return PointSample(ms * MS, frame, target, np.array([x, 2.0, 3.0]))
 
 
-def pose(ms: int, frame: str = "sensor", target: str = "ball") -> PoseSample:
-    return PoseSample(ms * MS, frame, target, np.eye(4))
+def pose(ms: int, frame: str = "sensor", target: str = "ball") -> PointSample:
+    return PointSample(ms * MS, frame, target, np.zeros(3), MEASURED_POSE, rotation=np.eye(3))
 
 
 def desk(frame: str | None = None) -> ObservationDesk:
@@ -55,7 +54,11 @@ def test_a_measurement_gets_the_joints_of_its_stamp():
     (found,) = everything(d)
     assert found.q == pytest.approx([0.1 + 1e-7 * 1650, 0.2], abs=1e-12)
     assert found.ready_ns == 1800 * MS  # the reading that ends the standstill window
-    assert (found.topic, found.frame, found.target) == (MEASURED_POINT, "sensor", "ball")
+    assert (found.sample.topic, found.sample.frame, found.sample.target) == (
+        MEASURED_POINT,
+        "sensor",
+        "ball",
+    )
 
 
 @pytest.mark.parametrize("first", ["joints", "measurement"])
@@ -140,7 +143,7 @@ def test_a_clock_that_jumps_back_begins_anew():
     assert d.ignored[MEASURED_POINT] == {"the clock jumped back": 2}
     assert d.newest_ns == {JOINTS: 2000 * MS}
     d.add_measurement(point(1500))
-    assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
+    assert [o.sample.stamp_ns for o in everything(d)] == [1500 * MS]
     assert d.from_ns == 1300 * MS
 
 
@@ -160,7 +163,7 @@ def test_the_earliest_observation_gives_the_frame(order):
     frames = {1500: "sensor", 1600: "camera"}
     for ms in order:
         d.add_measurement(point(ms, frame=frames[ms]))
-    assert [o.frame for o in everything(d)] == ["sensor"]
+    assert [o.sample.frame for o in everything(d)] == ["sensor"]
     assert d.frame == "sensor"
     assert sum(d.ignored[MEASURED_POINT].values()) == 1
     d.add_measurement(point(1700, frame="camera"))
@@ -176,12 +179,12 @@ def test_a_target_counts_once_at_a_stamp_and_the_pose_before_the_point():
     d.add_measurement(pose(1600))
     d.add_measurement(point(1500, 5.0, target="cube"))
     found = everything(d)
-    assert [(o.stamp_ns // MS, o.target, o.topic) for o in found] == [
+    assert [(o.sample.stamp_ns // MS, o.sample.target, o.sample.topic) for o in found] == [
         (1500, "ball", MEASURED_POINT),
         (1500, "cube", MEASURED_POINT),
         (1600, "ball", MEASURED_POSE),
     ]
-    assert found[0].position[0] == 1.0
+    assert found[0].sample.position_m[0] == 1.0
     samples = as_measurements(found).sample
     assert len(set(samples)) == 3
 
@@ -200,7 +203,7 @@ def test_a_window_holds_what_lies_between_its_bounds_and_before_its_marks():
     stand(d, 1000, 3000)
     for ms in (1500, 2000, 2500):
         d.add_measurement(point(ms))
-    stamps = lambda *w: [o.stamp_ns // MS for o in d.window(*w)]  # noqa: E731
+    stamps = lambda *w: [o.sample.stamp_ns // MS for o in d.window(*w)]  # noqa: E731
     assert stamps(1500 * MS, 2500 * MS, ALL) == [2000, 2500]
     assert stamps(-1, 2499 * MS, ALL) == [1500, 2000]
     assert stamps(-1, 2500 * MS, ALL | {JOINTS: 2100 * MS}) == [1500, 2000]
@@ -238,7 +241,7 @@ def test_measurements_whose_joints_are_far_off_cost_nothing_and_displace_none():
     d.add_measurement(point(1500))  # the last to come, the first to be complete
     stream.asked = 0
     stand(d, 1000, 2000)
-    assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
+    assert [o.sample.stamp_ns for o in everything(d)] == [1500 * MS]
     assert stream.asked == 10 + 1  # the first reading alone begins nothing
 
 
@@ -254,7 +257,7 @@ def test_one_wrong_joint_stamp_costs_that_reading_only(off_ms):
     d.add_joints(joints(3050 + off_ms))
     stand(d, 3100, 4000)
     d.add_measurement(point(3500))
-    assert [o.stamp_ns // MS for o in everything(d)] == [2500, 3500]
+    assert [o.sample.stamp_ns // MS for o in everything(d)] == [2500, 3500]
     assert d.marks == {JOINTS: 4000 * MS, MEASURED_POINT: 3500 * MS, JUMPS: 0}
     assert d.from_ns == 2300 * MS + 1
     assert d.ignored == {JOINTS: {"a stamp that no reading goes on from, # s off": 1}}
@@ -265,7 +268,7 @@ def test_a_wrong_first_joint_stamp_begins_nothing():
     d.add_measurement(point(1500))
     d.add_joints(joints(1000 + HOUR_MS))
     stand(d, 1000, 2000)
-    assert [o.stamp_ns // MS for o in everything(d)] == [1500]
+    assert [o.sample.stamp_ns // MS for o in everything(d)] == [1500]
     assert d.jumps == 0
 
 
@@ -281,7 +284,7 @@ def test_one_measurement_from_the_future_moves_no_mark():
     d.drop_far_ahead()
     assert d.ignored[MEASURED_POINT] == {"stamped # s after the newest joint reading": 1}
     stand(d, 2100, 3000)
-    assert [o.stamp_ns // MS for o in everything(d)] == [1500, 2300]
+    assert [o.sample.stamp_ns // MS for o in everything(d)] == [1500, 2300]
 
 
 @pytest.mark.parametrize("jump_ms", [-60_000, -3_000, 5_000])
@@ -299,7 +302,7 @@ def test_where_the_clock_jumps_the_order_of_arrival_does_not_matter(jump_ms):
         for _, sample in sorted([*arrivals, *late], key=lambda item: item[0]):
             d.add_joints(sample) if isinstance(sample, JointSample) else d.add_measurement(sample)
         assert d.jumps == (jump_ms < 0)
-        found.add((tuple(o.stamp_ns // MS for o in everything(d)), *d.marks.values()))
+        found.add((tuple(o.sample.stamp_ns // MS for o in everything(d)), *d.marks.values()))
     assert len(found) == 1
     stamps = found.pop()[0]
     on_new_clock = tuple(ms + jump_ms for ms in (102_350, 102_650, 103_650))
