@@ -43,8 +43,7 @@ from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.edges import BREAK, EDGES, RESTORE, BeamEdge, InputRule
 from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.measuring_plan import PlannedStep
-from robocal_ros.tool.run import ToolConfig, rows_of
+from robocal_ros.tool.run import PlannedStep, ToolConfig, rows_of
 from robocal_ros.tool.session import ToolSession, configuration
 
 BAG = Path(__file__).with_name("tool_runs.mcap")

@@ -38,12 +38,11 @@ from robocal_ros.cell_sim.tool_cell import (
 )
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.tool.crossed_model import Held, closed_form, fit_circle
-from robocal_ros.tool.crossed_run import classic_tool
-from robocal_ros.tool.edges import BeamEdge, CircleMotion, label_edges
-from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.circle import CircleMotion, classic_tool, closed_form, fit_circle, label_edges
+from robocal_ros.tool.crossed_model import Held
+from robocal_ros.tool.edges import BeamEdge
+from robocal_ros.tool.judging import CheckRule, KnownTool, quick_check
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.tool.quick_check import CheckRule, quick_check
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ MAY_IMPORT = {
 }
 COMMANDS = {"cli", "cli_sensors", "cli_shots"}  # files of a room
 ROS_FILES = {
-    "node", "node_motion", "messages", "action", "settings", "services", "report",
+    "node", "messages", "action", "settings", "services", "report",
     "graph", "driver", "replay_node", "replay_topics", "recorder_node",
 }  # fmt: skip
 ROS = {

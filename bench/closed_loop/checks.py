@@ -41,7 +41,7 @@ from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.tool.results import FULL, QUICK
+from robocal_ros.tool.session import FULL, QUICK
 
 SEEN_BY_CHECK: tuple[Fault, ...] = (
     "collision",

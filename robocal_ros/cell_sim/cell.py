@@ -94,7 +94,7 @@ from robocal_ros.ground.samples import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.screening import THRESHOLD_M
 from robocal_ros.tool.edges import BeamEdge, EdgeSample
-from robocal_ros.tool.measuring_plan import PlannedStep
+from robocal_ros.tool.run import PlannedStep
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

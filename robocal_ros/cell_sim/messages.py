@@ -39,9 +39,8 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import NS, header, transform_message
 from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 from robocal_ros.thermal.screening import THRESHOLD_M
-from robocal_ros.tool.crossed_model import StepKind
-from robocal_ros.tool.edges import BeamEdge
-from robocal_ros.tool.measuring_plan import PlannedStep
+from robocal_ros.tool.edges import BeamEdge, StepKind
+from robocal_ros.tool.run import PlannedStep
 
 # ---- what the simulated cell reads and says, as messages: pure mapping --------------------------
 

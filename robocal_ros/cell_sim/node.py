@@ -39,7 +39,7 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import WARN, Health
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.tool.measuring_plan import PlannedStep
+from robocal_ros.tool.run import PlannedStep
 
 Array = NDArray[np.float64]
 

@@ -18,12 +18,11 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.tool.crossed_model import BeamStep, CircleMethod, Held, RobotNoise, fit_circle
-from robocal_ros.tool.crossed_run import CommandedCircle, ToolEstimate, estimate_tool
-from robocal_ros.tool.edges import BEAMS, BeamEdge, CircleMotion, EdgeSample
-from robocal_ros.tool.flange_path import JointPath, axis_from_centres, upright_pose
-from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.measuring_plan import PlannedStep
+from robocal_ros.tool.circle import CircleMethod, CircleMotion, CommandedCircle, fit_circle
+from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
+from robocal_ros.tool.edges import BEAMS, BeamEdge, EdgeSample
+from robocal_ros.tool.laser_frame import JointPath, LaserFrame, axis_from_centres, upright_pose
+from robocal_ros.tool.run import PlannedStep
 
 # ---- motions of the flange at a beam station ----------------------------------------------------
 

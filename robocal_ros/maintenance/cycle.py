@@ -23,7 +23,7 @@ from robocal_ros.session.events import LEAVE, ROLLBACK, Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
-from robocal_ros.tool.results import FULL, QUICK
+from robocal_ros.tool.session import FULL, QUICK
 
 Array = NDArray[np.float64]
 

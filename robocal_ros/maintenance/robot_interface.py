@@ -17,7 +17,7 @@ from robocal_ros.maintenance.mover import HOME, STATION, FaultError, Mover, Rout
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.tool.driving import SETTLED_S, STANDS_S
-from robocal_ros.tool.results import QUICK
+from robocal_ros.tool.session import QUICK
 
 
 @dataclass(frozen=True)

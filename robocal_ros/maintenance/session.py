@@ -22,7 +22,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.cycle import CycleRun, ThermalCycle, ThermalPart
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.maintenance.memory import (
-    Accuracy,
     CycleResult,
     DocumentStore,
     Drift,
@@ -34,7 +33,8 @@ from robocal_ros.maintenance.memory import (
 from robocal_ros.maintenance.mover import FaultError, Ways
 from robocal_ros.maintenance.robot_interface import DriverAnswer, DriverRequest, Hands, Script
 from robocal_ros.session.events import Command, History, Outcome
-from robocal_ros.tool.results import FULL, QUICK
+from robocal_ros.thermal.accuracy import Accuracy
+from robocal_ros.tool.session import FULL, QUICK
 
 ENDED, FAULT = "maintenance_ended", "fault"
 UNSAVED_S = 2.0  # a fault is written by then, whatever the robot may be doing

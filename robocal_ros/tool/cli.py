@@ -25,13 +25,17 @@ from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.tool.crossed_model import fit_circle
-from robocal_ros.tool.crossed_run import estimate_tool
-from robocal_ros.tool.driven_circle import classic_from_path
-from robocal_ros.tool.edges import CircleMotion, InputRule, debounced
+from robocal_ros.tool.circle import CircleMotion, classic_from_path, fit_circle
+from robocal_ros.tool.crossed_model import estimate_tool
+from robocal_ros.tool.edges import InputRule, debounced
 from robocal_ros.tool.files import (
     Load,
+    circle_document,
+    classic_run_document,
     exported,
+    laser_document,
+    named_steps,
+    parallel_document,
     read_beam_points,
     read_edges,
     read_flange_poses,
@@ -39,6 +43,8 @@ from robocal_ros.tool.files import (
     read_step_edges,
     read_sweeps,
     read_tool,
+    run_document,
+    touch_document,
 )
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
 from robocal_ros.tool.laser_frame import (
@@ -47,15 +53,6 @@ from robocal_ros.tool.laser_frame import (
     calibrate_laser,
     read_laser_for,
     write_laser,
-)
-from robocal_ros.tool.measuring_plan import named_steps
-from robocal_ros.tool.quick_check import (
-    circle_document,
-    classic_run_document,
-    laser_document,
-    parallel_document,
-    run_document,
-    touch_document,
 )
 from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
 
@@ -142,9 +139,6 @@ def _show_beams(console: "Console", document: Document) -> None:
         console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
 
 
-# ---- options that give a tool's frame: a document of a measured tool, or numbers ----------------
-
-
 def add_frame_options(parser: "argparse._ActionsContainer", tip: str, turn: str) -> None:
     """Offer ``--tool``, and in numbers its ``tip`` and its ``turn``: the names of both options."""
     parser.add_argument(
@@ -184,9 +178,6 @@ def given_frame(args: argparse.Namespace) -> "NDArray[np.float64] | None":
     if R is not None:
         raise InputError("roll, pitch and yaw alone are no tool: give its tip too")
     return None
-
-
-# ---- a whole run of robocal tool crossed --------------------------------------------------------
 
 
 NEEDED = ("joints", "robot", "laser")
@@ -253,9 +244,6 @@ def _show_run(console: "Console", document: Document) -> None:
                            f"sees it, {radius['y']:.3f} mm as the y-beam"))  # fmt: skip
     if document["latency_s"] is not None:
         console.print(f"Latency of the input: {document['latency_s'] * 1e3:.3f} ms")
-
-
-# ---- ``robocal tool crossed``: a tool from its edges through two crossed beams ------------------
 
 
 METHODS = ("best", "classic")
@@ -360,9 +348,6 @@ def _show_crossed(console: "Console", document: Document) -> None:
     console.print(f"Latency of the input: {document['latency_s'] * 1e3:.3f} ms")
 
 
-# ---- ``robocal tool points``: a tool's tip, and its orientation, by touching a point ------------
-
-
 POINT_METHODS = ("four", "seven")
 
 
@@ -402,9 +387,6 @@ def _show_points(console: "Console", document: Document) -> None:
     if document["quat_xyzw"] is not None:
         quat = " ".join(f"{value:.6f}" for value in document["quat_xyzw"])
         console.print(f"Orientation, quaternion x y z w: {quat}")
-
-
-# ---- ``robocal tool parallel``: a tool by two parallel beams, one above the other ---------------
 
 
 def add_parallel(parser: argparse.ArgumentParser) -> None:
@@ -453,9 +435,6 @@ def _show_parallel(console: "Console", document: Document) -> None:
     if document["tcp_mm"] is not None:
         tip = ", ".join(f"{value:.3f}" for value in document["tcp_mm"])
         console.print(f"Tip in the flange frame, mm: {tip}")
-
-
-# ---- ``robocal tool export``: a tool's frame in the words of a controller -----------------------
 
 
 FORMATS = ("urdf", "kuka", "abb", "fanuc", "ur")

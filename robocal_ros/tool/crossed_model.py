@@ -13,7 +13,6 @@ tool is that of all of them together.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +20,22 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import ResidualError
-from robocal_ros.tool.edges import (
-    BEAMS,
-    BeamEdge,
-    BeamError,
-    CircleEdges,
-    CircleMotion,
-    label_edges,
+from robocal_ros.ground.errors import (
+    RankDeficientError,
+    ResidualError,
 )
-from robocal_ros.tool.flange_path import FlangePath, minimal_rotation
-from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.edges import BEAMS, FEWEST_EDGES, BeamEdge, BeamError, StepKind, edges_of
+from robocal_ros.tool.laser_frame import (
+    FlangePath,
+    LaserFrame,
+    minimal_rotation,
+    require_height,
+    require_upright,
+    retaught,
+)
 
 Array = NDArray[np.float64]
-StepKind = Literal["circle", "plunge"]
+Row = tuple[int, int, int, BeamEdge]  # beam, step, circle (-1 in a plunge) and edge
 
 TOOL_NAMES = ("tip_x", "tip_y", "tip_z", "tilt_x", "tilt_y")
 START_RADIUS_M = 2e-3
@@ -86,19 +87,6 @@ class ToolState:
     radius: Array
     shift: Array
     bend: Array
-
-    @classmethod
-    def taught(cls, T_flange_tool: Array, circles: int, steps: int) -> "ToolState":
-        """Where the search begins."""
-        return cls(
-            tip=T_flange_tool[:3, 3],
-            axis=T_flange_tool[:3, 2],
-            latency_s=0.0,
-            depth=0.0,
-            radius=np.full((circles, 2), START_RADIUS_M),
-            shift=np.zeros((steps, 3)),
-            bend=np.zeros((4, 2)),
-        )
 
 
 def across(axis: Array) -> Array:
@@ -210,8 +198,12 @@ class RunProblem:
         R = T[:, :3, :3]
         arm, axis = R @ state.tip, R @ state.axis
         tip = arm + T[:, :3, 3] + state.shift[self.step]
-        touch = self.touch(tip, axis, state.bend)
+        normals, up = self.laser.normals, self.laser.T_base_laser[:3, 2]
+        points = self.laser.points + state.bend[:, :1] * np.repeat(normals, 2, axis=0)
+        points = points + state.bend[:, 1:] * up
         circle = self.circle >= 0
+        ends = points[2 * self.beam], points[2 * self.beam + 1]
+        touch = touch_of(tip, axis, *ends, circle, self.beam)
         own = np.maximum(self.circle, 0)
         radius = state.radius[own, self.beam] + self.taper * (touch.height - self.height[own])
         wanted = np.where(circle, self.side * radius, -self.laser.reach[self.beam])
@@ -233,18 +225,9 @@ class RunProblem:
             J[rows, shifts + 3 * self.step + i] = by_tip[:, i]
         for end, share in ((0, 1.0 - touch.share), (1, touch.share)):
             first = bends + 4 * self.beam + 2 * end
-            J[rows, first] = -share * np.sum(by_tip * self.laser.normals[self.beam], axis=1)
-            J[rows, first + 1] = -share * (by_tip @ self.laser.T_base_laser[:3, 2])
+            J[rows, first] = -share * np.sum(by_tip * normals[self.beam], axis=1)
+            J[rows, first + 1] = -share * (by_tip @ up)
         return (residual / self.sigma_m)[:, None], (J / self.sigma_m[:, None])[:, None, :]
-
-    def touch(self, tip: Array, axis: Array, bend: Array) -> "Touch":
-        """How tips and axes (m, 3), base, lie to each edge's beam."""
-        laser = self.laser
-        up = laser.T_base_laser[:3, 2]
-        normals = np.repeat(laser.normals, 2, axis=0)
-        points = laser.points + bend[:, :1] * normals + bend[:, 1:] * up
-        start, end = points[2 * self.beam], points[2 * self.beam + 1]
-        return touch_of(tip, axis, start, end, self.circle >= 0, self.beam)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,241 +287,241 @@ def touch_of(
     )
 
 
-# ---- where the tool's axis is from one circle through two crossed beams, by time alone ----------
-#
-# The flange runs on a circle of radius R at constant speed in the beam plane, its orientation
-# held. In the laser frame the axis is at ``c + R (cos theta, sin theta)``; its signed distance
-# from beam b is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta, and at
-# an edge it is exactly +rho_b or -rho_b. The centre is ``c = (d_y / sin beta + d_x / tan beta,
-# d_x)``. Only ratios to R follow from times: R itself is the commanded one.
-
-
-CircleMethod = Literal["best", "classic"]
-
-LARGEST_MISFIT_M = 2e-4  # rms along the circle: speed not constant, or an edge that belongs not
-THICKEST = 0.7  # tool's radius on the circle's
-DEEPEST = 0.999  # of R: an edge where the circle hardly crosses the beam
-EDGE_SCATTER_M = RobotNoise().edge_m  # of a robot that repeats well
-
-
-@dataclass(frozen=True)
-class CircleState:
-    """Unknowns of a circle: d_x, d_y, rho_x, rho_y (m), latency and period (s)."""
-
-    d: Array
-    rho: Array
-    latency_s: float
-    period_s: float
+MOST_SIGMAS = 6.0  # of a step's shift
+LARGEST_MISFIT_M = 2e-4  # rms of the edges: more is no robot's repeatability
 
 
 @dataclass(frozen=True, eq=False)
-class CircleProblem:
-    """Edge times predicted minus measured, over sigma; see the module's text."""
-
-    motion: CircleMotion
-    edges: CircleEdges
-    latency_free: bool = True
-    period_free: bool = False
-    scale_components: int = field(default=1, init=False)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the unknowns."""
-        free = ("latency",) * self.latency_free + ("period",) * self.period_free
-        return ("d_x", "d_y", "rho_x", "rho_y", *free)
-
-    def deviation(self, state: CircleState) -> Array:
-        """No prior."""
-        return np.zeros(len(self.names))
-
-    def retract(self, state: CircleState, step: Array) -> CircleState:
-        """Add the increment."""
-        rest = list(step[4:])
-        latency = state.latency_s + (rest.pop(0) if self.latency_free else 0.0)
-        period = state.period_s + (rest.pop(0) if self.period_free else 0.0)
-        return CircleState(state.d + step[:2], state.rho + step[2:4], latency, period)
-
-    def sine(self, state: CircleState) -> Array:
-        """Of psi (m,) at each edge: the axis passes the beam at speed times the cosine."""
-        e = self.edges
-        w = (e.side * state.rho[e.beam] - state.d[e.beam]) / self.motion.radius_m
-        return np.clip(w, -DEEPEST, DEEPEST)
-
-    def linearise(self, state: CircleState) -> tuple[Array, Array]:
-        """Residual (m, 1) and Jacobian (m, 1, k)."""
-        e, R = self.edges, self.motion.radius_m
-        motion = replace(self.motion, period_s=state.period_s)
-        beam_rate = np.array([motion.psi_rate(b) for b in (0, 1)])[e.beam]
-        w = self.sine(state)
-        turn = e.rising * beam_rate  # +1: psi = asin w, -1: psi = pi - asin w
-        psi = np.where(turn > 0.0, np.arcsin(w), np.pi - np.arcsin(w))
-        theta = np.where(e.beam == 0, psi, motion.beam_angle_rad - psi)
-        time = (theta - motion.start_rad) / motion.rate_rad_s + state.latency_s
-        turns = np.round((e.time_s - time) / state.period_s)
-        time = time + turns * state.period_s
-        by_w = e.rising / (abs(motion.rate_rad_s) * np.sqrt(1.0 - w**2))
-        J = np.zeros((len(time), 6))
-        rows = np.arange(len(time))
-        J[rows, e.beam] = -by_w / R
-        J[rows, 2 + e.beam] = e.side * by_w / R
-        J[:, 4] = 1.0
-        J[:, 5] = (time - state.latency_s) / state.period_s
-        used = [0, 1, 2, 3, *([4] * self.latency_free), *([5] * self.period_free)]
-        whitened = J[:, used] / e.sigma_s[:, None]
-        return ((time - e.time_s) / e.sigma_s)[:, None], whitened[:, None, :]
-
-
-@dataclass(frozen=True, eq=False)
-class CircleFit:
-    """The tool's axis on one circle.
+class ToolEstimate:
+    """A measured tool.
 
     Attributes
     ----------
-    centre : (2,) place of the tool's axis in the beam plane, laser frame, when the flange is at
-        the circle's centre, m.
-    covariance : (2, 2) of it, m^2; None for the classic method, which has no noise model.
-    d, rho : (2,) distances from the x- and the y-beam, and the tool's radius seen by each, m; the
-        classic method does not see the radius (None).
-    latency_s, period_s : as estimated, or as given.
-    misfit_m : rms of the residuals along the circle, m.
+    T_flange_tool : (4, 4) z along the axis from flange to tip, turned about it as it was taught.
+    covariance : (5, 5) of the tip (flange axes, m^2) and of the axis' direction along the tool's
+        own x and y (rad^2); ``own_covariance`` (5, 5) its part that is this run's alone, without
+        the laser frame's, which all runs at a station have in common.
+    latency_s, latency_sigma_s : of the edges behind the robot's readings.
+    radius : (circles, 2) of the tool as each circle and beam sees it, m.
+    misfit_m : rms of the edges' residuals, m.
+    shift_m : largest shift of a step against the others, m.
+    estimate : with the covariance that all sigmas here are of: wider where the given noise does
+        not explain edges, shifts or what was held.
     """
 
-    method: CircleMethod
-    centre: Array
-    covariance: Array | None
-    d: Array
-    rho: Array | None
+    T_flange_tool: Array
+    covariance: Array
+    own_covariance: Array
     latency_s: float
-    latency_sigma_s: float | None
-    period_s: float
+    latency_sigma_s: float
+    radius: Array
     misfit_m: float
-    estimate: Estimate[CircleState] | None
+    shift_m: float
+    estimate: Estimate[ToolState]
+
+    @property
+    def tip(self) -> Array:
+        """(3,) in the flange frame, m."""
+        return np.asarray(self.T_flange_tool[:3, 3])
+
+    @property
+    def axis(self) -> Array:
+        """(3,) unit vector from flange to tip, flange frame."""
+        return np.asarray(self.T_flange_tool[:3, 2])
 
 
-def fit_circle(
-    motion: CircleMotion,
-    edges: Sequence[BeamEdge],
-    method: CircleMethod = "best",
+def estimate_tool(
+    laser: LaserFrame,
+    path: FlangePath,
+    steps: Sequence[BeamStep],
+    T_flange_tool: Array,
     *,
-    latency_s: float | None = None,
-    period_free: bool = False,
-    edge_m: float = EDGE_SCATTER_M,
-) -> CircleFit:
-    """Find the tool's axis from one circle at constant speed.
+    noise: RobotNoise | None = None,
+    taper: float = 0.0,
+    held: Held | None = None,
+) -> ToolEstimate:
+    """Find tip and axis from the edges of all steps together, by maximum likelihood.
 
-    ``best``: closed form from all edges, then maximum likelihood over the centre, the radii, the
-    phase (latency) and, where free, the period. ``classic``: mid-times (thesis eq. 4-8, 4-9).
-    ``latency_s`` fixes the latency; ``edge_m`` is the robot's scatter at an edge, m, beside which
-    a misfit is judged (chi-square). The covariance is that of the stamps alone, and wider where
-    they do not explain the misfit.
+    The flange pose is that of the path at each edge, so that the speed need not be constant and
+    the laser's axes need not be the base's.
+
+    Parameters
+    ----------
+    T_flange_tool : (4, 4) the taught tool: where the search begins, and the turn about the axis.
+    taper : growth of the radius per length above the tip; only matters while the tool is tilted.
+    held : what the steps need not determine, with its sigma about the taught tool.
 
     Raises
     ------
     BeamError
         When edges are missing, doubled or out of order.
+    RankDeficientError
+        When a motion is missing; the message names it.
     ResidualError
-        When no circle at constant speed explains the edges.
+        When no tool explains the edges.
     """
-    labelled = label_edges(motion, edges, latency_s or 0.0)
-    d, rho, latency = closed_form(motion, labelled)
-    if method == "classic":
-        d = classic_distances(motion, labelled)
-        return CircleFit(
-            "classic", motion.centre(d), None, d, None, latency, None, motion.period_s, 0.0, None
+    noise, held = noise or RobotNoise(), held or Held()
+    kinds = {step.kind for step in steps}
+    if "circle" not in kinds:
+        raise RankDeficientError(
+            "there is no circle: the place of the tool across the beams is not determined",
+            ("place across the beams",),
         )
-    if np.any(rho > THICKEST * motion.radius_m):
-        raise BeamError(
-            f"the shadows last for most of the turn (radius {rho.max() * 1e3:.2f} mm on a circle "
-            f"of {motion.radius_m * 1e3:.2f} mm): check the input's polarity; for a tool so thick "
-            "enlarge the circle"
+    if "plunge" not in kinds and held.along_m is None:
+        raise RankDeficientError(
+            "there is no plunge: how far the tip reaches is not determined; move the axis onto the "
+            "crossing and drive it down and up",
+            ("place along the axis",),
         )
-    problem = CircleProblem(motion, labelled, latency_s is None, period_free)
-    start = CircleState(d, rho, latency if latency_s is None else latency_s, motion.period_s)
-    found = solve(problem, start, robust=False)
-    return _checked(problem, found, edge_m)
+    problem, start = run_problem(laser, path, steps, T_flange_tool, noise, taper, held)
+    T, _ = path.at(problem.time_s)
+    axes = T[:, :3, :3] @ start.axis
+    require_upright(float(np.min(np.abs(axes @ laser.T_base_laser[:3, 2]))))
+    if held.tilt_rad is None:
+        require_height(float(np.ptp(problem.height)))
+    solved = solve(problem, start, prior_information=problem.prior, robust=False)
+    misfit = float(np.sqrt(np.mean((solved.residual[:, 0] * problem.sigma_m) ** 2)))
+    _require_fit(solved, misfit, steps, noise)
+    found, state = _widened(problem, solved), solved.state
+    R = retaught(T_flange_tool[:3, :3], state.axis)
+    # From tilts across the axis to those along the tool's x and y.
+    turn = np.eye(5)
+    turn[3:, 3:] = R[:, :2].T @ across(state.axis)
+    # What the laser's points make of the covariance C is C P C, with P their prior.
+    points = [i for i, name in enumerate(solved.names) if name.startswith("laser_")]
+    by_point = solved.covariance[:, points]
+    own = found.covariance - by_point @ problem.prior[np.ix_(points, points)] @ by_point.T
+    return ToolEstimate(
+        T_flange_tool=frames.transform(R, state.tip),
+        covariance=turn @ found.covariance[:5, :5] @ turn.T,
+        own_covariance=turn @ own[:5, :5] @ turn.T,
+        latency_s=state.latency_s,
+        latency_sigma_s=float(np.sqrt(found.covariance[5, 5])),
+        radius=state.radius,
+        misfit_m=misfit,
+        shift_m=float(np.linalg.norm(state.shift, axis=1).max()),
+        estimate=found,
+    )
 
 
-def _checked(problem: CircleProblem, found: Estimate[CircleState], edge_m: float) -> CircleFit:
-    motion, edges, state = problem.motion, problem.edges, found.state
-    speed = 2.0 * np.pi * motion.radius_m / state.period_s
-    late = found.residual[:, 0] * edges.sigma_s
-    misfit = float(speed * np.sqrt(np.mean(late**2)))
-    free = len(late) - len(found.names)
-    bound = chi2_quantile(SOUND_FIT, free)
-    passing = speed * np.sqrt(1.0 - problem.sine(state) ** 2)
-    variance = edges.sigma_s**2 + (edge_m / passing) ** 2
-    unexplained = float(np.sum(late**2 / variance)) > bound
-    if unexplained or misfit > LARGEST_MISFIT_M or not found.converged:
-        explained = speed * float(np.sqrt(bound / len(late) * variance.mean()))
-        raise ResidualError(
-            f"the edges miss a circle at constant speed by {misfit * 1e3:.4f} mm rms (stamps and "
-            f"the robot's scatter explain {min(explained, LARGEST_MISFIT_M) * 1e3:.4f} mm): speed "
-            "not constant: record joints and give them; or else check radius, period, start, beam "
-            "angle and the stamps' sigma"
-        )
-    J, spread = motion.centre_jacobian, found.covariance
-    sigma = float(np.sqrt(spread[4, 4])) if "latency" in found.names else None
-    return CircleFit(
-        "best", motion.centre(state.d), J @ spread[:2, :2] @ J.T, state.d, state.rho,
-        state.latency_s, sigma, state.period_s, misfit, found,
-    )  # fmt: skip
+def run_problem(
+    laser: LaserFrame,
+    path: FlangePath,
+    steps: Sequence[BeamStep],
+    T_flange_tool: Array,
+    noise: RobotNoise,
+    taper: float = 0.0,
+    held: Held | None = None,
+) -> tuple[RunProblem, ToolState]:
+    """The problem of a run and the state at which to begin; raises BeamError as `estimate_tool`."""
+    rows: list[Row] = []
+    circles = 0
+    for i, each in enumerate(steps):
+        own = circles if each.kind == "circle" else -1
+        circles += each.kind == "circle"
+        for b, name in enumerate(BEAMS):
+            try:
+                found = edges_of(each.edges, name, FEWEST_EDGES[each.kind])
+            except BeamError as error:
+                raise BeamError(f"{each.name}: {error}") from error
+            rows += [(b, i, own, edge) for edge in found]
+    beam, step, circle = (np.array([row[k] for row in rows]) for k in range(3))
+    time = np.array([edge.time_s for *_, edge in rows])
+    breaks = np.array([edge.blocked for *_, edge in rows])
+    sigma_s = np.array([edge.sigma_s for *_, edge in rows])
+    start = ToolState(
+        tip=T_flange_tool[:3, 3],
+        axis=T_flange_tool[:3, 2],
+        latency_s=0.0,
+        depth=0.0,
+        radius=np.full((circles, 2), START_RADIUS_M),
+        shift=np.zeros((len(steps), 3)),
+        bend=np.zeros((4, 2)),
+    )
+    # How the taught tool lies to each edge's beam, and its speed (m,) towards it, m/s.
+    T, twist = path.at(time)
+    tip, axis = T[:, :3, :3] @ start.tip + T[:, :3, 3], T[:, :3, :3] @ start.axis
+    ends = laser.points[2 * beam], laser.points[2 * beam + 1]
+    touch = touch_of(tip, axis, *ends, circle >= 0, beam)
+    rate = np.sum(touch.normal * twist[:, :3], axis=1)
+    _require_order(steps, rows, rate)
+    problem = RunProblem(
+        laser=laser,
+        path=path,
+        beam=beam,
+        step=step,
+        circle=circle,
+        side=np.where(breaks, -np.sign(rate), np.sign(rate)),
+        way=np.sign(rate),
+        time_s=time,
+        sigma_m=np.hypot(rate * sigma_s, noise.edge_m),
+        circles=circles,
+        steps=len(steps),
+        taper=taper,
+        height=np.array([touch.height[circle == c].mean() for c in range(circles)]),
+        taught=start,
+        noise=noise,
+        held=held or Held(),
+    )
+    return problem, start
 
 
-def closed_form(motion: CircleMotion, edges: CircleEdges) -> tuple[Array, Array, float]:
-    """Distances (2,), radii (2,), m, and latency, s, from the arcs on each beam's negative side.
-
-    ``R cos(inner / 2) = d + rho`` (beam clear, restore to break) and ``R cos(outer / 2) =
-    d - rho`` (with both shadows, break to restore); half sum d, half difference rho.
-    """
-    d, rho, late = np.zeros(2), np.zeros(2), []
-    for b in (0, 1):
-        psi = _mean_psi(motion, edges, b)
-        sign = motion.psi_rate(b)
-        half_inner = 0.5 * _positive(sign * (psi[1, -1] - psi[-1, -1]))
-        half_outer = 0.5 * _positive(sign * (psi[1, 1] - psi[-1, 1]))
-        inner, outer = motion.radius_m * np.cos([half_inner, half_outer])
-        d[b], rho[b] = 0.5 * (inner + outer), 0.5 * (inner - outer)
-        for side, half in ((-1, half_inner), (1, half_outer)):  # the arcs' middle is at -pi / 2
-            middle = psi[-1, side] + sign * half
-            late.append(sign * (middle + 0.5 * np.pi))
-    phase = np.angle(np.mean(np.exp(1j * np.array(late))))
-    return d, rho, float(phase / abs(motion.rate_rad_s))
-
-
-def classic_distances(motion: CircleMotion, edges: CircleEdges) -> Array:
-    """Distances (2,), m, from the mid-times of the crossings: R cos(arc / 2) (eq. 4-9).
-
-    Biased for a tool of finite radius: break and restore are not symmetric about the crossing.
-    """
-    d = np.zeros(2)
-    for b in (0, 1):
-        psi = _mean_psi(motion, edges, b)
-        middle = {}
-        for rising in (1, -1):
-            entry, leave = psi[rising, -rising], psi[rising, rising]
-            sign = motion.psi_rate(b)
-            middle[rising] = entry + 0.5 * sign * _positive(sign * (leave - entry))
-        arc = _positive(motion.psi_rate(b) * (middle[1] - middle[-1]))
-        d[b] = motion.radius_m * np.cos(0.5 * arc)
-    return d
-
-
-def _mean_psi(motion: CircleMotion, edges: CircleEdges, b: int) -> dict[tuple[int, int], float]:
-    """Angle psi at each kind (rising, side) of edge of a beam, mean over the turns, no latency."""
-    theta = motion.start_rad + motion.rate_rad_s * edges.time_s
-    found = {}
-    for rising in (1, -1):
-        for side in (1, -1):
-            own = (edges.beam == b) & (edges.rising == rising) & (edges.side == side)
-            if not np.any(own):
+def _require_order(steps: Sequence[BeamStep], rows: Sequence[Row], rate: Array) -> None:
+    """Refuse arcs that do not alternate, and a plunge that breaks on its way up."""
+    for (b, i, circle, edge), speed in zip(rows, rate, strict=True):
+        if circle < 0 and edge.blocked != (speed > 0.0):
+            way = "up" if edge.blocked else "down"
+            raise BeamError(
+                f"{steps[i].name}: beam {BEAMS[b]} was {'broken' if edge.blocked else 'restored'} "
+                f"at {edge.time_s:.4f} s while the tool moved {way}: begin above the beams, with "
+                "both of them clear"
+            )
+    for i, step in enumerate(steps):
+        for b, beam in enumerate(BEAMS):
+            own = [k for k, row in enumerate(rows) if row[:2] == (b, i)]
+            turned = np.sign(rate[own])
+            passes = np.cumsum([rows[k][3].blocked for k in own])
+            wanted = turned[0] * (-1.0) ** (passes - passes[0])
+            if step.kind == "circle" and np.any(turned != wanted):
                 raise BeamError(
-                    f"beam {BEAMS[b]}: a whole turn gives four edges, and one of them is missing; "
-                    "let the circle run past its start"
+                    f"{step.name}: the shadows on beam {beam} do not alternate between the two "
+                    "ways across it: edges were lost, or the robot was moved by hand; repeat it"
                 )
-            vector = np.mean(np.exp(1j * motion.psi(theta[own], b)))
-            found[rising, side] = float(np.angle(vector))
-    return found
 
 
-def _positive(angle: float) -> float:
-    return float(angle % (2.0 * np.pi))
+def _require_fit(
+    found: Estimate[ToolState], misfit: float, steps: Sequence[BeamStep], noise: RobotNoise
+) -> None:
+    """Refuse edges that miss any tool, and a step that lies apart from the others."""
+    if not found.converged:
+        raise ResidualError(
+            f"no tool is found: the search still moves with the edges {misfit * 1e3:.3f} mm rms "
+            "apart; check the robot's model, the laser frame and the taught tool"
+        )
+    if misfit > LARGEST_MISFIT_M:
+        raise ResidualError(
+            f"the edges miss any one tool by {misfit * 1e3:.3f} mm rms (allowed "
+            f"{LARGEST_MISFIT_M * 1e3:.1f} mm): check robot, laser frame and joint readings"
+        )
+    shift = np.linalg.norm(found.state.shift, axis=1)
+    worst = int(np.argmax(shift))
+    limit = max(LARGEST_MISFIT_M, MOST_SIGMAS * noise.step_m)
+    if shift[worst] > limit:
+        raise ResidualError(
+            f"{steps[worst].name}: {shift[worst] * 1e3:.3f} mm apart from the other steps (allowed "
+            f"{limit * 1e3:.3f} mm): was the robot moved by hand in between, the tool touched, or "
+            "the laser frame made at another station?"
+        )
+
+
+def _widened(problem: RunProblem, found: Estimate[ToolState]) -> Estimate[ToolState]:
+    """With a covariance for shifts, or what was held, that are larger than their sigmas explain.
+
+    For edges that are, `solve` has widened it: here they count with the scatter that it found.
+    """
+    away = problem.deviation(found.state)
+    misfit = float(np.sum((found.residual / found.scale) ** 2) + away @ problem.prior @ away)
+    free = len(found.residual) - problem.undetermined
+    if free <= 0 or misfit <= chi2_quantile(SOUND_FIT, free):
+        return found
+    return replace(found, covariance=misfit / free * found.covariance)

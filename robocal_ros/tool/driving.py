@@ -37,13 +37,9 @@ from robocal_ros.motion.plan import (
 )
 from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch, WatchedStop
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
-from robocal_ros.tool.flange_path import FEWEST_READINGS, JointPath
-from robocal_ros.tool.measuring_plan import PlannedStep
-from robocal_ros.tool.run import ToolRun
+from robocal_ros.tool.laser_frame import FEWEST_READINGS, JointPath
+from robocal_ros.tool.run import PlannedStep, ToolRun
 from robocal_ros.tool.session import ToolSession
-
-# ---- what a robot does that is driven through a tool measurement, and how long it may -----------
-
 
 STANDS_S = 0.2  # a robot that a run takes over has rested for so long
 SETTLED_S = 0.03  # one whose own motion has ended
@@ -74,9 +70,6 @@ def station_cell(run: ToolRun, config: DrivingConfig) -> MotionCell:
     seen = run.plan.T_flange_tool if run.seen is None else run.seen
     body = ToolBody(seen, config.tool_length_m, config.tool_radius_m, config.flange_radius_m)
     return MotionCell(run.arm, body, run.plan.laser.T_base_laser, config.housing, config.limits)
-
-
-# ---- measuring motion ---------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -233,9 +226,6 @@ def load_measuring(arm: SerialArm) -> None:
     load_motion(arm)
     time = np.linspace(0.0, 0.1, FEWEST_READINGS)
     JointPath(arm, time, np.full((len(time), arm.n), 0.3)).at(np.array([0.05]))
-
-
-# ---- driving ------------------------------------------------------------------------------------
 
 
 class ToolDriver:

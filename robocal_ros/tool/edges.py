@@ -4,8 +4,9 @@ Order is judged beam by beam: two beams' shadows may overlap, so nothing follows
 edges of different beams.
 """
 
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -15,12 +16,8 @@ from numpy.typing import NDArray
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import stamp_ns
 
-# ---- beam edges ---------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 Beam = Literal["x", "y"]
-
 BEAMS: tuple[Beam, Beam] = ("x", "y")
 MOST_BOUNCES = 5  # edges of one burst; more is no contact that settles
 
@@ -142,113 +139,11 @@ def edges_of(edges: Sequence[BeamEdge], beam: Beam, fewest: int) -> list[BeamEdg
     return own
 
 
-# ---- a circle through two crossed beams, and what each of its edges means -----------------------
 #
 # In the laser frame the tool's axis is at ``c + R (cos theta, sin theta)``; its signed distance
 # from beam b is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta.
-
-
-FEWEST_EDGES = 4  # of each beam: two shadows
-
-
-@dataclass(frozen=True)
-class CircleMotion:
-    """The commanded circle.
-
-    Attributes
-    ----------
-    radius_m, period_s : of the flange's circle.
-    start_rad : where the flange stands at time 0, counter-clockwise from the laser's x.
-    direction : +1 counter-clockwise seen from above, -1 clockwise.
-    beam_angle_rad : beta, from the x- to the y-beam.
-    """
-
-    radius_m: float
-    period_s: float
-    start_rad: float = 0.0
-    direction: int = 1
-    beam_angle_rad: float = float(np.pi / 2.0)
-
-    def __post_init__(self) -> None:
-        if not (self.radius_m > 0.0 and self.period_s > 0.0 and self.direction in (1, -1)):
-            raise ValueError("radius and period must be positive, direction +1 or -1")
-
-    @property
-    def rate_rad_s(self) -> float:
-        """Signed angular speed."""
-        return self.direction * 2.0 * float(np.pi) / self.period_s
-
-    def psi(self, theta: Array, beam: int) -> Array:
-        """Angle psi of a beam (its own inverse)."""
-        return theta if beam == 0 else self.beam_angle_rad - theta
-
-    def psi_rate(self, beam: int) -> float:
-        """Sign of the speed at which psi of a beam changes."""
-        return float(self.direction if beam == 0 else -self.direction)
-
-    def centre(self, d: Array) -> Array:
-        """Centre (2,), laser frame, m, from the distances d_x, d_y (thesis eq. 4-29)."""
-        return self.centre_jacobian @ d
-
-    @property
-    def centre_jacobian(self) -> Array:
-        """(2, 2) derivative of the centre by d_x and d_y."""
-        beta = self.beam_angle_rad
-        return np.array([[1.0 / np.tan(beta), 1.0 / np.sin(beta)], [1.0, 0.0]])
-
-
-@dataclass(frozen=True, eq=False)
-class CircleEdges:
-    """Edges of one circle with what each one means.
-
-    Attributes
-    ----------
-    beam : (m,) 0 for the x-beam, 1 for the y-beam.
-    rising : (m,) +1 where the distance from the beam grows, -1 where it falls.
-    side : (m,) +1 where the tool's axis is at +rho then, -1 at -rho.
-    time_s, sigma_s : (m,).
-    """
-
-    beam: NDArray[np.int64]
-    rising: Array
-    side: Array
-    time_s: Array
-    sigma_s: Array
-
-
-def label_edges(
-    motion: CircleMotion, edges: Sequence[BeamEdge], latency_s: float = 0.0
-) -> CircleEdges:
-    """Tell for each edge on which side of which beam the axis was, and which way it went.
-
-    Between the restore of a shadow and the next break the arc's middle is exactly above or below
-    the beam's middle: a latency up to a quarter of a turn does not confuse it. The first edge may
-    be a restore, and there may be several turns.
-
-    Raises
-    ------
-    BeamError
-        When a beam has fewer than four edges, or they do not come in turn.
-    """
-    parts = []
-    for b, beam in enumerate(BEAMS):
-        own = edges_of(edges, beam, FEWEST_EDGES)
-        time = np.array([e.time_s for e in own])
-        breaks = np.array([e.blocked for e in own])
-        shadow = np.cumsum(breaks)  # a first restore is of shadow 0
-        middle = 0.5 * (time[:-1] + time[1:])[~breaks[:-1]] - latency_s
-        theta = motion.start_rad + motion.rate_rad_s * middle
-        above = np.sin(motion.psi(theta, b)) * (-1.0) ** shadow[:-1][~breaks[:-1]]
-        rising = np.sign(np.sum(above)) * (-1.0) ** shadow
-        sigma = np.array([e.sigma_s for e in own])
-        parts.append((np.full(len(own), b), rising, np.where(breaks, -rising, rising), time, sigma))
-    beam_index, rising, side, time, sigma = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return CircleEdges(beam_index, rising, side, time, sigma)
-
-
-# ---- edges of light beams as messages bring them ------------------------------------------------
-
-
+StepKind = Literal["circle", "plunge"]
+FEWEST_EDGES: Mapping[StepKind, int] = {"circle": 4, "plunge": 2}  # of each beam
 BREAK, RESTORE = 1, 2  # as in robocal_msgs/BeamEvent
 
 
@@ -289,9 +184,6 @@ def edge_sample(message: Any, names: tuple[str, str]) -> EdgeSample:
         raise InputError("no time stamp: edges are stamped where they happen")
     beam = BEAMS[names.index(message.beam)]
     return EdgeSample(at_ns, message.header.frame_id, beam, message.edge == BREAK, sigma_s)
-
-
-# ---- the edges of a station's beams, as a tool session takes them -------------------------------
 
 
 EDGES = "beam_events"
@@ -340,3 +232,82 @@ class EdgeLog:
     def clear(self) -> None:
         """Forget all."""
         self._edges.clear()
+
+
+REST_S = 0.1
+REST_M = 2e-4  # the flange rests: it moved less in REST_S
+GIVEN_UP_S = 1.0  # rest after which an incomplete step is over: a program may pause in a plunge
+LEFT_M = 2e-3  # out of the circle's plane, or off the plunge's line
+AFTER_EDGE_S = 1e-3  # a reading so late after the last edge brackets it, whatever its latency
+
+
+@dataclass(eq=False)
+class StepWatch:
+    """Watches one step; times in s of any one origin, positions (3,) of the flange, base, m.
+
+    A robot program says nothing: a step is over when its edges are complete and the flange rests
+    or leaves, or when edges are missing and it has left or rested for long. The last step of a
+    run is over with its last edge.
+
+    Attributes
+    ----------
+    up : (3,) the laser's z, base.
+    first_edge_s : time of the first edge; None before.
+    """
+
+    kind: StepKind
+    last: bool
+    up: Array
+    first_edge_s: float | None = None
+    _edges: Counter[Beam] = field(default_factory=Counter)
+    _newest_edge_s: float = -np.inf
+    _start: Array | None = None
+    _recent: deque[tuple[float, Array]] = field(default_factory=deque)
+    _rest_since_s: float | None = None
+
+    def edge(self, beam: Beam, time_s: float) -> None:
+        """Take an edge."""
+        self._edges[beam] += 1
+        self.first_edge_s = time_s if self.first_edge_s is None else self.first_edge_s
+        self._newest_edge_s = max(self._newest_edge_s, time_s)
+
+    @property
+    def edges(self) -> int:
+        """How many edges there were."""
+        return self._edges.total()
+
+    def over(self, time_s: float, flange: Array) -> bool:
+        """Take a reading of the flange; whether the step is over now."""
+        rests_s = self._rests_s(time_s, flange)
+        if not self.edges or time_s < self._newest_edge_s + AFTER_EDGE_S:
+            return False
+        if self._start is None:
+            self._start = flange
+        complete = all(self._edges[beam] >= FEWEST_EDGES[self.kind] for beam in BEAMS)
+        even = all(self._edges[beam] % 2 == 0 for beam in BEAMS)
+        if complete and even and (self.last or rests_s > 0.0):
+            return True
+        return rests_s >= GIVEN_UP_S or self._left(flange)
+
+    def _left(self, flange: Array) -> bool:
+        if self._start is None:
+            return False
+        away = flange - self._start
+        height = float(away @ self.up)
+        if self.kind == "circle":
+            return abs(height) > LEFT_M
+        return float(np.linalg.norm(away - height * self.up)) > LEFT_M
+
+    def _rests_s(self, time_s: float, flange: Array) -> float:
+        """How long the flange has rested by now."""
+        self._recent.append((time_s, flange))
+        while len(self._recent) > 1 and self._recent[1][0] <= time_s - REST_S:
+            self._recent.popleft()
+        first_s, first = self._recent[0]
+        still = first_s <= time_s - REST_S and float(np.linalg.norm(flange - first)) < REST_M
+        if not still:
+            self._rest_since_s = None
+            return 0.0
+        if self._rest_since_s is None:
+            self._rest_since_s = first_s
+        return time_s - self._rest_since_s

@@ -1,16 +1,17 @@
 """Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.cells import Cells, read_cells
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
 from robocal_ros.kinematics import SerialArm
@@ -23,13 +24,24 @@ from robocal_ros.kinematics.tables import (
     read_rotations,
     read_stamps,
 )
-from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge
-from robocal_ros.tool.flange_path import JointPath
-from robocal_ros.tool.measuring_plan import STEP_NAMES, step_kind
-from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height
+from robocal_ros.tool.circle import CircleFit
+from robocal_ros.tool.crossed_model import BeamStep, ToolEstimate
+from robocal_ros.tool.edges import (
+    BEAMS,
+    Beam,
+    BeamEdge,
+    StepKind,
+    debounced,
+)
+from robocal_ros.tool.judging import (
+    KnownTool,
+    QuickCheck,
+    ToolChange,
+)
+from robocal_ros.tool.laser_frame import JointPath, LaserFrame, first_rotation
+from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height, TouchFit
 
 Array = NDArray[np.float64]
-
 QUATERNION_TOLERANCE = 1e-3
 
 
@@ -68,15 +80,11 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     return frames.transform(rotation, xyz)
 
 
-# ---- a tool frame in the words of a robot's controller ------------------------------------------
 #
 # Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
 # W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB a
 # unit quaternion, real part first; Universal Robots a rotation vector.
-
-
 Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]
-
 ABB_UNKNOWN = "1,[0,0,1]"  # ABB takes no load without mass or with its centre in the flange
 ABB_REMARK = "! mass and centre of gravity are placeholders: enter this tool's, in kg and mm\n"
 
@@ -148,11 +156,6 @@ _FORMATS: Mapping[str, Callable[[Array], str]] = {
     "fanuc": _fanuc,
     "ur": _ur,
 }
-
-
-# ---- tables about tools: points of light beams, edges, flange poses (docs/tool.md) --------------
-
-
 POSITION = ("x_mm", "y_mm", "z_mm")
 STATES = {"1": True, "true": True, "0": False, "false": False}
 
@@ -315,3 +318,171 @@ def _poses(path: Path, words: tuple[str, ...] = ()) -> tuple[Cells, Array]:
 
 def _positions(table: Cells) -> Array:
     return 1e-3 * np.column_stack([table.numbers(name) for name in POSITION])
+
+
+CIRCLES = ("low", "high", "upright")  # as a measuring plan calls them
+STEP_NAMES = f"circles are called {', '.join(CIRCLES)} or circle…, plunges plunge…"
+
+
+def step_kind(name: str) -> StepKind | None:
+    """What a step's name says it is; None where it says nothing."""
+    if name in CIRCLES or name.startswith("circle"):
+        return "circle"
+    return "plunge" if name.startswith("plunge") else None
+
+
+def named_steps(
+    edges: Sequence[BeamEdge], names: Sequence[str], debounce_s: float
+) -> list[BeamStep]:
+    """Steps in order of time, their edges debounced; ``names`` says the step of each edge.
+
+    Raises
+    ------
+    InputError
+        When a name says neither circle nor plunge, or comes again after another step.
+    BeamError
+        When a beam chatters.
+    """
+    inside: dict[str, list[BeamEdge]] = {}
+    before = None
+    for edge, name in sorted(zip(edges, names, strict=True), key=lambda pair: pair[0].time_s):
+        if name in inside and name != before:
+            raise InputError(
+                f"step '{name}' comes again at {edge.time_s:.4f} s, after step '{before}': give "
+                "each motion a name of its own"
+            )
+        inside.setdefault(name, []).append(edge)
+        before = name
+    steps = []
+    for name, own in inside.items():
+        kind = step_kind(name)
+        if kind is None:
+            raise InputError(f"step '{name}' is neither: {STEP_NAMES}")
+        steps.append(BeamStep(name, kind, debounced(own, debounce_s)))
+    return steps
+
+
+Document = dict[str, Any]
+COVARIANCE_UNITS = ("m", "m", "m", "rad", "rad")
+
+
+def laser_document(laser: LaserFrame) -> Document:
+    """Where two beams cross: origin, gap and angle; ``axes`` has x, y, z as rows, base."""
+    T_base_laser = laser.T_base_laser
+    return {
+        "origin_mm": (T_base_laser[:3, 3] * 1e3).tolist(),
+        "gap_mm": laser.gap_m * 1e3,
+        "axes": T_base_laser[:3, :3].T.tolist(),
+        "beam_angle_deg": float(np.degrees(laser.beam_angle_rad)),
+    }
+
+
+def circle_document(fit: CircleFit) -> Document:
+    """The tool's axis on one circle; what the method does not tell is null."""
+    sigma = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance)) * 1e3
+    rho = None if fit.rho is None else dict(zip("xy", (fit.rho * 1e3).tolist(), strict=True))
+    words = f"the axis is at ({fit.centre[0] * 1e3:.3f}, {fit.centre[1] * 1e3:.3f}) mm"
+    if sigma is not None:
+        words += f", known to {float(sigma.max()):.4f} mm; edges within {fit.misfit_m * 1e3:.4f} mm"
+    return {
+        "method": fit.method,
+        "center_mm": (fit.centre * 1e3).tolist(),
+        "sigma_mm": None if sigma is None else sigma.tolist(),
+        "tool_radius_mm": rho,
+        "latency_s": fit.latency_s,
+        "misfit_mm": None if sigma is None else fit.misfit_m * 1e3,
+        "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
+    }
+
+
+def run_document(
+    found: KnownTool, estimate: ToolEstimate, circles: Sequence[str], verdict: Verdict
+) -> Document:
+    """A tool ``found`` by a whole run; ``circles``: names in the order of their radii.
+
+    ``covariance`` (5, 5), SI: of the tip along the flange's x, y, z and of the axis' tilt along the
+    tool's x and y; ``sigma_mm`` and ``sigma_deg`` are the roots of its diagonal.
+    """
+    covariance = estimate.covariance if found.covariance is None else found.covariance
+    sigma = np.sqrt(np.diag(covariance))
+    radii = zip(circles, (estimate.radius * 1e3).tolist(), strict=True)
+    return {
+        "method": "best",
+        **_tool_part(found.T_flange_tool),
+        "covariance": covariance.tolist(),
+        "covariance_units": list(COVARIANCE_UNITS),
+        "sigma_mm": (sigma[:3] * 1e3).tolist(),
+        "sigma_deg": np.degrees(sigma[3:]).tolist(),
+        "tool_radius_mm": [{"circle": name, "x": x, "y": y} for name, (x, y) in radii],
+        "latency_s": estimate.latency_s,
+        "latency_sigma_s": estimate.latency_sigma_s,
+        "misfit_mm": estimate.misfit_m * 1e3,
+        "shift_mm": estimate.shift_m * 1e3,
+        "verdict": verdict_document(verdict),
+    }
+
+
+def classic_run_document(T_flange_tool: Array) -> Document:
+    """A tool by the classic method; what it does not tell is null."""
+    words = "mid-times: no covariance, and biased for a thick tool; compare with method best"
+    unknown = (
+        *("covariance", "covariance_units", "sigma_mm", "sigma_deg", "tool_radius_mm"),
+        *("latency_s", "latency_sigma_s", "misfit_mm", "shift_mm"),
+    )
+    return {
+        "method": "classic",
+        **_tool_part(T_flange_tool),
+        **dict.fromkeys(unknown),
+        "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
+    }
+
+
+def parallel_document(axis: Array, tip: Array | None) -> Document:
+    """A tool by parallel beams: turned from the flange's by the smallest angle; SI in, mm out."""
+    words = "the straightened tool stands upright" if tip is not None else "the axis alone"
+    T = frames.transform(first_rotation(axis), np.zeros(3) if tip is None else tip)
+    return _tool_part(T) | {
+        "tcp_mm": None if tip is None else (tip * 1e3).tolist(),
+        "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
+    }
+
+
+def _tool_part(T_flange_tool: Array) -> Document:
+    return {
+        "tcp_mm": (T_flange_tool[:3, 3] * 1e3).tolist(),
+        "quat_xyzw": frames.quat_xyzw(T_flange_tool).tolist(),
+        "axis": T_flange_tool[:3, 2].tolist(),
+    }
+
+
+def touch_document(fit: TouchFit) -> Document:
+    """A touched tool; without an orientation its quaternion is null."""
+    far = np.linalg.norm(fit.residual, axis=1)
+    turn = None if fit.rotation is None else frames.transform(fit.rotation, np.zeros(3))
+    return {
+        "tcp_mm": (fit.tip * 1e3).tolist(),
+        "quat_xyzw": None if turn is None else frames.quat_xyzw(turn).tolist(),
+        "sigma_mm": (np.sqrt(np.diag(fit.covariance)) * 1e3).tolist(),
+        "point_mm": (fit.point * 1e3).tolist(),
+        "residual_mm": {"rms": fit.rms_m * 1e3, "max": float(far.max()) * 1e3},
+        "touches": len(far),
+        "verdict": verdict_document(fit.verdict),
+    }
+
+
+def change_document(change: ToolChange) -> Document:
+    """How far a tool has moved."""
+    return {"tip_mm": change.tip_m * 1e3, "axis_deg": float(np.degrees(change.axis_rad))}
+
+
+def check_document(check: QuickCheck, verdict: Verdict) -> Document:
+    """The answer of a quick check; ``deviation_mm`` along the tool's axes."""
+    tilt_deg = float(np.degrees(check.tilt_rad))
+    return {
+        "answer": check.answer,
+        "deviation_mm": (check.deviation * 1e3).tolist(),
+        "change": {"tip_mm": check.deviation_m * 1e3, "axis_deg": tilt_deg},
+        "sigma_mm": check.sigma_m * 1e3,
+        "misfit_mm": check.measured.misfit_m * 1e3,
+        "verdict": verdict_document(verdict),
+    }

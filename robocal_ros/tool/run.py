@@ -1,36 +1,349 @@
-"""One run through the beams: its steps, and the edges and joint readings of each."""
+"""Which circles and plunges measure a tool: each follows from what is known by then."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise
-from robocal_ros.tool.crossed_run import (
-    RunTraits,
+from robocal_ros.tool.crossed_model import (
+    BeamStep,
+    Held,
+    RobotNoise,
     ToolEstimate,
-    TraitLimits,
     estimate_tool,
-    require_even,
     run_problem,
 )
-from robocal_ros.tool.edges import Beam, EdgeSample, InputRule, debounced
-from robocal_ros.tool.flange_path import JointPath
-from robocal_ros.tool.judging import ToolLimits
-from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.measuring_plan import MeasuringMotion, MeasuringPlan, PlannedStep, StepWatch
-from robocal_ros.tool.quick_check import CheckRule
-from robocal_ros.tool.witness import BendRule
-
-# ---- settings of the tool session ---------------------------------------------------------------
-
+from robocal_ros.tool.edges import (
+    BEAMS,
+    Beam,
+    BeamError,
+    EdgeSample,
+    InputRule,
+    StepKind,
+    StepWatch,
+    debounced,
+)
+from robocal_ros.tool.judging import BendRule, CheckRule, ToolLimits
+from robocal_ros.tool.laser_frame import (
+    JointPath,
+    LaserFrame,
+    upright_pose,
+)
 
 Array = NDArray[np.float64]
+Mode = Literal["full", "quick"]
+STEPS: Mapping[Mode, tuple[str, ...]] = {
+    "full": ("low", "high", "upright", "plunge_1", "plunge_2"),
+    "quick": ("circle", "plunge"),
+}
+START_RAD = float(np.pi / 4.0)  # in mid-quadrant: no circle begins on a beam
+
+
+@dataclass(frozen=True)
+class MeasuringMotion:
+    """Sizes and speeds of the steps, m and m/s.
+
+    Attributes
+    ----------
+    radius_m, speed_m_s : of the circles.
+    height_m : between the circles; the longer, the better the axis.
+    above_tip_m : where the lower circles meet the tool.
+    plunge_depth_m, plunge_speed_m_s : of the plunges, half of the depth below the beams.
+    """
+
+    radius_m: float = 0.012
+    speed_m_s: float = 0.05
+    height_m: float = 0.05
+    above_tip_m: float = 5e-3
+    plunge_depth_m: float = 7e-3
+    plunge_speed_m_s: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < np.inf:
+                raise InputError(f"{name} = {value}: must be positive")
+
+    @property
+    def period_s(self) -> float:
+        """Of a turn."""
+        return 2.0 * np.pi * self.radius_m / self.speed_m_s
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedStep:
+    """A circle or a plunge to be driven; the flange's orientation is held.
+
+    Attributes
+    ----------
+    number, of : place in the run, from 1.
+    T_base_flange : (4, 4) at the circle's centre, or where the plunge begins and ends.
+    R_base_laser : (3, 3) the circle lies in its x-y plane; the plunge goes along -z and back.
+    radius_m, speed_m_s : of a circle; ``direction`` +1 counter-clockwise about the laser's z.
+    depth_m : of a plunge; its speed is ``speed_m_s``.
+    """
+
+    name: str
+    kind: StepKind
+    number: int
+    of: int
+    T_base_flange: Array
+    R_base_laser: Array
+    speed_m_s: float
+    radius_m: float = 0.0
+    direction: int = 1
+    start_rad: float = START_RAD
+    depth_m: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuringPlan:
+    """The steps of a run.
+
+    Attributes
+    ----------
+    T_flange_tool : (4, 4) the taught tool (full) or the stored one (quick).
+    spin_rad : turn of the flange about the laser's z: with 0 its x lies along the laser's x.
+    """
+
+    mode: Mode
+    laser: LaserFrame
+    T_flange_tool: Array
+    motion: MeasuringMotion = field(default_factory=MeasuringMotion)
+    spin_rad: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the steps in turn."""
+        return STEPS[self.mode]
+
+    def step(self, number: int, seen: Array | None = None) -> PlannedStep:
+        """Step ``number`` (from 1).
+
+        ``seen`` (4, 4): the tool in the flange frame as the steps so far show it; needed by what
+        `needs_tool` names.
+
+        Raises
+        ------
+        InputError
+            When it is missing.
+        """
+        name = self.names[number - 1]
+        if self.needs_tool(number) and seen is None:
+            raise InputError(f"step {name} follows from the steps before it: measure them first")
+        tool = self.T_flange_tool if seen is None or not self.needs_tool(number) else seen
+        plunge = name.startswith("plunge")
+        T = self._pose(
+            tool, -0.5 * self.motion.plunge_depth_m if plunge else self.motion.above_tip_m
+        )
+        if name == "high":
+            # Straight below the first circle: the tool is not set upright yet.
+            T[:3, 3] -= self.motion.height_m * self.laser.T_base_laser[:3, 2]
+        return PlannedStep(
+            name=name,
+            kind="plunge" if plunge else "circle",
+            number=number,
+            of=len(self.names),
+            T_base_flange=T,
+            R_base_laser=self.laser.T_base_laser[:3, :3],
+            speed_m_s=self.motion.plunge_speed_m_s if plunge else self.motion.speed_m_s,
+            radius_m=0.0 if plunge else self.motion.radius_m,
+            direction=1 if number % 2 else -1,
+            depth_m=self.motion.plunge_depth_m if plunge else 0.0,
+        )
+
+    def needs_tool(self, number: int) -> bool:
+        """Whether a step follows from what the ones before it show."""
+        return self.mode == "full" and self.names[number - 1] not in ("low", "high")
+
+    def _pose(self, T_flange_tool: Array, above_tip_m: float) -> Array:
+        """Flange pose with the tool upright and a point of its axis on the crossing."""
+        spin = frames.exp_rotation([0.0, 0.0, self.spin_rad])
+        down = self.laser.T_base_laser[:3, :3] @ spin @ np.diag([1.0, -1.0, -1.0])
+        point = T_flange_tool[:3, 3] - above_tip_m * T_flange_tool[:3, 2]
+        near = frames.transform(down, np.zeros(3))
+        return upright_pose(self.laser, near, T_flange_tool[:3, 2], point)
+
+
+#
+# joint readings came. No bend changes these; what differs from the healthy tool's run is a fault.
+ONE_SIDED = 1.645  # sigmas: what is at a limit looks larger by so much in 5 % of cases
+AS_LOW = "circle"  # of a quick check: as high above the tip as the circle `low` of a whole run
+LOW = "low"
+
+
+class WrongToolError(RobocalError):
+    """Another tool than the healthy one that was measured."""
+
+    code = Code.WRONG_TOOL
+
+
+class ClockError(RobocalError):
+    """Edges and joint readings are not stamped on one clock, or the input's delay has changed."""
+
+    code = Code.CLOCK_WRONG
+
+
+@dataclass(frozen=True)
+class TraitLimits:
+    """Changes against the healthy tool's run that are no fault yet; 0: any.
+
+    Attributes
+    ----------
+    radius_m : of the tool as a beam sees it.
+    latency_s : of the edges behind the joint readings.
+    lost : share of the joint readings.
+    """
+
+    radius_m: float = 5e-5
+    latency_s: float = 5e-3
+    lost: float = 0.05
+
+
+@dataclass(frozen=True)
+class RunTraits:
+    """Traits of a run.
+
+    Attributes
+    ----------
+    radius_m : by circle, of the tool as the x- and the y-beam see it; ``radius_sigma_m`` of each.
+    latency_s, latency_sigma_s : of the edges behind the joint readings.
+    rate_hz : of the joint readings.
+    """
+
+    radius_m: Mapping[str, tuple[float, float]]
+    radius_sigma_m: float
+    latency_s: float
+    latency_sigma_s: float
+    rate_hz: float
+
+    @classmethod
+    def of(cls, estimate: ToolEstimate, circles: Sequence[str], rate_hz: float) -> "RunTraits":
+        """Of a measured tool; ``circles``: names in the order of its radii."""
+        found = estimate.estimate
+        own = np.array([name.startswith("radius_") for name in found.names])
+        variance = np.diag(found.covariance)[own]
+        radii = zip(circles, estimate.radius.tolist(), strict=True)
+        return cls(
+            {name: (x, y) for name, (x, y) in radii},
+            float(np.sqrt(np.max(variance))),
+            estimate.latency_s,
+            estimate.latency_sigma_s,
+            rate_hz,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Plain values; `of_document` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "RunTraits":
+        """Read what `document` gave, also after JSON."""
+        radius = {name: (x, y) for name, (x, y) in document["radius_m"].items()}
+        return cls(**(dict(document) | {"radius_m": radius}))
+
+    def require_readings(self, count: int, span_s: float, limits: TraitLimits) -> None:
+        """Refuse ``count`` readings over a time where this run would have had clearly more.
+
+        Raises
+        ------
+        TooFewSamplesError
+            When messages are lost.
+        """
+        expected = self.rate_hz * span_s
+        lost = 1.0 - count / expected if expected > 0.0 else 0.0
+        sigma = np.sqrt(max(lost * (1.0 - lost), 0.0) / max(expected, 1.0))
+        if _beyond(max(lost, 0.0), float(sigma), limits.lost):
+            raise TooFewSamplesError(
+                f"{lost:.0%} of the joint readings are missing: {count} in {span_s:.1f} s, the "
+                f"healthy tool was measured with {self.rate_hz:.0f} in a second; edges are lost "
+                "with them: look at network and load, or measure the healthy tool at this rate"
+            )
+
+    def require_like(self, healthy: "RunTraits", limits: TraitLimits) -> None:
+        """Refuse a run that differs from the healthy tool's in what no bend changes.
+
+        Raises
+        ------
+        ClockError
+            When the edges are later or earlier than they were.
+        BeamError
+            When one beam alone sees the tool grown or shrunk.
+        WrongToolError
+            When both do.
+        """
+        self._require_clock(healthy, limits)
+        change = self._grown(healthy)
+        if change is None:
+            return
+        sigma = float(np.hypot(self.radius_sigma_m, healthy.radius_sigma_m))
+        apart, both = float(change[0] - change[1]), float(np.mean(change))
+        x, y = (f"{1e3 * part:+.3f}" for part in change)
+        words = f"against the healthy tool its radius is {x} mm in beam x and {y} mm in beam y"
+        if _beyond(apart, np.sqrt(2.0) * sigma, limits.radius_m):
+            worse = BEAMS[int(np.argmax(np.abs(change)))]
+            raise BeamError(
+                f"{words}: a tool changes for both, so beam {worse} is dirty or out of line; clean "
+                "and align it, then measure the healthy tool anew"
+            )
+        if _beyond(both, np.sqrt(0.5) * sigma, limits.radius_m):
+            raise WrongToolError(
+                f"{words}: another tool is mounted, this one is worn or fouled, or both beams are "
+                "dirty; mount the right one, or measure it in mode REFERENCE"
+            )
+
+    def _require_clock(self, healthy: "RunTraits", limits: TraitLimits) -> None:
+        later = self.latency_s - healthy.latency_s
+        sigma = float(np.hypot(self.latency_sigma_s, healthy.latency_sigma_s))
+        if _beyond(later, sigma, limits.latency_s):
+            raise ClockError(
+                f"the edges are {1e3 * self.latency_s:.1f} ms behind the joint readings, with the "
+                f"healthy tool it were {1e3 * healthy.latency_s:.1f} ms: a clock has jumped, or "
+                "the input is delayed; put both on one clock, or measure the healthy tool anew"
+            )
+
+    def _grown(self, healthy: "RunTraits") -> Array | None:
+        """Growth (2,) of the radius in each beam, m; None where no circle is common."""
+        pairs = [
+            (radii, healthy.radius_m[LOW if name == AS_LOW else name])
+            for name, radii in self.radius_m.items()
+            if (LOW if name == AS_LOW else name) in healthy.radius_m
+        ]
+        if not pairs:
+            return None
+        return np.asarray(np.mean([np.subtract(now, then) for now, then in pairs], axis=0))
+
+
+def require_even(rates_hz: Sequence[float], limits: TraitLimits) -> None:
+    """Refuse a healthy tool's run whose steps (k,) had joint readings at unlike rates.
+
+    Measured under loss it would hide what is lost later. A loss that is alike in all steps does
+    not show.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When the slowest and the fastest step differ by more than the limit.
+    """
+    slowest, fastest = min(rates_hz), max(rates_hz)
+    if _beyond(1.0 - slowest / fastest, 0.0, limits.lost):
+        raise TooFewSamplesError(
+            f"joint readings came at {slowest:.0f} to {fastest:.0f} in a second: some were lost, "
+            "and a healthy tool measured so would hide later loss; look at network and load, then "
+            "measure it again"
+        )
+
+
+def _beyond(change: float, sigma: float, limit: float) -> bool:
+    """Whether a change is larger than the limit in all but 5 % of cases; not a number is."""
+    return limit > 0.0 and not abs(change) - ONE_SIDED * sigma <= limit
+
+
 Rows = tuple[tuple[float, ...], ...]
 
 
@@ -128,9 +441,6 @@ def made_with(config: ToolConfig) -> dict[str, Any]:
     """What two measurements must share to be compared: taught tool, beams and station."""
     document = {"taught": config.taught, "points_m": config.points_m, "station": config.station}
     return {name: json.loads(json.dumps(value)) for name, value in document.items()}
-
-
-# ---- one run through the beams: its steps, and the edges and joint readings of each -------------
 
 
 PLANNING = Held(along_m=5e-3)  # before any plunge the tip is taken where it was taught

@@ -1,6 +1,7 @@
 """The services and the action of the tool node: each call becomes a command to the session."""
 
-from collections.abc import Awaitable, Callable
+import math
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,23 +11,40 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
 from robocal_msgs.action import MeasureTool
-from robocal_msgs.msg import CalibrationQuality, ToolFrame, ToolStep
-from std_srvs.srv import Trigger
+from robocal_msgs.msg import CalibrationQuality, MaintenanceStatus, ToolFrame, ToolStep
+from std_srvs.srv import SetBool, Trigger
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, RobocalError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.proposals import TOOL
+from robocal_ros.ground.samples import joint_sample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.motion.driver import (
+    CONTROLLER,
+    MOTION,
+    LeaseHolder,
+    MotionDriver,
+    SteadyClock,
+    driving_config,
+    goal_tolerances,
+    require_limits,
+)
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import Gap, MotionReport
 from robocal_ros.ros import conversions, endpoints
-from robocal_ros.ros.conversions import StaticTf, header, pose_message, transform_message
-from robocal_ros.ros.endpoints import EndpointNode, trigger_text
+from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, transform_message
+from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
+from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
+from robocal_ros.ros.parameters import Setting, length
 from robocal_ros.ros.session_node import DecisionServices, SessionEvents
-from robocal_ros.session.events import Outcome
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.tool.driving import ToolDriver
+from robocal_ros.tool.edges import RESTORE
 from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.measuring_plan import PlannedStep
-from robocal_ros.tool.results import FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE
+from robocal_ros.tool.run import PlannedStep
+from robocal_ros.tool.session import FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE, ToolSession
 
 MODES = {
     MeasureTool.Goal.FULL: FULL,
@@ -200,11 +218,7 @@ def _fill(result: Any, document: Any) -> None:
     result.sigma_mm = float(np.max(sigma))
 
 
-# ---- steps and tools as messages: pure mapping --------------------------------------------------
-
-
 Array = NDArray[np.float64]
-
 KINDS = {"circle": ToolStep.CIRCLE, "plunge": ToolStep.PLUNGE}
 
 
@@ -281,9 +295,6 @@ class ToolMessages:
             child_frame_id=self._tool,
             transform=transform_message(known.T_flange_tool),
         )
-
-
-# ---- what the tool node says: its topics, and how results get onto them -------------------------
 
 
 AddOutput = Callable[[type, str, QoSProfile], Any]
@@ -365,3 +376,224 @@ class TcfOutputs:
         if "sigma_mm" in document:
             message.predicted_rms_mm = float(np.max(document["sigma_mm"]))
         self._quality.publish(message)
+
+
+TICK_S = 0.01
+LOOK_S = 0.5
+# What maintenance_node and joint_correction_node publish, who command the robot too.
+CELL = "accuracy_state", STATUS, "joint_correction_node/status"
+MOTION_SETTINGS = (
+    *MOTION,
+    *CONTROLLER,
+    length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
+    Setting(
+        "gap_stale_s",
+        0.5,
+        "Nothing moves unless gap_open is true, and neither it nor the beat that it echoes older; "
+        "0: it is not listened to, and maintenance_node does not measure with it",
+        unit="s",
+        low=0.0,
+        high=0.5,
+        check=lambda stale_s: (
+            f"0, or {SHORTEST_STALE_S:g} s at least" if 0.0 < stale_s < SHORTEST_STALE_S else None
+        ),
+    ),
+    GAP_BOOL,
+)
+UNHEARD = "gap_open is not listened to: gap_stale_s is 0"
+
+
+class TcfMotion:
+    """``~/arm``, the robot's controller, and ``gap_open`` where it is listened to.
+
+    Parameters
+    ----------
+    arm, serial : the robot.
+    ask : gives a command to the session.
+    """
+
+    def __init__(
+        self,
+        node: EndpointNode,
+        settings: Mapping[str, Any],
+        ask: Callable[[Command], object],
+        arm: SerialArm,
+        serial: str,
+    ) -> None:
+        self._node, self._ask = node, ask
+        self._config = driving_config(
+            settings,
+            plunge_speed_m_s=settings["plunge_speed_mm_s"] * 1e-3,
+            plunge_depth_m=settings["plunge_limit_mm"] * 1e-3,
+        )
+        self._names = arm.joint_names
+        self.driver: ToolDriver | None = None
+        self._steady = SteadyClock(self._slept)
+        self._motion = MotionDriver(
+            node,
+            arm.joint_names,
+            settings["follow_joint_trajectory"],
+            settings["hard_stop_service"],
+            goal_tolerances(arm, self._config),
+            self._reported,
+            lambda: None if self.driver is None else self.driver.robot,
+            self._steady.now_s,
+        )
+        self._lease = LeaseHolder(node, arm.name, serial)
+        self._others = CommandPath(node, self._motion.topic.topic_name, self._motion.action, CELL)
+        self._gap = Gap(stale_s) if (stale_s := settings["gap_stale_s"]) > 0.0 else None
+        if self._gap is not None:
+            is_bool = settings["gap_bool"]
+            self._sources = GapSources(node, is_bool, self._take_gap)
+            if not is_bool:
+                # Not latched: a beat of before is not taken for one of now.
+                node.add_input(MaintenanceStatus, STATUS, self._take_beat, endpoints.RELIABLE)
+        else:
+            node.get_logger().warning(self.deaf())
+        node.add_service(SetBool, "~/arm", self._arm, inactive=True)
+        node.add_timer(TICK_S, self._tick, steady=True)
+
+    def activate(self, session: ToolSession) -> None:
+        """Begin, disarmed.
+
+        Raises
+        ------
+        InputError
+            When a limit is given for another number of joints, or the robot has none.
+        """
+        require_limits(session.nominal, self._config)
+        self._looked_s = -math.inf
+        self.driver = ToolDriver(
+            session, self._config, self._send, self._ask, self._closed, self._motion.hard_stop
+        )
+
+    def deactivate(self) -> None:
+        """Stop what moves."""
+        if self.driver is not None:
+            self.driver.disarm("the node was deactivated", self._steady.now_s())
+            self._lease.hold("")
+        self.driver = None
+
+    def close(self) -> None:
+        """Take the controller's client down."""
+        self._motion.close()
+
+    def take(self, message: Any) -> None:
+        """Take a JointState before the session does: what is odd stops the robot first."""
+        if self.driver is None:
+            return
+        self._motion.hear(message)
+        try:
+            sample = joint_sample(message)
+            q = sample.position[sample.order(self._names)]
+        except InputError:  # the session counts it; without readings the robot stops
+            return
+        self.driver.reading(sample.stamp_ns / NS, q, self._steady.now_s())
+
+    def beam(self, message: Any) -> None:
+        """Take a BeamEvent, usable or not: on its way the tool breaks no beam."""
+        if self.driver is not None:
+            self.driver.beam(message.edge != RESTORE)
+
+    def require_ready(self) -> None:
+        """Refuse a run while nothing may move."""
+        if self.driver is None:
+            raise NotActiveError("no session: activate the node")
+        self.driver.require_ready()
+
+    def deaf(self) -> str:
+        """Why what moves would go on in a closed gap; empty: it would stop."""
+        if self._gap is not None:
+            return ""
+        return f"{UNHEARD}; set it to 0.5 in a cell with maintenance_node"
+
+    def words(self) -> str:
+        """What the diagnostics say."""
+        if self.driver is None:
+            return "inactive"
+        way = f"; motions go on {self._motion.way}" if self._motion.way else ""
+        return self.driver.words() + way
+
+    def trouble(self) -> str:
+        """What is to be warned of; empty: nothing."""
+        return "" if self.driver is None else self.driver.trouble(self._steady.now_s())
+
+    @property
+    def fault(self) -> str:
+        """Who else commands the robot, so that this node does not; empty: nobody."""
+        return self._others.violation
+
+    def on_its_way(self) -> bool:
+        """Whether a step is being driven: a robot that rests then only pauses."""
+        return self.driver is not None and self.driver.on_its_way(self._steady.now_s())
+
+    def run_ended(self, outcome: Outcome) -> None:
+        """A run without a result stops the robot."""
+        if self.driver is not None and outcome.document is None:
+            self.driver.run_failed(outcome.message, self._steady.now_s())
+
+    def _take_beat(self, message: Any) -> None:
+        if self._gap is not None:
+            self._gap.saw(message.beat, self._steady.now_s())
+
+    def _take_gap(self, is_open: bool, echo: int | None) -> None:
+        if self._gap is not None:
+            self._gap.doubt(self._sources.doubt())
+            self._gap.heard(is_open, echo, self._steady.now_s())
+            self._tick()
+
+    def _slept(self, for_s: float) -> None:
+        if self.driver is not None:
+            self.driver.slept(for_s)
+
+    def _closed(self, now_s: float) -> str:
+        """Why nothing may move, where somebody says so; a pause of this process is looked for."""
+        if self._gap is not None:
+            self._gap.look(now_s)
+            if why := self._gap.closed(now_s):
+                return why
+        return self._others.violation
+
+    def _tick(self) -> None:
+        now_s = self._steady.now_s()
+        if self._gap is not None:
+            self._gap.look(now_s)
+        if self.driver is not None:
+            if now_s >= self._looked_s + LOOK_S:
+                self._looked_s = now_s
+                self._others.look()
+            self.driver.tick(now_s)
+            self._lease.hold(f"tool: {self.driver.words()}" if self.driver.moves else "")
+
+    def _reported(self, report: MotionReport) -> None:
+        if self.driver is not None:
+            self.driver.reported(report, self._steady.now_s())
+
+    def _arm(self, request: Any, response: Any) -> Any:
+        if self.driver is None:
+            if request.data:
+                raise NotActiveError(f"the node is {self._node.state}: activate it to arm")
+            # deactivation disarmed; who must know that nothing moves gets a plain answer
+            response.success, response.message = True, "disarmed: the node is not active"
+            return response
+        now_s = self._steady.now_s()
+        if request.data:
+            self._others.look()
+            self.driver.arm(now_s)
+        else:
+            self.driver.disarm("disarmed by a call", now_s)
+        response.success = True
+        response.message = self._armed() if request.data else "disarmed"
+        self._node.get_logger().warning(f"arm {request.data}: {response.message}")
+        return response
+
+    def _send(self, plan: JointPlan, stop: bool) -> float:
+        if not stop and (why := self._others.look()):
+            raise ConflictError(why)  # at which the driver stops and disarms
+        sent_s = self._steady.now_s()  # not after it: a robot ahead of its plan is off it
+        self._motion.send(plan, stop=stop)
+        return sent_s
+
+    def _armed(self) -> str:
+        words = f"armed: begin the measurement within {self._config.armed_s:g} s"
+        return words if self._gap is not None else f"{words}; {UNHEARD}"

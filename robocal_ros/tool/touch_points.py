@@ -23,11 +23,10 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.tool.flange_path import minimal_rotation
+from robocal_ros.tool.laser_frame import minimal_rotation
 
 Array = NDArray[np.float64]
 EulerConvention = Literal["zxz", "zyx", "zyz"]
-
 FEWEST_TOUCHES = 4
 SHORTEST_MOVE_M = 1e-2
 LARGEST_RESIDUAL_M = 1e-3  # rms: the methods' class is 0.5 mm
@@ -182,9 +181,6 @@ def fit_seven(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
     )
 
 
-# ---- parallel beams -----------------------------------------------------------------------------
-
-
 SMALLEST_HEIGHT_M = 2e-3
 LARGEST_LEAN_M = 3e-4  # between both beams after straightening
 
@@ -284,11 +280,7 @@ def parallel_tip(
     return np.asarray(frame.T @ np.linalg.solve(A, np.array(right)))
 
 
-# ---- a tool by two parallel beams from named sweeps: flange poses at the edges ------------------
-
-
 Height = Literal["up", "down"]
-
 FIRST = ("straight", "turned")
 AGAIN = ("upright", "upright_turned")
 PLUNGE = "plunge"

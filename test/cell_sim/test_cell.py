@@ -23,7 +23,7 @@ from robocal_ros.ground.errors import LimitError
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.edges import BeamError, debounced
 from robocal_ros.tool.laser_frame import calibrate_laser
-from robocal_ros.tool.measuring_plan import MeasuringPlan, PlannedStep
+from robocal_ros.tool.run import MeasuringPlan, PlannedStep
 
 NOISE = TrueNoise(3e-5, 1e-5)
 SAMPLED = TrueInput(latency_s=0.004, sample_period_s=0.002)

@@ -11,7 +11,7 @@ from robocal_ros.cell_sim.cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAU
 from robocal_ros.cell_sim.robot import Warmth, shift, turn
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody
 from robocal_ros.tool.driving import approach, measuring
-from robocal_ros.tool.measuring_plan import MeasuringPlan
+from robocal_ros.tool.run import MeasuringPlan
 
 CROSSING = T_BASE_LASER[:3, 3]
 T_BASE_SENSOR = np.linalg.inv(thermal_shift.T_SENSOR_BASE)

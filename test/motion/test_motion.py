@@ -27,7 +27,7 @@ from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.motion.plan import MotionLimits, Ride
 from robocal_ros.tool.driving import approach, measuring, start_pose, turn_s
 from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.measuring_plan import MeasuringPlan
+from robocal_ros.tool.run import MeasuringPlan
 
 ROBOTS = pytest.mark.parametrize("robot", POSTURES)
 MICROMETRE = 1e-6

@@ -25,7 +25,7 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import header, transform_message
 from robocal_ros.tool.files import read_beam_points
 from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.tool.measuring_plan import MeasuringMotion, MeasuringPlan
+from robocal_ros.tool.run import MeasuringMotion, MeasuringPlan
 
 DEFAULTS = {setting.name: setting.default for setting in SETTINGS}
 ARM = straight_arm("ur10")

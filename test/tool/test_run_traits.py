@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import Code, RobocalError, TooFewSamplesError
-from robocal_ros.tool.crossed_run import (
-    ClockError,
-    RunTraits,
-    TraitLimits,
-    WrongToolError,
-    require_even,
-)
 from robocal_ros.tool.edges import BeamError
+from robocal_ros.tool.run import ClockError, RunTraits, TraitLimits, WrongToolError, require_even
 
 LIMITS = TraitLimits()
 SIGMA_M, SIGMA_S = 1e-5, 1e-3

@@ -9,14 +9,16 @@ from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool
 from robocal_ros.cell_sim.tool_cell import Circle
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ResidualError
-from robocal_ros.tool.crossed_model import (
+from robocal_ros.tool.circle import (
+    CircleMotion,
     CircleProblem,
     CircleState,
     classic_distances,
     closed_form,
     fit_circle,
+    label_edges,
 )
-from robocal_ros.tool.edges import BeamEdge, BeamError, CircleMotion, label_edges
+from robocal_ros.tool.edges import BeamEdge, BeamError
 
 RADIUS, PERIOD, START = 0.012, 2.0, np.radians(45.0)
 BETA = np.radians(92.2)

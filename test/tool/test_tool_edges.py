@@ -8,7 +8,7 @@ from robocal_ros.cell_sim.beams import TAUGHT
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.tool.edges import BeamEdge, BeamError, InputRule, debounced, edges_of
-from robocal_ros.tool.flange_path import JointPath
+from robocal_ros.tool.laser_frame import JointPath
 
 SIGMA = 2e-5
 

@@ -10,9 +10,16 @@ from beam_cell import make_cell
 from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, TrueInput, TrueNoise, laser_of
 from robocal_ros.ground import frames
 from robocal_ros.tool.crossed_model import Held
-from robocal_ros.tool.judging import UNCHANGED, KnownTool, changed_tool, unchanged
+from robocal_ros.tool.judging import (
+    UNCHANGED,
+    CheckRule,
+    KnownTool,
+    QuickCheck,
+    changed_tool,
+    quick_check,
+    unchanged,
+)
 from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.quick_check import CheckRule, QuickCheck, quick_check
 
 LASER_M = 2.2e-5  # of each point of a frame that the same robot has calibrated
 ROBOT_M = np.array([4e-4, -2e-4, 3e-4])  # absolute error: the same in each run

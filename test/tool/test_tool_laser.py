@@ -22,14 +22,15 @@ from robocal_ros.cell_sim.beams import (
 from robocal_ros.cell_sim.tool_cell import CYLINDER_M, laser_points, point_sigma
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError
-from robocal_ros.tool.flange_path import (
+from robocal_ros.tool.laser_frame import (
+    LaserFrame,
     axis_from_centres,
+    calibrate_laser,
     first_rotation,
     minimal_rotation,
     retaught,
     upright_pose,
 )
-from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
 
 
 def published() -> dict[str, np.ndarray]:

@@ -8,12 +8,11 @@ from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, bent
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError
+from robocal_ros.tool.circle import classic_from_path, classic_tool, driven_circle
 from robocal_ros.tool.crossed_model import BeamStep
-from robocal_ros.tool.crossed_run import classic_tool
-from robocal_ros.tool.driven_circle import classic_from_path, driven_circle
 from robocal_ros.tool.edges import BeamEdge, BeamError
-from robocal_ros.tool.flange_path import JointPath
-from robocal_ros.tool.measuring_plan import named_steps, step_kind
+from robocal_ros.tool.files import named_steps, step_kind
+from robocal_ros.tool.laser_frame import JointPath
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.001], [0.03, -0.02, 0.0])
 SPLINE_M = (

@@ -19,13 +19,12 @@ from robocal_ros.cell_sim.beams import (
 from robocal_ros.cell_sim.tool_cell import MeasuredRun, RunPlan, ToolCell
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError
-from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, fit_circle
-from robocal_ros.tool.crossed_run import RunTraits, classic_tool, estimate_tool, run_problem
+from robocal_ros.tool.circle import classic_tool, fit_circle
+from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, estimate_tool, run_problem
 from robocal_ros.tool.edges import BeamError
-from robocal_ros.tool.flange_path import JointPath
-from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.quick_check import CheckRule, quick_check
+from robocal_ros.tool.judging import CheckRule, KnownTool, quick_check
+from robocal_ros.tool.laser_frame import JointPath, LaserFrame
+from robocal_ros.tool.run import RunTraits
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
 NOISE = TrueNoise(3e-5, 1e-5)

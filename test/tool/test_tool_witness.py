@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.tool.witness import SMALL_M, BendRule, Witness, bend_or_station
+from robocal_ros.tool.judging import SMALL_M, BendRule, Witness, bend_or_station
 
 RULE = BendRule(nearest_m=0.055, farthest_m=0.15)
 TIP_M, TILT_RAD = 3.5e-5, np.radians(0.06)  # scatter in each direction of the change of two runs

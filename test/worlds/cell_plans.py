@@ -16,11 +16,9 @@ from robocal_ros.cell_sim.beams import (
 )
 from robocal_ros.cell_sim.cell import CellPlan, Happened, SimulatedCell, rigid_robot
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise
-from robocal_ros.tool.crossed_run import ToolEstimate, estimate_tool
-from robocal_ros.tool.flange_path import JointPath
-from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.measuring_plan import MeasuringPlan
+from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
+from robocal_ros.tool.laser_frame import JointPath, LaserFrame
+from robocal_ros.tool.run import MeasuringPlan
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
 ARM = replace(load_robot("ur10"), T_flange_tool=TAUGHT)

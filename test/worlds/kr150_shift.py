@@ -10,7 +10,7 @@ from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.measuring_plan import MeasuringPlan
+from robocal_ros.tool.run import MeasuringPlan
 
 NOMINAL = load_robot("kr150_r3100")
 ARM = replace(NOMINAL, T_flange_tool=TAUGHT)

@@ -6,7 +6,7 @@ from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody
 from robocal_ros.motion.plan import JointPlan, MotionLimits
-from robocal_ros.tool.measuring_plan import PlannedStep
+from robocal_ros.tool.run import PlannedStep
 
 POSTURES = {
     "ur10": np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618]),
