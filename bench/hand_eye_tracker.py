@@ -14,10 +14,9 @@ from bench.tables import Goal, Table
 from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.laser_tracker import Sizes, TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.tracker import solve_best, spread
-from robocal_ros.hand_eye.tracker_classic import solve_classic
+from robocal_ros.hand_eye.tracker import SENSOR, solve_best
 from robocal_ros.hand_eye.tracker_data import TrackerNoise
-from robocal_ros.hand_eye.tracker_problem import SENSOR
+from robocal_ros.hand_eye.tracker_scan import solve_classic
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -84,6 +83,43 @@ def repeat(cell: TrackerCell, runs: int) -> Runs:
 def source_runs() -> Runs:
     """The source's arm, sensor and noise."""
     return repeat(prp_cell(load_robot("p1r2p3")), RUNS)
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far runs (n,) are from their mean.
+
+    ``axis``: distance of each unit axis of rotation from the mean's. ``turn_rad``: angle of the
+    whole rotation from the mean; defined at any angle.
+    """
+
+    axis: Array
+    angle_rad: Array
+    translation_m: Array
+    turn_rad: Array
+
+
+def spread(poses: Array) -> Spread:
+    """Repeatability of poses (n, 4, 4), as the source evaluates it, but by the logarithm.
+
+    Near a half turn the axis is taken on the side of the mean's. Source: section 4.3, whose
+    arccos loses the angle near 0 and pi.
+    """
+    R = poses[:, :3, :3]
+    mean = frames.nearest_rotation(R.mean(axis=0))
+    vectors = np.vstack([frames.log_rotation(mean)[None], frames.log_rotation(R)])
+    angles = np.linalg.norm(vectors, axis=1)
+    axes = vectors / np.maximum(angles, np.finfo(float).tiny)[:, None]
+    back = axes @ axes[0] < 0.0
+    axes[back] *= -1.0
+    angles[back] = 2.0 * np.pi - angles[back]
+    t = poses[:, :3, 3]
+    return Spread(
+        axis=np.linalg.norm(axes[1:] - axes[0], axis=1),
+        angle_rad=np.abs(angles[1:] - angles[0]),
+        translation_m=np.linalg.norm(t - t.mean(axis=0), axis=1),
+        turn_rad=np.linalg.norm(frames.log_rotation(np.swapaxes(mean[None], 1, 2) @ R), axis=1),
+    )
 
 
 def largest_of_three(poses: Array) -> Array:

@@ -1,11 +1,14 @@
 """Where a profile sensor sits on a robot, by laser tracker (multiple coordinate transformations).
 
-Source: Jing, Hu and Guo 2020. ``classic`` is its closed form; ``best`` solves all measurements at
-once, from there.
+Source: Jing, Hu and Guo 2020. ``classic`` is its closed form; ``best`` is the maximum likelihood of
+all measurements at once, from there. Rows are whitened one by one, so that each is a sample of its
+own; the errors of the joints at a profile are common to all that it shows, and at a point of an arc
+they move it along its path.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,23 +19,346 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.hand_eye.quality import HandEyeSettings, apart, field_points, judge_classic
 from robocal_ros.hand_eye.result import HandEyeResult, Method, point_covariance
-from robocal_ros.hand_eye.tracker_classic import Classic, each_without, solve_classic
-from robocal_ros.hand_eye.tracker_data import FACES, Cube, TrackerData, TrackerNoise, TrackerTarget
-from robocal_ros.hand_eye.tracker_problem import (
-    SENSOR,
-    AxisPair,
-    TrackerProblem,
-    TrackerUnknowns,
-    sphere_in,
+from robocal_ros.hand_eye.target_models import moved, tangents
+from robocal_ros.hand_eye.tracker_data import (
+    FACES,
+    MOVED,
+    Axis,
+    Cube,
+    TrackerData,
+    TrackerNoise,
+    TrackerTarget,
+    nominal_axis,
 )
-from robocal_ros.hand_eye.tracker_scan import Lines, Scan, fit_caps, fit_lines
-
-# ---- tracker quality ----------------------------------------------------------------------------
-
+from robocal_ros.hand_eye.tracker_scan import (
+    Caps,
+    Classic,
+    Lines,
+    Scan,
+    each_without,
+    fit_caps,
+    fit_lines,
+    solve_classic,
+)
 
 Array = NDArray[np.float64]
 
-LARGEST_SCALE = 3.0  # of residuals over the noise that was told
+FLANGE, SENSOR = slice(0, 6), slice(6, 12)
+REFLECTOR, CENTRE = slice(12, 15), slice(15, 18)
+NORMALS = (slice(18, 20), slice(20, 22))
+OFFSETS, MISMATCH = slice(22, 24), slice(24, 26)
+UNKNOWNS = 26
+NAMES = tuple(
+    f"{what} {axis}"
+    for what, axes in (
+        ("flange in tracker", ("x", "y", "z", "turn x", "turn y", "turn z")),
+        ("sensor in flange", ("x", "y", "z", "turn x", "turn y", "turn z")),
+        ("reflector", ("x", "y", "z")),
+        ("sphere", ("x", "y", "z")),
+        *((face, ("tilt", "turn")) for face in FACES),
+        ("face offset", ("1", "2")),
+        ("axes", ("angle", "gap")),
+    )
+    for axis in axes
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerUnknowns:
+    """All unknowns, SI.
+
+    ``T_tracker_flange`` (4, 4): at the first profile. ``reflector`` (3,): in the flange. ``centre``
+    (3,) of the sphere, ``normals`` (2, 3), outward, and ``offsets`` (2,) of the faces: tracker
+    frame. ``mismatch`` (2,): of the axes' angle and gap, real minus nominal.
+    """
+
+    T_tracker_flange: Array
+    T_flange_sensor: Array
+    reflector: Array
+    centre: Array
+    normals: Array
+    offsets: Array
+    mismatch: Array
+
+    def moved(self, step: Array) -> "TrackerUnknowns":
+        """The state after an increment (26,)."""
+        tilts = np.array(
+            [tangents(n) @ step[part] for n, part in zip(self.normals, NORMALS, strict=True)]
+        )
+        normals = self.normals + tilts
+        return TrackerUnknowns(
+            T_tracker_flange=moved(self.T_tracker_flange, step[FLANGE]),
+            T_flange_sensor=moved(self.T_flange_sensor, step[SENSOR]),
+            reflector=self.reflector + step[REFLECTOR],
+            centre=self.centre + step[CENTRE],
+            normals=normals / np.linalg.norm(normals, axis=1)[:, None],
+            offsets=self.offsets + step[OFFSETS],
+            mismatch=self.mismatch + step[MISMATCH],
+        )
+
+    def sensor_poses(self, motion: Array) -> Array:
+        """T_tracker_sensor (m, 4, 4) of the profiles, from their T_flange0_flange (m, 4, 4)."""
+        return np.asarray(self.T_tracker_flange @ motion @ self.T_flange_sensor)
+
+
+def adjoint(T: Array) -> Array:
+    """(..., 6, 6): twists (v, w) given on the right of a frame, on the left of T (..., 4, 4).
+
+    ``exp(adjoint(T) x) T = T exp(x)``.
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    found = np.zeros((*T.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = R
+    found[..., :3, 3:] = frames.skew(t) @ R
+    return found
+
+
+# The axes of a real arm stand to each other a little otherwise than its model says. Both are taken
+# to miss the model by half of it: they turn about their common perpendicular, and shift along it,
+# in opposite directions. What the flange is then lies midway, as in the closed form.
+
+ANGLE_SIGMA, GAP_SIGMA_M = float(np.radians(0.5)), 1e-3  # of real arms: hardly a restraint
+HELD_M = 1e-9  # the gap from a joint that slides has no meaning
+
+
+@dataclass(frozen=True, eq=False)
+class AxisPair:
+    """The axes of both arcs in the flange of the first profile, by the nominal geometry.
+
+    ``screws`` (6, 2): twists that turn about the common perpendicular, and shift along it.
+    ``sigma`` (2,): of the mismatch, rad and m. ``height_axis`` (3,): direction of the last one that
+    turns.
+    """
+
+    joints: tuple[int, int]
+    screws: Array
+    sigma: Array
+    height_axis: Array
+
+    @classmethod
+    def of(cls, data: TrackerData, axes: Sequence[Axis]) -> "AxisPair":
+        """The axes of the arcs of ``data``."""
+        first, second = (
+            nominal_axis(data, arc, axis.joint) for arc, axis in zip(data.arcs, axes, strict=True)
+        )
+        across = np.cross(first[0], second[0])
+        across /= np.linalg.norm(across)
+        turning = [i for i in (0, 1) if not axes[i].slides]
+        last = max(turning, key=lambda i: axes[i].joint)
+        foot = (first, second)[last][1]
+        if len(turning) == 2:  # where the common perpendicular starts from the first axis
+            rows = np.column_stack([first[0], -second[0], across])
+            foot = first[1] + first[0] * np.linalg.solve(rows, second[1] - first[1])[0]
+        screws = np.zeros((6, 2))
+        screws[:3, 0], screws[3:, 0], screws[:3, 1] = np.cross(foot, across), across, across
+        return cls(
+            joints=(axes[0].joint, axes[1].joint),
+            screws=screws,
+            sigma=np.array([ANGLE_SIGMA, GAP_SIGMA_M if len(turning) == 2 else HELD_M]),
+            height_axis=(first, second)[last][0],
+        )
+
+    def share_of(self, q: Array) -> float:
+        """Share of the mismatch, -1/2 or 1/2, of the one joint that moves; 0 where several do."""
+        moved = np.flatnonzero(np.ptp(q, axis=0) > MOVED)
+        if len(moved) != 1 or moved[0] not in self.joints:
+            return 0.0
+        return self.joints.index(int(moved[0])) - 0.5
+
+    def carried(self, motion: Array, mismatch: Array, share: float) -> Array:
+        """Motions (n, 4, 4) about the real axis instead of the nominal one."""
+        turn, gap = share * mismatch
+        across = self.screws[3:, 0]
+        R = frames.exp_rotation(turn * across)
+        foot = np.cross(across, self.screws[:3, 0])
+        C = frames.transform(R, foot - R @ foot + gap * across)
+        return np.asarray(C @ motion @ frames.invert(C))
+
+    def twists(self, carried: Array, share: float) -> Array:
+        """Left twists (n, 6, 2) of carried motions by the mismatch."""
+        return np.asarray(share * (self.screws - adjoint(carried) @ self.screws))
+
+
+OF_FACE = 2  # rows of a profile for each face; then come those of the sphere
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerProblem:
+    """Residuals of all measurements; see `estimation.descent.Problem`.
+
+    ``start``: the state at which the noise of the joints is turned into noise of the rows.
+    ``lines``, ``caps``: what the profiles show of the faces and of the sphere, noise included.
+    """
+
+    data: TrackerData
+    target: TrackerTarget
+    noise: TrackerNoise
+    start: TrackerUnknowns
+    axes: AxisPair
+    lines: Sequence[Lines]
+    caps: Caps
+    names: tuple[str, ...] = NAMES
+    scale_components: int = 1  # the noise is known
+
+    def retract(self, state: TrackerUnknowns, step: Array) -> TrackerUnknowns:
+        """The state after an increment (26,)."""
+        return state.moved(step)
+
+    def deviation(self, state: TrackerUnknowns) -> Array:
+        """Zero: there is no prior."""
+        return np.zeros(UNKNOWNS)
+
+    @cached_property
+    def rows(self) -> tuple[str, ...]:
+        """What each row was measured by."""
+        parts = [(arc.name, arc.points) for arc in self.data.arcs] + [("sphere", self.data.sphere)]
+        found: list[str] = []
+        for name, points in parts:
+            found += [f"{name} {i + 1}" for i in range(len(points)) for _ in range(3)]
+        for name, points in zip(FACES, self.data.faces, strict=True):
+            found += [f"{name} {i + 1}" for i in range(len(points))]
+        found += ["axes"] * 2
+        found += ["height"] if self.target.height_m is not None else []
+        profiles, _ = np.nonzero(self._seen)
+        return tuple(found + [self.data.profiles[i].name for i in profiles.tolist()])
+
+    def linearise(self, state: TrackerUnknowns) -> tuple[Array, Array]:
+        """Whitened rows (r, 1), and their Jacobian (r, 1, 26)."""
+        parts = [*self._arc_rows(state), *self._target_rows(state)]
+        residual, J, _ = self._profiles(state)
+        white = self._whitening @ np.concatenate([residual[..., None], J], axis=2)
+        parts.append((white[..., 0][self._seen], white[..., 1:][self._seen]))
+        return (
+            np.concatenate([residual for residual, _ in parts])[:, None],
+            np.concatenate([J for _, J in parts])[:, None],
+        )
+
+    def _arc_rows(self, state: TrackerUnknowns) -> Iterator[tuple[Array, Array]]:
+        """Of both arcs."""
+        R, t = state.T_tracker_flange[:3, :3], state.T_tracker_flange[:3, 3]
+        for arc, (motion, white) in zip(self.data.arcs, self._arc_motions, strict=True):
+            share = self.axes.share_of(arc.q)
+            T = self.axes.carried(motion, state.mismatch, share)
+            place = T[:, :3, :3] @ state.reflector + T[:, :3, 3]
+            J = np.zeros((len(arc.points), 3, UNKNOWNS))
+            J[..., FLANGE] = np.concatenate(
+                [np.broadcast_to(R, (len(place), 3, 3)), -R @ frames.skew(place)], axis=2
+            )
+            J[..., REFLECTOR] = R @ T[:, :3, :3]
+            J[..., MISMATCH] = J[..., FLANGE] @ self.axes.twists(T, share)
+            residual = place @ R.T + t - arc.points
+            rows = white @ np.concatenate([residual[..., None], J], axis=2)
+            yield rows[..., 0].ravel(), rows[..., 1:].reshape(-1, UNKNOWNS)
+
+    def _target_rows(self, state: TrackerUnknowns) -> Iterator[tuple[Array, Array]]:
+        """Of the sphere and of the faces; then what is known of axes and height beforehand."""
+        sigma, axis = self.noise.tracker_m, self.axes.height_axis
+        J = np.zeros((len(self.data.sphere), 3, UNKNOWNS))
+        J[..., CENTRE] = np.eye(3) / sigma
+        yield ((state.centre - self.data.sphere) / sigma).ravel(), J.reshape(-1, UNKNOWNS)
+        for face, points in enumerate(self.data.faces):
+            normal = state.normals[face]
+            J = np.zeros((len(points), UNKNOWNS))
+            J[:, NORMALS[face]] = points @ tangents(normal) / sigma
+            J[:, OFFSETS.start + face] = -1.0 / sigma
+            off = points @ normal - state.offsets[face] - self.target.reflector_radius_m
+            yield off / sigma, J
+        J = np.zeros((2, UNKNOWNS))
+        J[:, MISMATCH] = np.diag(1.0 / self.axes.sigma)
+        yield state.mismatch / self.axes.sigma, J
+        if self.target.height_m is not None:
+            J = np.zeros((1, UNKNOWNS))
+            J[0, REFLECTOR] = axis / self.target.height_sigma_m
+            off = axis @ state.reflector - self.target.height_m
+            yield np.array([off / self.target.height_sigma_m]), J
+
+    def _profiles(self, state: TrackerUnknowns) -> tuple[Array, Array, Array]:
+        """Rows (m, 7) of the profiles, their Jacobian (m, 7, 26), and by the sensor's twist."""
+        share = self.axes.share_of(self.data.q)
+        motion = self.axes.carried(self.data.motion, state.mismatch, share)
+        P = state.sensor_poses(motion)
+        root, s = self.caps.root, sphere_in(P, state.centre)
+        shift = np.einsum("mij,mj->mi", root, s - self.caps.place) + self.caps.offset
+        by_place = np.zeros((len(P), 3, UNKNOWNS))
+        by_place[..., CENTRE] = root @ np.swapaxes(P[:, :3, :3], 1, 2)
+        by_twist = np.concatenate([-root, root @ frames.skew(s)], axis=2)
+        parts = [self._line(state, P, face) for face in (0, 1)] + [(shift, by_twist, by_place)]
+        residual = np.concatenate([part[0] for part in parts], axis=1)
+        twist = np.concatenate([part[1] for part in parts], axis=1)
+        J = np.concatenate([part[2] for part in parts], axis=1)
+        J[..., SENSOR] = twist
+        J[..., FLANGE] = twist @ adjoint(frames.invert(motion @ state.T_flange_sensor))
+        J[..., MISMATCH] = J[..., FLANGE] @ self.axes.twists(motion, share)
+        return residual, J, twist
+
+    def _line(self, state: TrackerUnknowns, P: Array, face: int) -> tuple[Array, Array, Array]:
+        lines, m = self.lines[face], len(P)
+        R, t = P[:, :3, :3], P[:, :3, 3]
+        n = state.normals[face] @ R
+        d = state.offsets[face] - t @ state.normals[face]
+        slope, z = -n[:, 0] / n[:, 2], (d - n[:, 0] * lines.middle) / n[:, 2]
+        sigma = np.column_stack([lines.z_sigma, lines.slope_sigma])
+        residual = np.column_stack([z - lines.z_m, slope - lines.slope]) / sigma
+        by_n = np.zeros((m, 2, 3))
+        by_n[:, 0, 0], by_n[:, 0, 2] = -lines.middle / n[:, 2], -z / n[:, 2]
+        by_n[:, 1, 0], by_n[:, 1, 2] = -1.0 / n[:, 2], -slope / n[:, 2]
+        by_d = np.zeros((m, 2, 1))
+        by_d[:, 0, 0] = 1.0 / n[:, 2]
+        twist = np.concatenate([by_d * -n[:, None], by_n @ frames.skew(n)], axis=2)
+        J = np.zeros((m, 2, UNKNOWNS))
+        B = tangents(state.normals[face])
+        J[..., NORMALS[face]] = (by_n @ np.swapaxes(R, 1, 2) - by_d * t[:, None]) @ B
+        J[..., OFFSETS.start + face] = by_d[..., 0]
+        return residual, twist / sigma[..., None], J / sigma[..., None]
+
+    @cached_property
+    def _seen(self) -> NDArray[np.bool_]:
+        """Which rows (m, 7) of the profiles there are."""
+        faces = [np.repeat(lines.seen[:, None], OF_FACE, axis=1) for lines in self.lines]
+        return np.concatenate([*faces, self.caps.seen], axis=1)
+
+    @cached_property
+    def _whitening(self) -> Array:
+        """Inverse square root (m, 7, 7) of the profiles' covariance."""
+        twist = self._profiles(self.start)[2] * self._seen[..., None]
+        to_sensor = adjoint(frames.invert(self.start.T_flange_sensor))
+        G = twist @ to_sensor @ self._joint_errors(self.data.q)
+        return np.linalg.inv(np.linalg.cholesky(np.eye(G.shape[1]) + G @ np.swapaxes(G, 1, 2)))
+
+    @cached_property
+    def _arc_motions(self) -> list[tuple[Array, Array]]:
+        """Of each arc its motion (n, 4, 4), and the inverse roots (n, 3, 3) of covariances."""
+        found = []
+        for arc in self.data.arcs:
+            T = self.data.relative(arc.q)
+            v, w = np.split(self._joint_errors(arc.q), 2, axis=1)
+            R = self.start.T_tracker_flange[:3, :3] @ T[:, :3, :3]
+            G = R @ (v - frames.skew(self.start.reflector) @ w)
+            covariance = self.noise.tracker_m**2 * np.eye(3) + G @ np.swapaxes(G, 1, 2)
+            found.append((T, np.linalg.inv(np.linalg.cholesky(covariance))))
+        return found
+
+    def _joint_errors(self, q: Array) -> Array:
+        """Twists (n, 6, dof) of the flange, its own axes, by one sigma of each joint.
+
+        A joint that stands still for an arc has no error; where several move, none stands still.
+        """
+        arm = self.data.arm
+        sigma = np.where(arm.prismatic, self.noise.joint_m, self.noise.joint_rad)
+        moved = np.ptp(q, axis=0) > MOVED
+        if np.sum(moved) == 1:
+            sigma = np.where(moved, sigma, 0.0)
+        R = np.swapaxes(arm.fk(q)[:, :3, :3], 1, 2)
+        J = arm.jacobian(q)
+        return np.asarray(np.concatenate([R @ J[:, :3], R @ J[:, 3:]], axis=1) * sigma)
+
+
+def sphere_in(P: Array, centre: Array) -> Array:
+    """A centre (3,) in the frames of sensor poses (m, 4, 4)."""
+    return np.asarray(np.einsum("mji,mj->mi", P[:, :3, :3], centre - P[:, :3, 3]))
+
+
+LARGEST_SCALE = 3.0  # of residuals over the noise that was given
 LEAST_REST = 1e-6  # what the others say about a profile, where they say anything
 
 
@@ -116,9 +442,6 @@ def verdict_of(estimate: Estimate[TrackerUnknowns], working_m: float, limit_m: f
     return Verdict(Code.ACCEPT, what)
 
 
-# ---- tracker ------------------------------------------------------------------------------------
-
-
 LIMIT_M = 5e-4  # of the error to expect at the working distance
 SMALLEST_NOISE_M = 1e-7  # no sensor sees less; keeps data without noise solvable
 MOST_ROUNDS, NEAR_M = 10, 1e-5  # the sphere is linear only near its place
@@ -131,11 +454,7 @@ def solve_tracker(
     method: Method = "best",
     limit_m: float = LIMIT_M,
 ) -> HandEyeResult:
-    """Calibrate.
-
-    Parameters
-    ----------
-    limit_m : largest error to expect at the working distance that is accepted.
+    """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted.
 
     Raises
     ------
@@ -144,42 +463,34 @@ def solve_tracker(
     """
     classic = solve_classic(data, target, noise)
     problem, estimate = solve_best(data, target, noise, classic)
-    best = _best(data, target, classic, problem, estimate, limit_m)
-    if method == "classic":
-        return _classic(data, target, classic, best, limit_m)
-    return best
-
-
-def _best(
-    data: TrackerData,
-    target: TrackerTarget,
-    classic: Classic,
-    problem: TrackerProblem,
-    estimate: Estimate[TrackerUnknowns],
-    limit_m: float,
-) -> HandEyeResult:
-    covariance = estimate.covariance[SENSOR, SENSOR]
-    found = _result(data, target, classic, estimate.state, "best")
-    rejected = {**found.rejected, **_rejected(problem, estimate)}
+    best = _result(data, target, classic, estimate.state, "best")
+    worst: dict[str, float] = {}
+    for index in np.flatnonzero(estimate.rejected):
+        name = problem.rows[index]
+        worst[name] = max(worst.get(name, 0.0), float(abs(estimate.residual[index, 0])))
+    misses = {
+        name: f"misses the solution by {miss:.1f} times its noise" for name, miss in worst.items()
+    }
     states = states_without(problem, estimate, [profile.name for profile in data.profiles])
-    found = replace(
-        found,
-        covariance=covariance,
-        rejected=rejected,
+    best = replace(
+        best,
+        covariance=estimate.covariance[SENSOR, SENSOR],
+        rejected={**best.rejected, **misses},
         leave_one_out_m=_left_out(data, target, classic, states),
     )
     z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
-    spread = point_covariance(found, np.array([[0.0, 0.0, z]]))
-    working_m = float(np.sqrt(np.trace(spread[0])))
+    covariance = point_covariance(best, np.array([[0.0, 0.0, z]]))
+    working_m = float(np.sqrt(np.trace(covariance[0])))
     angle, gap_m = estimate.state.mismatch.tolist()
     more = {
-        **found.more,
+        **best.more,
         "residual_over_noise": misfit(estimate),
         "widened_by": estimate.scale,
         "axes_off_nominal": {"angle_deg": float(np.degrees(angle)), "gap_mm": gap_m * 1e3},
     }
     verdict = verdict_of(estimate, working_m, limit_m)
-    return replace(found, working_error_m=working_m, verdict=verdict, more=more)
+    best = replace(best, working_error_m=working_m, verdict=verdict, more=more)
+    return _classic(data, target, classic, best, limit_m) if method == "classic" else best
 
 
 def _classic(
@@ -250,7 +561,10 @@ def solve_best(
     fits = [fit_lines(scan, name) for scan, name in zip(classic.parts, FACES, strict=False)]
     scatter_m = float(np.sqrt(np.mean([scatter**2 for _, scatter in fits])))
     noise_m = max(scatter_m, SMALLEST_NOISE_M)
-    lines = [_with_noise(lines, noise_m) for lines, _ in fits]
+    lines = [
+        replace(line, z_sigma=line.z_sigma * noise_m, slope_sigma=line.slope_sigma * noise_m)
+        for line, _ in fits
+    ]
     state = _state(classic)
     axes = AxisPair.of(data, classic.axes)
     for _ in range(MOST_ROUNDS):
@@ -267,20 +581,6 @@ def solve_best(
     )
 
 
-def _with_noise(lines: Lines, noise_m: float) -> Lines:
-    return replace(lines, z_sigma=lines.z_sigma * noise_m, slope_sigma=lines.slope_sigma * noise_m)
-
-
-def _rejected(problem: TrackerProblem, estimate: Estimate[TrackerUnknowns]) -> dict[str, str]:
-    worst: dict[str, float] = {}
-    for index in np.flatnonzero(estimate.rejected):
-        name = problem.rows[index]
-        worst[name] = max(worst.get(name, 0.0), float(abs(estimate.residual[index, 0])))
-    return {
-        name: f"misses the solution by {miss:.1f} times its noise" for name, miss in worst.items()
-    }
-
-
 def _result(
     data: TrackerData,
     target: TrackerTarget,
@@ -288,7 +588,7 @@ def _result(
     state: TrackerUnknowns,
     method: Method,
 ) -> HandEyeResult:
-    """What both methods tell, not judged yet."""
+    """What both methods report, not judged yet."""
     states = [state] * len(data.profiles)
     residual_m, seen = profile_distances(data, target, classic.parts, states)
     names = np.array([profile.name for profile in data.profiles])
@@ -311,44 +611,4 @@ def _result(
             "reflector_flange_mm": (state.reflector * 1e3).tolist(),
             "mismatch_mm": classic.mismatch_m * 1e3,
         },
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """How far runs are from their mean.
-
-    Attributes
-    ----------
-    axis : (n,) distance of each unit axis of rotation from the mean's.
-    angle_rad, translation_m : (n,) the same of the angle and of the translation.
-    turn_rad : (n,) angle of the whole rotation from the mean; defined at any angle.
-    """
-
-    axis: Array
-    angle_rad: Array
-    translation_m: Array
-    turn_rad: Array
-
-
-def spread(poses: Array) -> Spread:
-    """Repeatability of poses (n, 4, 4), as the source evaluates it, but by the logarithm.
-
-    Near a half turn the axis is taken on the side of the mean's. Source: section 4.3, whose
-    arccos loses the angle near 0 and pi.
-    """
-    R = poses[:, :3, :3]
-    mean = frames.nearest_rotation(R.mean(axis=0))
-    vectors = np.vstack([frames.log_rotation(mean)[None], frames.log_rotation(R)])
-    angles = np.linalg.norm(vectors, axis=1)
-    axes = vectors / np.maximum(angles, np.finfo(float).tiny)[:, None]
-    back = axes @ axes[0] < 0.0
-    axes[back] *= -1.0
-    angles[back] = 2.0 * np.pi - angles[back]
-    t = poses[:, :3, 3]
-    return Spread(
-        axis=np.linalg.norm(axes[1:] - axes[0], axis=1),
-        angle_rad=np.abs(angles[1:] - angles[0]),
-        translation_m=np.linalg.norm(t - t.mean(axis=0), axis=1),
-        turn_rad=np.linalg.norm(frames.log_rotation(np.swapaxes(mean[None], 1, 2) @ R), axis=1),
     )

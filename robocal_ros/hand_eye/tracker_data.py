@@ -1,9 +1,11 @@
-"""What a laser tracker and a profile sensor measure of one cube with a sphere beside it."""
+"""What a laser tracker measures: the paths of a reflector on the flange, and the target.
+
+The target is a cube with a sphere beside it. Source: Jing, Hu and Guo 2020, section 3.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +34,10 @@ FEWEST_PROFILES = 8
 class TrackerTarget:
     """Sizes of what is measured.
 
-    Attributes
-    ----------
-    sphere_radius_m : of the sphere that the sensor scans; the tracker measures its centre.
-    reflector_radius_m : of the tracked ball that touches the faces of the cube.
-    height_m, height_sigma_m : coordinate of the reflector on the flange, from the flange's origin
-        along the axis of the last turning joint of the arcs, and its standard deviation. Needed
-        where the other joint slides; None where it is not known.
+    The sensor scans the sphere and the tracker measures its centre; the tracked ball (reflector)
+    touches the faces of the cube. ``height_m``: coordinate of the reflector on the flange, from
+    the flange's origin along the axis of the last turning joint of the arcs; needed where the
+    other joint slides.
     """
 
     sphere_radius_m: float
@@ -60,10 +59,7 @@ class TrackerNoise:
 class Arc:
     """The reflector on the flange while one joint moves: an arc, or a line where it slides.
 
-    Attributes
-    ----------
-    name : for reports.
-    q : (n, dof) joint readings; ``points`` (n, 3) of the reflector in the tracker frame, m.
+    ``q`` (n, dof): joint readings; ``points`` (n, 3): of the reflector, tracker frame, m.
     """
 
     name: str
@@ -97,12 +93,9 @@ class Arc:
 class TrackerData:
     """All measurements of one calibration; the tracker, the target and the robot's base stay.
 
-    Attributes
-    ----------
-    arcs : of two joints, in any order.
-    sphere : (k, 3) measured centres of the sphere, tracker frame, m.
-    faces : (k, 3) each, reflector centres while it touches one face and the other.
-    q : (m, dof) joint readings of the profiles.
+    ``arcs``: of two joints, in any order. ``sphere`` (k, 3): measured centres of the sphere, and
+    ``faces`` (k, 3) each: reflector centres while it touches one face and the other, tracker
+    frame, m. ``q`` (m, dof): joint readings of the profiles.
     """
 
     arm: SerialArm
@@ -147,11 +140,9 @@ class TrackerData:
         return np.asarray(frames.invert(self.arm.fk(self.q[0])) @ self.arm.fk(q))
 
 
-# ---- pose of the flange in a laser tracker, from the paths of a reflector on it -----------------
-#
-# Source: Jing, Hu and Guo 2020, section 3.1, for the last two joints of a P-R-P arm; here for any
-# two joints, by the lines of their axes in the flange that the nominal geometry gives.
-
+# Pose of the flange in the tracker: section 3.1 of the source, for the last two joints of a P-R-P
+# arm; here for any two joints, by the lines of their axes in the flange that the nominal geometry
+# gives.
 
 SHORTEST_ARC_RAD = float(np.radians(20.0))
 SHORTEST_LINE_M = 0.03
@@ -169,11 +160,8 @@ PARALLEL = float(np.sin(np.radians(5.0)))
 class Axis:
     """A joint's axis in the tracker frame.
 
-    Attributes
-    ----------
-    direction : (3,) along the positive turn (right-hand rule) or slide.
-    centre : (3,) foot of the reflector on the axis, m; of a slide a point of its line.
-    used : (n,) points of the arc that were taken.
+    ``direction`` (3,): along the positive turn (right-hand rule) or slide. ``centre`` (3,): foot
+    of the reflector on the axis, m; of a slide a point of its line. ``used`` (n,): points taken.
     """
 
     name: str
@@ -211,57 +199,49 @@ def fit_axis(arc: Arc, joint: int, slides: bool, sigma_m: float) -> Axis:
         circle fits them.
     """
     used = np.ones(len(arc.points), dtype=np.bool_)
+    fewest = max(FEWEST_ARC_POINTS, (1.0 - MOST_REJECTED) * len(used))
     while True:
-        points, counts = arc.points[used], arc.q[used, joint]
-        fit = _line(points, counts) if slides else _circle(arc.name, points, counts)
+        points, readings = arc.points[used], arc.q[used, joint]
+        fit = _fit_line(points, readings) if slides else _fit_circle(arc.name, points, readings)
         direction, centre, miss = fit
-        scatter = float(np.median(miss)) / RAYLEIGH
-        if scatter > LARGEST_SCATTER * sigma_m:
-            _refuse_path(arc, joint, slides, scatter, sigma_m)
-        worst = int(np.argmax(miss))
-        if miss[worst] < REJECT * max(sigma_m, scatter):
+        scatter, worst = float(np.median(miss)) / RAYLEIGH, int(np.argmax(miss))
+        wild = miss[worst] >= REJECT * max(sigma_m, scatter)
+        if wild:
+            used[np.flatnonzero(used)[worst]] = False
+        scattered = scatter > LARGEST_SCATTER * sigma_m
+        if scattered or (wild and np.sum(used) < fewest):
+            beside_m = scatter if scattered else float(miss[worst])
+            raise ResidualError(
+                f"{arc.name}: points lie {beside_m * 1e3:.3f} mm beside the "
+                f"{'line' if slides else 'circle'} of joint {joint + 1} (noise "
+                f"{sigma_m * 1e3:.3f} mm): check that the reflector sits firmly, that the tracker "
+                "stood still and that no other joint moved"
+            )
+        if not wild:
             break
-        used[np.flatnonzero(used)[worst]] = False
-        if np.sum(used) < max(FEWEST_ARC_POINTS, (1.0 - MOST_REJECTED) * len(used)):
-            _refuse_path(arc, joint, slides, float(miss[worst]), sigma_m)
     _require_long(arc, used, centre, joint, slides)
     return Axis(arc.name, joint, slides, direction, centre, used)
 
 
-def _refuse_path(arc: Arc, joint: int, slides: bool, miss_m: float, sigma_m: float) -> NoReturn:
-    raise ResidualError(
-        f"{arc.name}: points lie {miss_m * 1e3:.3f} mm beside the "
-        f"{'line' if slides else 'circle'} of joint {joint + 1} (noise {sigma_m * 1e3:.3f} mm): "
-        "check that the reflector sits firmly, that the tracker stood still and that no other "
-        "joint moved"
-    )
-
-
-def _line(points: Array, counts: Array) -> tuple[Array, Array, Array]:
+def _fit_line(points: Array, readings: Array) -> tuple[Array, Array, Array]:
+    """Direction (3,), a point (3,) and the distances (n,) of points (n, 3) from the line."""
     centre = points.mean(axis=0)
     away = points - centre
     direction = np.linalg.svd(away, full_matrices=False)[2][0]
     along = away @ direction
     miss = np.linalg.norm(away - np.outer(along, direction), axis=1)
-    return direction * np.sign(along @ (counts - counts.mean())), centre, miss
+    return direction * np.sign(along @ (readings - readings.mean())), centre, miss
 
 
-def _circle(name: str, points: Array, counts: Array) -> tuple[Array, Array, Array]:
-    """Plane, then circle in it: to first order the axial and the radial distances part so."""
+def _fit_circle(name: str, points: Array, readings: Array) -> tuple[Array, Array, Array]:
+    """Axis (3,), centre (3,) and the distances (n,) of points (n, 3) from the circle.
+
+    Plane, then circle in it: to first order the axial and the radial distances part so.
+    """
     middle = points.mean(axis=0)
     basis = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ basis.T
     xy, height = local[:, :2], local[:, 2]
-    centre, radius = _plane_circle(name, xy)
-    away = xy - centre
-    miss = np.hypot(height, np.linalg.norm(away, axis=1) - radius)
-    a, b = (away[np.argsort(counts)][part] for part in (slice(None, -1), slice(1, None)))
-    turn = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) * np.linalg.det(basis)
-    return basis[2] * np.sign(turn), middle + centre @ basis[:2], miss
-
-
-def _plane_circle(name: str, xy: Array) -> tuple[Array, float]:
-    """Centre (2,) and radius of the circle nearest to points (n, 2)."""
     rows = np.column_stack([2.0 * xy, np.ones(len(xy))])  # Kasa's circle as the start
     start = np.linalg.lstsq(rows, np.sum(xy**2, axis=1), rcond=None)[0]
     centre, radius = start[:2], float(np.sqrt(start[2] + start[:2] @ start[:2]))
@@ -272,22 +252,31 @@ def _plane_circle(name: str, xy: Array) -> tuple[Array, float]:
         step = np.linalg.lstsq(rows, distance - radius, rcond=None)[0]
         centre, radius = centre + step[:2], radius + float(step[2])
         if np.linalg.norm(step) < SETTLED_M:
-            return centre, radius
-    raise ResidualError(
-        f"{name}: no circle fits its points (a fit did not settle in {MOST_ROUNDS} rounds): check "
-        "that the reflector sits firmly and that one joint alone moved, or drive a longer arc"
-    )
+            break
+    else:
+        raise ResidualError(
+            f"{name}: no circle fits its points (a fit did not settle in {MOST_ROUNDS} rounds): "
+            "check that the reflector sits firmly and that one joint alone moved, or drive a "
+            "longer arc"
+        )
+    away = xy - centre
+    miss = np.hypot(height, np.linalg.norm(away, axis=1) - radius)
+    ordered = away[np.argsort(readings)]
+    a, b = ordered[:-1], ordered[1:]
+    turn = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) * np.linalg.det(basis)
+    return basis[2] * np.sign(turn), middle + centre @ basis[:2], miss
 
 
 def _require_long(
     arc: Arc, used: NDArray[np.bool_], centre: Array, joint: int, slides: bool
 ) -> None:
     extent = float(np.ptp(arc.q[used, joint]))
-    if slides and extent < SHORTEST_LINE_M:
-        raise TooFewSamplesError(
-            f"{arc.name} slides over {extent * 1e3:.0f} mm (at least {SHORTEST_LINE_M * 1e3:.0f})"
-        )
     if slides:
+        if extent < SHORTEST_LINE_M:
+            raise TooFewSamplesError(
+                f"{arc.name} slides over {extent * 1e3:.0f} mm (at least "
+                f"{SHORTEST_LINE_M * 1e3:.0f})"
+            )
         return
     if extent < SHORTEST_ARC_RAD:
         raise TooFewSamplesError(
@@ -413,11 +402,8 @@ def reflector_in_flange(
     return np.asarray(np.concatenate(found).mean(axis=0))
 
 
-# ---- two faces of a cube and a sphere beside it, seen by a laser tracker or by a sensor ---------
-#
-# Both see the temporary frame K: origin in the sphere's centre, axes along the faces' outward
-# normals, made orthonormal in the same way on both sides (Jing, Hu and Guo 2020, section 3.2).
-
+# Tracker and sensor both see the temporary frame K: origin in the sphere's centre, axes along the
+# faces' outward normals, made orthonormal in the same way on both sides (section 3.2).
 
 NARROWEST_M = 5e-3  # rms extent of the points on a face in its narrower direction
 PARALLEL_FACES = float(np.cos(np.radians(20.0)))
@@ -434,12 +420,6 @@ class Plane:
     def distances(self, points: Array) -> Array:
         """Distances (n,) of points (n, 3), m."""
         return np.abs(points @ self.normal - self.offset)
-
-    def away_from(self, point: Array) -> "Plane":
-        """The same plane with the normal that points away from a point (3,)."""
-        if self.normal @ point <= self.offset:
-            return self
-        return Plane(-self.normal, -self.offset, self.middle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -480,9 +460,16 @@ def fit_plane(sums: Array) -> tuple[Plane, Array]:
     return Plane(normal, float(normal @ middle), middle), np.sqrt(np.maximum(size[::-1], 0.0))
 
 
-def outward(first: Plane, second: Plane) -> tuple[Plane, Plane]:
-    """The same planes with outward normals: a face of a cube lies behind the other's plane."""
-    return first.away_from(second.middle), second.away_from(first.middle)
+def outward(first: Plane, second: Plane) -> tuple[Array, Array]:
+    """Outward normals (2, 3) and offsets (2,): a face of a cube lies behind the other's plane."""
+    sign = np.array(
+        [
+            1.0 if plane.normal @ other.middle <= plane.offset else -1.0
+            for plane, other in ((first, second), (second, first))
+        ]
+    )
+    normals = sign[:, None] * np.array([first.normal, second.normal])
+    return normals, sign * np.array([first.offset, second.offset])
 
 
 def tracked_cube(
@@ -497,10 +484,8 @@ def tracked_cube(
     ResidualError
         When the points of a face miss a plane, or those of the sphere's centre differ.
     """
-    first, second = outward(
-        *(_tracked_face(*face, sigma_m) for face in zip(FACES, faces, strict=True))
-    )
-    normals = np.array([first.normal, second.normal])
+    first, second = (_tracked_face(*face, sigma_m) for face in zip(FACES, faces, strict=True))
+    normals, offsets = outward(first, second)
     if abs(normals[0] @ normals[1]) > PARALLEL_FACES:
         raise RankDeficientError(
             "face_1 and face_2 are parallel: touch two faces that meet in an edge",
@@ -513,8 +498,7 @@ def tracked_cube(
             f"the tracker's centres of the sphere differ by {spread * 1e3:.3f} mm (noise "
             f"{sigma_m * 1e3:.3f} mm): seat the reflector again and measure anew"
         )
-    offsets = np.array([first.offset, second.offset]) - reflector_radius_m
-    return Cube(normals, offsets, sphere.mean(axis=0))
+    return Cube(normals, offsets - reflector_radius_m, sphere.mean(axis=0))
 
 
 def _tracked_face(name: str, points: Array, sigma_m: float) -> Plane:

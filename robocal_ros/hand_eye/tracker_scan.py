@@ -1,20 +1,49 @@
-"""The scan of a cube and a sphere, built from profiles, and its parts."""
+"""The scan of a cube and a sphere, its parts, and the sensor's place from them in closed form.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+Source: Jing, Hu and Guo 2020, with the slide along the sensor axis that the solution itself gives
+instead of z (its equation 9). Which plane of the scan is which face, and whether the sensor moved
+along its +y or -y, is found by trial: the angle between the faces and the sphere's heights above
+them must be the tracker's.
+"""
+
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.estimation.surfaces import MAD
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
-from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.tracker_data import Cube, Plane, fit_plane, moment
+from robocal_ros.ground.errors import (
+    RankDeficientError,
+    ResidualError,
+    RobocalError,
+    TooFewSamplesError,
+)
+from robocal_ros.hand_eye.target_models import tangents
+from robocal_ros.hand_eye.tracker_data import (
+    PARALLEL_FACES,
+    Axis,
+    Cube,
+    Plane,
+    TrackerData,
+    TrackerNoise,
+    TrackerTarget,
+    fit_axes,
+    fit_plane,
+    flange_pose,
+    moment,
+    outward,
+    reflector_in_flange,
+    tracked_cube,
+    two_axis_frame,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 MOST_PLANES = 4
 TRIPLES = 150
@@ -35,25 +64,15 @@ LARGEST_TURN_RAD = float(np.radians(5.0))
 class Scan:
     """All profiles of a scan.
 
-    Attributes
-    ----------
-    points : (n, 2) x and z in the sensor frame of their own profile, m.
-    profile : (n,) number of the profile of each.
-    motion : (m, 4, 4) flange pose of each profile in that of the first.
+    ``points`` (n, 2): x and z in the sensor frame of their own profile, m; ``profile`` (n,): its
+    number; ``motion`` (m, 4, 4): flange pose of each profile in that of the first.
     """
 
     points: Array
     profile: Index
     motion: Array
 
-    @classmethod
-    def of(cls, profiles: Sequence[Profile], motion: Array) -> "Scan":
-        """Join profiles; ``motion`` (m, 4, 4)."""
-        xz = np.concatenate([profile.points for profile in profiles])
-        number = np.repeat(np.arange(len(profiles)), [len(p.points) for p in profiles])
-        return cls(xz, number, motion)
-
-    def part(self, which: Index | NDArray[np.bool_]) -> "Scan":
+    def part(self, which: Index | Mask) -> "Scan":
         """The same scan with some of its points."""
         return Scan(self.points[which], self.profile[which], self.motion)
 
@@ -80,7 +99,7 @@ class Scan:
         return found
 
     def moment(self, T_flange_sensor: Array) -> Array:
-        """`tracker_cube.moment` of the points `built`."""
+        """`tracker_data.moment` of the points `built`."""
         T = self.carried(T_flange_sensor)
         return np.asarray((T @ self._moments @ np.swapaxes(T, 1, 2)).sum(axis=0))
 
@@ -190,8 +209,8 @@ def parts_of(
         (second < NEAR_M) & (first > CLEAR_M) & off_ball,
         on_ball & (np.minimum(first, second) > CLEAR_M),
     )
-    faces_and_ball = [_unbroken(scan.part(which)) for which in chosen]
-    return faces_and_ball[0], faces_and_ball[1], faces_and_ball[2]
+    first_face, second_face, ball = (_unbroken(scan.part(which)) for which in chosen)
+    return first_face, second_face, ball
 
 
 def _unbroken(scan: Scan) -> Scan:
@@ -212,14 +231,9 @@ def _unbroken(scan: Scan) -> Scan:
     return scan.part(np.repeat(keep, ends - begins + 1))
 
 
-# ---- tracker features ---------------------------------------------------------------------------
-#
-# The sensor's noise is along its beam (z). Of a face a profile holds a line: its z at the middle
-# of its x, and its slope, are all that it tells. Of the sphere it tells the centre, to first order
+# The sensor's noise is along its beam (z). Of a face a profile holds a line: its z at the middle of
+# its x, and its slope, are all that it shows. Of the sphere it shows the centre, to first order
 # about a place that is known well: three combinations of it.
-
-
-Mask = NDArray[np.bool_]
 
 FEWEST_POINTS = 8  # of a part in a profile
 FEWEST_LINES = 4
@@ -230,13 +244,10 @@ FAINT = 1e-9  # share of the largest information below which a combination tells
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """A face in the m profiles.
+    """A face in the m profiles, each field (m,).
 
-    Attributes
-    ----------
-    middle : (m,) mean x, m; ``z_m`` (m,) the line there, ``slope`` (m,).
-    z_sigma, slope_sigma : (m,) their standard deviations.
-    seen : (m,) whether the profile shows the face; the other figures are 0, and sigma 1, without.
+    ``middle``: mean x, m; ``z_m`` and ``slope``: of the line there. ``seen``: whether the profile
+    shows the face; the other figures are 0, and sigma 1, without.
     """
 
     middle: Array
@@ -251,10 +262,8 @@ class Lines:
 class Caps:
     """A sphere in the m profiles: ``root @ (s - place) + offset`` is white for its centre s.
 
-    Attributes
-    ----------
-    place : (m, 3) about which it was linearised, sensor frame, m.
-    root : (m, 3, 3); ``offset`` (m, 3); ``seen`` (m, 3) which of the three tell anything.
+    ``place`` (m, 3): about which it was linearised, sensor frame, m. ``root`` (m, 3, 3), ``offset``
+    (m, 3); ``seen`` (m, 3): which of the three are determined.
     """
 
     place: Array
@@ -324,11 +333,16 @@ def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
     front = -np.sqrt(np.where(used, depth, radius_m**2))
     r = (z - place[scan.profile, 2] - front) / noise_m
     J = -np.column_stack([side[0] / front, side[1] / front, np.ones(len(x))]) / noise_m
+    information, gradient = np.empty((m, 3, 3)), np.empty((m, 3))
     for last in (False, True):
         used &= (np.bincount(scan.profile[used], minlength=m) >= FEWEST_POINTS)[scan.profile]
         if np.sum(used) < FEWEST_LINES * FEWEST_POINTS:
             raise TooFewSamplesError(f"{np.sum(used)} points show the sphere: scan more of it")
-        information, gradient = _sums(J[used], r[used], scan.profile[used], m)
+        rows, miss, profile = J[used], r[used], scan.profile[used]
+        for i in range(3):
+            gradient[:, i] = np.bincount(profile, rows[:, i] * miss, m)
+            for j in range(3):
+                information[:, i, j] = np.bincount(profile, rows[:, i] * rows[:, j], m)
         size, axes = np.linalg.eigh(information)
         seen = size > FAINT * float(size.max())
         turned = np.einsum("mij,mi->mj", axes, gradient)
@@ -346,11 +360,239 @@ def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
     )
 
 
-def _sums(J: Array, r: Array, profile: NDArray[np.int64], m: int) -> tuple[Array, Array]:
-    """Normal matrix (m, 3, 3) and gradient (m, 3) of the points of each profile."""
-    information, gradient = np.empty((m, 3, 3)), np.empty((m, 3))
-    for i in range(3):
-        gradient[:, i] = np.bincount(profile, J[:, i] * r, m)
-        for j in range(3):
-            information[:, i, j] = np.bincount(profile, J[:, i] * J[:, j], m)
-    return information, gradient
+THINNED = 6000  # points that are enough to find the parts
+FEW = 500  # points that are enough for a face while the direction is searched
+MOST_ROUNDS = 150
+SEARCHED, SETTLED = 1e-5, 1e-9  # rad
+MOST_TURNS, PLAIN_TURNS = 40, 4
+TRIAL, LONGEST_STEP = 1e-5, 0.3  # rad, of Newton's method
+PLACED = 1e-6
+MATCH_M = 5e-4  # of the sphere's heights, and of the faces' angle over ARM_M
+ARM_M = 0.05
+DISTINCT_RAD = float(np.radians(2.0))
+CLEARLY = 5.0  # times worse than the best is no rival
+ALIKE_M = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Classic:
+    """Closed-form answer, and what it was made of.
+
+    ``T_tracker_flange`` (4, 4): at the first profile. ``tracked``: the target in the tracker frame.
+    ``parts``: the scan of face 1, face 2 and the sphere. ``mismatch_m``: by how much tracker and
+    sensor disagree about the target's shape.
+    """
+
+    axes: tuple[Axis, Axis]
+    T_tracker_flange: Array
+    T_flange_sensor: Array
+    reflector: Array
+    tracked: Cube
+    parts: tuple[Scan, Scan, Scan]
+    mismatch_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    T_flange_sensor: Array
+    seen: Cube
+    mismatch_m: float
+
+
+def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise) -> Classic:
+    """Both poses in closed form.
+
+    Raises
+    ------
+    RobocalError
+        Naming what the data lack; see `fit_axes`, `flange_pose`, `tracked_cube`, `find_planes`.
+    """
+    data.require_enough()
+    axes = fit_axes(data, noise.tracker_m)
+    T_tracker_flange = flange_pose(data, axes, target)
+    tracked = tracked_cube(data.faces, data.sphere, target.reflector_radius_m, noise.tracker_m)
+    counts = [len(profile.points) for profile in data.profiles]
+    scan = Scan(
+        np.concatenate([profile.points for profile in data.profiles]),
+        np.repeat(np.arange(len(counts)), counts),
+        data.motion,
+    )
+    search = _CubeSearch(tracked, T_tracker_flange, target)
+    match = search.best(scan.thinned(THINNED))
+    parts = parts_of(scan, match.T_flange_sensor, match.seen, target.sphere_radius_m)
+    match = search.refined(parts, match.T_flange_sensor)
+    return Classic(
+        axes=axes,
+        T_tracker_flange=T_tracker_flange,
+        T_flange_sensor=match.T_flange_sensor,
+        reflector=reflector_in_flange(data, axes, T_tracker_flange),
+        tracked=tracked,
+        parts=parts,
+        mismatch_m=match.mismatch_m,
+    )
+
+
+def each_without(classic: Classic, target: TrackerTarget, profiles: int) -> list[Array | None]:
+    """T_flange_sensor without each of the profiles, solved again; None where that fails."""
+    search = _CubeSearch(classic.tracked, classic.T_tracker_flange, target)
+    found: list[Array | None] = []
+    for profile in range(profiles):
+        first, second, ball = (part.part(part.profile != profile) for part in classic.parts)
+        try:
+            match = search.refined((first, second, ball), classic.T_flange_sensor)
+            found.append(match.T_flange_sensor)
+        except RobocalError:
+            found.append(None)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _CubeSearch:
+    tracked: Cube
+    T_tracker_flange: Array
+    target: TrackerTarget
+
+    def best(self, scan: Scan) -> _Match:
+        """The one trial that fits.
+
+        Raises
+        ------
+        ResidualError
+            When none does; the sphere's own error where that is why.
+        RankDeficientError
+            When two mountings of the sensor do.
+        """
+        matches, failures = self._matches(scan)
+        backwards = replace(scan, motion=frames.invert(scan.motion))
+        if not matches and self._matches(backwards)[0]:
+            raise ResidualError(
+                "the scan fits the tracker's target only when it is built backwards, as its mirror "
+                "image (the frame of face_1, face_2 and their edge is left-handed): the joint "
+                "readings of the profiles run against those of the arcs, or against the motion"
+            )
+        if not matches and failures:
+            raise failures[0]
+        if not matches:
+            raise ResidualError(
+                "no two faces in the scan stand to each other and to the sphere as face_1 and "
+                f"face_2 do in the tracker ({np.degrees(self.tracked.angle):.2f} deg; sphere "
+                f"{self.tracked.heights[0] * 1e3:.2f} and {self.tracked.heights[1] * 1e3:.2f} mm "
+                "above them): were other faces touched, did the target move, is the reflector's "
+                "radius right?"
+            )
+        matches.sort(key=lambda match: match.mismatch_m)
+        first = matches[0]
+        for other in matches[1:]:
+            if other.mismatch_m < max(CLEARLY * first.mismatch_m, ALIKE_M):
+                raise RankDeficientError(
+                    "two mountings of the sensor explain the scan: the slide is square to the edge "
+                    "of both faces, or the sphere is as high above one as above the other; turn "
+                    "the cube so that its edge runs at about 45 deg to the slide",
+                    ["direction of the slide in the sensor frame"],
+                )
+        return first
+
+    def _matches(self, scan: Scan) -> tuple[list[_Match], list[RobocalError]]:
+        """All trials that fit, and why the sphere of others could not be fitted."""
+        matches: list[_Match] = []
+        failures: list[RobocalError] = []
+        starts = []
+        for y in (scan.direction(), -scan.direction()):
+            side, back = tangents(y).T
+            starts.append(frames.transform(np.column_stack([side, y, -back]), np.zeros(3)))
+        faces = find_planes(scan, starts[0])
+        for first, second in permutations(range(len(faces)), 2):
+            pair = scan.part(faces[first]).thinned(FEW), scan.part(faces[second]).thinned(FEW)
+            for start in starts:
+                X = self._turned(pair, start, SEARCHED)
+                if X is None:
+                    continue
+                known = [match.T_flange_sensor[:3, :3] for match in matches]
+                turns = [frames.log_rotation(X[:3, :3].T @ R) for R in known]
+                if any(np.linalg.norm(turn) < DISTINCT_RAD for turn in turns):
+                    continue
+                if abs(_cube(pair, X, np.zeros(3)).angle - self.tracked.angle) * ARM_M > MATCH_M:
+                    continue
+                rest = np.ones(len(scan.points), dtype=np.bool_)
+                rest[np.concatenate([faces[first], faces[second]])] = False
+                try:
+                    match = self._placed(pair, scan.part(rest), X)
+                except RobocalError as error:
+                    failures.append(error)
+                    continue
+                if match is not None and match.mismatch_m < MATCH_M:
+                    matches.append(match)
+        return matches, failures
+
+    def _turned(self, faces: tuple[Scan, Scan], X: Array, settled: float) -> Array | None:
+        """T_flange_sensor whose rotation builds the scan that gives it; None when none does.
+
+        The source's iteration first; then Newton's, which also settles where that creeps.
+        """
+        R, t = X[:3, :3], X[:3, 3]
+        for turn in range(MOST_TURNS):
+            miss = self._miss(faces, R, t)
+            if miss is None:
+                return None
+            step = miss
+            if turn >= PLAIN_TURNS:
+                tried = [
+                    self._miss(faces, R @ frames.exp_rotation(e), t) for e in TRIAL * np.eye(3)
+                ]
+                columns = [other - miss for other in tried if other is not None]
+                if len(columns) == 3:
+                    newton = np.linalg.lstsq(np.array(columns).T, -TRIAL * miss, rcond=None)[0]
+                    step = np.asarray(newton) if np.linalg.norm(newton) < LONGEST_STEP else miss
+            R = R @ frames.exp_rotation(step)
+            if np.linalg.norm(step) < settled:
+                return frames.transform(R, t)
+        return None
+
+    def _miss(self, faces: tuple[Scan, Scan], R: Array, t: Array) -> Array | None:
+        """Turn (3,) from a rotation to the one that the scan built with it gives."""
+        normals = _cube(faces, frames.transform(R, t), np.zeros(3)).normals
+        if normals[:, 2].max() > 0.0:  # the sensor sees no face from behind
+            return None
+        if abs(normals[0] @ normals[1]) > PARALLEL_FACES:
+            return None
+        measured = two_axis_frame(*self.tracked.normals)
+        image = self.T_tracker_flange[:3, :3].T @ measured @ two_axis_frame(*normals).T
+        return frames.log_rotation(R.T @ image)
+
+    def _placed(self, faces: tuple[Scan, Scan], ball: Scan, X: Array) -> _Match | None:
+        """The match with the place of the sensor too, from the sphere; None when none settles."""
+        rule = SphereRule(self.target.sphere_radius_m)
+        for _ in range(MOST_ROUNDS):
+            seen = _cube(faces, X, fit_sphere(ball.built(X), rule).centre)
+            T_tracker_sensor = self.tracked.frame @ frames.invert(seen.frame)
+            update = frames.invert(self.T_tracker_flange) @ T_tracker_sensor
+            change = float(np.abs(update - X).max())
+            X = update
+            if change < PLACED:
+                angle = abs(seen.angle - self.tracked.angle) * ARM_M
+                heights = np.abs(seen.heights - self.tracked.heights)
+                return _Match(X, seen, max(angle, float(heights.max())))
+        return None
+
+    def refined(self, parts: tuple[Scan, Scan, Scan], X: Array) -> _Match:
+        """The match from all points of the parts.
+
+        Raises
+        ------
+        ResidualError
+            When it does not settle.
+        """
+        turned = self._turned(parts[:2], X, SETTLED)
+        match = None if turned is None else self._placed(parts[:2], parts[2], turned)
+        if match is None:
+            raise ResidualError(
+                "the direction of the scan in the sensor frame does not settle: turn the cube so "
+                "that its edge runs at about 45 deg to the slide"
+            )
+        return match
+
+
+def _cube(faces: tuple[Scan, Scan], X: Array, centre: Array) -> Cube:
+    """The target in the sensor frame of the first profile."""
+    first, second = (fit_plane(face.moment(X))[0] for face in faces)
+    return Cube(*outward(first, second), centre)

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from bench.hand_eye_tracker import spread
 from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.laser_tracker import TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.cell_sim.sensors import Prism, Stem
@@ -19,11 +20,16 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.hand_eye import tracker
 from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.tracker import solve_best, solve_tracker, spread, states_without
-from robocal_ros.hand_eye.tracker_classic import solve_classic
+from robocal_ros.hand_eye.tracker import (
+    SENSOR,
+    UNKNOWNS,
+    adjoint,
+    solve_best,
+    solve_tracker,
+    states_without,
+)
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData
-from robocal_ros.hand_eye.tracker_problem import SENSOR, UNKNOWNS, adjoint
-from robocal_ros.hand_eye.tracker_scan import Scan, fit_caps
+from robocal_ros.hand_eye.tracker_scan import Scan, fit_caps, solve_classic
 from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
