@@ -49,7 +49,6 @@ from robocal_ros.tool.files import (
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
 from robocal_ros.tool.laser_frame import (
     LaserFile,
-    LaserFrame,
     calibrate_laser,
     read_laser_for,
     write_laser,
@@ -102,7 +101,10 @@ def run_beams(args: argparse.Namespace) -> CliResult:
         document["reach_mm"] = dict(zip("xy", (laser.reach * 1e3).tolist(), strict=True))
     document["output"] = None
     if args.output is not None:
-        _write(args, laser)
+        warnings: list[str] = []
+        arm = describe_robot(args.robot, warnings).arm
+        warn(warnings)
+        write_laser(args.output, LaserFile(laser, args.station, arm.name, arm.model_hash))
         document["output"] = str(args.output)
     return CliResult(document, partial(_show_beams, document=document))
 
@@ -115,13 +117,6 @@ def _require_together(args: argparse.Namespace) -> None:
             raise InputError(f"--output needs {name}: a laser file says whose it is")
         if args.output is None and given:
             raise InputError(f"{name} only matters for a laser file: give --output too")
-
-
-def _write(args: argparse.Namespace, laser: "LaserFrame") -> None:
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
-    warn(warnings)
-    write_laser(args.output, LaserFile(laser, args.station, arm.name, arm.model_hash))
 
 
 def _show_beams(console: "Console", document: Document) -> None:

@@ -28,7 +28,6 @@ from robocal_ros.motion.plan import (
     JointPlan,
     MotionLimits,
     Ride,
-    TipPath,
     circle,
     plunge,
     ramp_of,
@@ -79,7 +78,9 @@ def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:
     """T_base_flange (4, 4) where a step begins: a circle's run-up lies before its ``start_rad``."""
     T = step.T_base_flange.copy()
     if step.kind == "circle":
-        T[:3, 3] += step.R_base_laser @ _on_circle(step, _from_rad(step, limits))
+        angle = _from_rad(step, limits)
+        place = step.radius_m * np.array([np.cos(angle), np.sin(angle), 0.0])
+        T[:3, 3] += step.R_base_laser @ place
     return T
 
 
@@ -99,7 +100,13 @@ def approach(
         Where the way passes a joint limit, the reach, a singularity, or the housing.
     """
     q = _joints(cell, q_now)
-    corners = _corners(cell, cell.T_base_tip(q), step, after_circle)
+    here, there = cell.T_base_tip(q), cell.tip_of(start_pose(step, cell.limits))
+    first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
+    inside = cell.housing.opening_holds(first) and cell.housing.opening_holds(last)
+    if inside and after_circle and step.kind == "circle":  # both begin in one quadrant
+        corners = [there]
+    else:
+        corners = raised_way(cell, here, there, -np.inf if inside else cell.housing.retract_m)
     return along(cell, q, corners, f"way to step {step.name}")
 
 
@@ -123,8 +130,25 @@ def measuring(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPla
     q = _joints(cell, q_now)
     _require_start(cell, step, q)
     limit = cell.limits.tcp_speed_m_s if step.kind == "circle" else cell.limits.plunge_speed_m_s
-    _require_step(cell.limits, step, limit)
-    plan = cell.joints(_path(cell, step, cell.T_base_tip(q)), q)
+    if step.speed_m_s > limit:
+        raise LimitError(
+            f"step {step.name} asks for {step.speed_m_s * 1e3:.1f} mm/s, allowed are "
+            f"{limit * 1e3:.1f} mm/s for a {step.kind}: plan it slower"
+        )
+    T_start, limits = cell.T_base_tip(q), cell.limits
+    if step.kind == "circle":
+        start_rad, turn = _from_rad(step, limits), _turn(step, limits)
+        R, way = step.R_base_laser, step.direction
+        path = circle(T_start, R, step.radius_m, start_rad, way, turn)
+    else:
+        if step.depth_m > limits.plunge_depth_m:
+            raise LimitError(
+                f"step {step.name} plunges {step.depth_m * 1e3:.1f} mm, allowed are "
+                f"{limits.plunge_depth_m * 1e3:.1f} mm: plan it less deep"
+            )
+        ride = Ride.within(step.depth_m, step.speed_m_s, limits.tcp_acceleration_m_s2)
+        path = plunge(T_start, step.R_base_laser, ride)
+    plan = cell.joints(path, q)
     share, reason = cell.demand(plan, limit)
     if share > 1.0 + ROUNDING:
         raise LimitError(
@@ -149,16 +173,6 @@ def _joints(cell: MotionCell, q_now: ArrayLike) -> Array:
     return q
 
 
-def _corners(cell: MotionCell, here: Array, step: PlannedStep, after_circle: bool) -> list[Array]:
-    """Where the tip goes in turn; the last is the step's start."""
-    there = cell.tip_of(start_pose(step, cell.limits))
-    first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
-    inside = cell.housing.opening_holds(first) and cell.housing.opening_holds(last)
-    if inside and after_circle and step.kind == "circle":  # both begin in one quadrant
-        return [there]
-    return raised_way(cell, here, there, -np.inf if inside else cell.housing.retract_m)
-
-
 def _turn(step: PlannedStep, limits: MotionLimits) -> Ride:
     """A full turn, with a run-up before and a run-out after it."""
     ramp = ramp_of(step.speed_m_s, limits.tcp_acceleration_m_s2)
@@ -168,38 +182,6 @@ def _turn(step: PlannedStep, limits: MotionLimits) -> Ride:
 def _from_rad(step: PlannedStep, limits: MotionLimits) -> float:
     run_up = 0.5 * step.speed_m_s * _turn(step, limits).ramp_s
     return float(step.start_rad - step.direction * run_up / step.radius_m)
-
-
-def _on_circle(step: PlannedStep, angle: float) -> Array:
-    return step.radius_m * np.array([np.cos(angle), np.sin(angle), 0.0])
-
-
-def _path(cell: MotionCell, step: PlannedStep, T_start: Array) -> TipPath:
-    if step.kind == "circle":
-        return circle(
-            T_start,
-            step.R_base_laser,
-            step.radius_m,
-            _from_rad(step, cell.limits),
-            step.direction,
-            _turn(step, cell.limits),
-        )
-    ride = Ride.within(step.depth_m, step.speed_m_s, cell.limits.tcp_acceleration_m_s2)
-    return plunge(T_start, step.R_base_laser, ride)
-
-
-def _require_step(limits: MotionLimits, step: PlannedStep, speed_m_s: float) -> None:
-    """Refuse a step that asks for more than is allowed."""
-    if step.speed_m_s > speed_m_s:
-        raise LimitError(
-            f"step {step.name} asks for {step.speed_m_s * 1e3:.1f} mm/s, allowed are "
-            f"{speed_m_s * 1e3:.1f} mm/s for a {step.kind}: plan it slower"
-        )
-    if step.kind == "plunge" and step.depth_m > limits.plunge_depth_m:
-        raise LimitError(
-            f"step {step.name} plunges {step.depth_m * 1e3:.1f} mm, allowed are "
-            f"{limits.plunge_depth_m * 1e3:.1f} mm: plan it less deep"
-        )
 
 
 def _require_start(cell: MotionCell, step: PlannedStep, q: Array) -> None:
@@ -268,8 +250,6 @@ class ToolDriver:
         self._driven = NO_RUN
         self._failed = ""  # of the last stop, as it was acted upon
 
-    # ---- arming ---------------------------------------------------------------------------------
-
     def arm(self, now_s: float) -> None:
         """Allow motions, until the run ends.
 
@@ -321,8 +301,6 @@ class ToolDriver:
     def moves(self) -> bool:
         """Whether it moves the robot, or may at once."""
         return self.armed or self.phase is not DrivePhase.IDLE or self._stopping.under_way
-
-    # ---- what happens ---------------------------------------------------------------------------
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,), in the arm's order, as they arrive; ``stamp_s`` on their own clock."""
@@ -441,8 +419,6 @@ class ToolDriver:
         if sent_s is not None:
             self.robot.sent(sent_s)
 
-    # ---- supervision ----------------------------------------------------------------------------
-
     def _supervise(self, now_s: float) -> None:
         """Raise what must stop the robot."""
         silent_s = self.robot.silent_s
@@ -458,18 +434,14 @@ class ToolDriver:
             raise StopError(Code.BEAM_EDGES_WRONG, "more edges than a tool makes: look for it")
         self.robot.require_on_plan(now_s, REST_WITHIN_S)
         if self.robot.ended_for_s(now_s) > REST_WITHIN_S:
-            self._stop_overdue()
-
-    def _stop_overdue(self) -> None:
-        """Raise why a motion that ended long ago is not over."""
-        ended = f"the motion ended {REST_WITHIN_S:g} s ago, but"
-        if self.phase is not DrivePhase.MEASURE:
-            raise LeftPlanError(f"{ended} the robot does not rest where it ends")
-        missing = "edges are missing" if self._beams.total() else "no edge came"
-        raise StopError(
-            Code.BEAM_EDGES_WRONG,
-            f"{ended} {missing}: there is no tool, it is far too short, or beams are dead",
-        )
+            ended = f"the motion ended {REST_WITHIN_S:g} s ago, but"
+            if self.phase is not DrivePhase.MEASURE:
+                raise LeftPlanError(f"{ended} the robot does not rest where it ends")
+            missing = "edges are missing" if self._beams.total() else "no edge came"
+            raise StopError(
+                Code.BEAM_EDGES_WRONG,
+                f"{ended} {missing}: there is no tool, it is far too short, or beams are dead",
+            )
 
     def _fault(
         self, code: Code, reason: str, now_s: float, *, left_plan: bool = False, lost: bool = False

@@ -93,21 +93,18 @@ def debounced(edges: Sequence[BeamEdge], debounce_s: float) -> list[BeamEdge]:
         for i in range(1, len(own) + 1):
             if i < len(own) and own[i].time_s - own[i - 1].time_s < debounce_s:
                 continue
-            kept += [_settled(own[first:i], debounce_s)]
-            first = i
+            burst, first = own[first:i], i
+            start, end = burst[0], burst[-1]
+            length = end.time_s - start.time_s
+            if len(burst) > 1 and (start.blocked != end.blocked or len(burst) > MOST_BOUNCES):
+                raise BeamError(
+                    f"beam {start.beam} chatters: {len(burst)} edges within "
+                    f"{length * 1e3:.2f} ms at {start.time_s:.4f} s (debounce "
+                    f"{debounce_s * 1e3:.2f} ms): clean the lenses, check plug and alignment"
+                )
+            sigma_s = float(np.hypot(start.sigma_s, length / np.sqrt(12.0)))
+            kept.append(replace(start, sigma_s=sigma_s))
     return sorted(kept, key=lambda e: e.time_s)
-
-
-def _settled(burst: Sequence[BeamEdge], debounce_s: float) -> BeamEdge:
-    start, end = burst[0], burst[-1]
-    if len(burst) > 1 and (start.blocked != end.blocked or len(burst) > MOST_BOUNCES):
-        raise BeamError(
-            f"beam {start.beam} chatters: {len(burst)} edges within "
-            f"{(end.time_s - start.time_s) * 1e3:.2f} ms at {start.time_s:.4f} s (debounce "
-            f"{debounce_s * 1e3:.2f} ms): clean the lenses, check plug and alignment"
-        )
-    length = end.time_s - start.time_s
-    return replace(start, sigma_s=float(np.hypot(start.sigma_s, length / np.sqrt(12.0))))
 
 
 def edges_of(edges: Sequence[BeamEdge], beam: Beam, fewest: int) -> list[BeamEdge]:
@@ -139,9 +136,6 @@ def edges_of(edges: Sequence[BeamEdge], beam: Beam, fewest: int) -> list[BeamEdg
     return own
 
 
-#
-# In the laser frame the tool's axis is at ``c + R (cos theta, sin theta)``; its signed distance
-# from beam b is ``s_b = d_b + R sin(psi_b)`` with psi_x = theta and psi_y = beta - theta.
 StepKind = Literal["circle", "plunge"]
 FEWEST_EDGES: Mapping[StepKind, int] = {"circle": 4, "plunge": 2}  # of each beam
 BREAK, RESTORE = 1, 2  # as in robocal_msgs/BeamEvent

@@ -1,6 +1,6 @@
 """Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -80,10 +80,6 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     return frames.transform(rotation, xyz)
 
 
-#
-# Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
-# W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB a
-# unit quaternion, real part first; Universal Robots a rotation vector.
 Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]
 ABB_UNKNOWN = "1,[0,0,1]"  # ABB takes no load without mass or with its centre in the flange
 ABB_REMARK = "! mass and centre of gravity are placeholders: enter this tool's, in kg and mm\n"
@@ -104,58 +100,33 @@ class Load:
 
 
 def exported(T_flange_tool: Array, format: Format, load: Load | None = None) -> str:
-    """Text for a controller, with 1e-4 mm and 1e-5 deg; ``load`` is for ABB."""
-    if format == "abb":
-        return _abb(T_flange_tool, load)
-    return _FORMATS[format](T_flange_tool)
+    """Text for a controller, with 1e-4 mm and 1e-5 deg; ``load`` is for ABB.
 
-
-def _place_mm(T: Array) -> list[str]:
-    return fixed(T[:3, 3] * 1e3, 4)
-
-
-def _rpy_deg(T: Array) -> list[str]:
-    return fixed(np.degrees(frames.rpy(T[:3, :3])), 5)
-
-
-def _urdf(T: Array) -> str:
-    return urdf_joint("tool0", "tcp", *urdf_origin(T))
-
-
-def _kuka(T: Array) -> str:
-    x, y, z = _place_mm(T)
-    c, b, a = _rpy_deg(T)
-    return f"$TOOL={{X {x},Y {y},Z {z},A {a},B {b},C {c}}}"
-
-
-def _fanuc(T: Array) -> str:
-    x, y, z = _place_mm(T)
-    w, p, r = _rpy_deg(T)
-    return f"X {x}  Y {y}  Z {z}\nW {w}  P {p}  R {r}"
-
-
-def _ur(T: Array) -> str:
-    pose = fixed(T[:3, 3], 7) + fixed(frames.log_rotation(T[:3, :3]), 8)
-    return f"set_tcp(p[{','.join(pose)}])"
-
-
-def _abb(T: Array, load: Load | None) -> str:
-    x, y, z, w = fixed(frames.quat_xyzw(T), 9)
-    place, turn = ",".join(_place_mm(T)), ",".join((w, x, y, z))
+    Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
+    W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB
+    a unit quaternion, real part first; Universal Robots a rotation vector.
+    """
+    T = T_flange_tool
+    x, y, z = fixed(T[:3, 3] * 1e3, 4)
+    roll, pitch, yaw = fixed(np.degrees(frames.rpy(T[:3, :3])), 5)
+    if format == "urdf":
+        return urdf_joint("tool0", "tcp", *urdf_origin(T))
+    if format == "kuka":
+        return f"$TOOL={{X {x},Y {y},Z {z},A {yaw},B {pitch},C {roll}}}"
+    if format == "fanuc":
+        return f"X {x}  Y {y}  Z {z}\nW {roll}  P {pitch}  R {yaw}"
+    if format == "ur":
+        pose = fixed(T[:3, 3], 7) + fixed(frames.log_rotation(T[:3, :3]), 8)
+        return f"set_tcp(p[{','.join(pose)}])"
+    qx, qy, qz, qw = fixed(frames.quat_xyzw(T), 9)
     weight, remark = ABB_UNKNOWN, ABB_REMARK
     if load is not None:
         centre = ",".join(fixed(np.array(load.centre) * 1e3, 3))
         weight, remark = f"{load.mass_kg:.3f},[{centre}]", ""
-    frame = f"[[{place}],[{turn}]]"
+    frame = f"[[{x},{y},{z}],[{qw},{qx},{qy},{qz}]]"
     return f"{remark}PERS tooldata tcp:=[TRUE,{frame},[{weight},[1,0,0,0],0,0,0]];"
 
 
-_FORMATS: Mapping[str, Callable[[Array], str]] = {
-    "urdf": _urdf,
-    "kuka": _kuka,
-    "fanuc": _fanuc,
-    "ur": _ur,
-}
 POSITION = ("x_mm", "y_mm", "z_mm")
 STATES = {"1": True, "true": True, "0": False, "false": False}
 

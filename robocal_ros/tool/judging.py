@@ -113,7 +113,14 @@ def bend_or_station(change: Array, covariance: Array, rule: BendRule, small_m: f
     part along d is normal.
     """
     d, t, C_tt = change[:2], change[3:], covariance[3:, 3:]
-    lever_m, miss = _best_lever(d, t, covariance, rule)
+    # The lever that explains shift and tilt best, and what is left, as chi-square.
+    levers = np.linspace(rule.nearest_m, rule.farthest_m, LEVERS)
+    L, C_dt = levers[:, None, None], covariance[:2, 3:]
+    spread = covariance[:2, :2] - L * (C_dt + C_dt.T) + L**2 * C_tt
+    off = d - levers[:, None] * t
+    misses = np.einsum("ki,ki->k", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
+    best = int(np.argmin(misses))
+    lever_m, miss = float(levers[best]), float(misses[best])
     way = d / max(float(np.linalg.norm(d)), 1e-12)
     tilted = float(t @ way) > TILTED_SIGMAS * float(np.sqrt(way @ C_tt @ way))
     axial, sideways = abs(float(change[2])), float(np.linalg.norm(d))
@@ -147,18 +154,6 @@ def bend_or_station(change: Array, covariance: Array, rule: BendRule, small_m: f
     else:
         cause, why = "tool", f"as a bend {lever_m * 1e3:.0f} mm above the tip does"
     return Witness(cause, f"{what}: {why}", tip, tilt, sigma, lever_m)
-
-
-def _best_lever(d: Array, t: Array, covariance: Array, rule: BendRule) -> tuple[float, float]:
-    """The lever that explains shift (2,) and tilt (2,) best, and what is left, as chi-square."""
-    levers = np.linspace(rule.nearest_m, rule.farthest_m, LEVERS)
-    C_dd, C_dt, C_tt = covariance[:2, :2], covariance[:2, 3:], covariance[3:, 3:]
-    L = levers[:, None, None]
-    spread = C_dd - L * (C_dt + C_dt.T) + L**2 * C_tt
-    off = d - levers[:, None] * t
-    misses = np.einsum("ki,ki->k", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    best = int(np.argmin(misses))
-    return float(levers[best]), float(misses[best])
 
 
 Document = dict[str, Any]
@@ -566,6 +561,8 @@ def _compared(
     rule: CheckRule,
     ways: Array,
 ) -> QuickCheck:
+    from scipy.special import ndtr
+
     R = stored.T_flange_tool[:3, :3]
     deviation = ways @ R.T @ (found.tip - stored.T_flange_tool[:3, 3])
     measured = replace(KnownTool.measured(found), against=stored.against)
@@ -579,7 +576,20 @@ def _compared(
     # Noise across the deviation makes it look longer.
     across = max(float(np.trace(ways @ covariance @ ways)) - sigma**2, 0.0)
     likely = float(np.sqrt(max(size**2 - across, 0.0)))
-    answer, reason = _answer(size, likely, sigma, rule)
+    below = float(ndtr((likely - rule.limit_m) / sigma))
+    reason = (
+        f"the tip is {size * 1e3:.3f} mm from the stored one (sigma {sigma * 1e3:.3f} mm, allowed "
+        f"{rule.limit_m * 1e3:.3f} mm)"
+    )
+    answer: Answer = "cannot tell"
+    if below <= ERROR_CHANCE:
+        answer = "pass"
+        reason += f": a tool at the limit would look so in {below:.1%} of cases"
+    elif 1.0 - below <= ERROR_CHANCE:
+        answer = "recalibrate"
+        reason += f": a tool at the limit would look so in {1.0 - below:.1%} of cases"
+    else:
+        reason += ": too near the limit for this noise; repeat the check, or measure the tool anew"
     return QuickCheck(
         answer=answer,
         reason=reason,
@@ -589,25 +599,4 @@ def _compared(
         sigma_m=sigma,
         tilt_rad=float(np.arctan2(np.hypot(*deviation[:2]), rule.lever_m)),
         measured=found,
-    )
-
-
-def _answer(size: float, likely: float, sigma: float, rule: CheckRule) -> tuple[Answer, str]:
-    from scipy.special import ndtr
-
-    below = float(ndtr((likely - rule.limit_m) / sigma))
-    what = (
-        f"the tip is {size * 1e3:.3f} mm from the stored one (sigma {sigma * 1e3:.3f} mm, allowed "
-        f"{rule.limit_m * 1e3:.3f} mm)"
-    )
-    if below <= ERROR_CHANCE:
-        return "pass", f"{what}: a tool at the limit would look so in {below:.1%} of cases"
-    if 1.0 - below <= ERROR_CHANCE:
-        return (
-            "recalibrate",
-            f"{what}: a tool at the limit would look so in {1.0 - below:.1%} of cases",
-        )
-    return (
-        "cannot tell",
-        f"{what}: too near the limit for this noise; repeat the check, or measure the tool anew",
     )

@@ -151,11 +151,9 @@ def calibrate_laser(
         row[:2] = 0.5 * (flange[f"{name}1"] + flange[f"{name}2"])[:2]
         row[2] = 0.5 * (flange[f"{name}3"] + flange[f"{name}4"])[2]
     laser = LaserFrame(points, sigma_m)
-    return laser if radius_m is None else replace(laser, reach=_reach(laser, flange, radius_m))
-
-
-def _reach(laser: LaserFrame, flange: Mapping[str, Array], radius_m: float) -> Array:
-    """Half the way across a beam in its shadow, less the cylinder's radius; (2,) means, m."""
+    if radius_m is None:
+        return laser
+    # Half the way across a beam in its shadow, less the cylinder's radius.
     shares = []
     for name, u in zip(POINTS, np.repeat(laser.direction, 2, axis=0), strict=True):
         across = flange[f"{name}2"] - flange[f"{name}1"]
@@ -164,7 +162,8 @@ def _reach(laser: LaserFrame, flange: Mapping[str, Array], radius_m: float) -> A
         for way, axis in ((across, down), (down, across)):
             normal = np.cross(u, axis)
             shares.append(0.5 * abs(way @ normal) / np.linalg.norm(normal))
-    return np.asarray(np.mean(np.reshape(shares, (2, 4)), axis=1) - radius_m)
+    reach = np.mean(np.reshape(shares, (2, 4)), axis=1) - radius_m
+    return replace(laser, reach=np.asarray(reach))
 
 
 Document = dict[str, Any]

@@ -34,7 +34,6 @@ from robocal_ros.tool.services import MOTION_SETTINGS, Runner, TcfMotion, TcfOut
 from robocal_ros.tool.session import (
     WITNESS,
     WITNESS_REFERENCE,
-    ToolInForce,
     ToolSession,
     configuration,
     take_tool_message,
@@ -319,8 +318,6 @@ class TcfNode(SessionNode[ToolSession]):
         self._calls = None
         super().cleanup()
 
-    # ---- samples and commands -------------------------------------------------------------------
-
     def take(self, session: ToolSession, kind: str, message: Any) -> None:
         """Give a message of the input ``kind`` to what moves, and to the session."""
         motion = self._motion
@@ -356,8 +353,6 @@ class TcfNode(SessionNode[ToolSession]):
         if session.run is not None and silent_s > self.settings["joint_silence_s"]:
             words = f"joint states are silent for {silent_s:.2f} s: check the robot's driver"
             self._break_off(Code.TOO_FEW_SAMPLES, words)
-
-    # ---- outputs --------------------------------------------------------------------------------
 
     def show(self, outcome: Outcome) -> None:
         """Publish what came of a command; it is logged already."""
@@ -418,15 +413,12 @@ class TcfNode(SessionNode[ToolSession]):
         if self._shown == shown and not self._outputs.events.need_configuration:
             return
         if self._shown != shown:
-            self._show_tool(history, current)
+            head = current.head
+            stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
+            thermal = 0 if head.model is None else int(head.model["thermal_revision"])
+            self._outputs.tool(current.tool, head.revision, thermal, stamp)
         self._shown = shown
         self._outputs.events.tell(configuration(session, self._topics), None)
-
-    def _show_tool(self, history: CalibrationHistory, current: ToolInForce) -> None:
-        head = current.head
-        stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
-        thermal = 0 if head.model is None else int(head.model["thermal_revision"])
-        self._outputs.tool(current.tool, head.revision, thermal, stamp)
 
     def report(self, session: ToolSession, history: CalibrationHistory, health: Health) -> None:
         """Tell what is awaited, what moves, and what became of the last run."""

@@ -170,8 +170,8 @@ class MeasuringPlan:
         return upright_pose(self.laser, near, T_flange_tool[:3, 2], point)
 
 
-#
-# joint readings came. No bend changes these; what differs from the healthy tool's run is a fault.
+# Traits are the radii, the latency and the rate of the joint readings. No bend changes these; what
+# differs from the healthy tool's run is a fault.
 ONE_SIDED = 1.645  # sigmas: what is at a limit looks larger by so much in 5 % of cases
 AS_LOW = "circle"  # of a quick check: as high above the tip as the circle `low` of a whole run
 LOW = "low"
@@ -277,10 +277,25 @@ class RunTraits:
         WrongToolError
             When both do.
         """
-        self._require_clock(healthy, limits)
-        change = self._grown(healthy)
-        if change is None:
+        later = self.latency_s - healthy.latency_s
+        sigma = float(np.hypot(self.latency_sigma_s, healthy.latency_sigma_s))
+        if _beyond(later, sigma, limits.latency_s):
+            raise ClockError(
+                f"the edges are {1e3 * self.latency_s:.1f} ms behind the joint readings, with the "
+                f"healthy tool it were {1e3 * healthy.latency_s:.1f} ms: a clock has jumped, or "
+                "the input is delayed; put both on one clock, or measure the healthy tool anew"
+            )
+        # Growth of the radius in each beam, over the circles that both runs have.
+        common = [
+            np.subtract(radii, healthy.radius_m[name])
+            for name, radii in (
+                (LOW if name == AS_LOW else name, radii) for name, radii in self.radius_m.items()
+            )
+            if name in healthy.radius_m
+        ]
+        if not common:
             return
+        change = np.mean(common, axis=0)
         sigma = float(np.hypot(self.radius_sigma_m, healthy.radius_sigma_m))
         apart, both = float(change[0] - change[1]), float(np.mean(change))
         x, y = (f"{1e3 * part:+.3f}" for part in change)
@@ -296,27 +311,6 @@ class RunTraits:
                 f"{words}: another tool is mounted, this one is worn or fouled, or both beams are "
                 "dirty; mount the right one, or measure it in mode REFERENCE"
             )
-
-    def _require_clock(self, healthy: "RunTraits", limits: TraitLimits) -> None:
-        later = self.latency_s - healthy.latency_s
-        sigma = float(np.hypot(self.latency_sigma_s, healthy.latency_sigma_s))
-        if _beyond(later, sigma, limits.latency_s):
-            raise ClockError(
-                f"the edges are {1e3 * self.latency_s:.1f} ms behind the joint readings, with the "
-                f"healthy tool it were {1e3 * healthy.latency_s:.1f} ms: a clock has jumped, or "
-                "the input is delayed; put both on one clock, or measure the healthy tool anew"
-            )
-
-    def _grown(self, healthy: "RunTraits") -> Array | None:
-        """Growth (2,) of the radius in each beam, m; None where no circle is common."""
-        pairs = [
-            (radii, healthy.radius_m[LOW if name == AS_LOW else name])
-            for name, radii in self.radius_m.items()
-            if (LOW if name == AS_LOW else name) in healthy.radius_m
-        ]
-        if not pairs:
-            return None
-        return np.asarray(np.mean([np.subtract(now, then) for now, then in pairs], axis=0))
 
 
 def require_even(rates_hz: Sequence[float], limits: TraitLimits) -> None:
@@ -534,7 +528,10 @@ class ToolRun:
             stamps, q = stamps[near], q[near]
         self._time.append(1e-9 * (stamps - self.begun_ns).astype(np.float64))
         self._q.append(q)
-        self._require_readings()  # first: with readings edges are lost
+        # First: with readings edges are lost. The run so far: a short burst is no lossy line.
+        if self.healthy is not None and (readings := self._readings):
+            count, span_s = np.sum(readings, axis=0).tolist()
+            self.healthy.require_readings(int(count), span_s, self.config.traits)
         self.steps.append(BeamStep(step.name, step.kind, debounced(found, rule.debounce_s)))
         if self.complete:
             return
@@ -542,8 +539,9 @@ class ToolRun:
             tool = self.estimate(PLANNING)
             self.require_like_healthy(tool)
             self.seen = tool.T_flange_tool
-        else:
-            self._check()
+        else:  # refuse what is of no use before more is driven
+            taught, noise = self.plan.T_flange_tool, self.config.noise
+            run_problem(self.plan.laser, self.path, self.steps, taught, noise)
 
     @property
     def path(self) -> JointPath:
@@ -586,12 +584,6 @@ class ToolRun:
         """Of each step so far: joint readings after its first, and over what time, s."""
         return [(len(t) - 1, float(t[-1] - t[0])) for t in self._time if len(t) > 1]
 
-    def _require_readings(self) -> None:
-        """Judge the run so far: a short burst in one step is no lossy line."""
-        if self.healthy is not None and (readings := self._readings):
-            count, span_s = np.sum(readings, axis=0).tolist()
-            self.healthy.require_readings(int(count), span_s, self.config.traits)
-
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that was measured, for keeping."""
         edges = [(i, edge) for i, step in enumerate(self.steps) for edge in step.edges]
@@ -605,11 +597,6 @@ class ToolRun:
             "joint_s": np.concatenate(self._time),
             "q": np.concatenate(self._q),
         }
-
-    def _check(self) -> None:
-        """Refuse steps whose edges or joint readings are of no use, before more are driven."""
-        tool, noise = self.plan.T_flange_tool, self.config.noise
-        run_problem(self.plan.laser, self.path, self.steps, tool, noise)
 
     def _watched(self) -> StepWatch:
         if self._watch is None:

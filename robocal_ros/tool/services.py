@@ -124,8 +124,6 @@ class TcfServices:
         if self._goal is not None and self._goal.is_active:
             self._goal.publish_feedback(MeasureTool.Feedback(step=step, state=state))
 
-    # ---- action ---------------------------------------------------------------------------------
-
     async def _execute(self, goal: ServerGoalHandle) -> Any:
         request = goal.request
         try:
@@ -172,8 +170,6 @@ class TcfServices:
             return CancelResponse.REJECT
         await self._runner.cancel("cancelled by the caller")
         return CancelResponse.ACCEPT
-
-    # ---- Triggers -------------------------------------------------------------------------------
 
     def _starter(self, mode: str) -> Callable[[Any, Any], Any]:
         async def start(request: Any, response: Any) -> Any:
@@ -583,7 +579,10 @@ class TcfMotion:
         else:
             self.driver.disarm("disarmed by a call", now_s)
         response.success = True
-        response.message = self._armed() if request.data else "disarmed"
+        response.message = "disarmed"
+        if request.data:
+            words = f"armed: begin the measurement within {self._config.armed_s:g} s"
+            response.message = words if self._gap is not None else f"{words}; {UNHEARD}"
         self._node.get_logger().warning(f"arm {request.data}: {response.message}")
         return response
 
@@ -593,7 +592,3 @@ class TcfMotion:
         sent_s = self._steady.now_s()  # not after it: a robot ahead of its plan is off it
         self._motion.send(plan, stop=stop)
         return sent_s
-
-    def _armed(self) -> str:
-        words = f"armed: begin the measurement within {self._config.armed_s:g} s"
-        return words if self._gap is not None else f"{words}; {UNHEARD}"

@@ -399,6 +399,7 @@ class ToolSession(SessionBase):
 
     Attributes
     ----------
+    current : tool, thermal model and healthy tool in force.
     run : the run that is open; None while there is none.
     """
 
@@ -406,9 +407,9 @@ class ToolSession(SessionBase):
         self, nominal: SerialArm, history: History, config: ToolConfig, software: str
     ) -> None:
         self.config = config
-        self._current = ToolInForce(history, nominal, config)
-        super().__init__(nominal, history, TOOL, self._current)
-        self._results = ToolResults(nominal, history, config, software, self._current)
+        self.current = ToolInForce(history, nominal, config)
+        super().__init__(nominal, history, TOOL, self.current)
+        self._results = ToolResults(nominal, history, config, software, self.current)
         self._laser = config.laser
         self._edges = EdgeLog()
         self._runs = 0
@@ -416,19 +417,10 @@ class ToolSession(SessionBase):
         self._over: Command | None = None
         self.run: ToolRun | None = None
 
-    # ---- what is in force -----------------------------------------------------------------------
-
-    @property
-    def current(self) -> ToolInForce:
-        """Tool, thermal model and healthy tool in force."""
-        return self._current
-
     @property
     def awaited(self) -> PlannedStep | None:
         """The step to be driven now; None while nothing is awaited."""
         return None if self.run is None else self.run.awaited
-
-    # ---- samples --------------------------------------------------------------------------------
 
     def add(self, sample: JointSample | EdgeSample) -> None:
         """Take a sample.
@@ -481,24 +473,20 @@ class ToolSession(SessionBase):
             self._end_early(words)
             raise InputError(words)
         if self.run is not None and self.newest_joints_ns:
-            self._watch_clocks((sample.stamp_ns - self.newest_joints_ns) * 1e-9)
+            # One edge that is stamped far from the joints may be a mistake, a second one is none.
+            ahead_s = (sample.stamp_ns - self.newest_joints_ns) * 1e-9
+            self._strays += not -BEHIND_S <= ahead_s <= AHEAD_S
+            if self._strays == STRAYS:
+                where = "ahead of" if ahead_s > 0.0 else "behind"
+                self._end_early(
+                    f"edges come stamped {abs(ahead_s):.2f} s {where} the joint states: a clock "
+                    "has jumped, or one of them comes late; stamp both on one clock",
+                    Code.CLOCK_WRONG,
+                )
         self._edges.add(sample, self.newest_ns, self.newest_joints_ns)
         self.received[EDGES] += 1
         if self.run is not None:
             self.run.watch_edge(sample)
-
-    def _watch_clocks(self, ahead_s: float) -> None:
-        """One edge that is stamped far from the joints may be a mistake, a second one is none."""
-        self._strays += not -BEHIND_S <= ahead_s <= AHEAD_S
-        if self._strays == STRAYS:
-            where = "ahead of" if ahead_s > 0.0 else "behind"
-            self._end_early(
-                f"edges come stamped {abs(ahead_s):.2f} s {where} the joint states: a clock has "
-                "jumped, or one of them comes late; stamp both on one clock",
-                Code.CLOCK_WRONG,
-            )
-
-    # ---- commands -------------------------------------------------------------------------------
 
     def recognised(self) -> Command | None:
         """The command that follows from the samples: a step is over, or the run is broken off."""
@@ -529,7 +517,7 @@ class ToolSession(SessionBase):
             )
         if not self.newest_joints_ns:
             raise ConflictError(f"no joint states yet: does the robot's driver publish {JOINTS}?")
-        config, current = self.config, self._current
+        config, current = self.config, self.current
         quick = mode == QUICK
         tool = self._results.expected().T_flange_tool if quick else self._results.taught(mode)
         steps: Mode = "quick" if quick else "full"
