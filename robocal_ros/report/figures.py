@@ -4,7 +4,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -125,27 +125,21 @@ def error_by_pose(report: ShiftErrors) -> Figure:
     return figure
 
 
-class Drifted(Protocol):
-    """How a model moved."""
+@dataclass(frozen=True, eq=False)
+class ModelDrift:
+    """How the models of a session's cycles moved.
 
-    @property
-    def hours(self) -> Array:
-        """Time (c,) of each model."""
+    ``hours`` (c,) of each model; names of the k parameters, with their unit; ``drift`` in those
+    units and its ``sigma`` (c, k).
+    """
 
-    @property
-    def parameter_names(self) -> Sequence[str]:
-        """Names of the k parameters, with their unit."""
-
-    @property
-    def drift(self) -> Array:
-        """Drift (c, k) in those units."""
-
-    @property
-    def sigma(self) -> Array:
-        """Its standard deviation (c, k)."""
+    hours: Array
+    parameter_names: Sequence[str]
+    drift: Array
+    sigma: Array
 
 
-def parameter_drift(report: Drifted) -> Figure:
+def parameter_drift(report: ModelDrift) -> Figure:
     """Drift of the parameters that moved most in units of their sigma, with two sigma."""
     with mpl.rc_context(STYLE | {"axes.titlesize": 9.5, "axes.titlepad": 5, "font.size": 8.5}):
         figure = Figure(figsize=(8.0, 3.8), layout="constrained")
@@ -159,17 +153,13 @@ def parameter_drift(report: Drifted) -> Figure:
             axes.step(report.hours, value, where="post", color=AFTER, lw=1.6)
             axes.axhline(0.0, color=FAINT, lw=0.8)
             name, _, unit = report.parameter_names[k].rpartition("_")
-            axes.set_title(f"{_symbol(name)}, {unit}")
+            for word, letter in GREEK.items():
+                name = name.replace(word, letter)
+            axes.set_title(f"{name}, {unit}")
         for axes in grid[len(chosen) :]:
             axes.set_visible(False)
         figure.supxlabel("hours of production", fontsize=9, color=INK)
     return figure
-
-
-def _symbol(name: str) -> str:
-    for word, letter in GREEK.items():
-        name = name.replace(word, letter)
-    return name
 
 
 def titled(axes: Axes, words: str) -> None:
@@ -195,9 +185,6 @@ def png(figure: Figure, dpi: int = 160) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
     return stream.getvalue()
-
-
-# ---- the figure of a parameter screening: the share of every round ------------------------------
 
 
 def draw_rounds(path: Path, document: dict[str, Any]) -> None:
@@ -238,9 +225,6 @@ def draw_rounds(path: Path, document: dict[str, Any]) -> None:
         axes.set_ylabel("share, %")
         axes.set_title(f"Directions within {document['threshold_mm']:g} mm at check poses")
         figure.savefig(path, dpi=130)
-
-
-# ---- how accurate a simulated cell was: its figures, and the figure of its course ---------------
 
 
 Document = dict[str, Any]
@@ -293,25 +277,20 @@ class CellCourse:
     def _figures(self, chosen: NDArray[np.bool_]) -> Document:
         known = chosen & np.isfinite(self.bound_mm) & np.isfinite(self.p95_mm)
         kept = self.p95_mm[known] <= self.bound_mm[known]
+        period_h = float(np.median(np.diff(self.hours))) if len(self.hours) > 1 else 0.0
+        squares = [
+            (f"rms_{name}_mm", _mean(values[chosen] ** 2))
+            for name, values in (("without", self.without_mm), ("with", self.with_mm))
+        ]
         return {
-            "minutes": float(np.sum(chosen)) * self._period_h * 60.0,
-            "rms_without_mm": _rms(self.without_mm[chosen]),
-            "rms_with_mm": _rms(self.with_mm[chosen]),
+            "minutes": float(np.sum(chosen)) * period_h * 60.0,
+            **{name: None if mean is None else float(np.sqrt(mean)) for name, mean in squares},
             "lambda_without": _mean(self.lambda_without[chosen]),
             "lambda_with": _mean(self.lambda_with[chosen]),
             "bound_mm": _mean(self.bound_mm[known]),
             "p95_mm": _mean(self.p95_mm[known]),
             "time_below_bound": _mean(kept.astype(np.float64)),
         }
-
-    @property
-    def _period_h(self) -> float:
-        return float(np.median(np.diff(self.hours))) if len(self.hours) > 1 else 0.0
-
-
-def _rms(values: Array) -> float | None:
-    mean = _mean(values**2)
-    return None if mean is None else float(np.sqrt(mean))
 
 
 def _mean(values: Array) -> float | None:
@@ -331,10 +310,15 @@ def cell_figure(course: CellCourse) -> Figure:
         _errors(above, course, per_hour)
         if shares:
             _shares(lowest, course, per_hour)
-        for axes in all_axes[:, 0]:
-            for fault in course.faults:
-                axes.axvline(fault["hours"] * per_hour, color=BEFORE, lw=1.0, ls=(0, (1, 2)))
-        _name_faults(above, course, per_hour)
+        for fault in course.faults:
+            at = fault["hours"] * per_hour
+            for axes in all_axes[:, 0]:
+                axes.axvline(at, color=BEFORE, lw=1.0, ls=(0, (1, 2)))
+            above.annotate(
+                fault["fault"].replace("_", " ") + ("" if fault["size"] else " ends"),
+                (at, 0.0), xycoords=("data", "axes fraction"), rotation=90, xytext=(3, 4),
+                textcoords="offset points", va="bottom", fontsize=8, color=BEFORE,
+            )  # fmt: skip
         lowest.set(xlabel=f"{unit} of recording", xlim=(0.0, float(course.hours[-1]) * per_hour))
         figure.align_ylabels(all_axes[:, 0])
     return figure
@@ -358,38 +342,23 @@ def _errors(axes: Axes, course: CellCourse, per_hour: float) -> None:
     titled(axes, "True error at the working poses (simulated)")
 
 
-def _name_faults(axes: Axes, course: CellCourse, per_hour: float) -> None:
-    for fault in course.faults:
-        words = fault["fault"].replace("_", " ") + ("" if fault["size"] else " ends")
-        axes.annotate(
-            words, (fault["hours"] * per_hour, 0.0), xycoords=("data", "axes fraction"),
-            rotation=90, xytext=(3, 4), textcoords="offset points", va="bottom", fontsize=8,
-            color=BEFORE,
-        )  # fmt: skip
-
-
 def _shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
     """Of each hour; within the first one as it went."""
     if course.hours[-1] <= 1.0:
         for shares, color in ((course.lambda_without, BEFORE), (course.lambda_with, AFTER)):
             axes.plot(course.hours * per_hour, 100.0 * shares, color=color, lw=1.8)
     else:
-        _hourly_shares(axes, course, per_hour)
+        for row in course.document()["by_hour"]:
+            begin = row["hour"] - 1.0
+            ends = begin * per_hour, min(begin + 1.0, float(course.hours[-1])) * per_hour
+            for name, color in (("without", BEFORE), ("with", AFTER)):
+                share = row[f"lambda_{name}"]
+                if share is not None:
+                    axes.plot(
+                        ends, (100.0 * share,) * 2, color=color, lw=2.4, solid_capstyle="butt"
+                    )
     axes.axhline(100.0 * GOAL, color=FAINT, lw=0.8, ls=(0, (4, 3)))
     axes.set(ylabel=f"directions within\n{TOLERANCE_MM:g} mm, %", ylim=(0.0, 103.0))
-
-
-def _hourly_shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
-    for row in course.document()["by_hour"]:
-        begin = row["hour"] - 1.0
-        ends = begin * per_hour, min(begin + 1.0, float(course.hours[-1])) * per_hour
-        for name, color in (("without", BEFORE), ("with", AFTER)):
-            share = row[f"lambda_{name}"]
-            if share is not None:
-                axes.plot(ends, (100.0 * share,) * 2, color=color, lw=2.4, solid_capstyle="butt")
-
-
-# ---- figures of a validated bag, from its document ----------------------------------------------
 
 
 MOST_NAMED = 8  # runs that have their name below the axis
@@ -422,16 +391,6 @@ class Drawn:
     def of(cls, name: str, caption: str, figure: Figure) -> "Drawn":
         """Draw it."""
         return cls(name, caption, svg(figure), png(figure))
-
-
-@dataclass(frozen=True, eq=False)
-class ModelDrift:
-    """How the models of a session's cycles moved; see `figures.Drifted`."""
-
-    hours: Array
-    parameter_names: Sequence[str]
-    drift: Array
-    sigma: Array
 
 
 def cell_drawn(course: CellCourse) -> Drawn:

@@ -1,15 +1,12 @@
 """Many validated bags as one HTML page that needs nothing else."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
 from robocal_ros.report.figures import Drawn
 from robocal_ros.report.validation import TOLERANCE_MM, Document, summary_rows
-
-# ---- parts of an HTML page that needs nothing else: no network, no script, no other file --------
-
 
 CSS = """
 :root { --ink: #22303a; --faint: #6d7b85; --line: #e1e6ea; --accent: #0f6f86; --warm: #c2603a; }
@@ -46,17 +43,6 @@ dd { margin: 0; overflow-wrap: anywhere; }
 """
 
 
-def whole(title: str, parts: Sequence[str]) -> str:
-    """A page of these elements."""
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n"
-        + "\n".join(parts)
-        + "\n</body>\n</html>\n"
-    )
-
-
 def listed(facts: Sequence[tuple[str, str]]) -> str:
     """Names with what they stand for."""
     return "<dl>" + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in facts) + "</dl>"
@@ -89,9 +75,6 @@ def table(
     return f'<div class="wide"><table><tr>{cells("th", head)}</tr>{body}</table></div>'
 
 
-# ---- many validated bags as one HTML page that needs nothing else -------------------------------
-
-
 Figures = Mapping[str, Sequence[Sequence[Drawn]]]
 
 TITLES = {
@@ -110,6 +93,52 @@ ERRORS_NOTE = (
 )
 
 
+def _mm(value: Any) -> str:
+    return NOTHING if value is None else f"{value:.3f}"
+
+
+def _share(value: Any) -> str:
+    return NOTHING if value is None else f"{value:.1%}"
+
+
+Columns = Mapping[str, Callable[[Document], str]]
+OVERVIEW: Mapping[str, tuple[Columns, str]] = {
+    "thermal": (
+        {
+            "judged by": lambda row: row["judged_by"],
+            "accepted": lambda row: f"{row['accepted']} of {row['cycles']}",
+            "rms without": lambda row: _mm(row["rms_without_mm"]),
+            "rms in force": lambda row: _mm(row["rms_in_force_mm"]),
+            "rms after": lambda row: _mm(row["rms_after_mm"]),
+            "rms candidate": lambda row: _mm(row["rms_candidate_mm"]),
+            "λ without": lambda row: _share(row["lambda_without"]),
+            "λ in force": lambda row: _share(row["lambda_in_force"]),
+            "λ after": lambda row: _share(row["lambda_after"]),
+            "below bound": lambda row: _share(row["share_below_bound"]),
+        },
+        ERRORS_NOTE,
+    ),
+    "tool": (
+        {
+            "runs": lambda row: str(row["runs"]),
+            "largest change, mm": lambda row: _mm(row["largest_change_mm"]),
+            "largest true error, mm": lambda row: _mm(row["largest_true_error_mm"]),
+        },
+        "",
+    ),
+    "hand_eye": (
+        {
+            "calibrations": lambda row: str(row["calibrations"]),
+            "residual, mm": lambda row: _mm(row["residual_rms_mm"]),
+            "expected error, mm": lambda row: _mm(row["predicted_rms_mm"]),
+            "true error, mm": lambda row: _mm(row["true_error_mm"]),
+        },
+        "",
+    ),
+}
+"""Of each kind of session: what each column of its table shows of a row, and a note."""
+
+
 def page(report: Document, figures: Figures) -> str:
     """The whole page.
 
@@ -117,110 +146,89 @@ def page(report: Document, figures: Figures) -> str:
     then those of each of its sessions.
     """
     rows, bags = summary_rows(report["bags"]), report["bags"]
+    title = escape(report["title"])
     simulated = any(bag.get("simulated") for bag in bags)
     mark = '<span class="mark">simulated data</span>' if simulated else ""
     parts = [
-        f"<h1>{escape(report['title'])}</h1>",
+        f"<h1>{title}</h1>",
         f'<p class="faint">{escape(report["created"])} · {escape(report["software"])} {mark}</p>',
         f'<p class="lead">{_answer(rows, bags)}</p>',
         *_overview(rows),
     ]
     for bag in bags:
         parts += _bag(bag, figures.get(bag["bag"], ()))
-    parts += ["<h2>Where this comes from</h2>", _origin(report)]
-    return whole(report["title"], parts)
+    tables = "bags.csv, cycles.csv, decisions.csv, hours.csv, report.json"
+    origin = [
+        ("software", report["software"]),
+        ("date", report["created"]),
+        *report["versions"].items(),
+        ("tables", f"{tables} beside this page"),
+    ]
+    parts += ["<h2>Where this comes from</h2>", listed(origin)]
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{title}</title>\n<style>{CSS}</style>\n</head>\n<body>\n"
+        + "\n".join(parts)
+        + "\n</body>\n</html>\n"
+    )
 
 
 def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
-    """Is it good, in mm? In one or two sentences."""
-    failed = sum("error" in row for row in rows)
-    told = [_cell_answer(bag, cell) for bag in bags for cell in bag.get("cells", [])]
+    """Is it good, in mm? In one or two sentences.
+
+    By measurements it tells of the model that was in force: no candidate has corrected anything
+    yet.
+    """
+    answers = []
+    for bag in bags:
+        for cell in bag.get("cells", []):
+            name = bag["bag"] + (f", {cell['topic']}" if len(bag["cells"]) > 1 else "")
+            share = ""
+            if cell["lambda_with"] is not None:
+                share = f", {_share(cell['lambda_with'])} of all directions within "
+                share += f"{TOLERANCE_MM:g} mm"
+            answers.append(
+                f"{escape(name)}: true rms error of the tool {_mm(cell['rms_without_mm'])} mm "
+                f"without correction, <b>{_mm(cell['rms_with_mm'])} mm</b> with it{share}."
+            )
     for row in rows:
         if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
-            told.append(_thermal_answer(row))
-    if failed:
-        told.append(f"{failed} of {len({row['bag'] for row in rows})} bags could not be validated.")
-    return "<br>".join(told) or "No thermal cycle in these bags."
-
-
-def _thermal_answer(row: Document) -> str:
-    """By measurements of the model that was in force: no candidate has corrected anything yet."""
-    true = row["judged_by"] == "truth"
-    corrected = row["rms_after_mm" if true else "rms_in_force_mm"]
-    when = "after each cycle" if true else "with the model in force, at its oldest"
-    return (
-        f"{escape(row['bag'])}: {'true ' if true else ''}rms error {_mm(row['rms_without_mm'])} mm "
-        f"without correction, <b>{_mm(corrected)} mm</b> {when} ({_accepted(row)} cycles accepted)."
-    )
-
-
-def _accepted(row: Document) -> str:
-    return f"{row['accepted']} of {row['cycles']}"
-
-
-def _cell_answer(bag: Document, cell: Document) -> str:
-    name = bag["bag"] + (f", {cell['topic']}" if len(bag["cells"]) > 1 else "")
-    share = f", {_share(cell['lambda_with'])} of all directions within {TOLERANCE_MM:g} mm"
-    return (
-        f"{escape(name)}: true rms error of the tool {_mm(cell['rms_without_mm'])} mm "
-        f"without correction, <b>{_mm(cell['rms_with_mm'])} mm</b> with it"
-        f"{share if cell['lambda_with'] is not None else ''}."
-    )
+            true = row["judged_by"] == "truth"
+            corrected = row["rms_after_mm" if true else "rms_in_force_mm"]
+            when = "after each cycle" if true else "with the model in force, at its oldest"
+            answers.append(
+                f"{escape(row['bag'])}: {'true ' if true else ''}rms error "
+                f"{_mm(row['rms_without_mm'])} mm without correction, <b>{_mm(corrected)} mm</b> "
+                f"{when} ({row['accepted']} of {row['cycles']} cycles accepted)."
+            )
+    if failed := sum("error" in row for row in rows):
+        count = len({row["bag"] for row in rows})
+        answers.append(f"{failed} of {count} bags could not be validated.")
+    return "<br>".join(answers) or "No thermal cycle in these bags."
 
 
 def _overview(rows: Sequence[Document]) -> list[str]:
+    """A table of each kind of session; its last columns: does the replay give what was live?"""
     parts = []
     failed = [row for row in rows if "error" in row]
     if failed:
         cells = [[row["bag"], row["error"]["code"], row["error"]["message"]] for row in failed]
         parts += ["<h2>Not validated</h2>", table(["bag", "code", "why"], cells, words=(1, 2))]
-    for kind, heads, cells_of, note in (
-        ("thermal", _THERMAL, _thermal_cells, ERRORS_NOTE),
-        ("tool", _TOOL, _tool_cells, ""),
-        ("hand_eye", _HAND_EYE, _hand_eye_cells, ""),
-    ):
-        chosen = [row for row in rows if row["kind"] == kind]
-        if chosen:
-            body = [[row["bag"], *cells_of(row), *_common(row)] for row in chosen]
-            head = ["bag", *heads, "live", "refused", "warnings"]
+    for kind, (columns, note) in OVERVIEW.items():
+        body = []
+        for row in rows:
+            if row["kind"] == kind:
+                live = NOTHING
+                if row["as_recorded"]:
+                    live = f"{row['differs']} differ" if row["differs"] else "equal"
+                own = [shown(row) for shown in columns.values()]
+                body.append([row["bag"], *own, live, str(row["refused"]), str(row["warnings"])])
+        if body:
+            head = ["bag", *columns, "live", "refused", "warnings"]
             parts += [f"<h2>{TITLES[kind]}</h2>", table(head, body)]
             parts += [f'<p class="faint">{note}</p>'] if note else []
     return parts
-
-
-_THERMAL = (
-    "judged by", "accepted", "rms without", "rms in force", "rms after", "rms candidate",
-    "λ without", "λ in force", "λ after", "below bound",
-)  # fmt: skip
-_TOOL = ("runs", "largest change, mm", "largest true error, mm")
-_HAND_EYE = ("calibrations", "residual, mm", "expected error, mm", "true error, mm")
-
-
-def _thermal_cells(row: Document) -> list[str]:
-    return [
-        row["judged_by"],
-        _accepted(row),
-        *(_mm(row[f"rms_{name}_mm"]) for name in ("without", "in_force", "after", "candidate")),
-        *(_share(row[f"lambda_{name}"]) for name in ("without", "in_force", "after")),
-        _share(row["share_below_bound"]),
-    ]
-
-
-def _tool_cells(row: Document) -> list[str]:
-    return [str(row["runs"]), _mm(row["largest_change_mm"]), _mm(row["largest_true_error_mm"])]
-
-
-def _hand_eye_cells(row: Document) -> list[str]:
-    keys = ("residual_rms_mm", "predicted_rms_mm", "true_error_mm")
-    return [str(row["calibrations"]), *(_mm(row[key]) for key in keys)]
-
-
-def _common(row: Document) -> list[str]:
-    """Does the replay give what was live? What was refused, what is to be known?"""
-    live = NOTHING
-    if row["as_recorded"]:
-        live = f"{row['differs']} differ" if row["differs"] else "equal"
-    return [live, str(row["refused"]), str(row["warnings"])]
 
 
 def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
@@ -259,20 +267,16 @@ def _cell(cell: Document) -> list[str]:
         "expected below it; p95: 95 % truly were; below bound: share of the time in which p95 was. "
         f"λ: share of all directions within {TOLERANCE_MM:g} mm.</p>"
     )
-    faults = [
-        (_after(one["hours"]), f"{one['fault'].replace('_', ' ')} {one['told'] or 'ends'}")
-        for one in cell["faults"]
-    ]
-    told = ["<h3>Faults that were simulated</h3>", listed(faults)] if faults else []
-    return [table(head, body), note, *told]
-
-
-def _after(hours: float) -> str:
-    return f"{hours:.2f} h" if hours >= 1.0 else f"{hours * 60.0:.1f} min"
+    faults = []
+    for one in cell["faults"]:
+        hours = one["hours"]
+        after = f"{hours:.2f} h" if hours >= 1.0 else f"{hours * 60.0:.1f} min"
+        faults.append((after, f"{one['fault'].replace('_', ' ')} {one['told'] or 'ends'}"))
+    shown = ["<h3>Faults that were simulated</h3>", listed(faults)] if faults else []
+    return [table(head, body), note, *shown]
 
 
 def _session(session: Document) -> list[str]:
-    own = {"thermal": _cycles, "tool": _runs, "hand_eye": _calibrations}[session["kind"]](session)
     words = session["node"] or "no recorded commands: cycles found by their recurring poses, each "
     words += "" if session["node"] else "candidate accepted where its verdict accepts it"
     facts = [("session", words), ("robot", f"{session['robot']}, model {session['model_hash']}")]
@@ -290,7 +294,7 @@ def _session(session: Document) -> list[str]:
     ]
     settings = [(name, str(value)) for name, value in session["settings"].items()]
     return [
-        own,
+        _results(session),
         "<h3>Every decision and its reason</h3>",
         _decisions(session["decisions"]),
         listed(facts),
@@ -298,7 +302,25 @@ def _session(session: Document) -> list[str]:
     ]
 
 
-def _cycles(session: Document) -> str:
+def _results(session: Document) -> str:
+    """Every thermal cycle, tool run or hand-eye calibration of a session."""
+    if session["kind"] == "tool":
+        head = ["run", "answer", "code", "change, mm", "deg", "sigma, mm", "true error, mm", "why"]
+        body = [
+            [str(run["run"]), run["answer"], run["verdict"]["code"], _mm(run["change_mm"]),
+             _mm(run["change_deg"]), _mm(run["sigma_mm"]), _mm(run["true_error_mm"]),
+             run["verdict"]["reason"]]
+            for run in session["runs"]
+        ]  # fmt: skip
+        return table(head, body, words=(1, 2, 7))
+    if session["kind"] == "hand_eye":
+        head = ["target", "method", "code", "residual, mm", "expected, mm", "true, mm", "why"]
+        body = [
+            [one["kind"], one["method"], one["verdict"]["code"], _mm(one["residual_rms_mm"]),
+             _mm(one["predicted_rms_mm"]), _mm(one["true_error_mm"]), one["verdict"]["reason"]]
+            for one in session["calibrations"]
+        ]  # fmt: skip
+        return table(head, body, words=(1, 2, 6))
     head = ["cycle", "hour", "code", "revision", "without", "in force", "candidate", "expected",
             "bound", "true after", "λ", "rejected"]  # fmt: skip
     body = []
@@ -311,7 +333,8 @@ def _cycles(session: Document) -> str:
             *(_mm(cycle[name]["rms_mm"]) for name in ("nominal", "in_force", "candidate")),
             _mm(cycle["predicted_rms_mm"]), _mm(forecast.get("bound_mm")),
             _mm((true.get("after") or {}).get("rms_mm")),
-            _share(found.get("share_within_tolerance")), _of(cycle),
+            _share(found.get("share_within_tolerance")),
+            f"{len(cycle['rejected'])} of {cycle['samples']}" if cycle["rejected"] else "",
         ])  # fmt: skip
     note = (
         '<p class="faint">Rms in mm. Candidate: each pose predicted from the others; expected: the '
@@ -324,33 +347,6 @@ def _cycles(session: Document) -> str:
     return table(head, body, words=(2,)) + note
 
 
-def _of(cycle: Document) -> str:
-    """How many samples were rejected; their names are in the JSON."""
-    rejected = len(cycle["rejected"])
-    return f"{rejected} of {cycle['samples']}" if rejected else ""
-
-
-def _runs(session: Document) -> str:
-    head = ["run", "answer", "code", "change, mm", "deg", "sigma, mm", "true error, mm", "why"]
-    body = [
-        [str(run["run"]), run["answer"], run["verdict"]["code"], _mm(run["change_mm"]),
-         _mm(run["change_deg"]), _mm(run["sigma_mm"]), _mm(run["true_error_mm"]),
-         run["verdict"]["reason"]]
-        for run in session["runs"]
-    ]  # fmt: skip
-    return table(head, body, words=(1, 2, 7))
-
-
-def _calibrations(session: Document) -> str:
-    head = ["target", "method", "code", "residual, mm", "expected, mm", "true, mm", "why"]
-    body = [
-        [one["kind"], one["method"], one["verdict"]["code"], _mm(one["residual_rms_mm"]),
-         _mm(one["predicted_rms_mm"]), _mm(one["true_error_mm"]), one["verdict"]["reason"]]
-        for one in session["calibrations"]
-    ]  # fmt: skip
-    return table(head, body, words=(1, 2, 6))
-
-
 def _decisions(decisions: Sequence[Document]) -> str:
     body = [
         [datetime.fromtimestamp(one["stamp"], UTC).strftime("%Y-%m-%d %H:%M:%S"),
@@ -358,19 +354,3 @@ def _decisions(decisions: Sequence[Document]) -> str:
         for one in decisions
     ]  # fmt: skip
     return table(["time (UTC)", "command", "code", "reason"], body, words=(1, 2, 3))
-
-
-def _origin(report: Document) -> str:
-    facts = [("software", report["software"]), ("date", report["created"])]
-    facts += [(name, version) for name, version in report["versions"].items()]
-    tables = "bags.csv, cycles.csv, decisions.csv, hours.csv, report.json"
-    facts.append(("tables", f"{tables} beside this page"))
-    return listed(facts)
-
-
-def _mm(value: Any) -> str:
-    return NOTHING if value is None else f"{value:.3f}"
-
-
-def _share(value: Any) -> str:
-    return NOTHING if value is None else f"{value:.1%}"

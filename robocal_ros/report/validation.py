@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import summarise
 
+Array = NDArray[np.float64]
 Document = dict[str, Any]
+
+TOLERANCE_MM = 0.1
 
 ERRORS = ("without", "in_force", "after")
 MEASURED = {"without": "nominal", "in_force": "in_force", "candidate": "candidate"}
@@ -44,7 +47,18 @@ def summary_rows(bags: Sequence[Document]) -> list[Document]:
 
 def _row(bag: Document, session: Document) -> Document:
     refused = [d for d in session["decisions"] if d["code"] not in NO_FAULT]
-    own = {"thermal": _thermal, "tool": _tool, "hand_eye": _hand_eye}[session["kind"]](session)
+    if session["kind"] == "thermal":
+        own = _thermal(session)
+    elif session["kind"] == "tool":
+        own = {"runs": len(session["runs"])}
+        for name in ("change_mm", "true_error_mm"):
+            known = [run[name] for run in session["runs"] if run[name] is not None]
+            own[f"largest_{name}"] = max(known, default=None)
+    else:
+        last = (session["calibrations"] or [{}])[-1]
+        own = {"calibrations": len(session["calibrations"])}
+        for key in ("residual_rms_mm", "predicted_rms_mm", "true_error_mm"):
+            own[key] = last.get(key)
     return {
         "bag": bag["bag"],
         "kind": session["kind"],
@@ -95,23 +109,6 @@ def pooled_rms_mm(cycles: Sequence[Document], key: str) -> float | None:
     return float(np.sqrt(np.sum(n * rms**2) / np.sum(n)))
 
 
-def _tool(session: Document) -> Document:
-    changes = [run["change_mm"] for run in session["runs"] if run["change_mm"] is not None]
-    errors = [run["true_error_mm"] for run in session["runs"] if run["true_error_mm"] is not None]
-    return {
-        "runs": len(session["runs"]),
-        "largest_change_mm": max(changes, default=None),
-        "largest_true_error_mm": max(errors, default=None),
-    }
-
-
-def _hand_eye(session: Document) -> Document:
-    found = session["calibrations"]
-    last = found[-1] if found else {}
-    keys = ("residual_rms_mm", "predicted_rms_mm", "true_error_mm")
-    return {"calibrations": len(found)} | {key: last.get(key) for key in keys}
-
-
 def bags_table(bags: Sequence[Document]) -> str:
     """The rows as CSV."""
     rows = [
@@ -125,7 +122,24 @@ def bags_table(bags: Sequence[Document]) -> str:
 
 def cycles_table(bags: Sequence[Document]) -> str:
     """Every thermal cycle as CSV."""
-    return _csv([_cycle(bag, cycle) for bag, cycle in thermal_cycles(bags)], CYCLE)
+    rows = []
+    for bag, cycle in thermal_cycles(bags):
+        row = {name: cycle[name] for name in ("cycle", "stamp", "hours", "samples")}
+        row |= {"code": cycle["verdict"]["code"], "revision": cycle["revision"]}
+        for name in ("nominal", "in_force", "candidate"):
+            row[f"{name}_rms_mm"] = cycle[name]["rms_mm"]
+        row |= {
+            "predicted_rms_mm": cycle["predicted_rms_mm"],
+            "bound_mm": (cycle["forecast"] or {}).get("bound_mm"),
+        }
+        for judge in ("measured", "true"):
+            for name in ERRORS:
+                found = (cycle[judge] or {}).get(name) or {}
+                row |= {f"{judge}_{name}_{key}": found.get(key) for key in ERROR_KEYS}
+        row |= {f"drift_{name}": value for name, value in cycle["drift"].items()}
+        row |= {f"sigma_{name}": value for name, value in cycle["sigma"].items()}
+        rows.append({"bag": bag["bag"], **row, "reason": cycle["verdict"]["reason"]})
+    return _csv(rows, CYCLE)
 
 
 def thermal_cycles(bags: Sequence[Document]) -> list[tuple[Document, Document]]:
@@ -139,35 +153,14 @@ def thermal_cycles(bags: Sequence[Document]) -> list[tuple[Document, Document]]:
     ]
 
 
-def _cycle(bag: Document, cycle: Document) -> Document:
-    row = {name: cycle[name] for name in ("cycle", "stamp", "hours", "samples")}
-    row |= {"code": cycle["verdict"]["code"], "revision": cycle["revision"]}
-    for name in ("nominal", "in_force", "candidate"):
-        row[f"{name}_rms_mm"] = cycle[name]["rms_mm"]
-    row |= {
-        "predicted_rms_mm": cycle["predicted_rms_mm"],
-        "bound_mm": (cycle["forecast"] or {}).get("bound_mm"),
-    }
-    for judge in ("measured", "true"):
-        for name in ERRORS:
-            found = (cycle[judge] or {}).get(name) or {}
-            row |= {f"{judge}_{name}_{key}": found.get(key) for key in ERROR_KEYS}
-    row |= {f"drift_{name}": value for name, value in cycle["drift"].items()}
-    row |= {f"sigma_{name}": value for name, value in cycle["sigma"].items()}
-    return {"bag": bag["bag"], **row, "reason": cycle["verdict"]["reason"]}
-
-
 def decisions_table(bags: Sequence[Document]) -> str:
     """Every decision as CSV."""
-    return _csv(
-        [
-            {"bag": bag["bag"], "node": node, **decision}
-            for bag in bags
-            for node, decisions in _decided(bag)
-            for decision in decisions
-        ],
-        DECISION,
-    )
+    rows = []
+    for bag in bags:
+        sessions = [(session["node"], session["decisions"]) for session in bag.get("sessions", [])]
+        for node, decisions in [*sessions, *bag.get("other_decisions", {}).items()]:
+            rows += [{"bag": bag["bag"], "node": node, **decision} for decision in decisions]
+    return _csv(rows, DECISION)
 
 
 def hours_table(bags: Sequence[Document]) -> str:
@@ -183,32 +176,19 @@ def hours_table(bags: Sequence[Document]) -> str:
     )
 
 
-def _decided(bag: Document) -> list[tuple[str | None, Sequence[Document]]]:
-    """Each node of a bag with its decisions."""
-    sessions = [(session["node"], session["decisions"]) for session in bag.get("sessions", [])]
-    return [*sessions, *bag.get("other_decisions", {}).items()]
-
-
 def _csv(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
     """``first``: columns that a table without rows has too."""
     columns = list(dict.fromkeys((*first, *(name for row in rows for name in row))))
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows([{name: _cell(row.get(name)) for name in columns} for row in rows])
+    for row in rows:
+        cells = {name: row.get(name) for name in columns}
+        for name, value in cells.items():
+            if isinstance(value, float) and abs(value) < 1e6:
+                cells[name] = f"{value:.9g}"
+        writer.writerow(cells)
     return stream.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    return f"{value:.9g}" if isinstance(value, float) and abs(value) < 1e6 else value
-
-
-# ---- errors of a tool over a shift, and what they come to ---------------------------------------
-
-
-Array = NDArray[np.float64]
-
-TOLERANCE_MM = 0.1
 
 
 @dataclass(frozen=True, eq=False)
