@@ -5,7 +5,7 @@ beam's middle is that of a point from such outlines. Nothing of the estimators' 
 used, so that a mistake there cannot hide.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.cell_sim.robot import Draws, Stream
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge
+from robocal_ros.tool.edges import BEAMS, BeamEdge
 from robocal_ros.tool.laser_frame import LaserFrame
 
 Array = NDArray[np.float64]
@@ -188,15 +188,23 @@ class BeamStation:
         """Edges while the flange moves by ``poses`` (times -> T_base_flange), as reported."""
         shift = np.zeros((4, 4))
         shift[:3, 3] = self.noise.step_m * rng.standard_normal(3)
+        source = self.input
+        spread_s = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
+        sigma_s = max(float(spread_s), FINEST_S)
         found: list[BeamEdge] = []
         for name, beam in zip(BEAMS, self.beams, strict=True):
             time, blocked = crossings(
                 beam, tool, lambda t: poses(t) + shift, window, self.noise.edge_m, rng
             )
-            stamps = reported(time, self.input, rng)
+            stamps = reported(time, source, rng)
             for stamp, dark in zip(stamps.tolist(), blocked.tolist(), strict=True):
-                if rng.random() >= self.input.lost_share:
-                    found += _bounced(name, dark, stamp, self.input, rng)
+                if rng.random() < source.lost_share:
+                    continue
+                found.append(BeamEdge(name, dark, stamp, sigma_s))
+                if source.bounce_s > 0.0:
+                    again, last = sorted((stamp + source.bounce_s * rng.random(2)).tolist())
+                    found.append(BeamEdge(name, not dark, again, sigma_s))
+                    found.append(BeamEdge(name, dark, last, sigma_s))
         return sorted(found, key=lambda e: e.time_s)
 
 
@@ -238,20 +246,6 @@ def reported(time: ArrayLike, source: TrueInput, rng: np.random.Generator) -> Ar
     return np.asarray(late)
 
 
-def _bounced(
-    beam: Beam, blocked: bool, stamp: float, source: TrueInput, rng: np.random.Generator
-) -> Sequence[BeamEdge]:
-    spread = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
-    sigma = max(float(spread), FINEST_S)
-    times = [stamp]
-    if source.bounce_s > 0.0:
-        times += sorted((stamp + source.bounce_s * rng.random(2)).tolist())
-    return [
-        BeamEdge(beam, blocked if i % 2 == 0 else not blocked, t, sigma)
-        for i, t in enumerate(times)
-    ]
-
-
 def beams_of(
     T_base_laser: Array, beam_angle_rad: float, gap_m: float = 0.0, length: float = 0.1
 ) -> tuple[TrueBeam, TrueBeam]:
@@ -285,9 +279,6 @@ def on_one_clock(station: BeamStation, phase: float) -> BeamStation:
     )
 
 
-# ---- the edges at a beam station while a robot moves, found only where there can be any ---------
-
-
 ROOM_M = 0.15  # beams, bends and the way within a tick
 DETOUR = 1.5  # a way within a tick is at most so much longer than the straight one
 SLACK_M = 1e-5
@@ -314,9 +305,13 @@ class BeamWatch:
         ``q`` (k, n): joints there; ``joints`` and ``flange``: joints (m, n) and true T_base_flange
         (m, 4, 4) at times (m,).
         """
-        first, last = self._near(station, tool, q)
-        if last - first < 1:
+        middle = np.array([0.5 * (beam.start + beam.end) for beam in station.beams])
+        tip = (self._arm.fk(q) @ tool.T_flange_tool[:, 3])[:, :3]
+        away = np.min(np.linalg.norm(tip[:, None] - middle, axis=2), axis=1)
+        near = np.flatnonzero(away < np.max(tool.height) + ROOM_M)
+        if not len(near) or near[-1] == near[0]:
             return []
+        first, last = int(near[0]), int(near[-1])
         inside = slice(first, last + 1)
         T = flange(time_s[inside])
         found: list[BeamEdge] = []
@@ -327,15 +322,6 @@ class BeamWatch:
             rng = self._draws.of(Stream.EDGES, int(ticks[at]))
             found += station.edges(tool, poses, window, rng)
         return found
-
-    def _near(self, station: BeamStation, tool: RoundTool, q: Array) -> tuple[int, int]:
-        """First and last tick with the tool near the beams; last < first where there is none."""
-        middle = np.array([0.5 * (beam.start + beam.end) for beam in station.beams])
-        tip = (self._arm.fk(q) @ tool.T_flange_tool[:, 3])[:, :3]
-        away = np.min(np.linalg.norm(tip[:, None] - middle, axis=2), axis=1)
-        near = away < np.max(tool.height) + ROOM_M
-        places = np.flatnonzero(near)
-        return (int(places[0]), int(places[-1])) if len(places) else (0, -1)
 
     def _between(
         self, window: tuple[float, float], T: Array, joints: Callable[[Array], Array]
@@ -372,9 +358,7 @@ def _may_cross(station: BeamStation, tool: RoundTool, T: Array) -> NDArray[np.bo
     return may
 
 
-# ---- a beam station in front of a UR10: one for tests, bench and bags ---------------------------
-
-
+# A beam station in front of a UR10: one for tests, bench and bags.
 Q_NEAR = np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618])  # above the station
 BETA_RAD = float(np.radians(92.2))
 GAP_M = 5.8e-5

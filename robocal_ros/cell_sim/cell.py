@@ -195,9 +195,7 @@ def known_laser(
     return laser_points(replace(plan.station, beams=(x, y)), T_known_true @ T_base_laser, rng)
 
 
-# ---- a whole cell: KR 150, sphere sensor, beams, line laser -------------------------------------
-
-
+# A whole cell: KR 150, sphere sensor, beams, line laser.
 TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.40])  # the pin, longer than the ball's stem
 PIN_RADIUS_M = 2.5e-3
 T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.03, 0.01]), [1.25, 1.00, 0.60])
@@ -236,6 +234,8 @@ def kr150_cell(
     45 % of the tip's coordinates at the working poses stay within 0.1 mm.
     """
     arm = replace(nominal, T_flange_tool=TAUGHT)
+    target = ball_on_table(TARGET, TARGET_RADIUS_M)
+    line_laser = ProfileStation(ProfileSensor(), T_FLANGE_LASER, target, TARGET)
     robot = thermal_shift.true_robot(arm, np.random.default_rng([seed, 0]), effects)
     return CellPlan(
         robot=_as_published(robot, poses("work")),
@@ -247,7 +247,7 @@ def kr150_cell(
         reading_noise_rad=JITTER_RAD if robot.effects.noise else 0.0,
         heat=HeatPlan(thermal_shift.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(thermal_shift.sphere_sensor(effects), FLOOR, points=points),
-        profile=_line_laser() if profile else None,
+        profile=line_laser if profile else None,
         working=poses("work"),
         seed=seed,
     )
@@ -256,11 +256,6 @@ def kr150_cell(
 def worked_for(hours: float) -> Warmth:
     """As warm as the robot is after so long with its programme, from cold."""
     return thermal_shift.WARM_UP.step(Warmth.cold(len(DUTY)), DUTY, hours * HOUR_S)
-
-
-def _line_laser() -> ProfileStation:
-    scene = ball_on_table(TARGET, TARGET_RADIUS_M)
-    return ProfileStation(ProfileSensor(), T_FLANGE_LASER, scene, TARGET)
 
 
 def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:
@@ -273,9 +268,6 @@ def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:
         moved.append(np.abs(whole.point(working, state, p) - cold))
     factor = THRESHOLD_M / float(np.quantile(moved, UNCORRECTED))
     return replace(robot, motor_gain=factor * robot.motor_gain, link_gain=factor * robot.link_gain)
-
-
-# ---- what the simulated cell tells, each at its time --------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,32 +290,6 @@ class Happened:
     shots: list[SphereShot]
     profiles: list[ProfileShot]
     temperatures: list[Temperatures]
-
-
-@dataclass
-class Outbox:
-    """What waits until it is told."""
-
-    edges: list[BeamEdge] = field(default_factory=list)
-    shots: list[SphereShot] = field(default_factory=list)
-    profiles: list[ProfileShot] = field(default_factory=list)
-    temperatures: list[Temperatures] = field(default_factory=list)
-
-    def add_edge(self, edge: BeamEdge) -> None:
-        """An edge is told when its stamp has passed."""
-        insort(self.edges, edge, key=lambda e: e.time_s)
-
-    def told(self, now_s: float, time_s: Array, q: Array, qd: Array) -> Happened:
-        """Everything that is told by now, with joint readings."""
-        edges = [edge for edge in self.edges if edge.time_s <= now_s]
-        shots = [shot for shot in self.shots if shot.told_s <= now_s]
-        profiles = [shot for shot in self.profiles if shot.told_s <= now_s]
-        del self.edges[: len(edges)], self.shots[: len(shots)], self.profiles[: len(profiles)]
-        temperatures, self.temperatures = self.temperatures, []
-        return Happened(time_s, q, qd, edges, shots, profiles, temperatures)
-
-
-# ---- samples that sessions take -----------------------------------------------------------------
 
 
 Sample = JointSample | PointSample | TemperatureSample | EdgeSample
@@ -369,8 +335,17 @@ class CellSamples:
         samples += [
             EdgeSample(self.ns(e.time_s), station, e.beam, e.blocked, e.sigma_s) for e in came.edges
         ]
+        frame = self._frame
         for shot in came.shots:
-            samples += self._spheres(shot)
+            at = self.ns(shot.time_s)
+            floor = PointSample(at, frame, "floor", shot.floor, REFERENCE_SPHERE)
+            if len(shot.points):
+                fit = fit_sphere(shot.points.astype(np.float32).astype(np.float64), self._rule)
+                sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
+                ball = PointSample(at, frame, "ball", fit.centre, SPHERE_CLOUD, sigma_m)
+            else:
+                ball = PointSample(at, frame, "ball", shot.centre, MEASURED_POINT)
+            samples += [ball, floor]
         for told in came.temperatures:
             at = self.ns(told.time_s)
             samples += [
@@ -436,7 +411,10 @@ class SimulatedCell:
         self._hand, self._drawn = np.zeros(3), np.zeros(3 + plan.arm.n)
         self._ticks = self._motions = 0
         self._way = np.zeros((BEAT, plan.arm.n))
-        self._out = Outbox()
+        self._edges: list[BeamEdge] = []  # what waits until it is told
+        self._shots: list[SphereShot] = []
+        self._profiles: list[ProfileShot] = []
+        self._temperatures: list[Temperatures] = []
         # What it loads at its first use shall not stop a motion.
         self._see_edges(np.arange(2), np.array([0.0, TICK_S]), np.tile(plan.q_start, (2, 1)))
 
@@ -459,8 +437,6 @@ class SimulatedCell:
     def warmth(self) -> Warmth:
         """The robot's."""
         return self.heating.warmth if self.heating else Warmth.cold(self.plan.arm.n)
-
-    # ---- what is told to it ---------------------------------------------------------------------
 
     def set_fault(self, fault: AnyFault, size: float = 0.0) -> None:
         """Let something go wrong, in place of what went wrong before; "none" ends all at once.
@@ -519,24 +495,26 @@ class SimulatedCell:
         self.follow(self.now_s + time, q, qd)
         return replace(move, start_s=self.now_s + move.start_s)
 
-    # ---- time -----------------------------------------------------------------------------------
-
     def advance(self, to_s: float, readings: bool = True) -> Happened:
         """Let time pass, in whole ticks, up to ``to_s``.
 
         Without ``readings`` no joints are read: a long stretch of work takes less time.
         """
         last = int(np.floor(to_s / TICK_S * (1.0 + 1e-12)))
-        read = [self._read(readings)]
-        while self._ticks < last:
+        read = []
+        while True:
+            number = self._readings.due(self.now_s)
+            read.append(self._readings.read(number if readings else number[:0], self.motion))
+            if self._ticks >= last:
+                break
             self._pass(min(last, (self._ticks // BEAT + 1) * BEAT))
-            read.append(self._read(readings))
-        joints = [np.concatenate(parts) for parts in zip(*read, strict=True)]
-        return self._out.told(self.now_s, *joints)
-
-    def _read(self, readings: bool) -> tuple[Array, Array, Array]:
-        number = self._readings.due(self.now_s)
-        return self._readings.read(number if readings else number[:0], self.motion)
+        time_s, q, qd = (np.concatenate(parts) for parts in zip(*read, strict=True))
+        now_s, temperatures, self._temperatures = self.now_s, self._temperatures, []
+        edges = [edge for edge in self._edges if edge.time_s <= now_s]
+        shots = [shot for shot in self._shots if shot.told_s <= now_s]
+        profiles = [shot for shot in self._profiles if shot.told_s <= now_s]
+        del self._edges[: len(edges)], self._shots[: len(shots)], self._profiles[: len(profiles)]
+        return Happened(time_s, q, qd, edges, shots, profiles, temperatures)
 
     def flange(self, time_s: Array) -> Array:
         """True T_base_flange (m, 4, 4) at times (m,), the robot as warm as it is now."""
@@ -571,21 +549,40 @@ class SimulatedCell:
         q = self.motion.joints(time)
         way = np.abs(np.diff(q, axis=0))
         departed, stood = self._standing.look(now, np.max(way, axis=1) > STILL)
-        for tick in departed.tolist():
-            self._depart(tick)
+        for tick in departed.tolist():  # it moves after a rest: another scatter
+            robot, noise = self.plan.robot, self.plan.station.noise.step_m
+            in_joints = robot.repeatability if robot.effects.noise else 0.0
+            drawn = self._draws.of(Stream.SCATTER, tick).standard_normal(3 + self.plan.arm.n)
+            self._drawn = np.append(noise * drawn[:3], in_joints * drawn[3:])
+            offset = np.append(self._drawn[:3] + self._hand, self._drawn[3:])
+            self._scatter.begin(tick * TICK_S, offset)
         if not np.all(stood) or self._scatter.settled_s > time[0]:
             self._see_edges(ticks, time, q)
-        if self.plan.sphere:
-            self._see_sphere(self.plan.sphere, ticks[1:], q[1:], stood)
-        if self.plan.profile:
-            self._see_profile(self.plan.profile, ticks[1:], q[1:], stood)
+        self._measure(ticks[1:], q[1:], stood)
         begin = now % BEAT
         self._way[begin : begin + len(way)] = way
         self._ticks = stop
         if stop % BEAT == 0 and self.heating:
             self.heating.step(np.sum(self._way, axis=0), BEAT * TICK_S)
             swapped = "swapped_temperatures" in self.faults
-            self._out.temperatures.append(self.heating.tell(self.now_s, stop // BEAT, swapped))
+            self._temperatures.append(self.heating.tell(self.now_s, stop // BEAT, swapped))
+
+    def _measure(self, ticks: Index, q: Array, stood: Index) -> None:
+        """Measure sphere and target where the robot has ``stood`` still for so many ticks."""
+        arm, sphere, profile = self.plan.arm, self.plan.sphere, self.plan.profile
+        if sphere is not None:
+            for tick in standstills(sphere, arm, ticks, q, stood):
+                at_s = tick * TICK_S
+                T = self.flange(np.array([at_s]))[0]
+                if sphere.sees(T):
+                    rise = float(self.warmth.link[-1])
+                    shot = sphere.shoot(T, rise, tick, at_s, self.faults, self._draws)
+                    self._shots += [] if shot is None else [shot]
+        if profile is not None:
+            for tick in standstills(profile, arm, ticks, q, stood):
+                at_s = tick * TICK_S
+                view = profile.shoot(self.flange(np.array([at_s]))[0], tick, at_s, self._draws)
+                self._profiles += [] if view is None else [view]
 
     def _see_edges(self, ticks: Index, time_s: Array, q: Array) -> None:
         station = self.faults.station(self._station)
@@ -596,27 +593,7 @@ class SimulatedCell:
         for edge in self._input.passed(found):
             place = round(edge.time_s * 1e9)
             if not lost or self._draws.of(Stream.LOST_EDGES, place).random() >= lost:
-                self._out.add_edge(edge)
-
-    def _see_sphere(self, sphere: SphereStation, ticks: Index, q: Array, stood: Index) -> None:
-        """Measure the ball where the robot has ``stood`` still for so many ticks."""
-        for tick in standstills(sphere, self.plan.arm, ticks, q, stood):
-            T = self.flange(np.array([tick * TICK_S]))[0]
-            if sphere.sees(T):
-                rise = float(self.warmth.link[-1])
-                shot = sphere.shoot(T, rise, tick, tick * TICK_S, self.faults, self._draws)
-                if shot is not None:
-                    self._out.shots.append(shot)
-
-    def _see_profile(self, profile: ProfileStation, ticks: Index, q: Array, stood: Index) -> None:
-        """Look at the target with the robot's own sensor."""
-        for tick in standstills(profile, self.plan.arm, ticks, q, stood):
-            T = self.flange(np.array([tick * TICK_S]))[0]
-            shot = profile.shoot(T, tick, tick * TICK_S, self._draws)
-            if shot is not None:
-                self._out.profiles.append(shot)
-
-    # ---- what changes ---------------------------------------------------------------------------
+                insort(self._edges, edge, key=lambda e: e.time_s)
 
     def _begin(self) -> None:
         """A motion is told: the tool, the fault and the hand that wait for it."""
@@ -628,20 +605,8 @@ class SimulatedCell:
         self._motions += 1
         if not np.array_equal(self._hand, self.faults.hand):
             self._hand = self.faults.hand
-            self._scatter.begin(self.now_s, self._offset)
-
-    def _depart(self, tick: int) -> None:
-        """The robot moves after a rest: another scatter."""
-        rng, noise = self._draws.of(Stream.SCATTER, tick), self.plan.station.noise.step_m
-        robot = self.plan.robot
-        in_joints = robot.repeatability if robot.effects.noise else 0.0
-        drawn = rng.standard_normal(3 + self.plan.arm.n)
-        self._drawn = np.append(noise * drawn[:3], in_joints * drawn[3:])
-        self._scatter.begin(tick * TICK_S, self._offset)
-
-    @property
-    def _offset(self) -> Array:
-        return np.append(self._drawn[:3] + self._hand, self._drawn[3:])
+            offset = np.append(self._drawn[:3] + self._hand, self._drawn[3:])
+            self._scatter.begin(self.now_s, offset)
 
     def _replace_fault(self, fault: AnyFault, size: float) -> None:
         sizes = self.faults.sizes

@@ -20,7 +20,7 @@ from robocal_ros.cell_sim.trajectory_controller import (
 )
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.tool.edges import Beam, BeamEdge
+from robocal_ros.tool.edges import BeamEdge
 
 Array = NDArray[np.float64]
 
@@ -183,11 +183,6 @@ class Faults:
         return frames.transform(frames.exp_rotation(size * TURN_RAD_PER_M * TURN), size * KNOCK)
 
     @property
-    def ball_shift(self) -> Array:
-        """How far (3,) the sphere sits from its place, flange axes, m."""
-        return self.size("sphere_knocked") * BALL_KNOCK
-
-    @property
     def hand(self) -> Array:
         """How far (3,) a hand moves the flange, base, m."""
         return self.size("moved_by_hand") * HAND
@@ -244,40 +239,28 @@ class FaultyInput:
 
     def passed(self, edges: Sequence[BeamEdge]) -> list[BeamEdge]:
         """What comes through of edges, in order of time."""
-        out: list[BeamEdge] = []
-        for edge in edges:
-            out += self._passed(edge)
+        faults, out = self._faults, []
+        for given in edges:
+            edge, is_y = given, given.beam == "y"
+            if "beams_dead" in faults or f"beam_{edge.beam}_dead" in faults.sizes:
+                continue
+            self._seen += is_y
+            second = is_y and self._seen == 2
+            if second and "lost_edge" in faults:
+                continue
+            edge = replace(edge, time_s=edge.time_s + faults.size("input_latency"))
+            if "swapped_cables" in faults:
+                edge = replace(edge, beam="x" if is_y else "y")
+            out.append(edge)
+            if "chatter" in faults:  # a burst that does not settle within any debounce time
+                times = edge.time_s + np.linspace(0.0, CHATTER_S, CHATTER)
+                out[-1:] = [
+                    replace(edge, blocked=edge.blocked ^ bool(i % 2), time_s=t)
+                    for i, t in enumerate(times.tolist())
+                ]
+            elif second and "double_edge" in faults:
+                out.append(replace(edge, time_s=edge.time_s + AGAIN_S))
         return out
-
-    def _passed(self, edge: BeamEdge) -> list[BeamEdge]:
-        faults = self._faults
-        if "beams_dead" in faults or f"beam_{edge.beam}_dead" in faults.sizes:
-            return []
-        self._seen += edge.beam == "y"
-        second = edge.beam == "y" and self._seen == 2
-        if second and "lost_edge" in faults:
-            return []
-        edge = replace(edge, time_s=edge.time_s + faults.size("input_latency"))
-        if "swapped_cables" in faults:
-            other: Beam = "y" if edge.beam == "x" else "x"
-            edge = replace(edge, beam=other)
-        if "chatter" in faults:
-            return _chattered(edge)
-        if second and "double_edge" in faults:
-            return [edge, replace(edge, time_s=edge.time_s + AGAIN_S)]
-        return [edge]
-
-
-def _chattered(edge: BeamEdge) -> list[BeamEdge]:
-    """A burst that does not settle within any debounce time."""
-    times = edge.time_s + np.linspace(0.0, CHATTER_S, CHATTER)
-    return [
-        replace(edge, blocked=edge.blocked ^ bool(i % 2), time_s=t)
-        for i, t in enumerate(times.tolist())
-    ]
-
-
-# ---- what comes between commands and controller -------------------------------------------------
 
 
 class CommandGate:
@@ -364,9 +347,6 @@ class CommandGate:
         return False
 
 
-# ---- joint readings at their own rate, and what faults make of them -----------------------------
-
-
 PAGE = 128  # readings whose random numbers belong together
 KEPT_PAGES = 4
 
@@ -391,39 +371,30 @@ class JointReadings:
 
     def read(self, number: NDArray[np.int64], motion: JointMotion) -> tuple[Array, Array, Array]:
         """Stamps (k,), joints and velocities (k, n) of what is told of these readings."""
-        time = number / self._rate
+        time, faults = number / self._rate, self._faults
         q, qd = motion.at(time)
         if self._noise > 0.0:
             noise = self._paged(Stream.READINGS, number, self._n)
             q = np.round((q + self._noise * noise) / COUNT_RAD) * COUNT_RAD
-        self._freeze(q, qd)
-        told = self._told(number)
-        return self._stamps(time)[told], q[told], qd[told]
-
-    def _told(self, number: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which readings get through."""
-        faults = self._faults
-        if "lost_messages" in faults:
-            chance = self._paged(Stream.LOST_READINGS, number, 1, uniform=True)[:, 0]
-            return np.asarray(chance >= faults.size("lost_messages"))
-        return np.full(len(number), "joints_silent" not in faults)
-
-    def _stamps(self, time_s: Array) -> Array:
-        if "frozen_clock" in self._faults:
-            return np.full(len(time_s), self._stamp_s)
-        if len(time_s):
-            self._stamp_s = float(time_s[-1])
-        return time_s + self._faults.size("clock_jump")
-
-    def _freeze(self, q: Array, qd: Array) -> None:
-        """One encoder shows what it showed when the fault began."""
-        joint = min(int(self._faults.size("frozen_encoder")), self._n) - 1
+        joint = min(int(faults.size("frozen_encoder")), self._n) - 1
         if joint < 0:
             self._stuck = None
-        elif len(q):
+        elif len(q):  # one encoder shows what it showed when the fault began
             if self._stuck is None:
                 self._stuck = float(q[0, joint])
             q[:, joint], qd[:, joint] = self._stuck, 0.0
+        if "lost_messages" in faults:
+            chance = self._paged(Stream.LOST_READINGS, number, 1, uniform=True)[:, 0]
+            kept = np.asarray(chance >= faults.size("lost_messages"))
+        else:
+            kept = np.full(len(number), "joints_silent" not in faults)
+        if "frozen_clock" in faults:
+            stamps = np.full(len(time), self._stamp_s)
+        else:
+            if len(time):
+                self._stamp_s = float(time[-1])
+            stamps = time + faults.size("clock_jump")
+        return stamps[kept], q[kept], qd[kept]
 
     def _paged(
         self, stream: Stream, number: NDArray[np.int64], width: int, uniform: bool = False

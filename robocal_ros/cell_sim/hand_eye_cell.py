@@ -93,14 +93,7 @@ class ArmRobot:
     def stand(self, T_base_flange: Array, rng: np.random.Generator) -> Standstill:
         """See `Robot`."""
         cold = Warmth.cold(self.nominal.n)
-        q = self._reach(T_base_flange)
-        there = self.true.flange(q, cold)[0]
-        wanted = self.nominal.fk(q) @ frames.invert(there) @ T_base_flange
-        q = inverse(self.nominal, wanted[None], q)[0]
-        return Standstill(self.true.flange(q, cold, rng)[0], self.nominal.fk(q), q)
-
-    def _reach(self, T_base_flange: Array) -> Array:
-        """Joints (n,) at a pose of the nominal model, by way of poses between."""
+        # By way of poses between: inverse kinematics begin near each.
         start = self.nominal.fk(self.q_near)
         turned = frames.log_rotation(start[:3, :3].T @ T_base_flange[:3, :3])
         moved = T_base_flange[:3, 3] - start[:3, 3]
@@ -109,7 +102,11 @@ class ArmRobot:
         way = frames.transform(
             start[:3, :3] @ frames.exp_rotation(share * turned), start[:3, 3] + share * moved
         )
-        return np.asarray(inverse(self.nominal, way, self.q_near)[-1])
+        q = inverse(self.nominal, way, self.q_near)[-1]
+        there = self.true.flange(q, cold)[0]
+        wanted = self.nominal.fk(q) @ frames.invert(there) @ T_base_flange
+        q = inverse(self.nominal, wanted[None], q)[0]
+        return Standstill(self.true.flange(q, cold, rng)[0], self.nominal.fk(q), q)
 
 
 class WantedView(NamedTuple):
@@ -208,9 +205,6 @@ def _turns(angles_rad: ArrayLike) -> Array:
     return np.asarray((turn(0, x) @ turn(1, y) @ turn(2, z))[0, :3, :3])
 
 
-# ---- simulated sets of shots of a sphere, of stairs, of an edge and of a groove -----------------
-
-
 DOWN = np.diag([1.0, -1.0, -1.0])  # R_base_sensor of a sensor that looks down on the table
 FREE_M = 2e-3  # of the measuring range stays free at either end
 ASIDE_M = 5e-3  # how far the target lies beside the middle of the profile
@@ -239,7 +233,7 @@ def sphere_shots(
             for sign in signs:
                 y = sign * radius_m * rng.uniform(*OFF_CENTRE)
                 nearest = _distance(cell, rng, 0.5 * radius_m)
-                p = [_aside(rng), y, nearest + np.sqrt(radius_m**2 - y**2)]
+                p = [rng.uniform(-ASIDE_M, ASIDE_M), y, nearest + np.sqrt(radius_m**2 - y**2)]
                 turns = _random_turns(cell, rng, cell.roll_rad)
                 yield WantedView(view(DOWN, turns, centre, p))
 
@@ -305,7 +299,7 @@ def step_shots(
                 about_z = 2.0 * aim_m / target.extent_m * rng.standard_normal()
                 turns = [about_x, rng.uniform(-along, along), about_z]
                 middle = 0.5 * (cell.sensor.near_m + cell.sensor.far_m) - 0.5 * saw
-                p = [_aside(rng), aim_m * rng.standard_normal(), middle]
+                p = [rng.uniform(-ASIDE_M, ASIDE_M), aim_m * rng.standard_normal(), middle]
                 yield WantedView(view(look, turns, target.middle(mark), p), mark)
 
     return cell.shoot(Scene((target.body,)), wanted(), count, rng)
@@ -349,7 +343,7 @@ def _line_shots(
             x = BLOCK_M * rng.uniform(0.3, 0.7)
             room = behind * (sensor.far_m - sensor.near_m)
             near = 0.0 if behind else GROOVE_DEPTH_M + ASIDE_M
-            p = [_aside(rng), 0.0, _distance(cell, rng, room, near)]
+            p = [rng.uniform(-ASIDE_M, ASIDE_M), 0.0, _distance(cell, rng, room, near)]
             turns = _random_turns(cell, rng, turned)
             yield WantedView(view(look, turns, T[:3, 3] + x * T[:3, 0], p))
 
@@ -374,10 +368,6 @@ def _look(T_base_user: Array, rise: float, run: float) -> Array:
 def _random_turns(cell: HandEyeCell, rng: np.random.Generator, roll_rad: float) -> Array:
     bounds = np.array([cell.tilt_rad, cell.tilt_rad, roll_rad])
     return bounds * rng.uniform(-1.0, 1.0, 3)
-
-
-def _aside(rng: np.random.Generator) -> float:
-    return float(rng.uniform(-ASIDE_M, ASIDE_M))
 
 
 def _distance(
@@ -553,16 +543,3 @@ def _rays(lens: TrueLens) -> tuple[Array, Array]:
         if np.abs(np.stack([ideal_x, ideal_y]) - last).max() < _SETTLED:
             return ideal_x, ideal_y
     raise ValueError(f"the distortion of {lens} cannot be undone")
-
-
-def moving_flange(time_s: Array) -> TruePose:
-    """A smooth motion that turns about all axes, and stands for a moment now and then."""
-    t = time_s + 0.3 * np.sin(1.3 * time_s)
-    turn = np.column_stack(
-        [0.4 * np.sin(0.9 * t), 0.5 * np.sin(0.7 * t + 1.0), 0.8 * np.sin(0.5 * t + 2.0)]
-    )
-    place = np.column_stack(
-        [0.5 + 0.1 * np.sin(0.8 * t), 0.1 * np.sin(1.1 * t), 0.4 + 0.05 * np.sin(0.6 * t)]
-    )
-    start = Rotation.from_rotvec([np.pi - 0.2, 0.0, 0.0])
-    return TruePose(start * Rotation.from_rotvec(turn), place)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.robot import shift, turn
 from robocal_ros.cell_sim.sensors import Ball, ProfileSensor, ScannedBody, Scene, block
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.shots import Profile, profile_of
+from robocal_ros.hand_eye.shots import profile_of
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.inverse import inverse
@@ -103,18 +103,6 @@ class TrackerCell:
         ball = Ball(self.centre, self.sizes.target.sphere_radius_m)
         return Scene((block(self.T_base_cube, CUBE_M, CUBE_M, CUBE_M), ball, *self.around))
 
-    def face_points(self) -> tuple[Array, Array]:
-        """Centres (9, 3) of the reflector while it touches the face z = 0, and y = 0; base, m."""
-        a, b = (0.5 * CUBE_M + grid.ravel() for grid in np.meshgrid(GRID, GRID))
-        off = np.full(len(a), self.sizes.target.reflector_radius_m)
-        R, t = self.T_base_cube[:3, :3], self.T_base_cube[:3, 3]
-        return np.column_stack([a, b, off]) @ R.T + t, np.column_stack([a, -off, -b]) @ R.T + t
-
-    def reflector_points(self, q: Array) -> Array:
-        """Places (n, 3) of the reflector at true joint values, base, m."""
-        T = true_flange(self.arm, q)
-        return np.asarray(T[:, :3, :3] @ self.reflector + T[:, :3, 3])
-
     @cached_property
     def exact(self) -> TrackerData:
         """Everything without noise."""
@@ -125,10 +113,16 @@ class TrackerCell:
         lit = [i for i, xz in enumerate(shots) if np.sum(np.isfinite(xz[:, 0])) >= FEWEST_LIT]
         names = ("arc_a", "arc_b")
         arcs = [
-            Arc(name, q, self._seen(self.reflector_points(q)))
+            Arc(name, q, self._seen(T_flange[:, :3, :3] @ self.reflector + T_flange[:, :3, 3]))
             for name, q in zip(names, self.arcs, strict=True)
+            for T_flange in [true_flange(self.arm, q)]
         ]
-        first, second = self.face_points()
+        # Centres (9, 3) of the reflector while it touches the face z = 0, and y = 0; base.
+        a, b = (0.5 * CUBE_M + grid.ravel() for grid in np.meshgrid(GRID, GRID))
+        off = np.full(len(a), self.sizes.target.reflector_radius_m)
+        R, t = self.T_base_cube[:3, :3], self.T_base_cube[:3, 3]
+        first = np.column_stack([a, b, off]) @ R.T + t
+        second = np.column_stack([a, -off, -b]) @ R.T + t
         return TrackerData(
             arm=self.arm,
             arcs=(arcs[0], arcs[1]),
@@ -183,9 +177,6 @@ class TrackerCell:
         return q + np.where(moves, sigma, 0.0) * rng.standard_normal(q.shape)
 
 
-# ---- ready-made cells ---------------------------------------------------------------------------
-
-
 PRP_SENSOR = frames.transform(  # about as the source found it
     frames.exp_rotation(np.radians(89.87) * np.array([1.0, 0.0018, 0.0002])),
     [0.0571, 0.4474, 0.0493],
@@ -234,33 +225,3 @@ def one_joint(q: Array, joint: int, values: Array) -> Array:
     found = np.tile(q, (len(values), 1))
     found[:, joint] = values
     return found
-
-
-def prp_sphere_shots(
-    arm: SerialArm, rng: np.random.Generator, count: int = 15
-) -> tuple[Array, list[Profile]]:
-    """One sphere shot from ``count`` poses of the P-R-P arm, as the source's comparison does.
-
-    Its axes of slide 1 and of joint 2 are parallel, so the flange never tilts: where the sensor
-    sits along them cannot be seen.
-
-    Returns
-    -------
-    T_base_flange : (count, 4, 4) by the noisy joint readings, m.
-    profiles : of the sphere.
-    """
-    cell = prp_cell(arm)
-    radius = cell.sizes.target.sphere_radius_m
-    middle = true_flange(arm, PRP_STILL[None])[0] @ PRP_SENSOR
-    scene = Scene((Ball((middle @ [0.0, 0.0, 0.2, 1.0])[:3], radius),))
-    q: list[Array] = []
-    profiles: list[Profile] = []
-    while len(q) < count:
-        joints = PRP_STILL + rng.uniform(-1.0, 1.0, 3) * [0.008, np.radians(6.0), 0.02]
-        xz = cell.sensor.shoot(true_flange(arm, joints[None])[0] @ PRP_SENSOR, scene, rng)
-        if np.sum(np.isfinite(xz[:, 0])) > FEWEST_LIT:
-            q.append(joints)
-            profiles.append(profile_of(xz, f"s{len(q):02d}"))
-    noise = cell.sizes.noise
-    sigma = np.where(arm.prismatic, noise.joint_m, noise.joint_rad)
-    return arm.fk(np.array(q) + sigma * rng.standard_normal((count, 3))), profiles

@@ -39,11 +39,8 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import NS, header, transform_message
 from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 from robocal_ros.thermal.screening import THRESHOLD_M
-from robocal_ros.tool.edges import BeamEdge, StepKind
+from robocal_ros.tool.edges import StepKind
 from robocal_ros.tool.run import PlannedStep
-
-# ---- what the simulated cell reads and says, as messages: pure mapping --------------------------
-
 
 Array = NDArray[np.float64]
 
@@ -149,16 +146,6 @@ def tolerances_of(
     return Tolerances(path, end, resolved(own.goal_time_s, over_s))
 
 
-def beam_event(edge: BeamEdge, stamp_ns: int, station: str) -> BeamEvent:
-    """An edge as its input tells it."""
-    return BeamEvent(
-        header=header(stamp_ns, station),
-        beam=edge.beam,
-        edge=BeamEvent.BREAK if edge.blocked else BeamEvent.RESTORE,
-        stamp_sigma_s=edge.sigma_s,
-    )
-
-
 def joint_state(
     names: tuple[str, ...], stamp_ns: int, q: Array, qd: Array | None, missing: int = 0
 ) -> JointState:
@@ -214,14 +201,6 @@ def profile(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
     message = cloud(stamp_ns, frame, np.column_stack([x, np.zeros_like(x), z]))
     message.is_dense = bool(np.all(np.isfinite(points)))
     return message
-
-
-def temperature(stamp_ns: int, joint: str, celsius: float) -> Temperature:
-    """A motor's."""
-    return Temperature(header=header(stamp_ns, joint), temperature=celsius, variance=0.01)
-
-
-# ---- what the simulated cell tells the graph ----------------------------------------------------
 
 
 TRUTH_S = 1.0  # between two states of the truth
@@ -283,7 +262,13 @@ class CellOutputs:
             self._send("joint_states", joint_state(names, at, q, speed, missing))
         station = station_name(settings["station"], self._cell.faults)
         for edge in came.edges:
-            self._send("beam_events", beam_event(edge, stamp_ns(edge.time_s), station))
+            event = BeamEvent(
+                header=header(stamp_ns(edge.time_s), station),
+                beam=edge.beam,
+                edge=BeamEvent.BREAK if edge.blocked else BeamEvent.RESTORE,
+                stamp_sigma_s=edge.sigma_s,
+            )
+            self._send("beam_events", event)
         ball, floor = f"{settings['sensor_frame']}/ball", f"{settings['sensor_frame']}/floor"
         for shot in came.shots:
             at = stamp_ns(shot.time_s)
@@ -297,7 +282,8 @@ class CellOutputs:
             self._send(PROFILE, profile(stamp_ns(view.time_s), frame, view.points))
         for told in came.temperatures:
             for name, celsius in zip(names, told.celsius.tolist(), strict=True):
-                message = temperature(stamp_ns(told.time_s), name, celsius)
+                stamp = header(stamp_ns(told.time_s), name)
+                message = Temperature(header=stamp, temperature=celsius, variance=0.01)
                 self._send("motor_temperatures", message)
 
     def tell_truth(self, now_ns: int) -> None:
@@ -414,8 +400,6 @@ class SimulatedController:
         """Take the action down, while nothing spins."""
         self._server.destroy()
 
-    # ---- commands -------------------------------------------------------------------------------
-
     def _follow(self, message: Any) -> None:
         cell = self._ready()
         try:
@@ -466,14 +450,20 @@ class SimulatedController:
         self._tick()
         return self._cell
 
-    # ---- what is told ---------------------------------------------------------------------------
-
     def monitor(self) -> None:
         """End the goals that are over; tell the others where they are."""
         for handle, goal in list(self._goals):
             if goal.state is GoalState.EXECUTING:
                 if self._cell is not None and self._cell.motion.controller.active is goal:
-                    handle.publish_feedback(self._feedback(self._cell))
+                    reference, actual, error, _ = self._points(self._cell)
+                    feedback = FollowJointTrajectory.Feedback(
+                        header=header(self._node.now_ns(), ""),
+                        joint_names=list(self._cell.motion.controller.names),
+                        desired=reference,
+                        actual=actual,
+                        error=error,
+                    )
+                    handle.publish_feedback(feedback)
                 continue
             if goal.state is GoalState.CANCELED and not handle.is_cancel_requested:
                 continue  # rclpy marks it after the callback
@@ -495,16 +485,6 @@ class SimulatedController:
             sides = self._points(self._cell)
             message.reference, message.feedback, message.error, message.output = sides
             self._state.publish(message)
-
-    def _feedback(self, cell: SimulatedCell) -> Any:
-        reference, feedback, error, _ = self._points(cell)
-        return FollowJointTrajectory.Feedback(
-            header=header(self._node.now_ns(), ""),
-            joint_names=list(cell.motion.controller.names),
-            desired=reference,
-            actual=feedback,
-            error=error,
-        )
 
     def _points(self, cell: SimulatedCell) -> tuple[JointTrajectoryPoint, ...]:
         """Where the joints should be, are, the error, and what was sent."""

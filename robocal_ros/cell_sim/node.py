@@ -238,11 +238,6 @@ def laser_pose(settings: Mapping[str, Any]) -> Array:
     return frames.transform(R, np.array(settings["laser_xyz_mm"]) * MM)
 
 
-def at_station(settings: Mapping[str, Any], plan: CellPlan) -> Array:
-    """Joints (n,) with which the robot stands above the beams."""
-    return poses("tool")[0] if settings["cell"] == "kr150" else plan.q_start
-
-
 def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
     """The cell that the parameters describe.
 
@@ -292,23 +287,20 @@ def _tool_cell(settings: Mapping[str, Any]) -> CellPlan:
     gap_m, angle = settings["beam_gap_mm"] * MM, float(np.radians(settings["beam_angle_deg"]))
     noise = TrueNoise(settings["repeatability_mm"] * MM, settings["edge_noise_mm"] * MM)
     rng = np.random.default_rng([settings["seed"], 1])
+    T, radius = arm.T_flange_tool, settings["tool_radius_mm"] * MM
+    if settings["tool"] == "cone":
+        tool = RoundTool.cone(T, radius, TAPER)
+    elif settings["tool"] == "torch":
+        tool = RoundTool.torch(T, radius, radius + NOZZLE_M)
+    else:
+        tool = RoundTool.cylinder(T, radius)
     return CellPlan(
         robot=rigid_robot(arm, settings["arm_error_mm"] * MM, rng),
         station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), noise=noise),
-        tool=_tool(settings, arm.T_flange_tool),
+        tool=tool,
         q_start=np.where(arm.prismatic, given * MM, np.radians(given)),
         fastest=np.nan_to_num(load_description(settings["robot"]).max_velocity, nan=np.inf),
     )
-
-
-def _tool(settings: Mapping[str, Any], T: Array) -> RoundTool:
-    """The straight tool."""
-    radius = settings["tool_radius_mm"] * MM
-    if settings["tool"] == "cone":
-        return RoundTool.cone(T, radius, TAPER)
-    if settings["tool"] == "torch":
-        return RoundTool.torch(T, radius, radius + NOZZLE_M)
-    return RoundTool.cylinder(T, radius)
 
 
 BEHIND_S = 1.0  # a longer pause of the process, or a jump of its clock, is none of the cell's
@@ -337,7 +329,8 @@ class CellSimNode(HouseNode):
             self._cell.heating.warmth = worked_for(settings["warm_h"])
         if settings["laser_csv"]:
             rng = np.random.default_rng([settings["seed"], 2])
-            there = at_station(settings, plan)
+            # Above the beams.
+            there = poses("tool")[0] if settings["cell"] == "kr150" else plan.q_start
             points = known_laser(plan, laser_pose(settings), there, rng)
             rows = [
                 f"{name},{','.join(f'{1e3 * x:.6f}' for x in place)}\n"
@@ -388,8 +381,6 @@ class CellSimNode(HouseNode):
         if cell.heating:
             cell.heating.level = settings["warm_up"]
 
-    # ---- what comes in --------------------------------------------------------------------------
-
     def _judge(self, message: Any) -> None:
         """A trajectory of the programme: the truth tells what would come of it.
 
@@ -413,8 +404,6 @@ class CellSimNode(HouseNode):
             self._step = planned_step(message)
             self._driven = message.run, message.number
 
-    # ---- time -----------------------------------------------------------------------------------
-
     def _tick(self) -> None:
         cell, now_ns = self._cell, self.now_ns()
         if cell is None or now_ns <= 0:
@@ -423,7 +412,12 @@ class CellSimNode(HouseNode):
         if self._origin_ns is None or not 0 <= now_ns - self._origin_ns - cell_ns < BEHIND_S * 1e9:
             self._origin_ns = now_ns - cell_ns
         if self._step is not None and not cell.moving:
-            self._drive(cell, self._step)
+            step, self._step, self._refused = self._step, None, ""
+            try:
+                cell.drive(step)
+            except RobocalError as error:
+                self._refused = str(error)
+                self.get_logger().error(self._refused)
         faults = cell.motion.faults
         came = cell.advance((now_ns - self._origin_ns) * 1e-9)
         if cell.motion.faults > faults:
@@ -431,14 +425,6 @@ class CellSimNode(HouseNode):
         self._out.tell_truth(now_ns)
         self._out.tell(came, self._stamp_ns)
         self._controller.tell_state(self._stamp_ns(cell.now_s))
-
-    def _drive(self, cell: SimulatedCell, step: PlannedStep) -> None:
-        self._step, self._refused = None, ""
-        try:
-            cell.drive(step)
-        except RobocalError as error:
-            self._refused = str(error)
-            self.get_logger().error(self._refused)
 
     def _stamp_ns(self, time_s: float) -> int:
         return (self._origin_ns or 0) + round(time_s * 1e9)

@@ -12,9 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.kinematics import SerialArm
 
-# ---- thermal ------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 5.0
@@ -71,9 +68,6 @@ class WarmUp:
             link_goal = self.link_share * ends
             link = link_goal + keep_link * (link - link_goal)
         return Warmth(motor, link)
-
-
-# ---- robot --------------------------------------------------------------------------------------
 
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -240,9 +234,6 @@ def turn(axis: int, angle: Array) -> Array:
     return T
 
 
-# ---- draws --------------------------------------------------------------------------------------
-
-
 class Stream(IntEnum):
     """What random numbers are for."""
 
@@ -273,9 +264,6 @@ class Draws:
     def of(self, stream: Stream, place: int = 0) -> np.random.Generator:
         """A generator for a purpose at a place, such as a tick."""
         return np.random.default_rng([self._seed, stream, place])
-
-
-# ---- heating ------------------------------------------------------------------------------------
 
 
 ROUNDED_K = 0.1  # a temperature is told in such steps
@@ -331,9 +319,6 @@ class Heating:
         if swapped:
             celsius[[1, 2]] = celsius[[2, 1]]
         return Temperatures(time_s, np.round(celsius / ROUNDED_K) * ROUNDED_K)
-
-
-# ---- how far the robot is off this time: anew for each motion, reached smoothly -----------------
 
 
 SETTLE_S = 0.05  # another one is reached smoothly: the flange never jumps

@@ -11,13 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.cell_sim.faults import Faults
+from robocal_ros.cell_sim.faults import BALL_KNOCK, Faults
 from robocal_ros.cell_sim.robot import Draws, Effects, Stream
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.cell_setup import SensorField
-
-# ---- profile targets ----------------------------------------------------------------------------
-
 
 Array = NDArray[np.float64]
 
@@ -97,18 +94,10 @@ class Prism:
         """See `ScannedBody`."""
         R, t = self.T_base_user[:3, :3], self.T_base_user[:3, 3]
         p, d = (origin - t) @ R, direction @ R
-        best, normal = np.full(len(p), np.inf), np.zeros_like(p)
-        for distance, outward in [*self._sides(p, d), *self._ends(p, d)]:
-            nearer = distance < best
-            best = np.where(nearer, distance, best)
-            normal[nearer] = outward
-        return best, normal @ R.T
-
-    def _sides(self, p: Array, d: Array) -> list[tuple[Array, Array]]:
         found = []
-        following = np.roll(self.outline, -1, axis=0)
-        turn = np.sign(_area(self.outline))
-        for a, b in zip(self.outline, following, strict=True):
+        y, z = self.outline.T
+        turn = np.sign(float(np.sum(y * np.roll(z, -1) - np.roll(y, -1) * z)))  # of its signed area
+        for a, b in zip(self.outline, np.roll(self.outline, -1, axis=0), strict=True):
             side = b - a
             outward = turn * np.array([0.0, side[1], -side[0]]) / np.linalg.norm(side)
             distance = _plane(p, d, outward, np.array([0.0, *a]))
@@ -116,16 +105,17 @@ class Prism:
             share = ((y - a[0]) * side[0] + (z - a[1]) * side[1]) / (side @ side)
             inside = (x >= 0.0) & (x <= self.length_m) & (share >= 0.0) & (share <= 1.0)
             found.append((np.where(inside, distance, np.inf), outward))
-        return found
-
-    def _ends(self, p: Array, d: Array) -> list[tuple[Array, Array]]:
-        found = []
-        for x, sign in ((0.0, -1.0), (self.length_m, 1.0)):
+        for end, sign in ((0.0, -1.0), (self.length_m, 1.0)):
             outward = np.array([sign, 0.0, 0.0])
-            distance = _plane(p, d, outward, np.array([x, 0.0, 0.0]))
+            distance = _plane(p, d, outward, np.array([end, 0.0, 0.0]))
             inside = _inside(self.outline, _at(p, d, distance)[:, 1:])
             found.append((np.where(inside, distance, np.inf), outward))
-        return found
+        best, normal = np.full(len(p), np.inf), np.zeros_like(p)
+        for distance, outward in found:
+            nearer = distance < best
+            best = np.where(nearer, distance, best)
+            normal[nearer] = outward
+        return best, normal @ R.T
 
 
 @dataclass(frozen=True)
@@ -207,12 +197,6 @@ def _plane(p: Array, d: Array, normal: Array, point: Array) -> Array:
     return np.where(np.isfinite(t) & (t > AWAY_M), t, np.inf)
 
 
-def _area(outline: Array) -> float:
-    """Twice the signed area of a polygon."""
-    y, z = outline.T
-    return float(np.sum(y * np.roll(z, -1) - np.roll(y, -1) * z))
-
-
 def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
     """Whether points (n, 2) are in a polygon, by the parity of a ray's crossings."""
     odd = np.zeros(len(points), dtype=bool)
@@ -222,9 +206,6 @@ def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
             crosses = (a[1] > z) != (b[1] > z)
             odd ^= crosses & (y < a[0] + (z - a[1]) * (b[0] - a[0]) / (b[1] - a[1]))
     return odd
-
-
-# ---- profile sensor -----------------------------------------------------------------------------
 
 
 Mask = NDArray[np.bool_]
@@ -279,7 +260,12 @@ class ProfileSensor:
         xz = ((spot - origin) @ R)[:, ::2]
         xz[~seen] = np.nan
         if self.ghosts > 0.0:
-            second = self._mirrored(scene, spot, rays, normal, camera)
+            # Where mirrored light falls and the camera sees it.
+            back = rays - 2.0 * np.sum(rays * normal, axis=1)[:, None] * normal
+            distance, outward = scene.meet(spot, back)
+            met = np.isfinite(distance)
+            second = spot + np.where(met, distance, 0.0)[:, None] * back
+            second[~(met & self._shown(scene, second, outward, camera))] = np.nan
             ghost = (second - camera) @ R
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = -self.baseline_m / ghost[:, 1]
@@ -299,17 +285,6 @@ class ProfileSensor:
         blocked = scene.meet(spot, way)[0] < length
         return np.asarray(self._faces(normal, way) & ~blocked)
 
-    def _mirrored(
-        self, scene: Scene, spot: Array, rays: Array, normal: Array, camera: Array
-    ) -> Array:
-        """Where (n, 3) mirrored light falls and the camera sees it; else not-a-number."""
-        back = rays - 2.0 * np.sum(rays * normal, axis=1)[:, None] * normal
-        distance, outward = scene.meet(spot, back)
-        met = np.isfinite(distance)
-        second = spot + np.where(met, distance, 0.0)[:, None] * back
-        second[~(met & self._shown(scene, second, outward, camera))] = np.nan
-        return np.asarray(second)
-
     def _disturbed(self, xz: Array, rng: np.random.Generator) -> Array:
         n = self.columns
         xz[:, 1] += self.noise_m * rng.standard_normal(n)
@@ -324,9 +299,6 @@ class ProfileSensor:
             out = ~((xz[:, 1] >= self.near_m) & (xz[:, 1] <= self.far_m))
         xz[lost | out] = np.nan
         return xz
-
-
-# ---- a fixed sensor that measures the centre of a sphere carried at the flange ------------------
 
 
 STEM_EXPANSION_PER_K = 12e-6  # steel
@@ -355,12 +327,6 @@ class SphereSensor:
     outlier_size: float = 1e-3
     effects: Effects = field(default_factory=Effects)
 
-    def ball_in_flange(self, flange_rise: float) -> Array:
-        """Sphere centre (3,) when the flange is so many kelvin warmer than cold."""
-        if not self.effects.stem:
-            return self.ball
-        return np.asarray(self.ball * (1.0 + STEM_EXPANSION_PER_K * flange_rise))
-
     def measure(
         self,
         T_base_flange: Array,
@@ -377,7 +343,10 @@ class SphereSensor:
         since_start_s : time since the cold sensor was switched on.
         """
         T = self.T_sensor_base @ T_base_flange
-        p = T[:3, :3] @ self.ball_in_flange(flange_rise) + T[:3, 3]
+        ball = self.ball
+        if self.effects.stem:
+            ball = np.asarray(ball * (1.0 + STEM_EXPANSION_PER_K * flange_rise))
+        p = T[:3, :3] @ ball + T[:3, 3]
         # Drawn whether used or not: switching one effect off leaves the others' draws alone.
         noise, direction, chance = rng.standard_normal(3), rng.standard_normal(3), rng.random()
         if self.effects.sensor_warm_up:
@@ -387,9 +356,6 @@ class SphereSensor:
         if self.effects.outliers and chance < self.outlier_share:
             p = p + self.outlier_size * direction / np.linalg.norm(direction)
         return np.asarray(p)
-
-
-# ---- what a 3-D sensor sees of a sphere ---------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -440,9 +406,6 @@ def sphere_cloud(
     wild = centre + rng.uniform(-2.0 * r, 2.0 * r, (spikes, 3))
     cloud = np.vstack([cap, stem, plane, wild])
     return np.asarray(cloud[rng.permutation(len(cloud))])
-
-
-# ---- a sphere at the flange and one on the floor ------------------------------------------------
 
 
 CLEAR_RAD = float(np.radians(60.0))  # between the stem and the view, else the stem hides the sphere
@@ -497,7 +460,8 @@ class SphereStation:
         if draws.of(Stream.LOST_SHOTS, tick).random() < faults.size("lost_messages"):
             return None
         rng = draws.of(Stream.SHOTS, tick)
-        sensor = replace(self.sensor, ball=self.sensor.ball + faults.ball_shift)
+        shift = faults.size("sphere_knocked") * BALL_KNOCK
+        sensor = replace(self.sensor, ball=self.sensor.ball + shift)
         centre = sensor.measure(T_base_flange, flange_rise, time_s, rng)
         floor = self.floor + self.floor_sigma_m * rng.standard_normal(3)
         seen = np.vstack([centre, floor])
@@ -525,9 +489,6 @@ class SphereShot:
     centre: Array
     floor: Array
     points: Array
-
-
-# ---- a line laser on the flange, and the target that it looks at while the robot stands ---------
 
 
 TARGET_ROOM = 2.0  # a target further away than this many times the range is not looked at
@@ -579,9 +540,6 @@ class ProfileShot:
     time_s: float
     told_s: float
     points: Array
-
-
-# ---- when a robot stands, counted in ticks ------------------------------------------------------
 
 
 Index = NDArray[np.int64]

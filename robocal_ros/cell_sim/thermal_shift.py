@@ -8,7 +8,7 @@ scaled, before any estimator sees it, to what was published for a KR 150 R3100: 
 40 to 50 % of the monitored directions stay within 0.1 mm, with six length parameters 70 to 88 %.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,9 +22,6 @@ from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.screening import share_within
 
-# ---- shift --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
 
 REFERENCE = "reference"
@@ -32,6 +29,16 @@ SERVO_RAD = 2e-5  # a pose is reached this well; the encoders show where it real
 MOVE_S = 5.0  # from pose to pose, in a cycle and in production
 SETTLE_S = 1.0  # from arrival to measurement
 REST_S = 1.4  # at a measuring pose
+
+
+def level_at(phases: Sequence[tuple[float, float]], time_s: float) -> float:
+    """Level of a programme of (hours, level) at a time after its begin."""
+    end = 0.0
+    for hours, level in phases:
+        end += 3600.0 * hours
+        if time_s < end:
+            return level
+    return phases[-1][1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +65,6 @@ class ShiftPlan:
     def duration_s(self) -> float:
         """Length of the shift after the cold reference."""
         return 3600.0 * sum(hours for hours, _ in self.phases)
-
-    def level(self, time_s: float) -> float:
-        """Level of the programme at a time after the reference."""
-        end = 0.0
-        for hours, level in self.phases:
-            end += 3600.0 * hours
-            if time_s < end:
-                return level
-        return self.phases[-1][1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,11 +127,6 @@ class _Course:
         self.time_s += MOVE_S + rest_s
         self.log.append((self.time_s, self.warmth.motor))
 
-    def truth(self, name: str, tool: Array) -> Cycle:
-        """The state at the end of a cycle."""
-        check = self.robot.point(self.plan.check, self.warmth, tool)
-        return Cycle(name, self.time_s, self.warmth, check)
-
 
 def simulate(
     robot: TrueRobot,
@@ -156,7 +149,8 @@ def simulate(
             at = course.time_s - REST_S + SETTLE_S
             rise = float(course.warmth.link[-1])
             visits.append(Visit(at, name, reading, sensor.measure(flange, rise, at, rng)))
-        return course.truth(name, tool)
+        check = robot.point(plan.check, course.warmth, tool)
+        return Cycle(name, course.time_s, course.warmth, check)
 
     cycles = [measure(REFERENCE, plan.reference, 0.0)]
     start = course.time_s
@@ -164,10 +158,11 @@ def simulate(
     for number in range(1, count + 1):
         next_cycle = start + number * plan.period_s - len(plan.cycle) * (MOVE_S + REST_S)
         while course.time_s + MOVE_S <= next_cycle:
-            level = plan.level(course.time_s - start)
+            level = level_at(plan.phases, course.time_s - start)
             pose = plan.check[rng.integers(len(plan.check))] if level > 0.0 else course.q[-1]
             course.move(pose, 0.0, level)
-        cycles.append(measure(f"cycle-{number:02d}", plan.cycle, plan.level(course.time_s - start)))
+        level = level_at(plan.phases, course.time_s - start)
+        cycles.append(measure(f"cycle-{number:02d}", plan.cycle, level))
     time_s, temperatures = zip(*course.log, strict=True)
     return Shift(
         tuple(cycles),
@@ -178,9 +173,7 @@ def simulate(
     )
 
 
-# ---- a KUKA KR 150 R3100 as it might stand in a cell: plausible figures, none measured ----------
-
-
+# A KUKA KR 150 R3100 as it might stand in a cell: plausible figures, none measured.
 EXPANSION_PER_K = 12e-6
 HOUSING_M = 0.25  # a drive's housing grows too, also where the nominal length is zero
 BENDING_RAD_PER_K = 1.5e-6
@@ -255,9 +248,7 @@ def sphere_sensor(effects: Effects | None = None) -> SphereSensor:
     return SphereSensor(T_SENSOR_BASE, BALL, effects=effects or Effects())
 
 
-# ---- shifts of a robot that drifts, at the pace of its measuring cycles: many, quickly ----------
-
-
+# Shifts of a robot that drifts, at the pace of its measuring cycles: many, quickly.
 MEASURING = (5, 1, 11, 8, 10, 4)  # the six of the sphere poses that estimators are given
 UNCORRECTED = 0.45  # the middle of the published 43 to 49 %
 SIX_LENGTHS = (0.70, 0.88)
@@ -275,15 +266,6 @@ class DriftPlan:
     phases: tuple[tuple[float, float], ...]
     duty: Array
 
-    def level(self, time_s: float) -> float:
-        """Level of the programme at a time of the shift."""
-        end = 0.0
-        for hours, level in self.phases:
-            end += 3600.0 * hours
-            if time_s < end - 1.0:
-                return level
-        return self.phases[-1][1]
-
     @property
     def cycles(self) -> int:
         """Number of measuring cycles."""
@@ -293,7 +275,7 @@ class DriftPlan:
         """Time and state after each of ``parts`` equal steps of each cycle's period."""
         state, step = Warmth.cold(len(self.duty)), PERIOD_S / parts
         for i in range(self.cycles * parts):
-            duty = self.duty * self.level(i * step)
+            duty = self.duty * level_at(self.phases, i * step + 1.0)  # a second spares rounding
             state = WARM_UP.step(state, duty, step)
             yield (i + 1) * step, state
 
@@ -367,16 +349,22 @@ def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell
     def share(robot: TrueRobot, plan: DriftPlan) -> float:
         return share_within(_displacement(robot, check, TOOL, plan, chosen=_COARSE))
 
-    factor = _bisect(lambda f: share(_scaled(robot, f), PLANS[0]))
-    robot = _scaled(robot, factor)
-    plans = (PLANS[0], *(_levelled(robot, plan, share) for plan in PLANS[1:]))
-    return DriftingCell(
-        robot,
-        plans,
-        sphere,
-        check,
-        tuple(_with_lengths(robot, sphere, check, plan) for plan in plans),
-    )
+    def scaled(factor: float) -> TrueRobot:
+        motor, link = factor * robot.motor_gain, factor * robot.link_gain
+        return replace(robot, motor_gain=motor, link_gain=link)
+
+    drifting = scaled(_bisect(lambda f: share(scaled(f), PLANS[0])))
+
+    def levelled(plan: DriftPlan) -> DriftPlan:
+        def at(factor: float) -> DriftPlan:
+            phases = tuple((hours, factor * level) for hours, level in plan.phases)
+            return replace(plan, phases=phases)
+
+        return at(_bisect(lambda f: share(drifting, at(f))))
+
+    plans = (PLANS[0], *(levelled(plan) for plan in PLANS[1:]))
+    lengths = tuple(_with_lengths(drifting, sphere, check, plan) for plan in plans)
+    return DriftingCell(drifting, plans, sphere, check, lengths)
 
 
 def _bisect(share: Callable[[float], float]) -> float:
@@ -386,19 +374,6 @@ def _bisect(share: Callable[[float], float]) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if share(middle) > UNCORRECTED else (low, middle)
     return 0.5 * (low + high)
-
-
-def _levelled(
-    robot: TrueRobot, plan: DriftPlan, share: Callable[[TrueRobot, DriftPlan], float]
-) -> DriftPlan:
-    def at(factor: float) -> DriftPlan:
-        return replace(plan, phases=tuple((hours, factor * level) for hours, level in plan.phases))
-
-    return at(_bisect(lambda f: share(robot, at(f))))
-
-
-def _scaled(robot: TrueRobot, factor: float) -> TrueRobot:
-    return replace(robot, motor_gain=factor * robot.motor_gain, link_gain=factor * robot.link_gain)
 
 
 def _displacement(

@@ -20,12 +20,9 @@ from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.circle import CircleMethod, CircleMotion, CommandedCircle, fit_circle
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
-from robocal_ros.tool.edges import BEAMS, BeamEdge, EdgeSample
+from robocal_ros.tool.edges import BEAMS, BeamEdge, EdgeSample, StepKind
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, axis_from_centres, upright_pose
 from robocal_ros.tool.run import PlannedStep
-
-# ---- motions of the flange at a beam station ----------------------------------------------------
-
 
 Array = NDArray[np.float64]
 
@@ -68,10 +65,6 @@ class Circle:
     def span(self) -> tuple[float, float]:
         """From rest to rest."""
         return self.start_s - self.ramp_s, self.start_s + self.period_s + self.ramp_s
-
-    def starting(self, start_s: float) -> "Circle":
-        """The same turn, begun at another time."""
-        return replace(self, start_s=start_s)
 
     def __call__(self, time_s: Array) -> Array:
         """T_base_flange (m, 4, 4)."""
@@ -142,9 +135,6 @@ class Sweep:
     def __call__(self, time_s: Array) -> Array:
         """T_base_flange (m, 4, 4)."""
         return _moved(self.T_base_start, (time_s / self.duration_s)[:, None] * self.along)
-
-
-# ---- robot, tool and beams ----------------------------------------------------------------------
 
 
 ABOVE_TIP_M = 5e-3  # where the lower circles meet the tool
@@ -274,13 +264,13 @@ class MeasuredRun:
             ripple=plan.ripple,
             phase_rad=2.0 * np.pi * self._rng.random(),
         )
-        self._run(name, move.starting(self._next_s + move.ramp_s))
+        self._run(name, move)
 
     def plunge(self, name: str, T_base_top: Array) -> None:
         """Run a plunge."""
         plan = self.cell.plan
         depth, speed, down = plan.plunge_depth, plan.plunge_speed, -self.cell.up
-        self._run(name, Plunge(T_base_top, down, depth, speed, self._next_s))
+        self._run(name, Plunge(T_base_top, down, depth, speed))
 
     def upright(self, method: CircleMethod) -> Array:
         """Centre of the next circle, with the tool set upright as the circles so far show it."""
@@ -290,10 +280,10 @@ class MeasuredRun:
             point = seen.tip - ABOVE_TIP_M * seen.axis
             return upright_pose(laser, first.T_base_centre, seen.axis, point)
         second = self.commanded(1)
-        centres = self._classic_centre(first), self._classic_centre(second)
-        v = axis_from_centres(laser, (first.T_base_centre, second.T_base_centre), centres)
+        low, high = (fit_circle(of.motion, of.edges, "classic").centre for of in (first, second))
+        v = axis_from_centres(laser, (first.T_base_centre, second.T_base_centre), (low, high))
         T = first.T_base_centre
-        on_axis = laser.T_base_laser[:3, 3] + self._in_base(centres[0])
+        on_axis = laser.T_base_laser[:3, 3] + laser.T_base_laser[:3, :2] @ low
         return upright_pose(laser, T, v, T[:3, :3].T @ (on_axis - T[:3, 3]))
 
     def top(self, method: CircleMethod) -> Array:
@@ -303,15 +293,14 @@ class MeasuredRun:
             seen = self.estimate()
             T = upright_pose(self.cell.laser, last.T_base_centre, seen.axis, seen.tip)
             return raised(T, rise * self.cell.up)
-        T = raised(last.T_base_centre, -self._in_base(self._classic_centre(last)))
+        centre = fit_circle(last.motion, last.edges, "classic").centre
+        T = raised(last.T_base_centre, -(self.cell.laser.T_base_laser[:3, :2] @ centre))
         return raised(T, (ABOVE_TIP_M + rise) * self.cell.up)
 
-    @property
-    def _next_s(self) -> float:
-        return float(self._time[-1][-1]) + self.cell.plan.transfer_s if self._time else 0.0
-
     def _run(self, name: str, move: Circle | Plunge) -> None:
-        plan, kind = self.cell.plan, "circle" if isinstance(move, Circle) else "plunge"
+        plan = self.cell.plan
+        next_s = float(self._time[-1][-1]) + plan.transfer_s if self._time else 0.0
+        move = replace(move, start_s=next_s - move.span[0])
         count = int(np.ceil((move.span[1] - move.span[0]) * plan.rate_hz)) + 1
         time = move.span[0] + np.arange(count) / plan.rate_hz
         q = joints_at(self.cell.arm, move(time), self._q[-1][-1] if self._q else self.cell.q_near)
@@ -325,13 +314,8 @@ class MeasuredRun:
         self._q.append(q)
         edges = self.cell.station.edges(self.tool, move, move.window, self._rng)
         self.moves.append(move)
-        self.steps.append(BeamStep(name, "circle" if kind == "circle" else "plunge", edges))
-
-    def _classic_centre(self, circle: CommandedCircle) -> Array:
-        return fit_circle(circle.motion, circle.edges, "classic").centre
-
-    def _in_base(self, centre: Array) -> Array:
-        return np.asarray(self.cell.laser.T_base_laser[:3, :2] @ centre)
+        kind: StepKind = "circle" if isinstance(move, Circle) else "plunge"
+        self.steps.append(BeamStep(name, kind, edges))
 
 
 def raised(T: Array, by: Array) -> Array:
@@ -355,20 +339,11 @@ def joints_at(arm: SerialArm, T_base_flange: Array, q_near: Array) -> Array:
     raise ValueError("the poses are out of reach")
 
 
-# ---- calibration of a beam station by a robot that carries a cylinder: the edges A1 to D4 -------
-
-
 DOWN = np.array([0.0, 0.0, -1.0])
 SWEEP_M = 1e-2
 SWEEP_S = 1.0
 CYLINDER_M = 2.5e-3  # radius
-
-
-def calibration_tool(reach: float = 0.15) -> RoundTool:
-    """A cylinder along the flange's z."""
-    T = np.eye(4)
-    T[2, 3] = reach
-    return RoundTool.cylinder(T, CYLINDER_M)
+CYLINDER_TIP_M = 0.15  # of the calibration tool along the flange's z
 
 
 def laser_points(
@@ -380,42 +355,29 @@ def laser_points(
 
     ``T_base_laser`` is roughly known; ``along`` is the way of the points from the crossing.
     """
-    return {
-        name: place
-        for b, ends in ((0, "AB"), (1, "CD"))
-        for end, sign in zip(ends, (-1.0, 1.0), strict=True)
-        for name, place in _points_of(station, b, T_base_laser, sign * along, end, rng).items()
-    }
-
-
-def _points_of(
-    station: BeamStation,
-    b: int,
-    T_base_laser: Array,
-    along: float,
-    name: str,
-    rng: np.random.Generator,
-) -> dict[str, Array]:
-    """Two sweeps of one point: upright across the beam, then level in z."""
-    tool = calibration_tool()
-    e = np.eye(3)[b]  # base axis nearest to the beam
-    side = np.cross([0.0, 0.0, 1.0], e)
-    beam = station.beams[b]
-    u = (beam.end - beam.start) / np.linalg.norm(beam.end - beam.start)
-    to = (T_base_laser[:3, 3] + along * e - beam.start) @ e / (u @ e)
-    target = beam.start + to * u
-    reach = tool.T_flange_tool[2, 3] - 0.02
+    T_tool = frames.transform(np.eye(3), [0.0, 0.0, CYLINDER_TIP_M])
+    tool = RoundTool.cylinder(T_tool, CYLINDER_M)
+    reach = CYLINDER_TIP_M - 0.02
     found: dict[str, Array] = {}
-    for first, pointing, way in ((1, DOWN, side), (3, -side, DOWN)):
-        R = np.column_stack([e, np.cross(pointing, e), pointing])
-        start = frames.transform(R, target - reach * pointing - 0.5 * SWEEP_M * way)
-        places = []
-        for sweep in (Sweep(start, SWEEP_M * way, SWEEP_S), Sweep(start, SWEEP_M * way, -SWEEP_S)):
-            edges = station.edges(tool, sweep, sweep.window, rng)
-            own = [edge.time_s for edge in edges if edge.beam == BEAMS[b]]
-            places.append(sweep(np.array(own))[:, :3, 3])
-        both = 0.5 * (places[0] + places[1][::-1])
-        found[f"{name}{first}"], found[f"{name}{first + 1}"] = both
+    for b, sign, name in ((0, -1.0, "A"), (0, 1.0, "B"), (1, -1.0, "C"), (1, 1.0, "D")):
+        e = np.eye(3)[b]  # base axis nearest to the beam
+        side = np.cross([0.0, 0.0, 1.0], e)
+        beam = station.beams[b]
+        u = (beam.end - beam.start) / np.linalg.norm(beam.end - beam.start)
+        to = (T_base_laser[:3, 3] + sign * along * e - beam.start) @ e / (u @ e)
+        target = beam.start + to * u
+        # upright across the beam, then level in z
+        for first, pointing, way in ((1, DOWN, side), (3, -side, DOWN)):
+            R = np.column_stack([e, np.cross(pointing, e), pointing])
+            start = frames.transform(R, target - reach * pointing - 0.5 * SWEEP_M * way)
+            places = []
+            for duration_s in (SWEEP_S, -SWEEP_S):
+                sweep = Sweep(start, SWEEP_M * way, duration_s)
+                edges = station.edges(tool, sweep, sweep.window, rng)
+                own = [edge.time_s for edge in edges if edge.beam == BEAMS[b]]
+                places.append(sweep(np.array(own))[:, :3, 3])
+            both = 0.5 * (places[0] + places[1][::-1])
+            found[f"{name}{first}"], found[f"{name}{first + 1}"] = both
     return found
 
 
@@ -425,9 +387,6 @@ def point_sigma(station: BeamStation) -> float:
     stamp = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
     edge = np.hypot(noise.edge_m, speed * stamp)
     return float(np.sqrt(noise.step_m**2 / 2.0 + edge**2 / 4.0))
-
-
-# ---- motion -------------------------------------------------------------------------------------
 
 
 JITTER_RAD = 1e-6  # of a resting joint's reading: servo hum and encoder counts
@@ -462,9 +421,6 @@ def readings(path: SmoothPath, time_s: Array, rng: np.random.Generator) -> Array
     q = path.at(time_s)
     q = q + JITTER_RAD * rng.standard_normal(q.shape)
     return np.asarray(np.round(q / COUNT_RAD) * COUNT_RAD)
-
-
-# ---- a robot's own program: goes to where a measuring step begins, and drives it ----------------
 
 
 PITCH_S = 8e-3  # between two points of the program's joint path
@@ -512,6 +468,8 @@ def program(
     LimitError
         When the robot does not reach it.
     """
+    from scipy.interpolate import CubicSpline
+
     start = step_move(step, 0.0, ripple, phase_rad)
     try:
         way = _way(arm, step, q_now, start(np.array([start.span[0]]))[0])
@@ -527,7 +485,8 @@ def program(
         q[driven] = joints_at(arm, move(time[driven]), way[-1])
     except ValueError as error:
         raise LimitError(f"the robot does not reach step {step.name}: {error}") from error
-    return time, q, _rates(time, q), move
+    qd = CubicSpline(time, q, bc_type="clamped")(time, 1)  # from rest to rest
+    return time, q, np.asarray(qd), move
 
 
 def _way(arm: SerialArm, step: PlannedStep, q_now: Array, T_start: Array) -> Array:
@@ -544,16 +503,6 @@ def _way(arm: SerialArm, step: PlannedStep, q_now: Array, T_start: Array) -> Arr
     for T in poses:
         way.append(joints_at(arm, T[None], way[-1])[0])
     return np.array(way)
-
-
-def _rates(time: Array, q: Array) -> Array:
-    """Velocities (k, n) of smooth cubics through the points, from rest to rest."""
-    from scipy.interpolate import CubicSpline
-
-    return np.asarray(CubicSpline(time, q, bc_type="clamped")(time, 1))
-
-
-# ---- a robot's own program at a beam station: it drives the steps of a tool measurement ---------
 
 
 Sample = JointSample | EdgeSample
@@ -589,8 +538,10 @@ class RobotProgram:
 
     def rest(self, seconds: float) -> list[Sample]:
         """Stand still."""
-        count = int(seconds * self.cell.plan.rate_hz)
-        return self._samples(self._times(count), np.tile(self.q, (count, 1)), [])
+        rate_hz = self.cell.plan.rate_hz
+        count = int(seconds * rate_hz)
+        time = self.now_s + np.arange(count) / rate_hz
+        return self._samples(time, np.tile(self.q, (count, 1)), [])
 
     def drive(self, step: PlannedStep) -> list[Sample]:
         """Go to a step's start, drive it, and rest."""
@@ -601,7 +552,8 @@ class RobotProgram:
         steps = round(TRANSFER_S * self.cell.plan.rate_hz) + 1
         share = np.linspace(0.0, 1.0, steps)[:, None]
         smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-        there = self._samples(self._times(steps), self.q + smooth * (q[0] - self.q), [])
+        way = self.now_s + np.arange(steps) / self.cell.plan.rate_hz
+        there = self._samples(way, self.q + smooth * (q[0] - self.q), [])
         edges = self.cell.station.edges(self.tool, move, move.window, self._rng)
         driven = self._samples(time, q, self.edit(step, edges))
         return there + driven + self.rest(REST_S)
@@ -609,9 +561,6 @@ class RobotProgram:
     def ns(self, time_s: float) -> int:
         """Stamp of a time since the start."""
         return self.start_ns + round(time_s * 1e9)
-
-    def _times(self, count: int) -> Array:
-        return self.now_s + np.arange(count) / self.cell.plan.rate_hz
 
     def _samples(self, time: Array, q: Array, edges: Sequence[BeamEdge]) -> list[Sample]:
         names = self.cell.arm.joint_names
@@ -625,9 +574,6 @@ class RobotProgram:
         self.now_s = float(time[-1]) + 1.0 / self.cell.plan.rate_hz
         self.q = q[-1]
         return sorted(samples, key=lambda sample: sample.stamp_ns)
-
-
-# ---- a production programme: from pose to pose, a rest at each, and the way home ----------------
 
 
 SPEED_RAD_S = 1.5  # of the fastest joint at its peak
@@ -652,9 +598,6 @@ def programme(
     time = np.column_stack([depart - rest_s, depart]).ravel()
     q = np.repeat(points[1:], 2, axis=0)
     return time, q, np.zeros_like(q), np.zeros_like(q)
-
-
-# ---- files of taught poses: a row each, its kind and its joint angles in degrees ----------------
 
 
 def read_poses(path: Path, *kinds: str) -> NDArray[np.float64]:

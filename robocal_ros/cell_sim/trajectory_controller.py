@@ -614,7 +614,8 @@ class JointMotion:
             passed = 0
             if allowed:
                 cycles = cycles.first(allowed)
-                passed = self.controller.judge(cycles, self._measured(cycles)[:-1, 0])
+                sent = np.stack([cycles.command, cycles.speed], axis=1)
+                passed = self.controller.judge(cycles, self._mean(sent)[:-1, 0])
                 self._append(cycles.first(passed))
             if passed == allowed < len(time):  # refused: all joints come to rest together
                 self.faults += 1
@@ -623,12 +624,11 @@ class JointMotion:
                 brakes_s = BRAKES_S * float(np.max(np.abs(speed) / self._fastest))
                 self.controller.brake(brakes_s, speed)
 
-    def _measured(self, cycles: Cycles) -> Array:
-        """What the drives report (k + 1, 2, n) in each of the cycles, and after them."""
-        return self._mean(np.stack([cycles.command, cycles.speed], axis=1))
-
     def _mean(self, sent: Array) -> Array:
-        """Of what was sent and ``sent`` (k, 2, n) the means (k + 1, 2, n), to the last bit."""
+        """What the drives report (k + 1, 2, n) as ``sent`` (k, 2, n) follows what was sent.
+
+        They are means, to the last bit.
+        """
         rows, count = np.concatenate([self._sent, sent]), len(sent) + 1
         total = rows[:count].copy()
         for i in range(1, self._width):
@@ -643,13 +643,13 @@ class JointMotion:
             self._past_s[:KEPT] = self._past_s[row - KEPT : row]
             self._begin, row = self._count - KEPT, KEPT
         rows = slice(row, row + count)
-        self._rows[rows, :2] = self._measured(cycles)[:-1]
+        sent = np.stack([cycles.command, cycles.speed], axis=1)
+        self._rows[rows, :2] = self._mean(sent)[:-1]
         for i, part in enumerate(
             (cycles.command, cycles.speed, cycles.desired, cycles.desired_qd, cycles.desired_qdd)
         ):
             self._rows[rows, 2 + i] = part
         self._past_s[rows] = cycles.past_s
-        sent = np.stack([cycles.command, cycles.speed], axis=1)
         self._sent = np.concatenate([self._sent, sent])[-self._width :]
         self._count += count
 

@@ -5,16 +5,51 @@ import pytest
 
 from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.laser_tracker import (
+    FEWEST_LIT,
+    PRP_SENSOR,
+    PRP_STILL,
     TrackerCell,
     prp_cell,
-    prp_sphere_shots,
     six_axis_cell,
     true_flange,
 )
+from robocal_ros.cell_sim.sensors import Ball, Scene
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye.shots import Profile, profile_of
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
+
+
+def prp_sphere_shots(
+    arm: SerialArm, rng: np.random.Generator, count: int = 15
+) -> tuple[np.ndarray, list[Profile]]:
+    """One sphere shot from ``count`` poses of the P-R-P arm, as the source's comparison does.
+
+    Its axes of slide 1 and of joint 2 are parallel, so the flange never tilts: where the sensor
+    sits along them cannot be seen.
+
+    Returns
+    -------
+    T_base_flange : (count, 4, 4) by the noisy joint readings, m.
+    profiles : of the sphere.
+    """
+    cell = prp_cell(arm)
+    radius = cell.sizes.target.sphere_radius_m
+    middle = true_flange(arm, PRP_STILL[None])[0] @ PRP_SENSOR
+    scene = Scene((Ball((middle @ [0.0, 0.0, 0.2, 1.0])[:3], radius),))
+    q: list[np.ndarray] = []
+    profiles: list[Profile] = []
+    while len(q) < count:
+        joints = PRP_STILL + rng.uniform(-1.0, 1.0, 3) * [0.008, np.radians(6.0), 0.02]
+        xz = cell.sensor.shoot(true_flange(arm, joints[None])[0] @ PRP_SENSOR, scene, rng)
+        if np.sum(np.isfinite(xz[:, 0])) > FEWEST_LIT:
+            q.append(joints)
+            profiles.append(profile_of(xz, f"s{len(q):02d}"))
+    noise = cell.sizes.noise
+    sigma = np.where(arm.prismatic, noise.joint_m, noise.joint_rad)
+    return arm.fk(np.array(q) + sigma * rng.standard_normal((count, 3))), profiles
 
 
 @pytest.fixture(scope="module", params=["prp", "ur10"])

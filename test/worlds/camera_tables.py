@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, moving_flange
+from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.hand_eye.tables import write_pose_table
 
 NOISE = BoardNoise(1e-4, 2e-4, (2e-4, 2e-4, 2e-4), (5e-4, 5e-4, 5e-4))
@@ -20,6 +21,19 @@ camera_matrix: {{rows: 3, cols: 3, data: {MATRIX}}}
 distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: [{LENS.k1}, {LENS.k2}, 0, 0, 0]}}
 """
+
+
+def moving_flange(time_s: np.ndarray) -> TruePose:
+    """A smooth motion that turns about all axes, and stands for a moment now and then."""
+    t = time_s + 0.3 * np.sin(1.3 * time_s)
+    turn = np.column_stack(
+        [0.4 * np.sin(0.9 * t), 0.5 * np.sin(0.7 * t + 1.0), 0.8 * np.sin(0.5 * t + 2.0)]
+    )
+    place = np.column_stack(
+        [0.5 + 0.1 * np.sin(0.8 * t), 0.1 * np.sin(1.1 * t), 0.4 + 0.05 * np.sin(0.6 * t)]
+    )
+    start = Rotation.from_rotvec([np.pi - 0.2, 0.0, 0.0])
+    return TruePose(start * Rotation.from_rotvec(turn), place)
 
 
 def camera_tables(folder: Path) -> None:

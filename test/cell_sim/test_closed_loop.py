@@ -1,4 +1,4 @@
-"""The closed loop's judging can fail: on a suite that refuses, falls back, or is let off."""
+"""The closed loop: gaps and incidents count from when they are due, and its judging can fail."""
 
 import json
 from dataclasses import replace
@@ -7,22 +7,137 @@ import numpy as np
 import pytest
 
 from bench.closed_loop import tables
-from bench.closed_loop.judging import (
-    gaps_to_recover,
-    harm,
-    per_hour,
-    refused,
-    within_at_worst,
+from bench.closed_loop.judging import gaps_to_recover, harm, per_hour, refused, within_at_worst
+from bench.closed_loop.plant import (
+    AT_WORK,
+    BEAT_S,
+    PASS_S,
+    PROGRAMME,
+    REST_S,
+    STEP_S,
+    GapReport,
+    equipped,
 )
-from bench.closed_loop.plant import PASS_S, REST_S, GapReport
+from bench.closed_loop.setting import LIMITS
 from bench.closed_loop.shift import (
     GOLDEN,
     HOUR_S,
     MIDWORK,
     Incident,
     Judged,
+    ShiftPlan,
     ShiftRecord,
+    run_shift,
 )
+from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
+from robocal_ros.cell_sim.trajectory_controller import LAG_S
+from robocal_ros.ground.errors import ConflictError
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.tool.driving import DrivePhase
+
+
+@pytest.fixture
+def cell():
+    """The robot at home, and its sessions, a second after they began."""
+    nominal = load_robot("kr150_r3100")
+    simulated = SimulatedCell(kr150_cell(nominal, 3, points=0))
+    with equipped(nominal, simulated) as (plant, suite):
+        plant.listen(1.0)
+        yield plant, suite
+
+
+def test_nothing_is_armed_in_a_closed_gap(cell):
+    plant, suite = cell
+    with pytest.raises(ConflictError, match="gap_open is false"):
+        suite.driver.arm(plant.now_s)
+
+
+def test_a_gap_that_closes_stops_the_tools_driver(cell):
+    plant, suite = cell
+    plant.is_open = True
+    plant.listen(plant.now_s + 2.0 * BEAT_S)
+    suite.driver.arm(plant.now_s)
+    suite.tool_command(Command(events.MEASURE_TOOL, {"mode": "reference", "cycle_id": "one"}))
+    while suite.driver.phase is not DrivePhase.APPROACH:
+        plant.step()
+    plant.listen(plant.now_s + 0.5)
+    assert plant.cell.moving
+    plant.is_open = False
+    plant.listen(plant.now_s + BEAT_S + STEP_S)
+    assert not suite.driver.armed
+    assert suite.driver.told == "gap_open is false"
+    assert suite.tool.run is None
+    hardest_s = float(np.max(np.asarray(LIMITS.joint_velocity) / LIMITS.stop_deceleration))
+    plant.listen(plant.now_s + hardest_s + 3.0 * LAG_S)
+    assert not plant.cell.moving
+    assert plant.cell.motion.faults == 0
+
+
+def test_a_jump_that_is_sent_is_counted(cell):
+    plant, _ = cell
+    q = plant.cell.motion.at([plant.now_s])[0]
+    plant.send(JointPlan(np.array([0.0, 0.008]), np.vstack([q, q + 1.0]), *np.zeros((2, 2, 6))))
+    plant.listen(plant.now_s + 1.0)
+    assert plant.cell.motion.faults == 1
+    assert plant.cell.motion.at([plant.now_s])[0] == pytest.approx(q, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", [51, 65, 73])
+def test_a_healthy_tool_is_found_where_noisy_readings_bend_its_path(seed):
+    """Joint readings whose noise lets whole steps of the search overshoot for ever."""
+    nominal = load_robot("kr150_r3100")
+    with equipped(nominal, SimulatedCell(kr150_cell(nominal, seed, points=0))) as (plant, suite):
+        plant.commission()
+        assert suite.tool.current.measured_healthy is not None
+
+
+FIRST_S = 60.0  # one pass before the first gap
+GAP_S, EVERY_S = 90.0, 160.0
+IN_PASS_S = 30.0
+ARRIVES_S = PROGRAMME[0][AT_WORK]
+BEGINS_S = FIRST_S + GAP_S  # of the pass after the first gap
+TOOL_M = 1.5e-3  # a tip bent by 2 mm is off by more
+
+
+def plan(*incidents):
+    return ShiftPlan(
+        hours=(FIRST_S + 2.0 * EVERY_S) / 3600.0,
+        first_s=FIRST_S,
+        every_s=EVERY_S,
+        gap_s=GAP_S,
+        incidents=incidents,
+    )
+
+
+def sizes(one):
+    return np.linalg.norm(one.error, axis=1)
+
+
+def test_poses_before_a_collision_within_a_pass_are_made_with_the_healthy_tool():
+    struck = Incident(BEGINS_S + IN_PASS_S, "collision", 2.0)
+    before, hit, after = run_shift(plan(struck), seed=3, suite=False).passes
+    bent = ARRIVES_S > IN_PASS_S
+    assert 5 < np.count_nonzero(bent) < 22
+    assert np.array_equal(sizes(hit) > TOOL_M, bent)
+    assert sizes(before).max() < 1e-4
+    assert sizes(after).min() > TOOL_M
+
+
+@pytest.mark.parametrize("at_s", [BEGINS_S, BEGINS_S - 20.0])
+def test_a_collision_in_a_gap_befalls_the_whole_pass_after_it(at_s):
+    _, hit, _ = run_shift(plan(Incident(at_s, "collision", 2.0)), seed=3, suite=False).passes
+    assert sizes(hit).min() > TOOL_M
+
+
+def test_gaps_and_passes_begin_where_they_are_planned():
+    made = run_shift(plan(), seed=3, suite=False)
+    assert [one.cycle for one in made.passes] == [0, 1, 2]
+    begins_s = [one.time_s - PASS_S - REST_S for one in made.passes]
+    assert begins_s == pytest.approx([0.5, BEGINS_S, BEGINS_S + EVERY_S], abs=0.02)  # two ticks
+
 
 TOLERANCE_M = 3e-4
 GOOD, BENT = 5e-5, 2e-3

@@ -1,16 +1,24 @@
-"""The simulated sphere sensor and shift: noise, expansion, outliers, and a reproducible course."""
+"""Whole shifts: the sphere sensor, a reproducible course, robots scaled to what was published."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bench.thermal import SEEDS
 from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import SphereSensor
-from robocal_ros.cell_sim.thermal_shift import ShiftPlan, simulate
+from robocal_ros.cell_sim.thermal_shift import (
+    UNCORRECTED,
+    ShiftPlan,
+    drifting_cell,
+    poses,
+    simulate,
+)
 from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.screening import share_within
 
 FLANGE = np.array([[1.0, 0, 0, 1.2], [0, 0, -1.0, 0.1], [0, 1.0, 0, 0.8], [0, 0, 0, 1.0]])
 
@@ -153,3 +161,13 @@ def test_without_effects_the_visits_are_the_nominal_ones(plan):
         flange = robot.nominal.fk(visit.reading)
         expected = thermal_shift.T_SENSOR_BASE @ flange @ np.append(thermal_shift.BALL, 1.0)
         np.testing.assert_allclose(visit.position, expected[:3], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_a_robot_counts_where_six_lengths_do_as_published(seed):
+    robot = thermal_shift.true_robot(load_robot("kr150_r3100"), np.random.default_rng(seed))
+    cell = drifting_cell(robot, poses("sphere"), poses("check"))
+    assert cell.as_published == (seed in SEEDS)
+    # Scaled at every sixth cycle of 90: the others may differ by a cycle's share on either side.
+    for plan in cell.plans:
+        assert share_within(cell.truth(plan)) == pytest.approx(UNCORRECTED, abs=2.0 / 90.0)
