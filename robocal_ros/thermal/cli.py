@@ -51,11 +51,7 @@ if TYPE_CHECKING:
 import csv
 import io
 
-from robocal_ros.cli.arguments import (
-    count,
-    positive,
-    seed,
-)
+from robocal_ros.cli.arguments import count, positive, seed
 from robocal_ros.ground.files import write_text
 from robocal_ros.report.figures import draw_rounds
 from robocal_ros.thermal.cell_setup import PosePlan, SensorField, plan_cycle
@@ -409,10 +405,7 @@ def identify_flange_files(
     check = None if check_file is None else read_measurements(check_file, arm)
     judged = identify_and_judge_flange_sensor(arm, sessions, check)
     return flange_sensor_document(judged) | {
-        "data": {
-            "sessions": [str(path) for path in data_files],
-            "check": _name(check_file),
-        }
+        "data": {"sessions": [str(path) for path in data_files], "check": _name(check_file)}
     }
 
 
@@ -615,10 +608,7 @@ def run_screen(args: argparse.Namespace) -> CliResult:
         raise InputError(f"--wanted {args.wanted}: this robot has {len(arm.parameters)} parameters")
     history = _history(args, arm)
     found = screen(
-        history,
-        wanted=args.wanted,
-        removal=args.removal,
-        threshold_m=args.threshold_mm * 1e-3,
+        history, wanted=args.wanted, removal=args.removal, threshold_m=args.threshold_mm * 1e-3
     )
     document: Document = {
         "robot": arm.name,

@@ -1,6 +1,6 @@
-"""Parameters of the thermal node."""
+"""The thermal node: measurements in, judged models out, decisions kept (docs/thermal_node.md)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from robocal_msgs.srv import (
     PlanPoses,
 )
 from sensor_msgs.msg import JointState, PointCloud2, Temperature
-from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from robocal_ros import __version__
@@ -74,6 +73,18 @@ from robocal_ros.thermal.proposing import SENSOR
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
 
 Array = NDArray[np.float64]
+
+ACCURACY_S = 1.0
+MOST_POSES = 20  # a plan holds the node up for two seconds then
+INPUTS = {
+    JOINTS: (JointState, endpoints.STREAM),
+    MEASURED_POINT: (PointStamped, endpoints.STREAM),
+    SPHERE_CENTER: (PointStamped, endpoints.STREAM),
+    SPHERE_CLOUD: (PointCloud2, endpoints.STREAM),
+    REFERENCE_SPHERE: (PointStamped, endpoints.STREAM),
+    MEASURED_POSE: (PoseStamped, endpoints.STREAM),
+    TEMPERATURES: (Temperature, endpoints.STREAM),
+}
 
 
 def _field_fault(field: list[float]) -> str | None:
@@ -239,17 +250,25 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig
 
 
 class ThermalServices:
-    """Services and their Trigger twins.
+    """Services, and the Trigger twins of those that need no more than a name.
 
     Parameters
     ----------
-    add : creates a service.
-    ask : gives a command to the session and awaits its outcome.
+    add, ask : create a service; give a command to the session and await its outcome.
+    settings : the node's; ``prior`` tells the expected drift of the session, (k, k), SI.
     """
 
-    def __init__(self, add: AddService, ask: Ask, history: CalibrationHistory) -> None:
-        self._ask = ask
-        self._history = history
+    def __init__(
+        self,
+        add: AddService,
+        ask: Ask,
+        history: CalibrationHistory,
+        nominal: SerialArm,
+        settings: Mapping[str, Any],
+        prior: Callable[[], Array],
+    ) -> None:
+        self._ask, self._history, self._nominal = ask, history, nominal
+        self._settings, self._prior = settings, prior
         add(CaptureReference, "~/capture_reference", self._capture_reference)
         add(Identify, "~/identify", self._identify)
         add(BeginCycle, "~/begin_cycle", self._begin_cycle)
@@ -257,6 +276,9 @@ class ThermalServices:
         for name in (BEGIN_CYCLE, END_CYCLE, CAPTURE_REFERENCE, IDENTIFY):
             add(Trigger, f"~/{name}_trigger", twin(ask, name, {}))
         DecisionServices(add, ask, history, THERMAL)
+        add(CalibrateSensor, "~/calibrate_sensor", self._calibrate_sensor)
+        add(Trigger, "~/calibrate_sensor_trigger", self._calibrate_twin)
+        add(PlanPoses, "~/plan_poses", self._plan_poses)
 
     async def _capture_reference(self, request: Any, response: Any) -> Any:
         outcome = await self._ask(Command(CAPTURE_REFERENCE, {}))
@@ -292,34 +314,6 @@ class ThermalServices:
         response.success = known
         return response
 
-
-MOST_POSES = 20  # a plan holds the node up for two seconds then
-
-
-class SetUpServices:
-    """``~/calibrate_sensor`` with its twin, and ``~/plan_poses``.
-
-    Parameters
-    ----------
-    add, ask : create a service; give a command to the session and await its outcome.
-    settings : the node's; ``prior`` tells the expected drift of the session, (k, k), SI.
-    """
-
-    def __init__(
-        self,
-        add: AddService,
-        ask: Ask,
-        history: CalibrationHistory,
-        nominal: SerialArm,
-        settings: Mapping[str, Any],
-        prior: Callable[[], Array],
-    ) -> None:
-        self._ask, self._history, self._nominal = ask, history, nominal
-        self._settings, self._prior = settings, prior
-        add(CalibrateSensor, "~/calibrate_sensor", self._calibrate_sensor)
-        add(Trigger, "~/calibrate_sensor_trigger", self._calibrate_twin)
-        add(PlanPoses, "~/plan_poses", self._plan_poses)
-
     async def _calibrate_sensor(self, request: Any, response: Any) -> Any:
         outcome = await self._ask(Command(CALIBRATE_SENSOR, {"method": request.method}))
         response.success, response.status = outcome.done, int(outcome.status)
@@ -349,6 +343,9 @@ class SetUpServices:
         T_sensor_base, sphere = placed_of(sensor)
         if request.count > MOST_POSES:
             raise LimitError(f"{request.count} poses: at most {MOST_POSES} are planned at a time")
+        names = self._nominal.joint_names
+        states = [joint_sample(state) for state in request.own]
+        own = np.array([state.position[state.order(names)] for state in states])
         found = plan_cycle(
             self._nominal,
             T_sensor_base,
@@ -357,10 +354,10 @@ class SetUpServices:
             prior=self._prior(),
             sigma_m=self._settings["sigma_mm"] * 1e-3,
             count=request.count or POSES,
-            own=self._joints(request.own) if request.own else None,
+            own=own if states else None,
         )
-        plan, names = found.plan, list(self._nominal.joint_names)
-        response.poses = [JointState(name=names, position=q) for q in plan.q.tolist()]
+        plan = found.plan
+        response.poses = [JointState(name=list(names), position=q) for q in plan.q.tolist()]
         response.predicted_mm = plan.predicted_rms_m * 1e3
         response.random_mm, response.before_mm = plan.random_rms_m * 1e3, plan.before_rms_m * 1e3
         response.own_mm = -1.0 if found.own_rms_m is None else found.own_rms_m * 1e3
@@ -371,27 +368,13 @@ class SetUpServices:
         )
         return response
 
-    def _joints(self, states: Sequence[Any]) -> Array:
-        names = self._nominal.joint_names
-        samples = [joint_sample(state) for state in states]
-        return np.array([sample.position[sample.order(names)] for sample in samples])
-
-
-AddOutput = Callable[[type, str, QoSProfile], Any]
-
 
 class ThermalOutputs:
-    """Publishers of one robot's results.
-
-    Parameters
-    ----------
-    add : creates a publisher.
-    serial, robot_file_hash, base_frame : as messages carry them.
-    """
+    """Publishers of one robot's results; ``add`` creates one."""
 
     def __init__(
         self,
-        add: AddOutput,
+        add: Callable[[type, str, QoSProfile], Any],
         nominal: SerialArm,
         serial: str,
         robot_file_hash: str,
@@ -406,13 +389,19 @@ class ThermalOutputs:
         self._sensor = add(TransformStamped, "~/sensor", endpoints.LATCHED)
         self.events = SessionEvents(add)
 
-    def model(self, model: Mapping[str, Any], revision: int, stamp_ns: int) -> None:
-        """Say what is in force."""
-        self._model.publish(self._message(model, revision, KinematicModel.ACCEPTED, stamp_ns))
-
-    def candidate(self, model: Mapping[str, Any], stamp_ns: int) -> None:
-        """Show what was identified."""
-        self._candidate.publish(self._message(model, 0, KinematicModel.CANDIDATE, stamp_ns))
+    def model(self, model: Mapping[str, Any], revision: int | None, stamp_ns: int) -> None:
+        """Say what is in force; a candidate has no revision."""
+        candidate = revision is None
+        message = conversions.kinematic_model(
+            model,
+            serial=self._serial,
+            model_hash=self._nominal.model_hash,
+            robot_file_hash=self._robot_file_hash,
+            revision=revision or 0,
+            state=KinematicModel.CANDIDATE if candidate else KinematicModel.ACCEPTED,
+            stamp=conversions.header(stamp_ns, self._base_frame),
+        )
+        (self._candidate if candidate else self._model).publish(message)
 
     def quality(self, outcome: Outcome, frame: str) -> None:
         """Show the verdict on a candidate, or why there is none."""
@@ -426,12 +415,11 @@ class ThermalOutputs:
     def accuracy(self, found: Accuracy, tolerance_m: float, stamp_ns: int) -> None:
         """Tell the line how accurate the robot is believed to be."""
         self._accuracy.publish(
-            accuracy_message(
-                found,
-                tolerance_m,
+            AccuracyState(
+                header=conversions.header(stamp_ns, self._base_frame),
                 robot=self._nominal.name,
                 serial=self._serial,
-                stamp=conversions.header(stamp_ns, self._base_frame),
+                **found.document(tolerance_m),
             )
         )
 
@@ -444,41 +432,6 @@ class ThermalOutputs:
                 transform=conversions.transform_message(T_base_sensor),
             )
         )
-
-    def _message(
-        self, model: Mapping[str, Any], revision: int, state: int, stamp_ns: int
-    ) -> KinematicModel:
-        return conversions.kinematic_model(
-            model,
-            serial=self._serial,
-            model_hash=self._nominal.model_hash,
-            robot_file_hash=self._robot_file_hash,
-            revision=revision,
-            state=state,
-            stamp=conversions.header(stamp_ns, self._base_frame),
-        )
-
-
-def accuracy_message(
-    found: "Accuracy", tolerance_m: float, *, robot: str, serial: str, stamp: Header
-) -> AccuracyState:
-    """How accurate the robot is believed to be, see `Accuracy.document`."""
-    told = found.document(tolerance_m)
-    return AccuracyState(header=stamp, robot=robot, serial=serial, **told)
-
-
-ACCURACY_S = 1.0
-
-
-INPUTS = {
-    JOINTS: (JointState, endpoints.STREAM),
-    MEASURED_POINT: (PointStamped, endpoints.STREAM),
-    SPHERE_CENTER: (PointStamped, endpoints.STREAM),
-    SPHERE_CLOUD: (PointCloud2, endpoints.STREAM),
-    REFERENCE_SPHERE: (PointStamped, endpoints.STREAM),
-    MEASURED_POSE: (PoseStamped, endpoints.STREAM),
-    TEMPERATURES: (Temperature, endpoints.STREAM),
-}
 
 
 class ThermalNode(SessionNode[ThermalSession]):
@@ -504,8 +457,7 @@ class ThermalNode(SessionNode[ThermalSession]):
         )
         self._data_clock = DataClock()
         ask = self._desk.ask
-        ThermalServices(self.add_service, ask, history)
-        SetUpServices(self.add_service, ask, history, self._nominal, settings, self._prior)
+        ThermalServices(self.add_service, ask, history, self._nominal, settings, self._prior)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
 
     def new_session(self, history: CalibrationHistory) -> ThermalSession:
@@ -517,8 +469,6 @@ class ThermalNode(SessionNode[ThermalSession]):
         super().activate()
         self._shown: tuple[Any, ...] = ()
         self.show_in_force()
-
-    # ---- samples and commands -------------------------------------------------------------------
 
     def take(self, session: ThermalSession, kind: str, message: Any) -> None:
         """Give a message of the input ``kind`` to the session."""
@@ -536,26 +486,20 @@ class ThermalNode(SessionNode[ThermalSession]):
         if (command := session.overdue()) is not None:
             self._desk.ask(command)
 
-    # ---- outputs --------------------------------------------------------------------------------
-
     def show(self, outcome: Outcome) -> None:
         """Publish what came of a command; it is logged already."""
         try:
             if not outcome.repeated:
                 self._outputs.events.tell(outcome.command, outcome)
-                if outcome.command.name in CYCLE:
-                    self._show_candidate(outcome)
+                history, session = self._history, self._session
+                if outcome.command.name in CYCLE and session is not None and history is not None:
+                    self._outputs.quality(outcome, session.desk.frame or "")
+                    if outcome.calibration_id:
+                        model = history.model(outcome.calibration_id)
+                        self._outputs.model(model, None, outcome.command.stamp_ns or 0)
             self.show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{outcome.command.name} was done but not published: {error}")
-
-    def _show_candidate(self, outcome: Outcome) -> None:
-        if self._session is None or self._history is None:
-            return
-        self._outputs.quality(outcome, self._session.desk.frame or "")
-        if outcome.calibration_id:
-            model = self._history.model(outcome.calibration_id)
-            self._outputs.candidate(model, outcome.command.stamp_ns or 0)
 
     def show_in_force(self) -> None:
         """Publish the model in force and record the new state, when either changed."""

@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.assessment import FEWEST_GROUPS, LARGEST_RMS_M, pose_groups, summarise
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import (
-    InputError,
-    ResidualError,
-)
+from robocal_ros.ground.errors import InputError, ResidualError
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell import CellModel, make_layout
