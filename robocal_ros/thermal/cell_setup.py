@@ -132,7 +132,7 @@ def calibrate_sensor(
             f"{len(data.targets)} targets ({', '.join(data.targets)}) in one visit: give one sphere"
         )
     require_match(arm, data, base=True, tool=True)
-    cell, covariance, rejected = _place(arm, data, method)
+    cell, covariance, rejected = place_sensor(arm, data, method)
     return SensorCalibration(
         method=method,
         T_sensor_base=cell.T_frame_base,
@@ -144,9 +144,10 @@ def calibrate_sensor(
     )
 
 
-def _place(
+def place_sensor(
     arm: SerialArm, data: Measurements, method: SensorMethod
 ) -> tuple[CellModel, Array | None, NDArray[np.bool_]]:
+    """Sensor and sphere as a cell, their covariance, and which samples (m,) do not fit."""
     if method == "classic":
         return _classic(arm, data), None, np.zeros(len(data), dtype=np.bool_)
     placed = identify(arm, data, fit=("base", "tool"), method="lsq")
@@ -162,7 +163,7 @@ def _left_out(
         others = ~rejected
         others[i] = False
         try:
-            cell = _place(arm, data.take(others), method)[0]
+            cell = place_sensor(arm, data.take(others), method)[0]
         except (TooFewSamplesError, RankDeficientError):
             continue
         error[i] = np.linalg.norm(cell.residual(data.take(np.array([i]))))

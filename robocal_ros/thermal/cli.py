@@ -1,8 +1,7 @@
-"""Commands of ``robocal thermal``: calibrate-sensor, identify, learn-prior."""
+"""Commands of ``robocal thermal``: calibrate-sensor, identify, learn-prior, plan-poses, screen."""
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +29,6 @@ from robocal_ros.thermal.flange_sensor import (
     identify_and_judge_flange_sensor,
 )
 from robocal_ros.thermal.identification import (
-    CycleDrift,
     cycle_document,
     drift_prior,
     identify_cycle,
@@ -48,13 +46,11 @@ from robocal_ros.thermal.reference import (
 
 if TYPE_CHECKING:
     from rich.console import Console
-import csv
-import io
 
 from robocal_ros.cli.arguments import count, positive, seed
 from robocal_ros.ground.files import write_text
 from robocal_ros.report.figures import draw_rounds
-from robocal_ros.thermal.cell_setup import PosePlan, SensorField, plan_cycle
+from robocal_ros.thermal.cell_setup import SensorField, plan_cycle
 from robocal_ros.thermal.screening import DriftHistory, best_subset, screen, share_within
 
 Array = NDArray[np.float64]
@@ -172,17 +168,7 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     if args.arrangement == FLANGE:
         document = identify_flange_files(arm, args.data, args.check)
     else:
-        chosen = tuple(name.strip() for name in (args.parameters or "").split(",") if name.strip())
-        request = FixedRequest(
-            sensor_file=args.sensor,
-            cold_file=args.cold,
-            warm_file=args.warm,
-            check_file=args.check,
-            prior_file=args.prior,
-            parameters=chosen,
-            sigma_m=args.sigma_mm * 1e-3,
-        )
-        document = identify_fixed_files(arm, request)
+        document = identify_fixed_files(arm, args)
     document |= {"arrangement": args.arrangement, "warnings": warnings}
     warn(warnings)
     return CliResult(document, partial(show_identification, document=document))
@@ -282,20 +268,7 @@ def _show_learn_prior(console: "Console", document: Document) -> None:
         console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
 
 
-@dataclass(frozen=True)
-class FixedRequest:
-    """Files of a fixed sensor; ``parameters`` empty: all of them, with a prior."""
-
-    sensor_file: Path
-    cold_file: Path
-    warm_file: Path
-    check_file: Path | None
-    prior_file: Path | None
-    parameters: tuple[str, ...]
-    sigma_m: float
-
-
-def identify_fixed_files(arm: SerialArm, request: FixedRequest) -> Document:
+def identify_fixed_files(arm: SerialArm, args: argparse.Namespace) -> Document:
     """Identify each cycle of the warm table; the document is the last one's.
 
     Raises
@@ -305,30 +278,37 @@ def identify_fixed_files(arm: SerialArm, request: FixedRequest) -> Document:
     TooFewSamplesError, RankDeficientError
         When the data cannot answer.
     """
-    sensor = read_sensor(request.sensor_file, arm)
-    cold, spots = cold_spots(arm, sensor, request.cold_file)
-    warm = warm_visits(request.warm_file, arm, cold)
-    check = (
-        None if request.check_file is None else check_visits(request.check_file, arm, cold, warm)
-    )
-    prior = drift_prior(arm) if request.prior_file is None else read_prior(request.prior_file, arm)
+    chosen = tuple(name.strip() for name in (args.parameters or "").split(",") if name.strip())
+    sigma_m = args.sigma_mm * 1e-3
+    sensor = read_sensor(args.sensor, arm)
+    cold, spots = cold_spots(arm, sensor, args.cold)
+    warm = warm_visits(args.warm, arm, cold)
+    check = None if args.check is None else check_visits(args.check, arm, cold, warm)
+    prior = drift_prior(arm) if args.prior is None else read_prior(args.prior, arm)
     documents = []
     for name in warm.cycles:
-        found = _solve(spots, warm.of_cycle(name), request, prior)
-        own = None if check is None else _of_cycle(check, name, warm.cycles[-1])
-        unseen = None if own is None else own.data
-        judged = judge_cycle(found, spots, in_force=arm, check=unseen, sigma_m=request.sigma_m)
-        method = "subset" if request.parameters else "map"
+        data = warm.of_cycle(name).data
+        if chosen:
+            found = identify_subset(spots, data, chosen, sigma_m=sigma_m)
+        else:
+            found = identify_cycle(spots, data, prior_covariance=prior, sigma_m=sigma_m)
+        unseen = None
+        if check is not None:  # visits without a cycle belong to the last one
+            last = check.cycles == (ONLY_CYCLE,) and name == warm.cycles[-1]
+            own = check if last else check.of_cycle(name)
+            unseen = own.data if len(own.data) else None
+        judged = judge_cycle(found, spots, in_force=arm, check=unseen, sigma_m=sigma_m)
+        method = "subset" if chosen else "map"
         documents.append(cycle_document(found, judged, spots, arm, method) | {"cycle": name})
     return documents[-1] | {
         "cycles": documents,
         "cold_rejected": list(spots.rejected),
         "data": {
-            "sensor": str(request.sensor_file),
-            "cold": str(request.cold_file),
-            "warm": str(request.warm_file),
-            "check": _name(request.check_file),
-            "prior": _name(request.prior_file),
+            "sensor": str(args.sensor),
+            "cold": str(args.cold),
+            "warm": str(args.warm),
+            "check": _name(args.check),
+            "prior": _name(args.prior),
         },
     }
 
@@ -371,22 +351,6 @@ def check_visits(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visi
             column="pose",
         )
     return check
-
-
-def _of_cycle(check: Visits, name: str, last: str) -> Visits | None:
-    """The check visits of a cycle; those without a cycle belong to the last one."""
-    if check.cycles == (ONLY_CYCLE,) and name == last:
-        return check
-    own = check.of_cycle(name)
-    return own if len(own.data) else None
-
-
-def _solve(
-    spots: ColdSpots, cycle: Visits, request: FixedRequest, prior: NDArray[np.float64]
-) -> CycleDrift:
-    if request.parameters:
-        return identify_subset(spots, cycle.data, request.parameters, sigma_m=request.sigma_m)
-    return identify_cycle(spots, cycle.data, prior_covariance=prior, sigma_m=request.sigma_m)
 
 
 def identify_flange_files(
@@ -507,7 +471,7 @@ def plan_files(arm: SerialArm, args: argparse.Namespace) -> Document:
         When the sphere cannot be brought into the field often enough.
     """
     sensor = read_sensor(args.sensor, arm)
-    own = None if args.own is None else _joints(args.own, arm)
+    own = None if args.own is None else read_measurements(args.own, arm).q
     found = plan_cycle(
         arm,
         sensor.T_sensor_base,
@@ -517,51 +481,32 @@ def plan_files(arm: SerialArm, args: argparse.Namespace) -> Document:
         sigma_m=args.sigma_mm * 1e-3,
         count=args.poses,
         candidates=args.candidates,
-        working=None if args.working is None else _joints(args.working, arm),
+        working=None if args.working is None else read_measurements(args.working, arm).q,
         own=own,
         seed=args.seed,
     )
-    document = _document(arm, found.plan) | {
-        "working_poses": found.working,
-        "candidates": found.candidates,
-        "own_mm": None if found.own_rms_m is None else found.own_rms_m * 1e3,
-        "own_poses": None if own is None else len(own),
-        "output": None,
-    }
-    if args.output is not None:
-        _write(args.output, document)
-        document["output"] = str(args.output)
-    return document
-
-
-def _joints(path: Path, arm: SerialArm) -> Array:
-    return read_measurements(path, arm).q
-
-
-def _document(arm: SerialArm, plan: PosePlan) -> Document:
-    unit = np.where(arm.prismatic, 1e3, np.degrees(1.0))
+    plan, unit = found.plan, np.where(arm.prismatic, 1e3, np.degrees(1.0))
     names = [f"q{i}_{'mm' if slides else 'deg'}" for i, slides in enumerate(arm.prismatic, 1)]
+    poses = [{"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, 1)]
+    if args.output is not None:
+        rows = [[pose["pose"], *(f"{value:.4f}" for value in pose["joints"])] for pose in poses]
+        lines = [",".join(row) for row in [["pose", *names], *rows]]
+        write_text(args.output, "\n".join(lines) + "\n")
     return {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "columns": names,
-        "poses": [
-            {"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, start=1)
-        ],
+        "poses": poses,
         "predicted_mm": plan.predicted_rms_m * 1e3,
         "random_mm": plan.random_rms_m * 1e3,
         "before_mm": plan.before_rms_m * 1e3,
         "gain": 1.0 - plan.predicted_rms_m / plan.random_rms_m,
+        "working_poses": found.working,
+        "candidates": found.candidates,
+        "own_mm": None if found.own_rms_m is None else found.own_rms_m * 1e3,
+        "own_poses": None if own is None else len(own),
+        "output": None if args.output is None else str(args.output),
     }
-
-
-def _write(path: Path, document: Document) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["pose", *document["columns"]])
-    for pose in document["poses"]:
-        writer.writerow([pose["pose"], *(f"{value:.4f}" for value in pose["joints"])])
-    write_text(path, text.getvalue())
 
 
 WANTED = 8
@@ -620,10 +565,17 @@ def run_screen(args: argparse.Namespace) -> CliResult:
         "rounds": found.rows(),
         "chosen": list(found.chosen.names),
         "highest": list(found.highest.names),
-        "best_subset": _best_subset(args, history),
+        "best_subset": None,
         "plot": None if args.plot is None else str(args.plot),
         "warnings": warnings,
     }
+    if args.best_subset:
+        best = best_subset(history, args.wanted)
+        share = share_within(
+            history.residual([history.names.index(name) for name in best.names]),
+            args.threshold_mm * 1e-3,
+        )
+        document["best_subset"] = {"names": list(best.names), "cp": best.cp, "share": share}
     if args.plot is not None:
         draw_rounds(args.plot, document)
     warn(warnings)
@@ -648,16 +600,6 @@ def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
     )
 
 
-def _best_subset(args: argparse.Namespace, history: "DriftHistory") -> Document | None:
-    if not args.best_subset:
-        return None
-
-    found = best_subset(history, args.wanted)
-    chosen = [history.names.index(name) for name in found.names]
-    share = share_within(history.residual(chosen), args.threshold_mm * 1e-3)
-    return {"names": list(found.names), "cp": found.cp, "share": share}
-
-
 def _show_screen(console: "Console", document: Document) -> None:
     from rich.table import Table
     from rich.text import Text
@@ -668,8 +610,9 @@ def _show_screen(console: "Console", document: Document) -> None:
         title_justify="left",
         box=None,
     )
-    for name, justify in (("left", "right"), ("share", "right"), ("removed", "left")):
-        table.add_column(name, justify="right" if justify == "right" else "left")
+    for name in ("left", "share"):
+        table.add_column(name, justify="right")
+    table.add_column("removed")
     table.add_column("stationary")
     for row in document["rounds"]:
         share = "-" if row["share"] is None else f"{row['share']:.1%}"

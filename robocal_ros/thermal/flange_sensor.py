@@ -386,7 +386,11 @@ def identify_and_judge_flange_sensor(
     model = float(result.predicted_variance(check).mean())
     noise = result.noise_m if check.sigma is None else float(np.sqrt(np.mean(check.sigma**2)))
     plain_error = summarise(before[sound])
-    doubt = _doubt(result, plain_error.rms_m)
+    workspace_rms_m, change_m = result.workspace_rms(), result.workspace_change()
+    remedy = "look at the spheres from more sides, and turn every joint"
+    doubt = result.estimate.creeping or too_narrow(
+        workspace_rms_m, change_m, plain_error.rms_m, remedy
+    )
     return JudgedFlangeSensor(
         identification=result,
         nominal=plain_error,
@@ -394,17 +398,10 @@ def identify_and_judge_flange_sensor(
         candidate=summarise(after[sound]),
         predicted_rms_m=float(np.sqrt(model)),
         predicted_total_rms_m=float(np.sqrt(model + 3.0 * noise**2)),
-        workspace_rms_m=result.workspace_rms(),
+        workspace_rms_m=workspace_rms_m,
         held_out_rejected=tuple(check.sample[i] for i in np.flatnonzero(~sound)),
         verdict=judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt),
     )
-
-
-def _doubt(result: FlangeSensorIdentification, current_rms_m: float) -> str:
-    """Say why the poses do not carry over to other ones; empty when they do."""
-    remedy = "look at the spheres from more sides, and turn every joint"
-    error, change = result.workspace_rms(), result.workspace_change()
-    return result.estimate.creeping or too_narrow(error, change, current_rms_m, remedy)
 
 
 def flange_sensor_document(judged: JudgedFlangeSensor) -> Document:

@@ -434,10 +434,16 @@ def possible_causes(
     if (moved := _explains(setup[:, :, 3:], deviation, covariance)) is not None:
         by = f"{np.linalg.norm(moved) * 1e3:.2f} mm"
         found.append(Cause("sphere", f"the sphere moved on the flange by {by}"))
-    for name, column in _joint_zeros(spots.cell.arm):
-        if (moved := _explains(parameters[:, :, [column]], deviation, covariance)) is not None:
+    arm = spots.cell.arm
+    names = arm.parameters.names
+    for i, joint in enumerate(arm.joint_names, start=1):
+        zero = f"d{i}_mm" if arm.prismatic[i - 1] else f"theta{i}_deg"
+        if zero not in names:
+            continue
+        column = parameters[:, :, [names.index(zero)]]
+        if (moved := _explains(column, deviation, covariance)) is not None:
             by = f"{np.degrees(moved[0]):.4f} deg"
-            found.append(Cause(name, f"the zero of {name} changed by {by}"))
+            found.append(Cause(joint, f"the zero of {joint} changed by {by}"))
     return tuple(found)
 
 
@@ -461,15 +467,6 @@ def step_words(causes: Sequence[Cause], fixed: FixedSphere | None) -> str:
             "reference_sphere_center, would decide; "
         )
     return f"{said}look at sensor, sphere and robot, then calibrate or capture a new cold reference"
-
-
-def _joint_zeros(arm: SerialArm) -> list[tuple[str, int]]:
-    names = arm.parameters.names
-    wanted = [
-        (joint, f"d{i}_mm" if arm.prismatic[i - 1] else f"theta{i}_deg")
-        for i, joint in enumerate(arm.joint_names, start=1)
-    ]
-    return [(joint, names.index(name)) for joint, name in wanted if name in names]
 
 
 def _explains(rows: Array, deviation: Array, covariance: Array) -> Array | None:
@@ -564,6 +561,8 @@ def conclude(
     """Judge from the errors (m,) of the model in force and of the candidate at ``data``.
 
     ``spread`` (m,) is what the covariances expect of ``after``; ``usable`` (m,) what may judge.
+    Poses that halve the prior's error throughout the workspace carry over to it, however small
+    the change: the model in force came from such poses too and is no better known elsewhere.
     """
     chosen, cold, spot = spots.cell.arm.parameters, spots.cell.arm, spots.match(data)
     A = spots.rows(data.q, spots.target[spot])[0]
@@ -571,30 +570,21 @@ def conclude(
     rows = workspace_rows(spots)
     moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
     change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-    doubt = _doubt(found, rows, summarise(current[sound]).rms_m, change)
+    workspace_rms_m, prior = _rms(rows, found.covariance), found.prior_covariance
+    doubt = ""
+    if prior is None or workspace_rms_m > 0.5 * _rms(rows, prior):
+        current_rms_m = summarise(current[sound]).rms_m
+        doubt = too_narrow(workspace_rms_m, change, current_rms_m, SPREAD_POSES)
     return Judgement(
         nominal=summarise(np.linalg.norm(spots.drift(data), axis=1)[sound]),
         current=summarise(current[sound]),
         candidate=summarise(after[sound]),
         predicted_rms_m=_rms(A, found.covariance),
         predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
-        workspace_rms_m=_rms(rows, found.covariance),
+        workspace_rms_m=workspace_rms_m,
         held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
         verdict=judge(current[sound], after[sound], spot[sound], doubt),
     )
-
-
-def _doubt(found: CycleDrift, rows: Array, current_rms_m: float, change_m: float) -> str:
-    """Say why the poses do not carry over to the workspace; empty when they do.
-
-    Poses that halve the prior's error there do, however small the change: the model in force came
-    from such poses too and is no better known elsewhere.
-    """
-    error = _rms(rows, found.covariance)
-    prior = found.prior_covariance
-    if prior is not None and error <= 0.5 * _rms(rows, prior):
-        return ""
-    return too_narrow(error, change_m, current_rms_m, SPREAD_POSES)
 
 
 def _rms(rows: Array, covariance: Array) -> float:

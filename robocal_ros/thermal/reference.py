@@ -340,9 +340,10 @@ def require_cold_counterparts(cold: Visits, warm: Visits, file: str | None = Non
     known = {pose: cold.data.q[i] for i, pose in enumerate(cold.pose)}
     for i, pose in enumerate(warm.pose):
         if pose not in known:
+            more = f" and {len(known) - 6} more" if len(known) > 6 else ""
             raise InputError(
                 f"sample {warm.data.sample[i]}: pose '{pose}' was not visited cold (those are "
-                f"{_listed(tuple(known))})",
+                f"{', '.join(list(known)[:6])}{more})",
                 file=file,
                 column="pose",
             )
@@ -355,11 +356,6 @@ def require_cold_counterparts(cold: Visits, warm: Visits, file: str | None = Non
                 file=file,
                 column="pose",
             )
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    few = ", ".join(names[:6])
-    return few if len(names) <= 6 else f"{few} and {len(names) - 6} more"
 
 
 def read_visits(path: str | Path, arm: SerialArm) -> Visits:

@@ -67,26 +67,24 @@ class DriftProcess:
                 f"be shorter than the {self.steady_s:g} s after which the steady state is forgotten"
             )
 
-    def transition(self, step_s: float) -> tuple[Array, Array]:
-        """Transition (2, 2) of a drift and its steady state, and its noise for variance 1."""
-        return _transition(step_s, self.approach_s, self.steady_s)
+    def transition(self, step_s: float, approach_s: float | None = None) -> tuple[Array, Array]:
+        """Transition (2, 2) of a drift and its steady state, and its noise for variance 1.
 
-    def setup_transition(self, step_s: float) -> tuple[Array, Array]:
-        """The same of a coordinate of the set-up."""
-        return _transition(step_s, self.setup_approach_s, self.steady_s)
-
-
-def _transition(step_s: float, approach_s: float, steady_s: float) -> tuple[Array, Array]:
-    near, far = np.exp(-step_s / approach_s), np.exp(-step_s / steady_s)
-    share = steady_s / (steady_s - approach_s)
-    F = np.array([[near, share * (far - near)], [0.0, far]])
-    reached = steady_s / (steady_s + approach_s)
-    long_run = np.array([[reached, reached], [reached, 1.0]])
-    return F, long_run - F @ long_run @ F.T
+        ``approach_s``: of another coordinate than the parameters.
+        """
+        approach_s, steady_s = self.approach_s if approach_s is None else approach_s, self.steady_s
+        near, far = np.exp(-step_s / approach_s), np.exp(-step_s / steady_s)
+        share = steady_s / (steady_s - approach_s)
+        F = np.array([[near, share * (far - near)], [0.0, far]])
+        reached = steady_s / (steady_s + approach_s)
+        long_run = np.array([[reached, reached], [reached, 1.0]])
+        return F, long_run - F @ long_run @ F.T
 
 
-# A motor and its gear move their own joint's parameters at once. The link that follows the joint
-# lies between its motor and the next one, and follows both with a lag.
+# What the motors' temperatures say of the drift. A motor and its gear move their own joint's
+# parameters at once. The link that follows the joint lies between its motor and the next one, and
+# follows both with a lag.
+
 SOURCES = 3  # of each parameter: its joint's motor, the same lagged, the next motor lagged
 SWING_K = 20.0  # where a temperature may go once it is no longer read
 SWING_TIME_S = 3600.0
@@ -159,11 +157,6 @@ class Heat:
         own = np.arange(len(joint))
         rows[own, own] = np.column_stack([self.motor, self.lagged, next_lagged])[joint]
         return rows.reshape(len(joint), -1)
-
-
-def swing_k(silent_s: float) -> float:
-    """Standard deviation, K, of a motor's temperature so long after it was read."""
-    return float(SWING_K * (1.0 - np.exp(-max(silent_s, 0.0) / SWING_TIME_S)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +315,11 @@ class DriftTracker:
         process, setup = self.process, slice(self._setup, None)
         for part, (F, noise), variance in (
             (slice(2 * k), process.transition(step), process.covariance),
-            (setup, process.setup_transition(step), process.setup_sigma_m**2 * np.eye(SETUP)),
+            (
+                setup,
+                process.transition(step, process.setup_approach_s),
+                process.setup_sigma_m**2 * np.eye(SETUP),
+            ),
         ):
             for rows in (mean[:, None], P, P.T):  # F P F^T by blocks: the rest of F is one
                 before = rows[part].reshape(2, len(variance), -1)
@@ -350,7 +347,8 @@ class DriftTracker:
         if heat is None:
             return total
         silent_s, gains = time_s - heat.time_s, self.state.mean[self._gains]
-        for warm in swing_k(silent_s) * np.eye(len(heat.motor)):
+        swing_k = SWING_K * (1.0 - np.exp(-max(silent_s, 0.0) / SWING_TIME_S))
+        for warm in swing_k * np.eye(len(heat.motor)):
             gone = Heat(0.0, warm, np.zeros_like(warm), heat.lag_s).held(silent_s)
             drift = gone.rows(self._joint) @ gains
             total += np.outer(drift, drift)

@@ -9,7 +9,7 @@ from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.cell_setup import calibrate_sensor
+from robocal_ros.thermal.cell_setup import calibrate_sensor, place_sensor
 
 SIGMA = 2e-5
 T_SENSOR_BASE, BALL = thermal_shift.T_SENSOR_BASE, thermal_shift.BALL
@@ -50,10 +50,10 @@ def errors(arm: SerialArm, method: str, count: int) -> np.ndarray:
     """Errors (count, 9) in the order of the covariance, the first of them of the same visits."""
     q, rows = poses(9), []
     for seed in range(count):
-        found = calibrate_sensor(arm, visit(arm, q, np.random.default_rng(seed)), method)
-        turn = frames.log_rotation(found.T_sensor_base[:3, :3] @ T_SENSOR_BASE[:3, :3].T)
-        shift = found.T_sensor_base[:3, 3] - T_SENSOR_BASE[:3, 3]
-        rows.append(np.concatenate([shift, turn, found.sphere_in_flange - BALL]))
+        cell, _, _ = place_sensor(arm, visit(arm, q, np.random.default_rng(seed)), method)
+        turn = frames.log_rotation(cell.T_frame_base[:3, :3] @ T_SENSOR_BASE[:3, :3].T)
+        shift = cell.T_frame_base[:3, 3] - T_SENSOR_BASE[:3, 3]
+        rows.append(np.concatenate([shift, turn, cell.T_flange_target[0, :3, 3] - BALL]))
     return np.array(rows)
 
 
