@@ -27,11 +27,11 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.maintenance import MaintenanceSession
-from robocal_ros.maintenance.memory import Accuracy
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.accuracy import Accuracy
 from robocal_ros.thermal.drift_following import EXPECTED
 from robocal_ros.thermal.learning import LearnedProcess, process_document
 from robocal_ros.thermal.session import ThermalSession

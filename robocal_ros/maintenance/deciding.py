@@ -28,7 +28,7 @@ from robocal_ros.ground.proposals import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.maintenance.memory import MaintenanceConfig
-from robocal_ros.maintenance.robot_interface import Hands, Script
+from robocal_ros.maintenance.robot_interface import CellInterface, Script
 from robocal_ros.session.events import (
     ACCEPT,
     REJECT,
@@ -236,12 +236,9 @@ class Decider:
         entry = self._history.get(calibration_id)
         if entry.state is not CalibrationState.PENDING:
             return f"it is {entry.state.value}"
-        if entry.kind == THERMAL:
-            return self._shift_withheld(calibration_id)
-        return self._outdated(entry) or self._tool_withheld(calibration_id)
-
-    def _shift_withheld(self, calibration_id: int) -> str:
-        allowed_m, shift_m = self._config.bounds.thermal_m, self.thermal_shift_m(calibration_id)
+        if entry.kind != THERMAL:
+            return self._outdated(entry) or self._tool_withheld(calibration_id)
+        allowed_m, shift_m = bounds.thermal_m, self.thermal_shift_m(calibration_id)
         if not shift_m <= allowed_m:
             return (
                 f"the tool centre point would be {shift_m * 1e3:.2f} mm from where it was at "
@@ -296,17 +293,11 @@ def _nothing_to_do(command: Command, words: str) -> Outcome:
     return Outcome(command, Code.ACCEPT, words, repeated=True)
 
 
-def withholding(kind: str, calibration_id: int, why: str) -> Outcome:
-    """A candidate is left to a person, for the record."""
-    words = f"{kind} candidate {calibration_id} waits for a decision: {why}"
-    return Outcome(Command(WITHHOLD, {"id": calibration_id, "kind": kind}), Code.ACCEPT, words)
-
-
 HELD_S = 2.0  # another process's change is a matter of milliseconds
 WITHIN = "within the configured bounds"
 
 
-def patiently(hands: Hands, act: Callable[[], Outcome]) -> Script[Outcome]:
+def patiently(cell: CellInterface, act: Callable[[], Outcome]) -> Script[Outcome]:
     """What ``act`` gives; where the storage refuses, at the next ticks again while time allows.
 
     Raises
@@ -314,9 +305,9 @@ def patiently(hands: Hands, act: Callable[[], Outcome]) -> Script[Outcome]:
     StorageError
         The last refusal, where it raised.
     """
-    until_s = hands.now_s + HELD_S
+    until_s = cell.now_s + HELD_S
     while True:
-        last = hands.now_s >= until_s or not hands.fits(0.0)
+        last = cell.now_s >= until_s or not cell.fits(0.0)
         try:
             outcome = act()
         except StorageError:
@@ -329,7 +320,7 @@ def patiently(hands: Hands, act: Callable[[], Outcome]) -> Script[Outcome]:
 
 
 def settled(
-    hands: Hands,
+    cell: CellInterface,
     decider: Decider,
     kind: str,
     calibration_id: int,
@@ -344,10 +335,12 @@ def settled(
     def act() -> Outcome:
         mine = decider.accepted_here(calibration_id)  # by a try whose answer was lost
         if not mine and (why := decider.withheld(calibration_id) or unsure()):
-            return withholding(kind, calibration_id, why)
+            message = f"{kind} candidate {calibration_id} waits for a decision: {why}"
+            command = Command(WITHHOLD, {"id": calibration_id, "kind": kind})
+            return Outcome(command, Code.ACCEPT, message)
         return decider.decide(ACCEPT, calibration_id, BY, WITHIN, wall_ns)
 
-    return (yield from patiently(hands, act))
+    return (yield from patiently(cell, act))
 
 
 def is_accepted(outcome: Outcome) -> bool:

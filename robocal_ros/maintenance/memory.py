@@ -43,34 +43,27 @@ class DocumentStore(Protocol):
 
 @dataclass(frozen=True)
 class CycleResult:
-    """How a maintenance cycle ended, or how far it has come.
-
-    Attributes
-    ----------
-    stamp_ns : when it ended, by the wall clock; began, while it runs, and of one that was killed.
-    run : the how many-th since the state folder was made; 0: of a version that did not count.
-    code : ACCEPT when it ran as planned, with the robot at home; NONE while it runs.
-    complete : nothing that was due is left for the next gap; ``left`` names what is.
-    thermal_code, thermal_id : of the end of the thermal cycle; NONE where it did not end.
-    tool_found_code : what was found of the tool as the gap began, also where that was mended.
-    tool_code, tool_id : of the last tool measurement, and its candidate.
-    tool_answer : of the last quick check.
-    accepted : calibrations that were accepted without a person.
-    """
+    """How a maintenance cycle ended, or how far it has come."""
 
     cycle_id: str
+    # ACCEPT when it ran as planned, with the robot at home; NONE while it runs
     code: Code = Code.NONE
     message: str = ""
-    complete: bool = False
+    complete: bool = False  # nothing that was due is left for the next gap; ``left`` names what is
     left: tuple[str, ...] = ()
+    # thermal_code, thermal_id: of the end of the thermal cycle; NONE where it did not end
     thermal_code: Code = Code.NONE
     thermal_id: int = 0
+    # tool_code, tool_id: of the last tool measurement, and its candidate
     tool_code: Code = Code.NONE
     tool_id: int = 0
-    tool_answer: str = ""
-    accepted: tuple[int, ...] = ()
+    tool_answer: str = ""  # of the last quick check
+    accepted: tuple[int, ...] = ()  # calibrations that were accepted without a person
+    # what was found of the tool as the gap began, also where that was mended
     tool_found_code: Code = Code.NONE
+    # when it ended, by the wall clock; began, while it runs, and of one that was killed
     stamp_ns: int = 0
+    # the how many-th since the state folder was made; 0: of a version that did not count
     run: int = 0
 
     def document(self) -> dict[str, Any]:
@@ -90,55 +83,41 @@ class CycleResult:
 
 @dataclass(frozen=True)
 class ToolRecord:
-    """What is known of the tool in force from its last measurement.
+    """What is known of the tool in force from its last measurement."""
 
-    Attributes
-    ----------
-    answer : "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong
-        and has no result for the tool in force; empty: never measured.
-    revision : of the tool that was in force in the last run.
-    thermal_id : thermal model that was in force in it; 0: the nominal one.
-    candidate : calibration that a full measurement proposes in its place; 0: none.
-    postponed : only the time for its check was missing to accept it without a person.
-    wall_ns, full_ns : of its last result, and of the last full one; 0: none.
-    drift_rms_m, drift_bound_m : error of the thermal model through which a tool was last measured.
-    """
-
+    # "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong and has
+    # no result for the tool in force; empty: never measured
     answer: str = ""
     words: str = "the tool was never checked"
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
-    revision: int = 0
-    thermal_id: int = 0
-    candidate: int = 0
-    postponed: bool = False
+    revision: int = 0  # of the tool that was in force in the last run
+    thermal_id: int = 0  # thermal model that was in force in it; 0: the nominal one
+    candidate: int = 0  # calibration that a full measurement proposes in its place; 0: none
+    postponed: bool = False  # only the time for its check was missing to accept it without a person
+    # wall_ns, full_ns: of its last result, and of the last full one; 0: none
     wall_ns: int = 0
     full_ns: int = 0
+    # drift_rms_m, drift_bound_m: error of the thermal model through which a tool was last measured
     drift_rms_m: float = 0.0
     drift_bound_m: float = 0.0
 
 
 @dataclass
 class Memory:
-    """The kept state.
-
-    Attributes
-    ----------
-    fault_code, fault : what stopped the maintenance until it is acknowledged; empty: nothing.
-    running, began_ns : the cycle that is open.
-    runs : cycles that have begun, ever.
-    earlier : ids of the cycles that had ended before this start.
-    """
+    """The kept state."""
 
     keeper: DocumentStore
     cycles: dict[str, CycleResult] = field(default_factory=dict)
     tool: ToolRecord = field(default_factory=ToolRecord)
+    # fault_code, fault: what stopped the maintenance until it is acknowledged; empty: nothing
     fault_code: Code = Code.NONE
     fault: str = ""
+    # running, began_ns: the cycle that is open
     running: str = ""
     began_ns: int = 0
-    runs: int = 0
-    earlier: frozenset[str] = frozenset()
+    runs: int = 0  # cycles that have begun, ever
+    earlier: frozenset[str] = frozenset()  # ids of the cycles that had ended before this start
 
     @classmethod
     def load(cls, keeper: DocumentStore) -> "Memory":
@@ -266,50 +245,33 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AcceptBounds:
-    """What may be accepted without a person, absolute against the commissioning model.
+    """What may be accepted without a person, absolute against the commissioning model."""
 
-    Attributes
-    ----------
-    automatic : False: nothing may.
-    thermal_m : largest shift of the tool's tip at home and measuring poses from the cold reference.
-    tool_m, tool_rad : of the tip and of the axis from the taught tool.
-    """
-
-    automatic: bool = False
+    automatic: bool = False  # False: nothing may
+    # largest shift of the tool's tip at home and measuring poses from the cold reference
     thermal_m: float = 1e-3
+    # tool_m, tool_rad: of the tip and of the axis from the taught tool
     tool_m: float = 1e-3
     tool_rad: float = float(np.radians(1.5))
 
 
 @dataclass(frozen=True)
 class Times:
-    """How long each part may take at the most, s; what takes longer is broken off.
+    """How long each part may take at the most, s; what takes longer is broken off."""
 
-    Attributes
-    ----------
-    answer_s : a service of another node.
-    solve_s : the end of a thermal cycle.
-    settle_s : a measurement counts so long after the robot stands.
-    stay_s : the robot stays so long after the last measurement of a pose.
-    measure_s : at a pose, from standstill on.
-    check_s, full_s : a quick check and a full measurement of the tool, from home to its end.
-    tool_home_s : kept free for the way home from the beams; a longer one counts once it was driven.
-    reserve_s : kept free before the end of a gap.
-    rest_s : after a motion's end, until the robot rests where it ends.
-    stale_s : ``gap_open`` may pause for so long.
-    """
-
-    answer_s: float = 1.0
-    solve_s: float = 6.0
-    settle_s: float = 0.3
-    stay_s: float = 0.2
-    measure_s: float = 3.0
+    answer_s: float = 1.0  # a service of another node
+    solve_s: float = 6.0  # the end of a thermal cycle
+    settle_s: float = 0.3  # a measurement counts so long after the robot stands
+    stay_s: float = 0.2  # the robot stays so long after the last measurement of a pose
+    measure_s: float = 3.0  # at a pose, from standstill on
+    # check_s, full_s: a quick check and a full measurement of the tool, from home to its end
     check_s: float = 15.0
     full_s: float = 30.0
+    # kept free for the way home from the beams; a longer one counts once it was driven
     tool_home_s: float = 10.0
-    reserve_s: float = 1.0
-    rest_s: float = 1.0
-    stale_s: float = 0.5
+    reserve_s: float = 1.0  # kept free before the end of a gap
+    rest_s: float = 1.0  # after a motion's end, until the robot rests where it ends
+    stale_s: float = 0.5  # ``gap_open`` may pause for so long
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -319,52 +281,38 @@ class Times:
 
 @dataclass(frozen=True, eq=False)
 class MaintenanceConfig:
-    """What the maintenance of one robot is made of.
+    """What the maintenance of one robot is made of."""
 
-    Attributes
-    ----------
-    home : (n,) taught joints at which the robot is handed over, rad (prismatic: m).
-    poses : (k, n) measuring poses in their order; k = 0: no thermal measurement. The straight
-        joint lines from home through all of them and back home are ways that are free.
-    T_flange_tool : (4, 4) the taught tool.
-    T_base_laser : (4, 4) of the beam station; None: no tool measurement.
-    driving : limits, sizes and deviations; its limits hold at the station.
-    travel_speed_m_s : of the tip on the ways between taught poses.
-    home_near : (n,), or one for all: the robot is at home with all joints so near, rad (m).
-    measurements : so many make a pose measured.
-    resume_within_s : an unfinished thermal cycle goes on when its last pose is no older. The
-        tracker takes all poses of a cycle for measured in its middle, half of a pause away: within
-        300 s a cold robot of this size drifts by as much as one measurement scatters, 0.03 mm.
-    check_every_s, full_every_s : tool measurements that are due without a reason; 0: in each gap,
-        and never.
-    tool_due_s, tool_expires_s : age of a tool check at which it is due, and says nothing any more.
-    silent_s : `~/accuracy` of the thermal node may pause for so long.
-    correction_silent_s : the same of the joint correction's status; 0: there is none, whatever is
-        in force is applied by the robot's controller.
-    tolerance_m : error that the process allows.
-    """
-
-    home: Array
+    home: Array  # (n,) taught joints at which the robot is handed over, rad (prismatic: m)
+    # (k, n) measuring poses in their order; k = 0: no thermal measurement. The straight joint lines
+    # from home through all of them and back home are ways that are free.
     poses: Array
-    T_flange_tool: Array
-    driving: DrivingConfig
-    T_base_laser: Array | None = None
-    travel_speed_m_s: float = 0.25
+    T_flange_tool: Array  # (4, 4) the taught tool
+    driving: DrivingConfig  # limits, sizes and deviations; its limits hold at the station
+    T_base_laser: Array | None = None  # (4, 4) of the beam station; None: no tool measurement
+    travel_speed_m_s: float = 0.25  # of the tip on the ways between taught poses
+    # (n,), or one for all: the robot is at home with all joints so near, rad (m)
     home_near: ArrayLike = float(np.radians(0.5))
-    measurements: int = 1
+    measurements: int = 1  # so many make a pose measured
+    # an unfinished thermal cycle goes on when its last pose is no older. The tracker takes all
+    # poses of a cycle for measured in its middle, half of a pause away: within 300 s a cold robot
+    # of this size drifts by as much as one measurement scatters, 0.03 mm.
     resume_within_s: float = 600.0
+    # check_every_s, full_every_s: tool measurements that are due without a reason; 0: in each gap,
+    # and never
     check_every_s: float = 0.0
     full_every_s: float = 0.0
+    # tool_due_s, tool_expires_s: age of a tool check at which it is due, and says nothing any more
     tool_due_s: float = 2.0 * 3600.0
     tool_expires_s: float = 8.0 * 3600.0
-    silent_s: float = 5.0
+    silent_s: float = 5.0  # `~/accuracy` of the thermal node may pause for so long
+    # the same of the joint correction's status; 0: there is none, whatever is in force is applied
+    # by the robot's controller
     correction_silent_s: float = 5.0
-    tolerance_m: float = 3e-4
+    tolerance_m: float = 3e-4  # error that the process allows
     times: Times = field(default_factory=Times)
     bounds: AcceptBounds = field(default_factory=AcceptBounds)
 
-
-__all__ = ["Accuracy", "Drift", "accuracy_of"]
 
 NS = 1_000_000_000
 MM = 1e-3
@@ -406,8 +354,12 @@ def accuracy_of(
     tool, thermal_id : tool and thermal model (0: nominal) in force.
     """
     parts = []
-    if len(config.poses):
-        parts.append(_thermal(drift))
+    if len(config.poses) and drift is None:
+        silent = "drift: the thermal node is silent"
+        parts.append(_Finding(AccuracyLevel.FAULT, silent, None, 0.0))
+    elif len(config.poses) and drift is not None:
+        reason = f"drift: {drift.reason}"
+        parts.append(_Finding(drift.level, reason, drift.error, drift.due_in_s))
     if config.T_base_laser is not None:
         parts.append(_tool(config, memory.tool, tool, thermal_id, wall_ns))
     if parts and uncorrected:  # what is known of model and tool is not what the line makes
@@ -430,12 +382,6 @@ def accuracy_of(
             return Accuracy(AccuracyLevel.DEGRADED, f"{whose}: {bound}", error, due_in_s)
         words = f"{bound}; {words}" if error is not None else words
     return Accuracy(worst, words, error, due_in_s)
-
-
-def _thermal(drift: Drift | None) -> _Finding:
-    if drift is None:
-        return _Finding(AccuracyLevel.FAULT, "drift: the thermal node is silent", None, 0.0)
-    return _Finding(drift.level, f"drift: {drift.reason}", drift.error, drift.due_in_s)
 
 
 def _tool(

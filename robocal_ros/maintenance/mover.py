@@ -82,7 +82,8 @@ class Ways:
         travel = replace(driving.limits, tcp_speed_m_s=config.travel_speed_m_s)
         self.cell = replace(self.station, limits=travel)
         self._home, self._points = config.home, np.vstack([config.home, config.poses])
-        lines = [self._line(a, b) for a, b in self._ring(HOME, len(self._points), +1)]
+        ring, points = self._ring(HOME, len(self._points), +1), self._points
+        lines = [joint_way(self.cell, points[a], points[b]) for a, b in ring]
         if laser is not None:
             for number, plan in enumerate(lines, start=1):
                 self.cell.require_clear(plan, f"taught way {number}")
@@ -158,9 +159,6 @@ class Ways:
         points = [(first + sense * i) % len(self._points) for i in range(count + 1)]
         return list(pairwise(points))
 
-    def _line(self, a: int, b: int) -> JointPlan:
-        return joint_way(self.cell, self._points[a], self._points[b])
-
     def _route(self, q: Array, lines: Sequence[Line]) -> Route:
         plans = []
         for _, end in lines:
@@ -208,14 +206,6 @@ class Mover:
         self.watch.reading(stamp_s, q, now_s)
         if (newest := self.watch.newest) is not None:
             self.newest_s, self._q = newest  # an older stamp does not count
-
-    def look(self, now_s: float) -> None:
-        """Count silence; call it often."""
-        self.watch.silence.look(now_s)
-
-    def slept(self, for_s: float) -> None:
-        """The host was suspended for so long."""
-        self.watch.slept(for_s)
 
     @property
     def moving(self) -> bool:
@@ -333,10 +323,6 @@ class Mover:
     def lasts_s(self, planned_s: float) -> float:
         """How long the robot takes for what is planned, at the present speed scaling."""
         return planned_s / max(self.watch.scaling, 1e-3)
-
-    def sent(self, now_s: float) -> None:
-        """When the route really was sent: it may have taken a while to plan."""
-        self.watch.sent(now_s)
 
     def arrived(self, now_s: float) -> bool:
         """Whether the route is over, with the robot at its end."""

@@ -117,7 +117,10 @@ class MaintenanceDriver:
             case asked.Measure(mode=mode, cycle_id=name):
                 self._begin_measure(number, mode, name)
             case asked.CancelMeasure():
-                self._cancel_measures()
+                for measure, handle in self._goals.items():
+                    self._cancelled.add(measure)
+                    if handle is not None:
+                        handle.cancel_goal_async()
 
     def _call(
         self, client: Any, request: Any, number: int, read: Callable[[Any], DriverAnswer]
@@ -172,12 +175,6 @@ class MaintenanceDriver:
                 left_plan=result.left_plan,
             ),
         )
-
-    def _cancel_measures(self) -> None:
-        for number, handle in self._goals.items():
-            self._cancelled.add(number)
-            if handle is not None:
-                handle.cancel_goal_async()
 
 
 def _code(status: int) -> Code:
@@ -359,17 +356,16 @@ class MaintenanceNode(HouseNode):
             self._session.slept(for_s)
 
     def _tick(self) -> None:
-        if self._session is not None:
-            requests = self._session.tick(*self._clocks())
-            self._hold_lease()  # before anything moves
-            self._carry_out(requests)
-
-    def _hold_lease(self) -> None:
-        session = self._session
-        running = None if session is None else session.running
-        cycle = "" if running is None else f"cycle '{running.cycle_id}'"
-        stops = session is not None and session.robot.stopping.under_way
-        self._lease.hold(cycle or "a stop" * stops)
+        if self._session is None:
+            return
+        requests = self._session.tick(*self._clocks())
+        running, purpose = self._session.running, ""
+        if running is not None:
+            purpose = f"cycle '{running.cycle_id}'"
+        elif self._session.robot.stopping.under_way:
+            purpose = "a stop"
+        self._lease.hold(purpose)  # before anything moves
+        self._carry_out(requests)
 
     def _carry_out(self, requests: list[DriverRequest]) -> None:
         for request in requests:

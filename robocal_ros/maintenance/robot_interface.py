@@ -91,32 +91,20 @@ class HardStop(DriverRequest):
 
 @dataclass(frozen=True)
 class DriverAnswer:
-    """What came of a request.
+    """What came of a request."""
 
-    Attributes
-    ----------
-    code : ACCEPT when done, else why not; a verdict where there is one.
-    candidate_id : calibration in the history, else 0.
-    missing : numbers, from 1, of the cold poses that were not measured.
-    visited : number of those that were; None where that is not told.
-    has_result : whether a measurement reached one.
-    answer : of a quick check: "pass", "recalibrate", "cannot tell".
-    deviation_mm, sigma_mm : of the tip from the tool in force.
-    left_plan : the robot was stopped because it left its plan.
-    absent : the request reached nobody, as the node is not there.
-    """
-
-    code: Code
+    code: Code  # ACCEPT when done, else why not; a verdict where there is one
     message: str = ""
-    candidate_id: int = 0
-    missing: tuple[int, ...] = ()
-    has_result: bool = False
-    answer: str = ""
+    candidate_id: int = 0  # calibration in the history, else 0
+    missing: tuple[int, ...] = ()  # numbers, from 1, of the cold poses that were not measured
+    has_result: bool = False  # whether a measurement reached one
+    answer: str = ""  # of a quick check: "pass", "recalibrate", "cannot tell"
+    # deviation_mm, sigma_mm: of the tip from the tool in force
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
-    left_plan: bool = False
-    absent: bool = False
-    visited: int | None = None
+    left_plan: bool = False  # the robot was stopped because it left its plan
+    absent: bool = False  # the request reached nobody, as the node is not there
+    visited: int | None = None  # number of those that were; None where that is not told
 
     @property
     def done(self) -> bool:
@@ -203,8 +191,8 @@ class Asking:
 # is let go where it cannot move anything: its service has not existed for `GONE_S`, with each
 # disarm that was asked (a node that starts is found sooner, and starts disarmed); this node has
 # not armed it since the last confirmed disarm, so that no motion that was asked for here can be
-# under way, not the rest of a dead node's trajectory either; and the robot rests at home (`Hands`
-# looks).
+# under way, not the rest of a dead node's trajectory either; and the robot rests at home
+# (`CellInterface` looks).
 #
 # A node that was started anew confirms too, but knows nothing of that trajectory. So a
 # confirmation tells what will be sent; what was sent before it is over where the measurement has
@@ -272,7 +260,7 @@ class Disarming:
         """Whether it cannot move a robot that rests at home."""
         return self._heard and not self.armed and now_s >= self._absent_from_s + GONE_S
 
-    def words(self) -> str:
+    def advice(self) -> str:
         """What a person can do."""
         if self.absent:
             return "the tool node is not there: start it, or leave 'laser' empty"
@@ -282,7 +270,7 @@ class Disarming:
         """Refuse, with a `ConflictError`, what needs a robot that nothing moves from there."""
         if self.engaged:
             words = "the tool node has not confirmed that it is disarmed"
-            raise ConflictError(f"{words}; {self.words()}")
+            raise ConflictError(f"{words}; {self.advice()}")
         if self.armed:
             raise ConflictError(f"{SENT}: wait until the robot rests")
 
@@ -292,7 +280,7 @@ DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stop
 Array = NDArray[np.float64]
 
 
-class Hands(Asking):
+class CellInterface(Asking):
     """Robot, gap and the requests to other nodes; times of a steady clock.
 
     Attributes
@@ -429,7 +417,7 @@ class Hands(Asking):
         until_s = self.now_s + self.config.times.answer_s
         while self.tool.engaged:
             if self.now_s >= until_s:
-                words = f"the tool node does not confirm that it disarmed; {self.tool.words()}"
+                words = f"the tool node does not confirm that it disarmed; {self.tool.advice()}"
                 raise FaultError(Code.CONFLICT, words)
             yield
 
@@ -541,11 +529,11 @@ class Hands(Asking):
             return  # the next run begins from here
         if duration_s >= left_s:
             words = f"the way home takes {duration_s:.1f} s, {max(left_s, 0.0):.1f} s are left"
-            words = "; ".join(filter(None, (words, self.home_told())))
+            words = "; ".join(filter(None, (words, self.longer_way_home())))
             raise FaultError(Code.LIMIT_EXCEEDED, words)
         yield from self.drive(route, route.plan.duration_s)
 
-    def home_told(self) -> str:
+    def longer_way_home(self) -> str:
         """That the way home from the beams took longer than was set, and what to set; or empty."""
         set_s = self.config.times.tool_home_s
         if self.tool_home_s <= set_s:

@@ -159,7 +159,8 @@ class MaintenanceServices:
         add(Trigger, "~/run_trigger", self._twin(self._run_now))
         add(Trigger, "~/status_trigger", self._twin(self._last))
         add(Trigger, "~/cancel_trigger", self._twin(self._cancel_run))
-        add(Trigger, "~/acknowledge_trigger", self._twin(self._acknowledge_now))
+        acknowledge = self._twin(lambda: (0, Code.ACCEPT, self._session().acknowledge(TWIN)))
+        add(Trigger, "~/acknowledge_trigger", acknowledge)
         self._server = DeferredActionServer(
             node,
             RunMaintenance,
@@ -305,9 +306,6 @@ class MaintenanceServices:
         if self._session().cancel("cancelled by a Trigger"):
             return 0, Code.ACCEPT, "the cycle is broken off; the robot is brought home"
         return 0, Code.CONFLICT, "no cycle runs"
-
-    def _acknowledge_now(self) -> tuple[int, Code, str]:
-        return 0, Code.ACCEPT, self._session().acknowledge(TWIN)
 
     def _decide_only(self, name: str) -> Callable[[], tuple[int, Code, str]]:
         def decide() -> tuple[int, Code, str]:
@@ -538,7 +536,10 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
         silent_s=settings["thermal_silent_s"],
         correction_silent_s=settings["correction_silent_s"],
         tolerance_m=settings["tolerance_mm"] * MM,
-        times=_times(settings),
+        times=Times(
+            stale_s=settings["gap_stale_s"],
+            **{each.name: settings[each.name] for each in fields(Times) if each.name != "stale_s"},
+        ),
         bounds=AcceptBounds(
             settings["auto_accept"],
             settings["accept_thermal_mm"] * MM,
@@ -546,8 +547,3 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
             settings["accept_tool_deg"] * degree,
         ),
     )
-
-
-def _times(settings: Mapping[str, Any]) -> Times:
-    same = {field.name: settings[field.name] for field in fields(Times) if field.name != "stale_s"}
-    return Times(stale_s=settings["gap_stale_s"], **same)

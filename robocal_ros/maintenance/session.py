@@ -31,7 +31,12 @@ from robocal_ros.maintenance.memory import (
     accuracy_of,
 )
 from robocal_ros.maintenance.mover import FaultError, Ways
-from robocal_ros.maintenance.robot_interface import DriverAnswer, DriverRequest, Hands, Script
+from robocal_ros.maintenance.robot_interface import (
+    CellInterface,
+    DriverAnswer,
+    DriverRequest,
+    Script,
+)
 from robocal_ros.session.events import Command, History, Outcome
 from robocal_ros.thermal.accuracy import Accuracy
 from robocal_ros.tool.session import FULL, QUICK
@@ -54,8 +59,8 @@ class Conductor:
     broken : why the run is broken off; None while it goes on.
     """
 
-    def __init__(self, hands: Hands, memory: Memory, tell: Tell) -> None:
-        self._hands, self._memory, self._tell = hands, memory, tell
+    def __init__(self, cell: CellInterface, memory: Memory, tell: Tell) -> None:
+        self._cell, self._memory, self._tell = cell, memory, tell
         self.run: CycleRun | None = None
         self.broken: tuple[Code, str] | None = None
         self._script: Script[None] | None = None
@@ -63,35 +68,36 @@ class Conductor:
 
     def begin(self, run: CycleRun) -> None:
         """A run begins at the next tick; nothing moves before the tool's driver is disarmed."""
-        self._hands.doubt()
+        self._cell.doubt()
         self.run, self._script, self.broken = run, self._whole(run), None
-        self._hands.doing = "begins"
+        self._cell.doing = "begins"
 
     def tick(self, wall_ns: int) -> None:
         """Look after gap and robot, then go on."""
-        run, hands = self.run, self._hands
-        if self._unsaved and (not hands.stopping or hands.now_s >= self._save_by_s):
+        run, cell = self.run, self._cell
+        if self._unsaved and (not cell.stopping or cell.now_s >= self._save_by_s):
             self._save()
-        hands.look_after_tool()
+        cell.look_after_tool()
         if run is None:
-            hands.keep_disarming()
+            cell.keep_disarming()
             return
         run.at(wall_ns)
         try:
-            if hands.may_wait():
+            if cell.may_wait():
                 return
-            if why := hands.gap.over(hands.now_s):
+            if why := cell.gap.over(cell.now_s):
                 self.give_up(why)
                 return
-            hands.robot.require_sane(hands.now_s)
+            cell.robot.require_sane(cell.now_s)
             if self._script is not None:
                 next(self._script)
         except StopIteration:
             self._script_ended(run)
         except FaultError as error:
             self.fault(error.code, str(error))
-        except RobocalError as error:
-            self._failed(error)
+        except RobocalError as error:  # refused in the middle of it: home, and end with its code
+            end = self.break_off if self.broken is None else self.fault
+            end(error.code, str(error))
         except Exception as error:  # a defect: the script is over, and the robot may move
             self.fault(Code.CONFLICT, _defect(error))
 
@@ -99,72 +105,65 @@ class Conductor:
         """Stop the robot, and bring it home; the run ends with this code."""
         self._close_script()
         self.broken = code, reason
-        self._hands.doing = "is broken off"
-        self._script = self._hands.after_break()
+        self._cell.doing = "is broken off"
+        self._script = self._cell.after_break()
 
     def fault(self, code: Code, reason: str, at_once: bool = False) -> None:
         """Stop the robot where it moves, disarm, end the run; nothing more until acknowledged.
 
-        ``at_once``: no tick follows, see `Hands.halt`.
+        ``at_once``: no tick follows, see `CellInterface.halt`.
         """
         self._close_script()
-        hands, run = self._hands, self.run
+        cell, run = self._cell, self.run
         if run is not None and run.owes not in reason:
             reason = f"{reason}; {run.owes}"
         try:
-            hands.halt(at_once)
+            cell.halt(at_once)
         except Exception as error:  # without a stop of ours it must still be disarmed, and told
             reason = f"{reason}; no stop was sent: {_defect(error)}"
-        if hands.tool.engaged:
-            hands.disengage()
-        self.run, hands.doing = None, "fault"
+        if cell.tool.engaged:
+            cell.disengage()
+        self.run, cell.doing = None, "fault"
         self._tell(FAULT, {}, code, reason)
         self._note(run, code, reason, fault=reason)
         # A stop, one that is yet to come too, does not wait for the disk: without this write too
         # the next start finds a fault.
-        self._unsaved = bool(hands.out or hands.stopping)
-        self._save_by_s = hands.now_s + UNSAVED_S
+        self._unsaved = bool(cell.out or cell.stopping)
+        self._save_by_s = cell.now_s + UNSAVED_S
         if not self._unsaved:
             self._save()
 
     def give_up(self, why: str, at_once: bool = False) -> None:
         """End the run now: at home and disarmed it just ends, anywhere else it is a `fault`.
 
-        ``at_once``: a stop that is still due after a fault goes out too, see `Hands.halt`.
+        ``at_once``: a stop that is still due after a fault goes out too, see `CellInterface.halt`.
         """
-        hands = self._hands
+        cell = self._cell
         if self.run is None:
-            if at_once and hands.stopping:
-                hands.halt(at_once)
-        elif hands.not_handed_over():
+            if at_once and cell.stopping:
+                cell.halt(at_once)
+        elif cell.not_handed_over():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
             self._end(Code.CONFLICT, why)
 
     def _whole(self, run: CycleRun) -> Script[None]:
-        if self._hands.tool.engaged:
-            yield from self._hands.disarmed()
+        if self._cell.tool.engaged:
+            yield from self._cell.disarmed()
         yield from run.script()
 
     def _script_ended(self, run: CycleRun) -> None:
-        robot = self._hands.robot
+        robot = self._cell.robot
         if away := robot.beside_home():
             code = Code.TOO_FEW_SAMPLES if robot.unheard else Code.LIMIT_EXCEEDED
             self.fault(code, f"robot is not at home: {away}")
-        elif self._hands.tool.doubted:
+        elif self._cell.tool.doubted:
             self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)
         else:
             self._end(run.result.code, run.result.message)
-
-    def _failed(self, error: RobocalError) -> None:
-        """Something was refused in the middle of it: home, and end with its code."""
-        if self.broken is None:
-            self.break_off(error.code, str(error))
-        else:
-            self.fault(error.code, str(error))
 
     def _end(self, code: Code, message: str) -> None:
         self._close_script()
@@ -175,7 +174,7 @@ class Conductor:
                 self.fault(Code.CONFLICT, message)
                 return
         self.run = None
-        self._hands.doing = ""
+        self._cell.doing = ""
         self._note(run, code, message)
         self._save()
 
@@ -204,7 +203,7 @@ class Conductor:
         if self._script is not None:
             self._script.close()
         self._script = None
-        self._hands.forget_answers()
+        self._cell.forget_answers()
 
 
 def _defect(error: Exception) -> str:
@@ -228,72 +227,26 @@ class MaintenanceState(IntEnum):
 
 @dataclass(frozen=True)
 class Status:
-    """The maintenance at one instant.
-
-    Attributes
-    ----------
-    cycle_id : that runs, or ran last.
-    doing : in words.
-    left_s : of the gap; 0 while nothing runs.
-    at_home, disarmed : of the robot and of the tool's driver, as far as is known; disarmed is one
-        of which nothing is under way either.
-    last : how the last cycle ended; None before any.
-    thermal_pending, tool_pending : newest candidates that wait for a decision; 0: none.
-    fault_code, fault : NONE and empty without one.
-    beat : counts up with each status that is published; the PLC's heartbeat echoes it.
-    closed : why the gap counts as closed; empty while it is open.
-    trouble : why nobody knows what waits; empty: the pending ids are true.
-    """
+    """The maintenance at one instant."""
 
     state: MaintenanceState
-    cycle_id: str
-    doing: str
-    left_s: float
+    cycle_id: str  # that runs, or ran last
+    doing: str  # in words
+    left_s: float  # of the gap; 0 while nothing runs
+    # at_home, disarmed: of the robot and of the tool's driver, as far as is known; disarmed is one
+    # of which nothing is under way either
     at_home: bool
     disarmed: bool
-    last: CycleResult | None
+    last: CycleResult | None  # how the last cycle ended; None before any
+    # thermal_pending, tool_pending: newest candidates that wait for a decision; 0: none
     thermal_pending: int
     tool_pending: int
+    # fault_code, fault: NONE and empty without one
     fault_code: Code
     fault: str
-    beat: int
-    closed: str = ""
-    trouble: str = ""
-
-
-def status_of(
-    state: MaintenanceState,
-    running: CycleResult | None,
-    memory: Memory,
-    hands: Hands,
-    decider: Decider,
-    now_s: float,
-) -> Status:
-    """All of it, at a time; ``running``: the cycle that runs, as far as it has come."""
-    last = next(reversed(memory.cycles.values()), None)
-    named = last.cycle_id if last is not None else ""
-    thermal, tool, trouble = 0, 0, ""
-    try:
-        newest = [decider.newest(kind) for kind in (THERMAL, TOOL)]
-        thermal, tool = (found.id if found else 0 for found in newest)
-    except RobocalError as error:
-        trouble = str(error)
-    return Status(
-        state=state,
-        cycle_id=named if running is None else running.cycle_id,
-        doing=hands.doing,
-        left_s=0.0 if running is None else max(hands.gap.left_s(now_s), 0.0),
-        at_home=not hands.robot.beside_home(),
-        disarmed=not hands.tool.doubted,
-        last=last,
-        thermal_pending=thermal,
-        tool_pending=tool,
-        fault_code=memory.fault_code,
-        fault=memory.fault,
-        beat=hands.gap.beat,
-        closed=hands.gap.closed(now_s),
-        trouble=trouble,
-    )
+    beat: int  # counts up with each status that is published; the PLC's heartbeat echoes it
+    closed: str = ""  # why the gap counts as closed; empty while it is open
+    trouble: str = ""  # why nobody knows what waits; empty: the pending ids are true
 
 
 Array = NDArray[np.float64]
@@ -327,26 +280,26 @@ class MaintenanceSession:
         self.config, self.ways = config, Ways(nominal, config)
         self.memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
-        self._hands = Hands(config, self.ways)
-        self.robot = self._hands.robot
-        self._hands.doubt()  # whoever ran before may have left the tool's driver armed
+        self._cell = CellInterface(config, self.ways)
+        self.robot = self._cell.robot
+        self._cell.doubt()  # whoever ran before may have left the tool's driver armed
         self._book = ThermalCycle()
         self._record = record
-        self._conductor = Conductor(self._hands, self.memory, self._tell)
+        self._conductor = Conductor(self._cell, self.memory, self._tell)
         self._heard = Heard(config)
         self._second = ""
 
     def beat(self, now_s: float) -> int:
         """The next beat, to be published now; 5 Hz. A heartbeat echoes it."""
-        return self._hands.gap.count(now_s)
+        return self._cell.gap.count(now_s)
 
     def gap(self, is_open: bool, echo: int | None, now_s: float) -> None:
         """Take a heartbeat of ``gap_open``, with the beat that it echoes (None: it has none)."""
-        self._hands.gap.heard(is_open, echo, now_s)
+        self._cell.gap.heard(is_open, echo, now_s)
 
     def doubt_gap(self, why: str) -> None:
         """The heartbeats do not count, and why; empty: they do."""
-        self._hands.gap.doubt(why)
+        self._cell.gap.doubt(why)
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,), in the arm's order; ``stamp_s`` on their own clock."""
@@ -354,21 +307,21 @@ class MaintenanceSession:
 
     def slept(self, for_s: float) -> None:
         """The host was suspended; call it before anything else with a time of afterwards."""
-        self.robot.slept(for_s)
+        self.robot.watch.slept(for_s)
 
     def sent(self, now_s: float) -> None:
         """The motion that `tick` gave goes out now: its time begins then, not when planned."""
-        self.robot.sent(now_s)
+        self.robot.watch.sent(now_s)
 
     def second(self, why: str, now_s: float) -> None:
         """Somebody else commands this robot, a second maintenance node too; empty: nobody."""
-        self._second, self._hands.now_s = why, now_s
+        self._second, self._cell.now_s = why, now_s
         self._conductor.give_up(why) if why else None
 
     def measured(self, stamp_s: float) -> None:
         """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
-        self._hands.measured.append(stamp_s)
-        del self._hands.measured[:-1000]
+        self._cell.measured.append(stamp_s)
+        del self._cell.measured[:-1000]
 
     def drift(self, drift: Drift, now_s: float) -> None:
         """What the thermal part believes of the accuracy."""
@@ -380,7 +333,7 @@ class MaintenanceSession:
 
     def answered(self, number: int, answer: DriverAnswer) -> None:
         """What came of a request."""
-        self._hands.answered(number, answer)
+        self._cell.answered(number, answer)
 
     def run(self, cycle_id: str, gap_s: float, now_s: float, wall_ns: int) -> CycleResult:
         """Begin a cycle; one that runs or has ended gives what it has, and nothing runs twice.
@@ -396,16 +349,16 @@ class MaintenanceSession:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
         if (known := self.result(cycle_id)) is not None:
             return known
-        hands, memory = self._hands, self.memory
-        hands.now_s = now_s
+        cell, memory = self._cell, self.memory
+        cell.now_s = now_s
         if memory.fault:
             raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
         if (open_run := self._conductor.run) is not None:
             raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
-        hands.tool.require_disarmed()
-        if why := self._second or hands.gap.closed(now_s):
+        cell.tool.require_disarmed()
+        if why := self._second or cell.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
-        hands.begin(gap_s)
+        cell.begin(gap_s)
         try:
             self.robot.require_home()
         except LimitError as error:
@@ -413,12 +366,12 @@ class MaintenanceSession:
             raise
         run = CycleRun(
             memory.begin(cycle_id, wall_ns),
-            hands,
+            cell,
             self._book,
             self._decider,
             memory,
             self._decided,
-            lambda: self._heard.drift(hands.now_s),
+            lambda: self._heard.drift(cell.now_s),
         )
         run.at(wall_ns)
         self._conductor.begin(run)
@@ -478,30 +431,30 @@ class MaintenanceSession:
         """
         if not self.memory.fault:
             return "there is no fault"
-        self._hands.tool.require_disarmed()
+        self._cell.tool.require_disarmed()
         self.robot.require_home()
         words = f"acknowledged: {self.memory.fault}"
         self.memory.clear_fault()
-        self._hands.doing = ""
+        self._cell.doing = ""
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words
 
     def tick(self, now_s: float, wall_ns: int) -> list[DriverRequest]:
         """Look at everything, and go on; what is to be carried out now, in this order."""
-        hands, self._hands.now_s = self._hands, now_s
-        hands.gap.look(now_s)
-        hands.robot.look(now_s)
+        cell, self._cell.now_s = self._cell, now_s
+        cell.gap.look(now_s)
+        cell.robot.watch.silence.look(now_s)
         self._conductor.tick(wall_ns)
-        return hands.handed_out()
+        return cell.handed_out()
 
     def give_up(self, reason: str, now_s: float) -> list[DriverRequest]:
         """The driver goes: stop and disarm, to be carried out at once; a fault unless at home.
 
         Then call `close`.
         """
-        self._hands.now_s = now_s
+        self._cell.now_s = now_s
         self._conductor.give_up(reason, at_once=True)
-        return self._hands.handed_out()
+        return self._cell.handed_out()
 
     def close(self) -> None:
         """Write what waited until the robot was told to stop."""
@@ -509,10 +462,10 @@ class MaintenanceSession:
 
     def worst_cases(self) -> dict[str, float]:
         """How long each step may take at the most, its way home included, s."""
-        thermal = ThermalPart(self._hands, self._book)
+        thermal = ThermalPart(self._cell, self._book)
         found = {"the first measuring pose": thermal.worst_s()} if self.ways.count else {}
         if self.config.T_base_laser is not None:
-            worst_s = self._hands.tool_worst_s
+            worst_s = self._cell.tool_worst_s
             found |= {f"tool measurement ({mode})": worst_s(mode) for mode in (QUICK, FULL)}
         return found
 
@@ -543,7 +496,31 @@ class MaintenanceSession:
 
     def status(self, now_s: float) -> Status:
         """Everything at once."""
-        return status_of(self.state, self.running, self.memory, self._hands, self._decider, now_s)
+        cell, memory, running = self._cell, self.memory, self.running
+        last = next(reversed(memory.cycles.values()), None)
+        named = last.cycle_id if last is not None else ""
+        thermal, tool, trouble = 0, 0, ""
+        try:
+            newest = [self._decider.newest(kind) for kind in (THERMAL, TOOL)]
+            thermal, tool = (found.id if found else 0 for found in newest)
+        except RobocalError as error:
+            trouble = str(error)
+        return Status(
+            state=self.state,
+            cycle_id=named if running is None else running.cycle_id,
+            doing=cell.doing,
+            left_s=0.0 if running is None else max(cell.gap.left_s(now_s), 0.0),
+            at_home=not cell.robot.beside_home(),
+            disarmed=not cell.tool.doubted,
+            last=last,
+            thermal_pending=thermal,
+            tool_pending=tool,
+            fault_code=memory.fault_code,
+            fault=memory.fault,
+            beat=cell.gap.beat,
+            closed=cell.gap.closed(now_s),
+            trouble=trouble,
+        )
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""

@@ -31,20 +31,14 @@ class Housing:
 
     Solid is all that lies below ``top_m`` outside a cylinder about z, and all below ``floor_m``, as
     far as the housing reaches.
-
-    Attributes
-    ----------
-    clear_radius_m : of that cylinder, the opening.
-    top_m, floor_m : heights above the beam plane; the floor's is negative.
-    retract_m : height of the tool's tip on a way over the housing.
-    reach_m : radius about z beyond which nothing is solid; infinite: all around.
     """
 
-    clear_radius_m: float
+    clear_radius_m: float  # of that cylinder, the opening
+    # top_m, floor_m: heights above the beam plane; the floor's is negative
     top_m: float
     floor_m: float
-    retract_m: float
-    reach_m: float = np.inf
+    retract_m: float  # height of the tool's tip on a way over the housing
+    reach_m: float = np.inf  # radius about z beyond which nothing is solid; infinite: all around
 
     def __post_init__(self) -> None:
         opening, top, depth = 1e3 * self.clear_radius_m, 1e3 * self.top_m, -1e3 * self.floor_m
@@ -100,19 +94,13 @@ class Housing:
 
 @dataclass(frozen=True, eq=False)
 class ToolBody:
-    """A tool as two capsules, along its axis from the tip and on to the flange, and the flange.
+    """A tool as two capsules, along its axis from the tip and on to the flange, and the flange."""
 
-    Attributes
-    ----------
-    T_flange_tool : (4, 4) tip, and axis from flange to tip along z.
-    length_m, radius_m : of the part along the axis; the rest of the tool has this radius too.
-    flange_radius_m : of a ball around the flange's origin.
-    """
-
-    T_flange_tool: Array
+    T_flange_tool: Array  # (4, 4) tip, and axis from flange to tip along z
+    # length_m, radius_m: of the part along the axis; the rest of the tool has this radius too
     length_m: float
     radius_m: float
-    flange_radius_m: float
+    flange_radius_m: float  # of a ball around the flange's origin
 
     def __post_init__(self) -> None:
         sizes = {
@@ -151,27 +139,20 @@ class ToolBody:
 
 @dataclass(frozen=True, eq=False)
 class DrivingConfig:
-    """What a driven measurement may do.
-
-    Attributes
-    ----------
-    tool_length_m, tool_radius_m, flange_radius_m : see `ToolBody`.
-    deviation_m, deviation_rad : largest distance of the tip, and of a turning joint, from the plan.
-    silence_s : joint states may pause for so long while the robot moves.
-    late_s : the robot lags at most so far behind its plan.
-    armed_s : without a run it disarms after so long.
-    """
+    """What a driven measurement may do."""
 
     housing: Housing
+    # tool_length_m, tool_radius_m, flange_radius_m: see `ToolBody`
     tool_length_m: float
     tool_radius_m: float
     flange_radius_m: float
     limits: MotionLimits = field(default_factory=MotionLimits)
+    # deviation_m, deviation_rad: largest distance of the tip, and of a turning joint, from the plan
     deviation_m: float = 2e-3
     deviation_rad: float = float(np.radians(0.5))
-    silence_s: float = 0.1
-    late_s: float = 0.15
-    armed_s: float = 60.0
+    silence_s: float = 0.1  # joint states may pause for so long while the robot moves
+    late_s: float = 0.15  # the robot lags at most so far behind its plan
+    armed_s: float = 60.0  # without a run it disarms after so long
 
 
 ROUNDING = 1e-6  # relative, of a speed that is driven at its limit
@@ -181,17 +162,11 @@ FEWEST_STEPS = 4  # between two points of a plan
 
 @dataclass(frozen=True, eq=False)
 class MotionCell:
-    """What motions are planned for.
+    """What motions are planned for."""
 
-    Attributes
-    ----------
-    arm : the model in force, with the joints' limits.
-    T_base_laser : (4, 4) of the station.
-    """
-
-    arm: SerialArm
+    arm: SerialArm  # the model in force, with the joints' limits
     tool: ToolBody
-    T_base_laser: Array
+    T_base_laser: Array  # (4, 4) of the station
     housing: Housing
     limits: MotionLimits = field(default_factory=MotionLimits)
 

@@ -32,14 +32,10 @@ class JointPlan:
     Between points it is the cubic through positions and velocities: what a trajectory controller
     makes of points that carry these two. ``qdd`` is the exact path's; sent along, it would turn
     the cubic into a quintic.
-
-    Attributes
-    ----------
-    time_s : (k,) from the start, increasing, the first 0.
-    q, qd, qdd : (k, n) joints, rad (prismatic: m), and their derivatives.
     """
 
-    time_s: Array
+    time_s: Array  # (k,) from the start, increasing, the first 0
+    # q, qd, qdd: (k, n) joints, rad (prismatic: m), and their derivatives
     q: Array
     qd: Array
     qdd: Array
@@ -191,17 +187,11 @@ def ramp_of(speed_m_s: float, acceleration_m_s2: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TipPath:
-    """The flange's orientation and the tip's place over time.
+    """The flange's orientation and the tip's place over time."""
 
-    Attributes
-    ----------
-    time_s : (k,).
-    T_base_tip : (k, 4, 4) with the flange's axes and the tip as origin.
-    twist, twist_rate : (k, 6) [v; w] of the tip in base, and its derivative.
-    """
-
-    time_s: Array
-    T_base_tip: Array
+    time_s: Array  # (k,)
+    T_base_tip: Array  # (k, 4, 4) with the flange's axes and the tip as origin
+    # twist, twist_rate: (k, 6) [v; w] of the tip in base, and its derivative
     twist: Array
     twist_rate: Array
 
@@ -274,21 +264,16 @@ START_NEAR_M = 5e-5  # prismatic
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Largest values; those of joints for all, or (n,) for each.
+    """Largest values; those of joints for all, or (n,) for each."""
 
-    Attributes
-    ----------
-    joint_velocity, joint_acceleration : rad/s and rad/s^2 (prismatic: m/s and m/s^2).
-    stop_deceleration : of a stop after a fault, rad/s^2 (prismatic: m/s^2).
-    tcp_speed_m_s, tcp_acceleration_m_s2 : of the tool's tip along its path, on every way.
-    plunge_speed_m_s, plunge_depth_m : of a plunge.
-    """
-
+    # joint_velocity, joint_acceleration: rad/s and rad/s^2 (prismatic: m/s and m/s^2)
     joint_velocity: ArrayLike = 1.0
     joint_acceleration: ArrayLike = 5.0
-    stop_deceleration: ArrayLike = 10.0
+    stop_deceleration: ArrayLike = 10.0  # of a stop after a fault, rad/s^2 (prismatic: m/s^2)
+    # tcp_speed_m_s, tcp_acceleration_m_s2: of the tool's tip along its path, on every way
     tcp_speed_m_s: float = 0.05
     tcp_acceleration_m_s2: float = 1.2
+    # plunge_speed_m_s, plunge_depth_m: of a plunge
     plunge_speed_m_s: float = 0.01
     plunge_depth_m: float = 0.02
 

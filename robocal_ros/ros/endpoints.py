@@ -294,23 +294,20 @@ class EndpointNode(LifecycleNode):
             raise NotActiveError(f"{self.get_name()} is {self.state}: activate it to use {name}")
 
     def _refuse(self, name: str, response: Any, error: Exception) -> Any:
-        code = Code.BAD_INPUT
         if isinstance(error, RobocalError):
-            code = error.code
+            code, words = error.code, str(error)
             self.get_logger().warning(f"{name}: {error}")
         else:
+            kind = type(error).__name__
+            code = Code.BAD_INPUT
+            words = f"a defect of this software, please report it: {kind}: {error}"
             self.get_logger().error(f"{name}:\n{''.join(traceback.format_exception(error))}")
         response.success = False
-        words = str(error) if isinstance(error, RobocalError) else _defect(error)
         trigger = isinstance(response, Trigger.Response)
         response.message = trigger_text(0, code, words) if trigger else words
         if hasattr(response, "status"):
             response.status = int(code)
         return response
-
-
-def _defect(error: Exception) -> str:
-    return f"a defect of this software, please report it: {type(error).__name__}: {error}"
 
 
 OK = DiagnosticStatus.OK

@@ -44,28 +44,21 @@ Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[s
 
 @dataclass(frozen=True)
 class Setting:
-    """One parameter.
+    """One parameter."""
 
-    Attributes
-    ----------
-    name, default, description : the type is the default's. An optional list of strings has the
-        default ``[""]`` (ROS has no typed empty list); empty strings are dropped when read.
-    unit : "" when it has none.
-    low, high : inclusive bounds of a number, or of each number of a list.
-    choices : the allowed strings.
-    check : says what is wrong with a value of the right type and within the bounds, or None.
-    live : may change at any time; others only while the node is unconfigured.
-    """
-
+    # name, default, description: the type is the default's. An optional list of strings has the
+    # default ``[""]`` (ROS has no typed empty list); empty strings are dropped when read.
     name: str
     default: Value
     description: str
-    unit: str = ""
+    unit: str = ""  # "" when it has none
+    # low, high: inclusive bounds of a number, or of each number of a list
     low: float | None = None
     high: float | None = None
-    choices: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()  # the allowed strings
+    # says what is wrong with a value of the right type and within the bounds, or None
     check: Callable[[Any], str | None] | None = None
-    live: bool = False
+    live: bool = False  # may change at any time; others only while the node is unconfigured
 
     def accept(self, value: object) -> Value:
         """Return ``value`` as this parameter's type.
@@ -77,8 +70,12 @@ class Setting:
         """
         typed = _typed(value, self.default)
         if typed is None:
-            wanted = _type_name(self.default)
-            raise InputError(f"{self.name} = {value!r} is not {wanted}")
+            names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+            many = isinstance(self.default, list)
+            wanted = names[
+                type(self.default[0] if isinstance(self.default, list) else self.default)
+            ]
+            raise InputError(f"{self.name} = {value!r} is not {'a list, each ' * many}{wanted}")
         for item in typed if isinstance(typed, list) else [typed]:
             self._check_item(item)
         fault = self.check(typed) if self.check else None
@@ -123,13 +120,6 @@ class Setting:
                 whole = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)
                 descriptor.integer_range = [whole]
         return descriptor
-
-
-def _type_name(default: Value) -> str:
-    names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-    if isinstance(default, list):
-        return f"a list, each {names[type(default[0])]}"
-    return names[type(default)]
 
 
 def _typed(value: object, like: Value) -> Value | None:
@@ -204,7 +194,10 @@ class ParameterTable:
         if faults:
             raise InputError("; ".join(faults))
         values = {name: self._node.get_parameter(name).value for name in self._settings}
-        return {name: _without_blanks(value) for name, value in values.items()}
+        for name, value in values.items():
+            if hasattr(value, "__iter__") and not isinstance(value, str):
+                values[name] = [item for item in value if item != ""]
+        return values
 
     def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -226,12 +219,6 @@ class ParameterTable:
             self._faults.pop(name, None)
         if ours and self.locked and self.changed is not None:
             self.changed()
-
-
-def _without_blanks(value: Any) -> Any:
-    if isinstance(value, str) or not hasattr(value, "__iter__"):
-        return value
-    return [item for item in value if item != ""]
 
 
 ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]

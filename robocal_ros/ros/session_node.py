@@ -228,7 +228,15 @@ class SessionEvents:
         """Record a command and what came of it, None for the configuration."""
         self._sequence += 1
         self._since = 0 if command.name == CONFIGURE else self._since + 1
-        self._events.publish(event_message(command, outcome, self._sequence))
+        self._events.publish(
+            SessionEvent(
+                stamp=time_message(command.stamp_ns or 0),
+                sequence=self._sequence,
+                command=command.name,
+                arguments=arguments_text(command),
+                outcome="{}" if outcome is None else outcome_text(outcome),
+            )
+        )
 
     @property
     def need_configuration(self) -> bool:
@@ -238,17 +246,6 @@ class SessionEvents:
         configuration among them.
         """
         return self._since >= EVENTS.depth // 2
-
-
-def event_message(command: Command, outcome: Outcome | None, sequence: int) -> SessionEvent:
-    """A command and what came of it, None for the configuration."""
-    return SessionEvent(
-        stamp=time_message(command.stamp_ns or 0),
-        sequence=sequence,
-        command=command.name,
-        arguments=arguments_text(command),
-        outcome="{}" if outcome is None else outcome_text(outcome),
-    )
 
 
 class Session(Protocol):
@@ -306,7 +303,7 @@ class CommandDesk:
         self._node, self._show = node, show
         self._asked: deque[Future] = deque()
         self.session: Session | None = None
-        self._deadline = node.add_timer(timeout_s, self._force, steady=True)
+        self._deadline = node.add_timer(timeout_s, lambda: self.step(force=True), steady=True)
         self._deadline.cancel()
 
     def ask(self, command: Command) -> Future:
@@ -333,16 +330,12 @@ class CommandDesk:
                 return
             asked = self._asked.popleft()  # before it is shown: that may give a command too
             for outcome in outcomes:
-                self._show_safely(outcome)
+                try:
+                    self._show(outcome)
+                except Exception:  # must not take the answer from its caller
+                    self._node.get_logger().error(f"not shown:\n{traceback.format_exc()}")
             asked.set_result(outcomes[-1])
         self._deadline.cancel()
-
-    def _show_safely(self, outcome: Outcome) -> None:
-        """A defect in showing what was done must not take the answer from its caller."""
-        try:
-            self._show(outcome)
-        except Exception:
-            self._node.get_logger().error(f"not shown:\n{traceback.format_exc()}")
 
     def close(self) -> None:
         """End the session; calls that wait are answered."""
@@ -351,9 +344,6 @@ class CommandDesk:
         while self._asked:
             error = NotActiveError("deactivated while the command waited: nothing was done")
             self._asked.popleft().set_exception(error)
-
-    def _force(self) -> None:
-        self.step(force=True)
 
 
 SessionT = TypeVar("SessionT", bound=Session)

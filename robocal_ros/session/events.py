@@ -45,46 +45,32 @@ MEASURED = (IDENTIFY, END_CYCLE, *SET_UP)  # wait for the last measurements
 
 @dataclass(frozen=True)
 class Command:
-    """Something asked of a session.
+    """Something asked of a session."""
 
-    Attributes
-    ----------
-    name : one of the constants of this module.
-    arguments : plain values (JSON).
-    stamp_ns : data time of the command: only samples up to it count. None: the newest stamp
-        known when the session takes the command.
-    marks : newest stamp taken from each topic when the command was carried out; None until
-        then. A recorded command carries them, so that replay uses the same samples.
-    """
-
-    name: str
-    arguments: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # one of the constants of this module
+    arguments: Mapping[str, Any] = field(default_factory=dict)  # plain values (JSON)
+    # data time of the command: only samples up to it count. None: the newest stamp known when the
+    # session takes the command.
     stamp_ns: int | None = None
+    # newest stamp taken from each topic when the command was carried out; None until then. A
+    # recorded command carries them, so that replay uses the same samples.
     marks: Mapping[str, int] | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A command carried out.
-
-    Attributes
-    ----------
-    status : ACCEPT when done, else why not.
-    document : the identification, where one was made.
-    calibration_id, revision : what was proposed or decided, and the revision now in force.
-    outside : decided in the history by another process; nobody asked this session.
-    repeated : the answer of an earlier command, given again; nothing was done.
-    """
+    """A command carried out."""
 
     command: Command
-    status: Code
+    status: Code  # ACCEPT when done, else why not
     message: str
-    document: Mapping[str, Any] | None = None
+    document: Mapping[str, Any] | None = None  # the identification, where one was made
+    # calibration_id, revision: what was proposed or decided, and the revision now in force
     calibration_id: int = 0
     revision: int = 0
     samples: int = 0
-    outside: bool = False
-    repeated: bool = False
+    outside: bool = False  # decided in the history by another process; nobody asked this session
+    repeated: bool = False  # the answer of an earlier command, given again; nothing was done
 
     @property
     def left_plan(self) -> bool:

@@ -353,9 +353,9 @@ def test_a_way_home_that_took_longer_than_was_set_counts_from_then_on(history):
         step = f"tool measurement ({mode})"
         assert after_s[step] - before_s[step] == pytest.approx(takes_s - set_s, abs=0.02)
     quick_s = before_s["tool measurement (quick)"] + TIMES.reserve_s
-    hands = cell.session._hands
-    hands.begin(quick_s + 0.01)
-    assert not hands.fits(hands.tool_worst_s("quick"))
+    cell = cell.session._cell
+    cell.begin(quick_s + 0.01)
+    assert not cell.fits(cell.tool_worst_s("quick"))
 
 
 def test_without_a_station_only_the_drift_is_measured(history):

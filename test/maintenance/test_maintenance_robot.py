@@ -27,7 +27,7 @@ from maintenance_cell import (
 from robocal_ros.ground.errors import Code, RobocalError, StorageError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.mover import Ways
-from robocal_ros.maintenance.robot_interface import DriverAnswer, Hands
+from robocal_ros.maintenance.robot_interface import CellInterface, DriverAnswer
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
@@ -272,13 +272,13 @@ def test_a_robot_that_has_not_come_to_rest_is_not_handed_over(history):
 @pytest.mark.parametrize("left_s", [0.05, 5.0])
 def test_the_rest_of_the_way_home_is_driven_where_it_fits(left_s):
     config = config_of(home_near=np.radians(2.0))
-    hands = Hands(config, Ways(ARM, config))
-    hands.begin(left_s)
-    hands.left_home = True
+    cell = CellInterface(config, Ways(ARM, config))
+    cell.begin(left_s)
+    cell.left_home = True
     for now_s in np.arange(0.0, 0.5, TICK_S):
-        hands.robot.reading(now_s, HOME + np.radians(1.0), now_s)
-    assert next(hands.go_home(), "over") == (None if left_s > 1.0 else "over")
-    assert [type(request).__name__ for request in hands.out] == ["Move"] * (left_s > 1.0)
+        cell.robot.reading(now_s, HOME + np.radians(1.0), now_s)
+    assert next(cell.go_home(), "over") == (None if left_s > 1.0 else "over")
+    assert [type(request).__name__ for request in cell.out] == ["Move"] * (left_s > 1.0)
 
 
 def test_a_fault_ends_after_the_joints_clock_began_anew(cell):

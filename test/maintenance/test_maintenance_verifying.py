@@ -247,7 +247,7 @@ def test_a_tool_that_waits_for_its_check_stays_so_while_the_drift_is_not_known(h
     cell.full = lambda cell: new_tool(number)
     while cell.tool.measuring:
         cell.step()
-    cell.session._hands.gap.ends_s = cell.ends_s = cell.now_s + 12.0  # the line is early
+    cell.session._cell.gap.ends_s = cell.ends_s = cell.now_s + 12.0  # the line is early
     assert cell.finish().left == (f"acceptance of tool candidate {number}",)
     cell.services["thermal"] = SILENT
     cell.check = passed()

@@ -121,7 +121,7 @@ class OwnMotions(HouseNode):
         self._going = False
         plan = joint_way(self._cell, q, self._order["go"])
         self.mover.start(Route(plan, ((0, 0),), (plan.duration_s,)), self._steady.now_s())
-        self.mover.sent(self._steady.now_s())
+        self.mover.watch.sent(self._steady.now_s())
         self._send(plan, stop=False)
         self._say("moves", lasts_s=plan.duration_s)
 
@@ -156,7 +156,7 @@ class OwnMotions(HouseNode):
         mover, now_s = self.mover, self._steady.now_s()
         self._longest_tick_s = max(self._longest_tick_s, now_s - self._ticked_s)
         self._ticked_s = now_s
-        mover.look(now_s)
+        mover.watch.silence.look(now_s)
         stopping = mover.stopping
         if (plan := stopping.look(mover.watch, now_s)) is not None:
             self._send(plan, stop=True)
