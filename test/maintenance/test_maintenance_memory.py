@@ -1,10 +1,28 @@
-"""What the maintenance remembers over a restart, where it was written by another version."""
+"""What a cycle finds, what it leaves for the next gap, and what outlives a restart."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
-from maintenance_cell import LONG_S, Cell, opened
+from maintenance_cell import (
+    LONG_S,
+    POSES,
+    REFUSED,
+    SILENT,
+    Cell,
+    bent,
+    config_of,
+    kinds,
+    opened,
+    passed,
+)
+from maintenance_tools import automatic, measured_in_full, until_verified
 
 from robocal_ros.ground.errors import Code, StorageError
+from robocal_ros.maintenance import MaintenanceState
+from robocal_ros.maintenance import robot_interface as ask
 from robocal_ros.maintenance.memory import VERSION
+from robocal_ros.maintenance.robot_interface import DriverAnswer
 
 SPOILT = {
     "a part is missing": lambda kept: kept.pop("tool"),
@@ -87,3 +105,155 @@ def test_a_state_of_the_first_version_is_read(history):
     cell.open_gap()
     cell.run("c2", LONG_S)
     assert cell.finish().run == 1
+
+
+UNSURE = replace(bent(), code=Code.TOO_FEW_SAMPLES, answer="cannot tell")
+
+
+def test_a_bent_tool_that_the_same_gap_mends_is_told(history):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    until_verified(cell)
+    cell.check = passed()
+    result = cell.finish()
+    assert (result.accepted, result.complete) == ((number,), True)
+    assert (result.tool_found_code, result.tool_code) == (Code.LIMIT_EXCEEDED, Code.ACCEPT)
+    assert f"tool: {bent().message}; tool: {passed().message}" in result.message
+    cell.restart()
+    assert cell.session.result(result.cycle_id) == result
+
+
+@pytest.mark.parametrize("first", ["cannot tell", "a gap before"])
+def test_a_bent_tool_that_only_the_full_measurement_finds_is_told(history, first):
+    cell = automatic(history)
+    if first == "a gap before":  # which was too short for more
+        assert cell.run("c0", 30.0) is Code.ACCEPT
+        assert cell.finish().left == ("tool measurement (full)",)
+        cell.open_gap()
+    else:
+        cell.check = UNSURE
+    number = measured_in_full(cell)
+    until_verified(cell)
+    cell.check = passed()
+    result = cell.finish()
+    assert result.accepted == (number,)
+    assert (result.tool_found_code, result.tool_code) == (Code.LIMIT_EXCEEDED, Code.ACCEPT)
+
+
+def test_another_tool_that_a_check_lets_pass_is_no_alarm(history):
+    cell = automatic(history, full_every_s=1.0)
+    cell.check = passed()
+    number = measured_in_full(cell)
+    result = cell.finish()
+    assert result.tool_id == number
+    assert result.tool_found_code is Code.ACCEPT
+
+
+UNKNOWN = set(Code) - {
+    Code.NONE,
+    Code.ACCEPT,
+    Code.NO_SIGNIFICANT_GAIN,
+    Code.WORSE_THAN_CURRENT,
+}
+
+
+@pytest.fixture
+def cell(history) -> Cell:
+    return opened(history)
+
+
+@pytest.mark.parametrize("how", [REFUSED, SILENT])
+def test_a_thermal_node_that_fails_leaves_the_measurement(cell, how):
+    cell.services["thermal"] = how
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.code, result.complete, result.left) == (
+        Code.ACCEPT,
+        False,
+        ("thermal measurement",),
+    )
+    assert "thermal: " in result.message
+    assert result.tool_answer == "pass"
+
+
+@pytest.mark.parametrize("code", sorted(UNKNOWN), ids=lambda code: code.name)
+def test_a_verdict_that_does_not_tell_the_drift_leaves_it(cell, code):
+    cell.thermal = DriverAnswer(code, "why")
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.complete, result.left) == (False, ("thermal measurement",))
+    assert result.thermal_code is code
+
+
+def test_a_pose_that_was_not_measured_is_left_by_its_number(cell):
+    cell.run("c1", LONG_S)
+    while cell.state is MaintenanceState.RUNNING:
+        at_second = "measuring pose 2 of" in cell.session.status(cell.now_s).doing
+        cell.services["sensor"] = SILENT if at_second else "ok"
+        cell.step()
+    result = cell.session.result("c1")
+    assert (result.complete, result.left) == (False, ("thermal measurement at pose 2",))
+    assert result.thermal_code is Code.NO_SIGNIFICANT_GAIN  # the others told enough
+    cell.open_gap()
+    cell.run("c2", LONG_S)
+    assert cell.finish().complete
+
+
+def test_a_pose_that_an_earlier_gap_missed_is_still_named(cell):
+    cell.services["sensor"] = SILENT
+    cell.run("c1", 15.0)
+    assert "poses" in cell.finish().left[0]
+    cell.services["sensor"] = "ok"
+    cell.open_gap()
+    cell.run("c2", LONG_S)
+    assert cell.finish().left == ("thermal measurement at pose 1",)
+
+
+def test_cold_poses_that_were_not_measured_are_named(cell):
+    cell.thermal = replace(cell.thermal, missing=(2, 7))
+    cell.run("c1", LONG_S)
+    assert "without pose 2, 7 of the cold reference" in cell.finish().message
+
+
+def test_poses_that_the_thermal_node_lost_are_left(cell):
+    """Started anew between two gaps it opens the same cycle, without what was measured before."""
+    cell.run("c1", 15.0)
+    assert "poses" in cell.finish().left[0]
+    first = kinds(cell).count("Move") - 1
+    cell.open_gap()
+    cell.thermal = replace(cell.thermal, visited=len(POSES) - first)
+    cell.run("c2", LONG_S)
+    result = cell.finish()
+    words = f"thermal measurement at 3 poses, of which the thermal node has {len(POSES) - first}"
+    assert (result.complete, result.left) == (False, (words,))
+    cell.open_gap()
+    cell.thermal = replace(cell.thermal, visited=len(POSES))
+    cell.log.clear()
+    cell.run("c3", LONG_S)
+    assert cell.finish().complete
+    assert [each.cycle_id for each in cell.log if isinstance(each, ask.BeginCycle)] == ["c3"]
+
+
+def test_a_pose_that_was_taught_twice_is_one_to_the_thermal_node(history):
+    """Past an obstacle, there and back."""
+    config = config_of(poses=np.vstack([POSES, POSES[1]]), T_base_laser=None)
+    cell = Cell(history, config=config)
+    cell.open_gap()
+    cell.thermal = replace(cell.thermal, visited=len(POSES))
+    cell.run("c1", LONG_S)
+    assert cell.finish().complete
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_sensor_that_measures_often_does_not_hold_the_robot(history, every):
+    """The measurements that a pose takes must be stood through, not also those that follow."""
+    config = config_of(T_base_laser=None)
+    taken_s = []
+    for ticks in (10, every):
+        cell = Cell(history, config=config, measures_every=ticks)
+        cell.open_gap()
+        begin_s = cell.now_s
+        cell.run("c1", LONG_S)
+        assert cell.finish().complete
+        taken_s.append(cell.now_s - begin_s)
+    assert taken_s[1] <= taken_s[0]

@@ -1,4 +1,6 @@
-"""Where a robot is stopped from: its plan, or what most of its readings tell."""
+"""Where the robot is against its plan, and how fast its controller drives."""
+
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing, MotionCell, ToolBody, joint_way
 from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, MotionLimits, stop
-from robocal_ros.motion.robot_watch import LEAST, RobotWatch
+from robocal_ros.motion.robot_watch import LEAST, TOLD_S, RobotWatch, SpeedScaling
 
 ARM = load_robot("kr150_r3100")
 LIMITS = MotionLimits()
@@ -137,3 +139,49 @@ def test_a_scaling_that_is_not_told_again_is_as_planned():
         watch.reading(begin_s + 0.008 * count, HOME, begin_s + 0.008 * count)
         assert watch.scaling == float(0.008 * count > 1.0)
     assert watch.driven_s(begin_s + 3.2) - watch.driven_s(begin_s + 2.2) == pytest.approx(1.0)
+
+
+def test_what_is_not_told_again_is_forgotten() -> None:
+    """Finding: a broadcaster that died at 0 % was believed for ever."""
+    scaling = SpeedScaling()
+    assert scaling.at(0.0) is None
+    scaling.slider(100.0, 10.0)
+    scaling.slider(0.0, 10.1)
+    assert scaling.at(10.1 + TOLD_S) == 0.0
+    assert scaling.at(10.11 + TOLD_S) is None
+    scaling.slider(0.0, 20.0)  # it has told another number before
+    assert scaling.at(20.0) == 0.0
+
+
+def test_the_controller_knows_better_than_the_slider_while_it_tells() -> None:
+    """Finding: the one that said less won, though the controller ran at full speed."""
+    scaling = SpeedScaling()
+    scaling.slider(30.0, 10.0)
+    assert scaling.at(10.0) == pytest.approx(0.3)
+    scaling.controller(1.0, 10.1)
+    assert scaling.at(10.2) == 1.0
+    scaling.slider(30.0, 11.5)
+    assert scaling.at(11.5) == pytest.approx(0.3)  # the controller is silent
+
+
+def test_a_scaling_that_is_never_filled_tells_nothing() -> None:
+    """Finding: a controller without it, which leaves it at 0, was paused for ever."""
+    scaling = SpeedScaling()
+    scaling.controller(0.0, 10.0)
+    assert scaling.at(10.0) is None
+    scaling.slider(50.0, 10.1)
+    scaling.controller(0.0, 10.2)
+    assert scaling.at(10.2) == 0.5
+    scaling.controller(0.2, 10.3)
+    scaling.controller(0.0, 10.4)
+    assert scaling.at(10.4) == 0.0
+
+
+@pytest.mark.parametrize("strange", [math.nan, math.inf, -math.inf, -0.1])
+def test_what_is_no_scaling_tells_nothing(strange: float) -> None:
+    scaling = SpeedScaling()
+    scaling.controller(0.7, 10.0)
+    scaling.controller(strange, 10.1)
+    assert scaling.at(10.1) == 0.7
+    scaling.controller(5.0, 10.2)
+    assert scaling.at(10.2) == 1.0
