@@ -27,9 +27,7 @@ VERSION = 2  # of the document; one without a version is the first, which knew n
 class DocumentStore(Protocol):
     """Keeps one document; whole or not at all.
 
-    Attributes
-    ----------
-    path : where, for whoever must mend it.
+    ``path``: where, for whoever must mend it.
     """
 
     path: Path
@@ -430,7 +428,7 @@ def _tool_error(record: ToolRecord, tool: Head) -> ToolError:
     return both_errors(ToolError(record.drift_rms_m, record.drift_bound_m), found)
 
 
-class Heard:
+class NodeReports:
     """Keeps what came last; times of a steady clock."""
 
     def __init__(self, config: MaintenanceConfig) -> None:

@@ -179,12 +179,9 @@ class FaultError(RobocalError):
 class Mover:
     """Where the robot is, and the route that it drives; times of a steady clock.
 
-    Attributes
-    ----------
-    watch : the readings, and how fast the controller's clock runs.
-    stopping : the stop that was sent last.
-    place : point, line or station at which it was last known to be.
-    stops_within_s : a stop that was sent is over in the readings by then, from any speed.
+    ``watch``: the readings, and how fast the controller's clock runs. ``stopping``: the stop that
+    was sent last. ``place``: point, line or station at which it was last known to be.
+    ``stops_within_s``: a stop that was sent is over in the readings by then, from any speed.
     """
 
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:

@@ -37,10 +37,10 @@ from robocal_ros.maintenance.services import (
     MaintenanceOutputs,
     MaintenanceServices,
     Now,
+    correction_of_message,
+    drift_of_message,
     require_robot,
     session_config,
-    told_correction,
-    told_drift,
 )
 from robocal_ros.motion.cell import load_motion
 from robocal_ros.motion.driver import (
@@ -68,11 +68,9 @@ Answered = Callable[[int, DriverAnswer], None]
 class MaintenanceDriver:
     """Clients of ``thermal_node`` and ``tcf_node``, and of the robot's controller.
 
-    Parameters
-    ----------
-    motion : sends motions to the controller.
-    answered : takes the number of a request and what came of it.
-    moves : told just before a motion goes out: later, the robot would be ahead of its plan.
+    ``motion``: sends motions to the controller. ``answered``: takes the number of a request and
+    what came of it. ``moves``: told just before a motion goes out: later, the robot would be ahead
+    of its plan.
     """
 
     def __init__(
@@ -332,12 +330,12 @@ class MaintenanceNode(HouseNode):
     def _take_accuracy(self, message: Any) -> None:
         if self._session is not None:
             require_robot(ACCURACY, message, self._nominal.name, self._serial_in_use)
-            self._session.drift(told_drift(message), self._steady.now_s())
+            self._session.drift(drift_of_message(message), self._steady.now_s())
 
     def _take_correction(self, message: Any) -> None:
         if self._session is not None:
             require_robot(CORRECTION, message, self._nominal.name, self._serial_in_use)
-            self._session.correction(told_correction(message), self._steady.now_s())
+            self._session.correction(correction_of_message(message), self._steady.now_s())
 
     def _reported(self, report: MotionReport) -> None:
         if self._session is not None:

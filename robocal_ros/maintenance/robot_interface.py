@@ -53,7 +53,7 @@ class Disarm(DriverRequest):
 
 @dataclass(frozen=True)
 class Measure(DriverRequest):
-    """Measure the tool; ``mode`` of `tool.results`. Answered when the run has ended."""
+    """Measure the tool; ``mode`` of `tool.session`. Answered when the run has ended."""
 
     mode: str
     cycle_id: str
@@ -123,10 +123,7 @@ class SilentError(ConflictError):
 class Asking:
     """What was asked and who waits for an answer; times of a steady clock.
 
-    Attributes
-    ----------
-    now_s : of the tick.
-    out : requests that wait to be carried out.
+    ``now_s``: of the tick. ``out``: requests that wait to be carried out.
     """
 
     # of all in a process: a late answer to one that is gone is not taken for another's
@@ -207,10 +204,8 @@ SENT = "what the tool node sent may still be driven"
 class Disarming:
     """What is known of the tool's driver; times of a steady clock.
 
-    Attributes
-    ----------
-    engaged : it may be armed.
-    armed : this node armed it, and what it was to move may still be under way.
+    ``engaged``: it may be armed. ``armed``: this node armed it, and what it was to move may still
+    be under way.
     """
 
     def __init__(self) -> None:
@@ -283,13 +278,10 @@ Array = NDArray[np.float64]
 class CellInterface(Asking):
     """Robot, gap and the requests to other nodes; times of a steady clock.
 
-    Attributes
-    ----------
-    tool : whether the tool's driver may move the robot.
-    left_home : whether something may have moved the robot since the run began.
-    measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
-    doing : what goes on, in words.
-    tool_home_s : for the way home from the beams; the longest so far where that took longer.
+    ``tool``: whether the tool's driver may move the robot. ``left_home``: whether something may
+    have moved the robot since the run began. ``measured``: stamps of measurements of the flange's
+    target, on the joints' clock, newest last. ``doing``: what goes on, in words. ``tool_home_s``:
+    for the way home from the beams; the longest so far where that took longer.
     """
 
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
@@ -369,8 +361,13 @@ class CellInterface(Asking):
         Who has not answered its measurement may be another one: a robot that stands may then be at
         a corner of what was sent before, where plans rest for a while, and is held.
         """
-        tool, robot = self.tool, self.robot
-        self._look_after_stop()
+        tool, robot, stopping = self.tool, self.robot, self.robot.stopping
+        if (plan := stopping.look(robot.watch, self.now_s)) is not None:
+            self.request(Stop, plan)  # the robot does not obey: sent again
+        if stopping.failed != self._failed:
+            self._failed = stopping.failed
+            if self._failed:
+                self.request(HardStop, self._failed)
         rests = robot.resting(STANDS_S) is not None
         self._told_s = min(self._told_s, robot.newest_s)  # their clock may have begun anew
         since_s = robot.newest_s - self._told_s  # readings that are late do not count against it
@@ -384,16 +381,6 @@ class CellInterface(Asking):
                 self._stop_measured()
         if tool.gone(self.now_s) and not robot.beside_home():
             tool.engaged &= not rests
-
-    def _look_after_stop(self) -> None:
-        """Send it again where the robot does not obey; then stop it by other means."""
-        stopping = self.robot.stopping
-        if (plan := stopping.look(self.robot.watch, self.now_s)) is not None:
-            self.request(Stop, plan)
-        if stopping.failed != self._failed:
-            self._failed = stopping.failed
-            if self._failed:
-                self.request(HardStop, self._failed)
 
     @property
     def stopping(self) -> bool:

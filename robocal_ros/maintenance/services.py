@@ -128,12 +128,9 @@ class Now(NamedTuple):
 class MaintenanceServices:
     """``~/run_maintenance`` as action, the calls of a PLC, and their Trigger twins.
 
-    Parameters
-    ----------
-    session : the one that runs; raises `NotActiveError` without one.
-    starting : the same, for a cycle that is to begin, once it is known who else moves the robot.
-    clocks : reads steady and wall clock.
-    default_gap_s : of ``~/run_trigger``.
+    ``session``: the one that runs; raises `NotActiveError` without one. ``starting``: the same, for
+    a cycle that is to begin, once it is known who else moves the robot. ``clocks``: reads steady
+    and wall clock. ``default_gap_s``: of ``~/run_trigger``.
     """
 
     def __init__(
@@ -333,7 +330,7 @@ def require_robot(topic: str, message: Any, robot: str, serial: str) -> None:
         )
 
 
-def told_drift(message: Any) -> Drift:
+def drift_of_message(message: Any) -> Drift:
     """Read a ``robocal_msgs/AccuracyState`` of the thermal node.
 
     Raises
@@ -353,7 +350,7 @@ def told_drift(message: Any) -> Drift:
     return Drift(level, message.reason, found, due_in_s)
 
 
-def told_correction(message: Any) -> ToldCorrection:
+def correction_of_message(message: Any) -> ToldCorrection:
     """Read a ``robocal_msgs/CorrectionStatus``.
 
     Raises

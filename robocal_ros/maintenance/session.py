@@ -25,9 +25,9 @@ from robocal_ros.maintenance.memory import (
     CycleResult,
     DocumentStore,
     Drift,
-    Heard,
     MaintenanceConfig,
     Memory,
+    NodeReports,
     accuracy_of,
 )
 from robocal_ros.maintenance.mover import FaultError, Ways
@@ -49,14 +49,8 @@ Tell = Callable[[str, dict[str, object], Code, str], None]
 class Conductor:
     """The run that is open.
 
-    Parameters
-    ----------
-    tell : takes name, arguments, code and words of what happens.
-
-    Attributes
-    ----------
-    run : None while nothing runs.
-    broken : why the run is broken off; None while it goes on.
+    ``tell``: takes name, arguments, code and words of what happens.
+    ``run``: None while nothing runs. ``broken``: why the run is broken off; None while it goes on.
     """
 
     def __init__(self, cell: CellInterface, memory: Memory, tell: Tell) -> None:
@@ -258,15 +252,9 @@ MOST_ID = 100  # characters of a cycle's name
 class MaintenanceSession:
     """Keeps one robot accurate in the gaps that the PLC gives.
 
-    Parameters
-    ----------
-    record : takes each command with what came of it.
-
-    Attributes
-    ----------
-    ways : the ways that the robot may take.
-    memory : what outlives a restart; read it only.
-    robot : where it is, and what its controller says (`Mover.reported`, `Mover.watch`).
+    ``record``: takes each command with what came of it.
+    ``ways``: the ways that the robot may take. ``memory``: what outlives a restart; read it only.
+    ``robot``: where it is, and what its controller says (`Mover.reported`, `Mover.watch`).
     """
 
     def __init__(
@@ -286,7 +274,7 @@ class MaintenanceSession:
         self._book = ThermalCycle()
         self._record = record
         self._conductor = Conductor(self._cell, self.memory, self._tell)
-        self._heard = Heard(config)
+        self._reports = NodeReports(config)
         self._second = ""
 
     def beat(self, now_s: float) -> int:
@@ -325,11 +313,11 @@ class MaintenanceSession:
 
     def drift(self, drift: Drift, now_s: float) -> None:
         """What the thermal part believes of the accuracy."""
-        self._heard.take_drift(drift, now_s)
+        self._reports.take_drift(drift, now_s)
 
     def correction(self, told: ToldCorrection, now_s: float) -> None:
         """What the joint correction says of itself."""
-        self._heard.take_correction(told, now_s)
+        self._reports.take_correction(told, now_s)
 
     def answered(self, number: int, answer: DriverAnswer) -> None:
         """What came of a request."""
@@ -371,7 +359,7 @@ class MaintenanceSession:
             self._decider,
             memory,
             self._decided,
-            lambda: self._heard.drift(cell.now_s),
+            lambda: self._reports.drift(cell.now_s),
         )
         run.at(wall_ns)
         self._conductor.begin(run)
@@ -524,10 +512,16 @@ class MaintenanceSession:
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""
-        thermal, tool, heard = self._decider.head(THERMAL), self._decider.head(TOOL), self._heard
-        told = heard.drift(now_s), heard.uncorrected(thermal, tool, now_s)
-        number = thermal.calibration_id or 0
-        return accuracy_of(self.config, *told, self.memory, tool, number, wall_ns)
+        thermal, tool = self._decider.head(THERMAL), self._decider.head(TOOL)
+        return accuracy_of(
+            self.config,
+            self._reports.drift(now_s),
+            self._reports.uncorrected(thermal, tool, now_s),
+            self.memory,
+            tool,
+            thermal.calibration_id or 0,
+            wall_ns,
+        )
 
     def _decided(self, outcome: Outcome) -> None:
         if not outcome.repeated:

@@ -80,16 +80,13 @@ class Housing:
         wall = self.clear_radius_m - radius_m - widest
         open_space = np.maximum(wall, low[:, 2] - brim)
         above_floor = low[:, 2] - radius_m - self.floor_m
-        free = np.maximum(np.minimum(open_space, above_floor), self._beyond(start, end) - radius_m)
-        return np.asarray(np.maximum(-free, 0.0))
-
-    def _beyond(self, start: Array, end: Array) -> Array:
-        """How far beyond the housing's reach lines (m,) pass z, m."""
+        # how far beyond the housing's reach the lines pass z
         a, along = start[:, :2], end[:, :2] - start[:, :2]
         length = np.maximum(np.sum(along**2, axis=1), 1e-300)
-        share = np.clip(-np.sum(a * along, axis=1) / length, 0.0, 1.0)
-        nearest = a + share[:, None] * along
-        return np.asarray(np.hypot(nearest[:, 0], nearest[:, 1]) - self.reach_m)
+        nearest = a + np.clip(-np.sum(a * along, axis=1) / length, 0.0, 1.0)[:, None] * along
+        beyond = np.hypot(nearest[:, 0], nearest[:, 1]) - self.reach_m
+        free = np.maximum(np.minimum(open_space, above_floor), beyond - radius_m)
+        return np.asarray(np.maximum(-free, 0.0))
 
 
 @dataclass(frozen=True, eq=False)

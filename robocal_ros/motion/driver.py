@@ -56,10 +56,8 @@ AT_REST = 5e-3  # rad/s (m/s); slower references move nothing
 class StatedController:
     """What a controller says of itself; times of a steady clock.
 
-    Attributes
-    ----------
-    velocities : whether the hardware has any, as far as it is told.
-    held_s : when one that pauses was last seen to give up a motion: its reference came to rest.
+    ``velocities``: whether the hardware has any, as far as it is told. ``held_s``: when one that
+    pauses was last seen to give up a motion: its reference came to rest.
     """
 
     def __init__(self) -> None:
@@ -349,16 +347,10 @@ VIOLATIONS = {
 class MotionDriver:
     """One client of the controller, and what the controller says of itself.
 
-    Parameters
-    ----------
-    reported : takes what the controller makes of the motion that was sent last.
-    tolerances : of motions, see `goal_tolerances`; a stop has the controller's own, and is watched.
-    robot : where readings of the controller go now; None: nowhere.
-    now : their steady clock.
-
-    Attributes
-    ----------
-    way : how the last motion went out, in words; empty before any.
+    ``reported``: takes what the controller makes of the motion that was sent last. ``tolerances``:
+    of motions, see `goal_tolerances`; a stop has the controller's own, and is watched. ``robot``:
+    where readings of the controller go now; None: nowhere. ``now``: their steady clock.
+    ``way``: how the last motion went out, in words; empty before any.
     """
 
     def __init__(
@@ -554,9 +546,7 @@ class SteadyClock:
     What was heard before it was suspended is old when it wakes. A motion is not: the controller of
     the same host stood still with it.
 
-    Parameters
-    ----------
-    slept : takes for how long the host was suspended, before a time of afterwards is given out.
+    ``slept``: takes for how long the host was suspended, before a time of afterwards is given out.
     """
 
     def __init__(self, slept: Callable[[float], None]) -> None:

@@ -96,16 +96,10 @@ class RobotWatch:
     A controller that scales its speed stretches the plan's clock, which stands while it pauses.
     Where nobody tells the scaling, a robot that is on its path is late, not lost.
 
-    Parameters
-    ----------
-    driving : how far the robot may be beside its plan, and how fast its joints are.
-
-    Attributes
-    ----------
-    silence : how long no new reading came.
-    scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it lately.
-    held_s : when a controller that pauses was last seen to give up a motion, as
-        `StatedController` has it.
+    ``driving``: how far the robot may be beside its plan, and how fast its joints are.
+    ``silence``: how long no new reading came. ``scaling``: how fast the controller's clock runs, 1
+    as planned; 1 where nobody tells it lately. ``held_s``: when a controller that pauses was last
+    seen to give up a motion, as `StatedController` has it.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
@@ -423,10 +417,8 @@ class WatchedStop:
     A message may be lost, and a goal may be rejected or taken over: where the robot stands is the
     only proof.
 
-    Attributes
-    ----------
-    sent : how often it was sent.
-    failed : why the robot is to be stopped by other means; empty: it is not.
+    ``sent``: how often it was sent. ``failed``: why the robot is to be stopped by other means;
+    empty: it is not.
     """
 
     def __init__(self, arm: SerialArm, limits: MotionLimits) -> None:
@@ -532,9 +524,7 @@ class Gap:
     A message that is taken just after a pause of the own process may have waited all through it: it
     counts from before the pause, or from when its beat was counted up.
 
-    Parameters
-    ----------
-    stale_s : a heartbeat counts for so long, and so old may the beat be that it echoes.
+    ``stale_s``: a heartbeat counts for so long, and so old may the beat be that it echoes.
     """
 
     def __init__(self, stale_s: float) -> None:

@@ -226,13 +226,8 @@ def _pose(arm: SerialArm, text: str, name: str) -> Array:
 class StaticTf:
     """Publisher of a node's static transforms.
 
-    Parameters
-    ----------
-    add : creates a publisher.
-
-    Attributes
-    ----------
-    missing : why nothing can be published on this machine; empty when it can.
+    ``add``: creates a publisher.
+    ``missing``: why nothing can be published on this machine; empty when it can.
     """
 
     def __init__(self, add: Callable[[type, str, QoSProfile], Any]) -> None:

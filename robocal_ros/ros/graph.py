@@ -103,15 +103,10 @@ def strangers(
 class CommandPath:
     """Looks at who commands a robot.
 
-    Parameters
-    ----------
-    topic, action : resolved names by which this node commands it; an empty action is none.
-    cell : topics whose publishers may command it too: each waits while another holds the lease.
-    mine : topic that one node of this kind publishes for each robot; empty: `cell` tells all.
-
-    Attributes
-    ----------
-    violation : who else commands the robot; empty: nobody.
+    ``topic``, ``action``: resolved names by which this node commands it; an empty action is none.
+    ``cell``: topics whose publishers may command it too: each waits while another holds the lease.
+    ``mine``: topic that one node of this kind publishes for each robot; empty: `cell` tells all.
+    ``violation``: who else commands the robot; empty: nobody.
     """
 
     def __init__(
@@ -156,9 +151,7 @@ _STATUS = "robocal_msgs/msg/CorrectionStatus"  # who publishes it is a correctio
 class SourceGuard:
     """Looks at who publishes a topic: a correction node, whatever its name, must not.
 
-    Attributes
-    ----------
-    fault : why the readings must not be used; empty when they may.
+    ``fault``: why the readings must not be used; empty when they may.
     """
 
     def __init__(self, node: Node, topic: str) -> None:
@@ -212,10 +205,8 @@ TYPES = {False: "robocal_msgs/msg/GapOpen", True: "std_msgs/msg/Bool"}
 class GapSources:
     """Subscribes the heartbeat, and looks at its publishers.
 
-    Parameters
-    ----------
-    is_bool : whether it is a ``std_msgs/Bool``.
-    heard : takes what it says, and its echo; None where it has none.
+    ``is_bool``: whether it is a ``std_msgs/Bool``. ``heard``: takes what it says, and its echo;
+    None where it has none.
     """
 
     def __init__(
@@ -277,9 +268,7 @@ class FrameWatch:
 
     ``own``: the transforms that the node itself has published, which grow as it publishes more.
 
-    Attributes
-    ----------
-    settled : whether it has listened for so long that what others put onto tf was heard.
+    ``settled``: whether it has listened for so long that what others put onto tf was heard.
     """
 
     def __init__(self, node: LifecycleNode, child: str, own: Sequence[Any]) -> None:

@@ -75,10 +75,8 @@ class StampWatch:
     An input is ahead where every message since the last look was: one wrong stamp is the sessions'
     to leave out. With simulated time the stamps are the clock, and only silence is judged.
 
-    Parameters
-    ----------
-    node : its clock is what stamps are compared with.
-    needed : the topic whose silence is worth a warning once it has been heard.
+    ``node``: its clock is what stamps are compared with. ``needed``: the topic whose silence is
+    worth a warning once it has been heard.
     """
 
     def __init__(self, node: EndpointNode, needed: str) -> None:
@@ -251,9 +249,7 @@ class SessionEvents:
 class Session(Protocol):
     """What its node asks of a session.
 
-    Attributes
-    ----------
-    received, ignored : samples by topic, and those that were not used.
+    ``received``, ``ignored``: samples by topic, and those that were not used.
     """
 
     received: Counter[str]
@@ -284,17 +280,12 @@ class Session(Protocol):
         """Carry out one command: what was decided outside before it, and it."""
 
 
-class CommandDesk:
+class CommandQueue:
     """Between the callers of a node and its session.
 
-    Parameters
-    ----------
-    timeout_s : a command waits at most so long for its samples.
-    show : takes each outcome, also of what was decided outside.
-
-    Attributes
-    ----------
-    session : None while the node is inactive.
+    ``timeout_s``: a command waits at most so long for its samples. ``show``: takes each outcome,
+    also of what was decided outside.
+    ``session``: None while the node is inactive.
     """
 
     def __init__(
@@ -402,7 +393,7 @@ class SessionNode(HouseNode, Generic[SessionT]):
         self._topics = {kind: self.resolve_topic_name(kind) for kind in self.INPUTS}
         for kind, (message_type, profile) in self.INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), profile)
-        self._desk = CommandDesk(self, command_s, self._show)
+        self._desk = CommandQueue(self, command_s, self._show)
         self.add_timer(POLL_S, self._poll, steady=True)
         return self._history
 
@@ -481,10 +472,7 @@ Ask = Callable[[Command], Awaitable[Outcome]]
 class DecisionServices:
     """Services about the calibrations of one kind.
 
-    Parameters
-    ----------
-    add : creates a service.
-    ask : gives a command to the session and awaits its outcome.
+    ``add``: creates a service. ``ask``: gives a command to the session and awaits its outcome.
     """
 
     def __init__(self, add: AddService, ask: Ask, history: CalibrationHistory, kind: str) -> None:

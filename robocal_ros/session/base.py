@@ -31,14 +31,9 @@ from robocal_ros.session.events import (
 class HistoryFollower:
     """Heads of a history as of the last look; a subclass reads those that it is about.
 
-    Parameters
-    ----------
-    kind : whose decisions are told.
-
-    Attributes
-    ----------
-    head : of that kind.
-    fault : why the history could not be read at the last look; empty when it could.
+    ``kind``: whose decisions are told.
+    ``head``: of that kind. ``fault``: why the history could not be read at the last look; empty
+    when it could.
     """
 
     def __init__(self, history: History, kind: str) -> None:
@@ -124,16 +119,9 @@ class SessionBase:
 
     A subclass gives its handlers. A recorded command waits for its marks.
 
-    Parameters
-    ----------
-    kind : of the calibrations that it decides about.
-    current : follows what is in force.
-
-    Attributes
-    ----------
-    stream : the joint readings.
-    received, ignored : samples by topic, and those that were not used.
-    newest_ns : newest stamp of each topic.
+    ``kind``: of the calibrations that it decides about. ``current``: follows what is in force.
+    ``stream``: the joint readings. ``received``, ``ignored``: samples by topic, and those that were
+    not used. ``newest_ns``: newest stamp of each topic.
     """
 
     def __init__(
