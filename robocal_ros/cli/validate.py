@@ -6,9 +6,11 @@ Jobs go out and results come back. A bag whose process dies is told, the others 
 import argparse
 import multiprocessing
 import os
+import pickle
 import platform
 import signal
 import sys
+import tempfile
 import threading
 import traceback
 from collections import Counter
@@ -121,13 +123,18 @@ def _not_validated(job: "Job", answer: Document) -> "Validated":
 
 
 class _Slots:
-    """Places for one job each, with a process of its own: who dies takes no other's job along."""
+    """Places for one job each, with a process of its own: who dies takes no other's job along.
+
+    Results come by file: of one that is killed while it sends a pipe would hold a part, and who
+    reads that waits for ever.
+    """
 
     def __init__(self, count: int) -> None:
+        self._results = tempfile.TemporaryDirectory()
         self._context = multiprocessing.get_context("forkserver")
         self._others = set(multiprocessing.active_children())
         self._pools = [self._pool() for _ in range(count)]
-        self._busy: dict[Future[Validated], tuple[int, int]] = {}  # slot and number of a job
+        self._busy: dict[Future[None], tuple[int, int]] = {}  # slot and number of a job
 
     def __enter__(self) -> "_Slots":
         return self
@@ -138,6 +145,7 @@ class _Slots:
                 child.kill()
         for pool in self._pools:
             pool.shutdown(cancel_futures=True)
+        self._results.cleanup()
 
     def validated(self, jobs: "Sequence[Job]") -> "Iterator[Numbered]":
         waiting = iter(enumerate(jobs))
@@ -147,7 +155,9 @@ class _Slots:
             for future in wait(self._busy, return_when=FIRST_COMPLETED).done:
                 slot, number = self._busy.pop(future)
                 try:
-                    result = future.result()
+                    future.result()
+                    result = pickle.loads(self._file(number).read_bytes())
+                    self._file(number).unlink()
                 except BrokenProcessPool:
                     self._renew(slot)
                     result = _not_validated(jobs[number], refusal(Code.NONE, KILLED))
@@ -157,16 +167,17 @@ class _Slots:
                 yield number, result
 
     def _begin_next(self, slot: int, waiting: "Iterator[tuple[int, Job]]") -> None:
-        from robocal_ros.cli.validating import validate_bag
-
         for number, job in waiting:
             try:
-                future = self._pools[slot].submit(validate_bag, job)
+                future = self._pools[slot].submit(_validate_to, self._file(number), job)
             except BrokenProcessPool:  # its process died while it had nothing to do
                 self._renew(slot)
-                future = self._pools[slot].submit(validate_bag, job)
+                future = self._pools[slot].submit(_validate_to, self._file(number), job)
             self._busy[future] = slot, number
             return
+
+    def _file(self, number: int) -> Path:
+        return Path(self._results.name) / str(number)
 
     def _pool(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(1, self._context, _end_with_parent)
@@ -174,6 +185,12 @@ class _Slots:
     def _renew(self, slot: int) -> None:
         self._pools[slot].shutdown()
         self._pools[slot] = self._pool()
+
+
+def _validate_to(file: Path, job: "Job") -> None:
+    from robocal_ros.cli.validating import validate_bag
+
+    file.write_bytes(pickle.dumps(validate_bag(job)))
 
 
 def _end_with_parent() -> None:

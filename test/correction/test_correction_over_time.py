@@ -24,7 +24,7 @@ from correction_robot import (
     still,
     swing,
 )
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
@@ -45,6 +45,7 @@ class Watch:
         self.robot, self.period_s = robot, period_s  # the least of the stream's
         self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
         self.offsets: dict[int, tuple[float, float, float]] = {}  # when, offset, rate
+        self.begun: set[int] = set()  # joints of which one step is known since they stood
         self.taught = np.full(6, np.nan)  # the last target, as it was followed
 
     def out(self, names: tuple[str, ...], out: np.ndarray) -> None:
@@ -72,9 +73,14 @@ class Watch:
                 # after two periods without a message the controller holds, and the robot stands
                 held = dt > 2.0 * self.period_s + ROUNDING
                 if np.isfinite(rate):
-                    goes_on = abs(new - rate) <= LARGEST_A * dt + 2.0 * ROUNDING / dt
+                    # the step that began at rest is one of the rate's already
+                    begun = REST_A * self.period_s if j in self.begun else 0.0
+                    goes_on = abs(new - rate) <= LARGEST_A * dt + begun + 2.0 * ROUNDING / dt
                     from_rest = abs(offset - before) <= LARGEST_A * dt * dt + ROUNDING
                     assert goes_on or (held and from_rest), name
+                self.begun.discard(j)
+                if rate == BEGINS:
+                    self.begun.add(j)
                 self.offsets[j] = now, offset, 0.0 if rate == BEGINS else np.nan if held else new
             else:
                 self.offsets[j] = now, offset, 0.0
@@ -216,6 +222,7 @@ def slow_down(robot: Robot, watch: Watch) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(EVENT, min_size=1, max_size=12), st.floats(0.0, 1.0), st.booleans())
+@example([("on", 0, 1), ("tool", 1, 1), ("pause", 0, 1), ("on", 0, 1)], 0.25, False)
 def test_streams_through_anything(
     events: list[tuple[str, int, int]], speed: float, whole: bool
 ) -> None:
