@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.bags.bag_types import encode
 from robocal_ros.bags.bag_writer import BagWriter, ros_time
+from robocal_ros.bags.mcap_files import encode
 from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.cell_sim.sensors import sphere_cloud
 from robocal_ros.cell_sim.thermal_shift import MEASURING, MOVE_S, Shift, ShiftPlan, poses, simulate

@@ -32,7 +32,7 @@ MAY_IMPORT = {
 COMMANDS = {"cli", "cli_sensors", "cli_shots"}  # files of a room
 ROS_FILES = {
     "node", "messages", "action", "settings", "services", "report",
-    "graph", "driver", "replay_node", "replay_topics", "recorder_node",
+    "graph", "driver", "replay_node", "recorder_node",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",

@@ -1,6 +1,8 @@
-"""``robocal identify``: a robot's model from measurements, judged on measurements not used."""
+"""``robocal identify`` and ``iso9283``: what measurements say of a robot."""
 
 import argparse
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -9,13 +11,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robocal_ros import __version__
-from robocal_ros.cli.arguments import PARTS, ROBOT_HELP, describe_robot, parts, seed, share, warn
-from robocal_ros.cli.output import DONE, NO_ANSWER, CliResult, refusal, tell
+from robocal_ros.cli.command import (
+    DONE,
+    NO_ANSWER,
+    PARTS,
+    ROBOT_HELP,
+    CliResult,
+    Document,
+    describe_robot,
+    parts,
+    refusal,
+    seed,
+    share,
+    tell,
+    warn,
+)
 from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
-from robocal_ros.ground.files import quoted
+from robocal_ros.ground.files import nearest, quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge
+from robocal_ros.identification.iso9283 import CYCLES, Repeated, read_positions, repeated
 from robocal_ros.identification.judged import (
     explain_mismatch,
     identification_document,
@@ -29,11 +45,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-
-# ---- an identification for people: the verdict in one line, then what stands behind it ----------
-
-
-Document = dict[str, Any]
 
 MOVED_SIGMA = 2.0
 MOST_LISTED = 12
@@ -146,9 +157,6 @@ def _show_doubts(console: "Console", document: Document) -> None:
 
 def _listed(samples: list[str]) -> str:
     return ", ".join(samples[:MOST_LISTED]) + (" …" if len(samples) > MOST_LISTED else "")
-
-
-# ---- robocal identify ---------------------------------------------------------------------------
 
 
 _HOLD_OUT = 0.5
@@ -275,9 +283,6 @@ def _save(
     )
     save_robot(arm, path, like=robot, comment=comment)
     document["output"] = str(path)
-
-
-# ---- from files to an identification ------------------------------------------------------------
 
 
 _OTHER_SET_UP = (
@@ -436,3 +441,125 @@ def _compared(train: Measurements, check: Measurements, request: IdentifyRequest
             "model is solved and judged by positions"
         )
     return found
+
+
+EVERY = ""  # stands for every target that has no commanded position of its own
+Point = tuple[float, ...]
+
+
+def add_iso9283(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``iso9283``."""
+    parser.add_argument(
+        "--data",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="attained positions: x_mm, y_mm, z_mm, and target where there are several",
+    )
+    parser.add_argument(
+        "--commanded",
+        type=_commanded,
+        action="append",
+        default=[],
+        metavar="[TARGET=]X,Y,Z",
+        help="commanded position in mm, in the frame of the table, which must come from other "
+        "points than these; TARGET=X,Y,Z, repeated, where there are several targets. Without it "
+        "AP is not known",
+    )
+
+
+def run_iso9283(args: argparse.Namespace) -> CliResult:
+    """Do ``iso9283``. Raises `RobocalError` for what a user can mend."""
+    table = read_positions(args.data)
+    commanded = _by_target(args.commanded, list(table), str(args.data))
+    targets: Document = {}
+    warnings = []
+    if EVERY in commanded and len(table) > 1:
+        warnings.append(
+            "one commanded position is taken for the targets "
+            f"{', '.join(name for name in table if name not in commanded)}: give each its own "
+            "with --commanded TARGET=X,Y,Z"
+        )
+    for name, position in table.items():
+        where = commanded.get(name, commanded.get(EVERY))
+        try:
+            found = repeated(position, None if where is None else np.array(where) * 1e-3)
+        except TooFewSamplesError as error:
+            raise TooFewSamplesError(f"{args.data}, target {quoted(name)}: {error}") from error
+        targets[name] = _document(found)
+        if found.n < CYCLES:
+            warnings.append(
+                f"target {quoted(name)}: {found.n} cycles; ISO 9283 asks for {CYCLES}: RP is less "
+                "certain"
+            )
+    warn(warnings)
+    document: Document = {"targets": targets, "warnings": warnings}
+    return CliResult(document, partial(_show_iso9283, document=document))
+
+
+def _document(found: "Repeated") -> Document:
+    axes = (None,) * 3 if found.offset is None else (found.offset * 1e3).tolist()
+    return {
+        "n": found.n,
+        "AP_mm": None if found.AP_m is None else found.AP_m * 1e3,
+        "RP_mm": found.RP_m * 1e3,
+        "mean_distance_mm": found.mean_distance_m * 1e3,
+        "S_mm": found.S_m * 1e3,
+        "barycentre_mm": (found.barycentre * 1e3).tolist(),
+        **dict(zip(("AP_x_mm", "AP_y_mm", "AP_z_mm"), axes, strict=True)),
+    }
+
+
+def _commanded(value: str) -> tuple[str, Point]:
+    """Target, or ``EVERY``, and its commanded position in mm."""
+    name, sign, cells = value.rpartition("=")
+    try:
+        point = tuple(float(cell) for cell in cells.split(","))
+    except ValueError:
+        point = ()
+    if len(point) != 3 or not all(map(math.isfinite, point)) or (sign and not name):
+        raise argparse.ArgumentTypeError(
+            f"{quoted(value)} is not X,Y,Z or TARGET=X,Y,Z, in mm with a point as decimal mark"
+        )
+    return name, point
+
+
+def _by_target(
+    given: Sequence[tuple[str, Point]], targets: Sequence[str], file: str
+) -> Mapping[str, Point]:
+    """Commanded positions by target.
+
+    Raises
+    ------
+    InputError
+        For a target that the table has not, or that is given twice.
+    """
+    found: dict[str, Point] = {}
+    for name, point in given:
+        if name != EVERY and name not in targets:
+            hint = nearest(name, targets)
+            raise InputError(
+                f"--commanded: no target {quoted(name)}{hint}; the table has {', '.join(targets)}",
+                file=file,
+            )
+        if name in found:
+            whose = f"target {quoted(name)}" if name else "all targets"
+            raise InputError(f"--commanded: a position of {whose} is given twice")
+        found[name] = point
+    return found
+
+
+def _show_iso9283(console: "Console", document: Document) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    title = "Position accuracy and repeatability as in ISO 9283, 7.2, in mm"
+    table = Table(title=title, title_justify="left", box=None)
+    table.add_column("target")
+    for head in ("cycles", "AP", "AP x", "AP y", "AP z", "RP", "mean distance", "S"):
+        table.add_column(head, justify="right")
+    keys = ("AP_mm", "AP_x_mm", "AP_y_mm", "AP_z_mm", "RP_mm", "mean_distance_mm", "S_mm")
+    for name, found in document["targets"].items():
+        values = ["-" if found[key] is None else f"{found[key]:z.4f}" for key in keys]
+        table.add_row(Text(name), str(found["n"]), *values)
+    console.print(table)

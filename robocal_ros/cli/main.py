@@ -18,25 +18,23 @@ from importlib import import_module
 from typing import TextIO
 
 from robocal_ros import __version__
-from robocal_ros.cli.output import (
+from robocal_ros.cli.command import (
     BAD_REQUEST,
     CRASHED,
     DONE,
     INTERRUPTED,
     CliResult,
+    CommandParser,
     Document,
+    InformationAskedFor,
+    UsageError,
     crash,
     exit_status,
     failure,
     show,
     tell,
-    write_json,
-)
-from robocal_ros.cli.parsing import (
-    CommandParser,
-    InformationAskedFor,
-    UsageError,
     with_negative_values,
+    write_json,
 )
 from robocal_ros.ground.errors import InputError, RobocalError
 
@@ -75,7 +73,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "replay any number of bags, in parallel, and write one report: is it good, in mm?",
     ),
     "history": CliCommand(
-        "cli.history:history", "list the calibrations of a robot; accept, reject or roll back"
+        "cli.robot:history", "list the calibrations of a robot; accept, reject or roll back"
     ),
     "thermal": CliGroup(
         "place the sensor, identify a thermal drift, learn what drift to expect, screen, plan"
@@ -179,7 +177,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         },
     ),
     "iso9283": CliCommand(
-        "cli.robot:iso9283",
+        "cli.identify:iso9283",
         "position accuracy and repeatability (AP, RP) of single poses as ISO 9283, 7.2, "
         "defines them; no whole test",
     ),

@@ -27,12 +27,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from robocal_ros import __version__
-from robocal_ros.cli.arguments import ROBOT_HELP, count
-from robocal_ros.cli.output import (
+from robocal_ros.cli.command import (
     DONE,
     NO_ANSWER,
+    ROBOT_HELP,
     CliResult,
     Document,
+    count,
     crash,
     progress_console,
     refusal,

@@ -1,13 +1,14 @@
 """One bag through the code of ``robocal replay``, and judged, for ``robocal validate``.
 
-Runs in a process of its own: a `Job` goes in, a `Validated` comes out, no message between.
+What judges it is the truth of a simulated one, else its own measurements. Runs in a process of its
+own: a `Job` goes in, a `Validated` comes out, no message between.
 """
 
 import math
 import tempfile
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,326 +19,59 @@ from numpy.typing import NDArray
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
 from robocal_ros.cell_sim.faults import SIZES
-from robocal_ros.cli.bag_truth import (
+from robocal_ros.cli.command import Document, refusal
+from robocal_ros.cli.recording import (
     HAND_EYE,
     TOOL,
+    UNASKED,
+    BagOverview,
     BagTruth,
-    CycleErrors,
-    Forecasts,
-    ReplayedCycle,
-    ThermalHistory,
-    ToldStates,
+    CheckPoints,
     above,
+    begin_ns,
+    find_robot,
     finite,
     is_simulated,
+    open_recording,
 )
-from robocal_ros.cli.output import Document, refusal
-from robocal_ros.cli.recording import UNASKED, BagOverview, begin_ns, find_robot, open_recording
-from robocal_ros.cli.replaying import ReplayRequest, replay_bag, seconds
+from robocal_ros.cli.replay import ReplayRequest, replay_bag, seconds
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError
+from robocal_ros.ground.proposals import REFERENCE, THERMAL, Action, Entry
+from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.hand_eye.session import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.report.figures import CellCourse, Drawn, cell_drawn, thermal_figures, tool_figures
-from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors
+from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.report.figures import (
+    CellCourse,
+    Drawn,
+    cell_drawn,
+    thermal_figures,
+    tool_figures,
+)
+from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors, figures_of
 from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command
 from robocal_ros.thermal.drift_following import ThermalConfig
-from robocal_ros.thermal.session import is_thermal_session
+from robocal_ros.thermal.reference import (
+    ColdReference,
+    holds_drift,
+    measured_errors,
+    reference_of,
+    true_errors,
+)
+from robocal_ros.thermal.session import ThermalSession, is_thermal_session
 from robocal_ros.tool.session import is_tool_session
 
-# ---- the course of a simulated cell -------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
+Truth = Sequence[tuple[int, Array]]  # stamps, ns, and transforms (4, 4) from then on
 
 HOUR_NS = 3.6e12
 ACCURACY = "accuracy_state"
-UNITS: dict[str, tuple[float, str]] = {
-    fault: (factor, unit) for fault, (_, factor, unit) in SIZES.items()
-}
-
-
-@dataclass(eq=False)
-class _Line:
-    """What the line read: stamps, ns; 95 % bound, nan where not known, and allowed error, mm."""
-
-    stamp_ns: "array[int]" = field(default_factory=lambda: array("q"))
-    bound_mm: "array[float]" = field(default_factory=lambda: array("d"))
-    tolerance_mm: float | None = None
-
-    def at(self, stamp_ns: Array) -> Array:
-        """The bound that was told last at each time; not a number before any."""
-        bound_mm = np.array([np.nan, *self.bound_mm])
-        return bound_mm[np.searchsorted(self.stamp_ns, stamp_ns, side="right")]
-
-
-def cell_courses(reader: BagReader, truth: BagTruth) -> list[CellCourse]:
-    """The course of the true error of each cell that a bag tells of.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
-    if not truth.states:
-        return []
-    told = [topic for topic in reader.info.topics if topic_kind(topic) == ACCURACY]
-    lines = {truth.state_topic(above(topic)): topic for topic in told}
-    return [
-        _course(topic, states, _line(reader, truth, lines.get(topic)), reader.info.start_ns or 0)
-        for topic, states in truth.states.items()
-    ]
-
-
-def _course(topic: str, states: ToldStates, line: _Line, start_ns: int) -> CellCourse:
-    series = {name: np.array(values) for name, values in states.series.items()}
-    return CellCourse(
-        topic=topic,
-        hours=(np.array(states.stamp_ns) - start_ns) / HOUR_NS,
-        without_mm=1e3 * series["without_m"],
-        with_mm=1e3 * series["with_m"],
-        p95_mm=1e3 * series["p95_m"],
-        lambda_without=series["lambda_without"],
-        lambda_with=series["lambda_with"],
-        bound_mm=line.at(np.array(states.stamp_ns)),
-        tolerance_mm=line.tolerance_mm,
-        faults=[
-            {"hours": (stamp_ns - start_ns) / HOUR_NS, "fault": fault, "size": size}
-            | {"told": _told(fault, size)}
-            for stamp_ns, fault, size in states.faults
-        ],
-    )
-
-
-def _told(fault: str, size: float) -> str:
-    """A size in the fault's own unit; empty where it ended."""
-    factor, unit = UNITS.get(fault, (1.0, ""))
-    return f"{size / factor:.4g} {unit}".strip() if size else ""
-
-
-def _line(reader: BagReader, truth: BagTruth, topic: str | None) -> _Line:
-    line = _Line()
-    if topic is None:
-        return line
-    with truth.reading(topic):
-        for recorded in reader.messages([topic]):
-            told = recorded.message
-            bound_mm = finite(told.bound_mm, "bound_mm")
-            line.stamp_ns.append(recorded.log_time_ns)
-            line.bound_mm.append(bound_mm if bound_mm >= 0.0 else np.nan)
-            line.tolerance_mm = finite(told.tolerance_mm, "tolerance_mm")
-    return line
-
-
-# ---- what a thermal session brought, cycle by cycle and altogether, as a document ---------------
-
-
-def thermal_document(cycles: Sequence[ReplayedCycle], arm: SerialArm) -> Document:
-    """Every cycle, and the errors of all of them together."""
-    measured = [c.measured for c in cycles if c.measured is not None]
-    true = [c.true for c in cycles if c.true is not None]
-    return {
-        "cycles": [_cycle(cycle, arm) for cycle in cycles],
-        "tolerance_mm": TOLERANCE_MM,
-        "measured": together(measured),
-        "true": together(true),
-        "bound": _kept(cycles),
-    }
-
-
-def together(errors: Sequence[CycleErrors]) -> Document | None:
-    """Figures over all cycles; None where there are none."""
-    if not errors:
-        return None
-    after = [e.after for e in errors if e.after is not None]
-    return CycleErrors(
-        np.concatenate([e.without for e in errors]),
-        np.concatenate([e.in_force for e in errors]),
-        np.concatenate(after) if after else None,
-    ).document()
-
-
-def _cycle(cycle: ReplayedCycle, arm: SerialArm) -> Document:
-    entry, found = cycle.entry, cycle.document
-    names, unit = arm.parameters.names, arm.parameters.to_display
-    return {
-        "cycle": entry.cycle_id,
-        "stamp": entry.stamp_ns * 1e-9,
-        "hours": cycle.hours,
-        "samples": found["samples"],
-        "nominal": found["nominal"]["held_out"],
-        "in_force": found["in_force"]["held_out"],
-        "candidate": found["calibrated"]["held_out"],
-        "predicted_rms_mm": found["calibrated"]["predicted"]["total_rms_mm"],
-        "forecast": cycle.forecast,
-        "measured": None if cycle.measured is None else cycle.measured.document(),
-        "true": None if cycle.true is None else cycle.true.document(),
-        "verdict": found["verdict"],
-        "revision": entry.revision,
-        "based_on": entry.based_on,
-        "rejected": found["rejected"],
-        "unobservable": found["unobservable"],
-        "drift": dict(zip(names, (cycle.drift * unit).tolist(), strict=True)),
-        "sigma": dict(zip(names, (cycle.sigma * unit).tolist(), strict=True)),
-    }
-
-
-def _kept(cycles: Sequence[ReplayedCycle]) -> Document:
-    """Shares of the errors of the model in force below the 95 % bound expected beforehand."""
-    return {
-        "measured_share": _share(cycles, lambda cycle: cycle.measured),
-        "true_share": _share(cycles, lambda cycle: cycle.true),
-    }
-
-
-def _share(
-    cycles: Sequence[ReplayedCycle], errors: Callable[[ReplayedCycle], CycleErrors | None]
-) -> float | None:
-    below: list[Array] = []
-    for cycle in cycles:
-        known = errors(cycle)
-        if known is not None and cycle.forecast is not None:
-            bound_m = cycle.forecast["bound_mm"] * 1e-3
-            below.append(np.linalg.norm(known.in_force, axis=1) <= bound_m)
-    return float(np.mean(np.concatenate(below))) if below else None
-
-
-def shift_errors(cycles: Sequence[ReplayedCycle]) -> ShiftErrors | None:
-    """Errors of the cycles that a truth judges; None without any."""
-    judged = [(c, c.true) for c in cycles if c.true is not None and c.true.after is not None]
-    if not judged:
-        return None
-    return ShiftErrors(
-        hours=np.array([c.hours for c, _ in judged]),
-        accepted=[c.entry.revision > 0 for c, _ in judged],
-        before=np.array([true.without for _, true in judged]),
-        after=np.array([true.after for _, true in judged]),
-        held=np.array([true.in_force for _, true in judged]),
-    )
-
-
-# ---- parts of a session document ----------------------------------------------------------------
-
-
-Truth = Sequence[tuple[int, Array]]
-
-
-def tool_runs(replayed: Document, truth: Truth) -> list[Document]:
-    """Each run: what it found; the true error of a tip that it gives, where a truth is told."""
-    return [_run(run, truth) for run in replayed["runs"]]
-
-
-def _run(run: Document, truth: Truth) -> Document:
-    change = run.get("change") or {}
-    sigma = run.get("sigma_mm")
-    true = _at(truth, round(run["stamp"] * 1e9))
-    error = None
-    if true is not None and "tcp_mm" in run:
-        error = float(np.linalg.norm(np.array(run["tcp_mm"]) - true[:3, 3] * 1e3))
-    return {
-        "run": run["run"],
-        "stamp": run["stamp"],
-        "answer": run.get("answer", "measured"),
-        "tcp_mm": run.get("tcp_mm"),
-        "change_mm": change.get("tip_mm"),
-        "change_deg": change.get("axis_deg"),
-        "sigma_mm": float(np.linalg.norm(sigma)) if isinstance(sigma, list) else sigma,
-        "misfit_mm": run.get("misfit_mm"),
-        "true_error_mm": error,
-        "verdict": run["verdict"],
-    }
-
-
-def calibrations(replayed: Document, truth: Truth) -> list[Document]:
-    """Each placement of a sensor: its figures, and the true error at the working distance."""
-    return [_calibration(found, truth) for found in replayed["calibrations"]]
-
-
-def _calibration(found: Document, truth: Truth) -> Document:
-    pose, away_mm = found.get("T_flange_sensor"), found.get("working_distance_mm")
-    true = _at(truth, round(found["stamp"] * 1e9))
-    error = None
-    if true is not None and pose is not None and away_mm is not None:
-        T = frames.transform_from_quat(np.array(pose["xyz_mm"]) * 1e-3, pose["quat_xyzw"])
-        at = np.array([0.0, 0.0, away_mm * 1e-3, 1.0])
-        error = float(np.linalg.norm(((T - true) @ at)[:3]) * 1e3)
-    return {
-        "stamp": found["stamp"],
-        "kind": found["kind"],
-        "method": found["method"],
-        "T_flange_sensor": pose,
-        "residual_rms_mm": (found.get("residual_mm") or {}).get("rms"),
-        "left_out": found.get("leave_one_out_mm"),
-        "predicted_rms_mm": found.get("working_error_mm"),
-        "working_distance_mm": away_mm,
-        "true_error_mm": error,
-        "rejected": list(found.get("rejected", [])),
-        "verdict": found["verdict"],
-    }
-
-
-def _at(truth: Truth, stamp_ns: int) -> Array | None:
-    """What was true at a stamp: told last before it, else first of all."""
-    told = [T for at_ns, T in truth if at_ns <= stamp_ns] or [T for _, T in truth[:1]]
-    return told[-1] if told else None
-
-
-def decisions(
-    commands: Sequence[Document], routine: Sequence[str], *, asked: bool
-) -> list[dict[str, Any]]:
-    """Commands with their code and reason, without routine steps that were carried out.
-
-    ``asked``: somebody gave the commands; else an acceptance that did not come about is none.
-    """
-    return [
-        {name: entry[name] for name in ("stamp", "command", "code", "message")}
-        for entry in commands
-        if not (
-            entry["command"] in routine if entry["code"] == "ACCEPT" else _unasked(entry, asked)
-        )
-    ]
-
-
-def as_recorded(command: Command, outcome: Mapping[str, Any]) -> Document:
-    """A decision of a node that is not replayed."""
-    return {
-        "stamp": seconds(command.stamp_ns),
-        "command": command.name,
-        "code": Code(outcome["status"]).name,
-        "message": str(outcome["message"]),
-    }
-
-
-def require_finite(told: Any, path: str, field: str = "") -> None:
-    """See that a bag's document has finite numbers alone, for JSON knows no others.
-
-    Raises
-    ------
-    InputError
-        With the bag and the number's place in the document.
-    """
-    if isinstance(told, float) and not math.isfinite(told):
-        raise InputError(f"{field} is {told}, which is no finite number", file=path)
-    parts: Iterable[tuple[str, Any]] = ()
-    if isinstance(told, dict):
-        parts = ((f"{field}.{name}" if field else name, part) for name, part in told.items())
-    elif isinstance(told, list | tuple):
-        parts = ((f"{field}[{i}]", part) for i, part in enumerate(told))
-    for name, part in parts:
-        require_finite(part, path, name)
-
-
-def _unasked(entry: Document, asked: bool) -> bool:
-    return not asked and entry["command"] == ACCEPT
-
-
-# ---- one bag through the code of ``robocal replay``, and judged, for ``robocal validate`` -------
-
-
-_SESSIONS = (is_thermal_session, is_tool_session, is_hand_eye_session)
 ROUTINE = (events.START, events.CAPTURE, events.SAMPLE, events.TOOL_STEP, events.STEP_BEGINS)
+_EVERY_ENTRY = 1_000_000
+_SESSIONS = (is_thermal_session, is_tool_session, is_hand_eye_session)
 
 
 @dataclass(frozen=True)
@@ -366,59 +100,52 @@ def validate_bag(job: Job) -> Validated:
     head: Document = {"bag": job.name, "path": job.path}
     try:
         with BagReader(job.path) as reader:
-            head |= _about(reader)
-            recordings, skipped, others = _events_of(reader)
+            info = reader.info
+            start_ns, end_ns = info.start_ns or 0, info.end_ns or 0
+            head |= {
+                "from": _utc(start_ns),
+                "to": _utc(end_ns),
+                "duration_s": (end_ns - start_ns) * 1e-9,
+                "topics": {topic: found.messages for topic, found in info.topics.items()},
+                "simulated": is_simulated(reader),
+            }
+            recordings, skipped, others = _recordings(reader)
             if not recordings and not skipped:
                 recordings = [open_recording(reader, {})]
             truth = BagTruth(reader)
-            sessions = [_Session(job, recording, truth).judged() for recording in recordings]
+            sessions = [_SessionReplay(job, recording, truth).judged() for recording in recordings]
             courses = cell_courses(reader, truth)
-        told = {"sessions": [document for document, _ in sessions], "other_decisions": others}
-        told["skipped"] = skipped
-        told["cells"] = [course.document() for course in courses]
-        require_finite(told, job.path)
+        found = {
+            "sessions": [document for document, _ in sessions],
+            "other_decisions": others,
+            "skipped": skipped,
+            "cells": [course.document() for course in courses],
+        }
+        require_finite(found, job.path)
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:
         words = f"{error.filename or job.path}: {error.strerror}"
         return Validated(head | {"error": refusal(RobocalError.code, words)["error"]})
     figures = tuple(tuple(drawn) for _, drawn in sessions)
-    return Validated(head | told, figures, tuple(cell_drawn(course) for course in courses))
-
-
-def _about(reader: BagReader) -> Document:
-    info = reader.info
-    start_ns, end_ns = info.start_ns or 0, info.end_ns or 0
-    return {
-        "from": _utc(start_ns),
-        "to": _utc(end_ns),
-        "duration_s": (end_ns - start_ns) * 1e-9,
-        "topics": {topic: found.messages for topic, found in info.topics.items()},
-        "simulated": is_simulated(reader),
-    }
+    return Validated(head | found, figures, tuple(cell_drawn(course) for course in courses))
 
 
 def _utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def _events_of(
+def _recordings(
     reader: BagReader,
 ) -> tuple[list[BagOverview], dict[str, str], dict[str, list[Document]]]:
-    """Sessions that can be replayed, others with why not, and what other nodes decided.
-
-    Raises
-    ------
-    InputError
-        When an event cannot be read, or a session's joint states.
-    """
+    """Sessions that can be replayed, others with why not, and what other nodes decided."""
     sessions: list[BagOverview] = []
     skipped: dict[str, str] = {}
     others: dict[str, list[Document]] = {}
     begin = begin_ns(reader)
     for topic in (topic for topic in reader.info.topics if topic_kind(topic) == EVENTS):
-        told_by = first_configuration(reader.messages([topic]))
-        if any(is_of(told_by) for is_of in _SESSIONS):
+        configured = first_configuration(reader.messages([topic]))
+        if any(is_of(configured) for is_of in _SESSIONS):
             recording = open_recording(reader, {EVENTS: topic})
             if not recording.commands:
                 skipped[topic] = UNASKED
@@ -428,18 +155,44 @@ def _events_of(
                 continue
             skipped[topic] = "the state that its commands began from was not recorded"
         if commands := read_events(reader.messages([topic]), begin)[1]:
-            others[topic] = [as_recorded(*event) for event in commands if event[1]]
+            others[topic] = [_recorded_decision(*event) for event in commands if event[1]]
     return sessions, skipped, others
 
 
-class _Session:
-    """One node's session in a bag; the whole bag where nobody told events."""
+def _recorded_decision(command: Command, outcome: Mapping[str, Any]) -> Document:
+    return {
+        "stamp": seconds(command.stamp_ns),
+        "command": command.name,
+        "code": Code(outcome["status"]).name,
+        "message": str(outcome["message"]),
+    }
+
+
+def require_finite(found: Any, path: str, field: str = "") -> None:
+    """See that a bag's document has finite numbers alone, for JSON knows no others.
+
+    Raises
+    ------
+    InputError
+        With the bag and the number's place in the document.
+    """
+    if isinstance(found, float) and not math.isfinite(found):
+        raise InputError(f"{field} is {found}, which is no finite number", file=path)
+    parts: Iterable[tuple[str, Any]] = ()
+    if isinstance(found, dict):
+        parts = ((f"{field}.{name}" if field else name, part) for name, part in found.items())
+    elif isinstance(found, list | tuple):
+        parts = ((f"{field}[{i}]", part) for i, part in enumerate(found))
+    for name, part in parts:
+        require_finite(part, path, name)
+
+
+class _SessionReplay:
+    """One node's session in a bag; the whole bag where it holds no events."""
 
     def __init__(self, job: Job, recording: BagOverview, truth: BagTruth) -> None:
         self._job, self._recording, self._truth = job, recording, truth
-        self._topic = topic = recording.events
-        self._namespace = above(above(topic or ""))  # of the node that told its events
-        self._given = {} if topic is None else {EVENTS: topic}
+        self._namespace = above(above(recording.events or ""))  # of the node that told its events
         self._mark = " (simulated)" if is_simulated(recording.reader) else ""
         self._forecasts = Forecasts()
         self._warnings: list[str] = []
@@ -447,97 +200,446 @@ class _Session:
 
     def judged(self) -> tuple[Document, list[Drawn]]:
         """Replay it: what it gave, and its figures."""
-        configured, truth, space = self._recording.configured, self._truth, self._namespace
+        configured, namespace = self._recording.configured, self._namespace
+        auto, topic = not self._recording.commands, self._recording.events
         with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
-            replayed = self._replayed(Path(folder))
+            request = ReplayRequest(
+                bag=Path(self._job.path),
+                find_robot=self._robot,
+                auto=auto,
+                accept=auto,
+                topics={} if topic is None else {EVENTS: topic},
+                state=Path(folder),
+                observe=self._forecasts.observed,
+            )
+            replayed = replay_bag(request, lambda _, recording: recording.blocks())
+            if "error" in replayed:
+                failed = RobocalError(replayed["error"]["message"])
+                failed.code = Code[replayed["error"]["code"]]
+                raise failed
             common = self._common(replayed)
             if is_tool_session(configured):
-                runs = tool_runs(replayed, truth.transforms(TOOL, space))
+                runs = tool_runs(replayed, self._truth.transforms(TOOL, namespace))
                 found = {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
                 return common | found, tool_figures(runs, self._mark)
             if is_hand_eye_session(configured):
-                sensor = truth.transforms(HAND_EYE, space)
-                made = {"calibrations": calibrations(replayed, sensor)}
-                made |= {"final": replayed["final_sensor"]}
-                return common | {"kind": "hand_eye", **made}, []
-            document, figures = self._thermal(Path(folder), common)
+                made = calibrations(replayed, self._truth.transforms(HAND_EYE, namespace))
+                final = replayed["final_sensor"]
+                return common | {"kind": "hand_eye", "calibrations": made, "final": final}, []
+            document, figures = self._thermal(Path(folder), common["settings"]["sigma_m"])
             return common | document, figures
-
-    def _replayed(self, folder: Path) -> Document:
-        auto = not self._recording.commands
-        request = ReplayRequest(
-            bag=Path(self._job.path),
-            find_robot=self._robot,
-            auto=auto,
-            accept=auto,
-            topics=self._given,
-            state=folder,
-            beside=self._forecasts.beside,
-        )
-        replayed = replay_bag(request, _silent)
-        if "error" in replayed:
-            raise _ReplayError(replayed["error"])
-        return replayed
 
     def _robot(self, configured: Command | None) -> SerialArm:
         """The recorded robot, else the one that the user names."""
         name = self._job.robot
         if name is not None and configured is not None:
-            notes: list[str] = []
-            arm = find_robot(name, notes, None)
+            arm = find_robot(name, [], None)
             if arm.model_hash != configured.arguments.get("model_hash"):
                 name = None
         self._arm = find_robot(name, self._warnings, configured)
         return self._arm
 
-    def _thermal(self, folder: Path, common: Document) -> tuple[Document, list[Drawn]]:
+    def _thermal(self, folder: Path, sigma_m: float) -> tuple[Document, list[Drawn]]:
         arm, serial = self._arm, Path(self._job.path).resolve().stem
         if arm is None:
             raise ValueError("replayed without a robot")
         with CalibrationHistory.open(serial, state_dir=folder, create=False) as history:
             made = ThermalHistory(history, arm, self._recording.start_ns)
-            sigma_m = float(common["settings"]["sigma_m"])
             points = self._truth.check_points(self._namespace)
-            cycles = made.cycles(self._forecasts, points, sigma_m)
+            cycles = made.cycles(self._forecasts, points, float(sigma_m))
         document = thermal_document(cycles, arm)
-        shown = thermal_figures(document["cycles"], shift_errors(cycles), self._mark)
-        return {"kind": "thermal", **document}, shown
+        figures = thermal_figures(document["cycles"], shift_errors(cycles), self._mark)
+        return {"kind": "thermal", **document}, figures
 
     def _common(self, replayed: Document) -> Document:
-        configured, recorded = self._recording.configured, bool(self._recording.commands)
+        configured, recorded = self._recording.configured, self._recording.commands
         settings = asdict(ThermalConfig()) if configured is None else configured.arguments["config"]
+        commands = replayed["commands"]
+        if recorded:
+            # Each as it was recorded, with its own numbers of runs and calibrations: what comes
+            # out otherwise here is in ``differs``.
+            commands = [
+                here | (_recorded_decision(*event) if event[1] else {})
+                for here, event in zip(commands, recorded, strict=True)
+            ]
         return {
-            "node": self._topic,
+            "node": self._recording.events,
             "robot": replayed["robot"],
             "model_hash": replayed["model_hash"],
-            "as_recorded": recorded,
+            "as_recorded": bool(recorded),
             "differs": replayed["differs"] if recorded else [],
             "settings": settings,
-            "decisions": decisions(self._as_told(replayed["commands"]), ROUTINE, asked=recorded),
+            "decisions": _decisions(commands, asked=bool(recorded)),
             "ignored": replayed["ignored_reasons"],
             "gaps": replayed["gaps"],
             "warnings": [*self._warnings, *replayed["warnings"]],
         }
 
-    def _as_told(self, commands: list[Document]) -> list[Document]:
-        """Each as it was recorded, with its own numbers of runs and calibrations.
 
-        What comes out otherwise here is in ``differs``.
-        """
-        recorded = self._recording.commands
-        if not recorded:
-            return commands
-        told = [as_recorded(*event) if event[1] else {} for event in recorded]
-        return [here | there for here, there in zip(commands, told, strict=True)]
+def _decisions(commands: Sequence[Document], *, asked: bool) -> list[Document]:
+    """Commands with their code and reason, without routine steps that were carried out.
 
-
-class _ReplayError(RobocalError):
-    """What a replay told in its document, as an error."""
-
-    def __init__(self, told: Document) -> None:
-        super().__init__(told["message"])
-        self.code = Code[told["code"]]
+    ``asked``: somebody gave the commands; else an acceptance that did not come about is none.
+    """
+    return [
+        {name: entry[name] for name in ("stamp", "command", "code", "message")}
+        for entry in commands
+        if (
+            entry["command"] not in ROUTINE
+            if entry["code"] == "ACCEPT"
+            else asked or entry["command"] != ACCEPT
+        )
+    ]
 
 
-def _silent(what: str, recording: BagOverview) -> Iterator[BagMessage]:
-    return recording.blocks()
+def tool_runs(replayed: Document, truth: Truth) -> list[Document]:
+    """Each run: what it found; the true error of a tip that it gives, where a truth is told."""
+    runs = []
+    for run in replayed["runs"]:
+        change = run.get("change") or {}
+        sigma = run.get("sigma_mm")
+        true = _at(truth, round(run["stamp"] * 1e9))
+        error = None
+        if true is not None and "tcp_mm" in run:
+            error = float(np.linalg.norm(np.array(run["tcp_mm"]) - true[:3, 3] * 1e3))
+        runs.append(
+            {
+                "run": run["run"],
+                "stamp": run["stamp"],
+                "answer": run.get("answer", "measured"),
+                "tcp_mm": run.get("tcp_mm"),
+                "change_mm": change.get("tip_mm"),
+                "change_deg": change.get("axis_deg"),
+                "sigma_mm": float(np.linalg.norm(sigma)) if isinstance(sigma, list) else sigma,
+                "misfit_mm": run.get("misfit_mm"),
+                "true_error_mm": error,
+                "verdict": run["verdict"],
+            }
+        )
+    return runs
+
+
+def calibrations(replayed: Document, truth: Truth) -> list[Document]:
+    """Each placement of a sensor: its figures, and the true error at the working distance."""
+    made = []
+    for found in replayed["calibrations"]:
+        pose, away_mm = found.get("T_flange_sensor"), found.get("working_distance_mm")
+        true = _at(truth, round(found["stamp"] * 1e9))
+        error = None
+        if true is not None and pose is not None and away_mm is not None:
+            T = frames.transform_from_quat(np.array(pose["xyz_mm"]) * 1e-3, pose["quat_xyzw"])
+            at = np.array([0.0, 0.0, away_mm * 1e-3, 1.0])
+            error = float(np.linalg.norm(((T - true) @ at)[:3]) * 1e3)
+        made.append(
+            {
+                "stamp": found["stamp"],
+                "kind": found["kind"],
+                "method": found["method"],
+                "T_flange_sensor": pose,
+                "residual_rms_mm": (found.get("residual_mm") or {}).get("rms"),
+                "left_out": found.get("leave_one_out_mm"),
+                "predicted_rms_mm": found.get("working_error_mm"),
+                "working_distance_mm": away_mm,
+                "true_error_mm": error,
+                "rejected": list(found.get("rejected", [])),
+                "verdict": found["verdict"],
+            }
+        )
+    return made
+
+
+def _at(truth: Truth, stamp_ns: int) -> Array | None:
+    """What was true at a stamp: told last before it, else first of all."""
+    told = [T for at_ns, T in truth if at_ns <= stamp_ns] or [T for _, T in truth[:1]]
+    return told[-1] if told else None
+
+
+class Forecasts:
+    """What a thermal session expected of the tool's error whenever something was measured."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[int, float, float]] = []  # stamp, ns; rms and 95 % bound, mm
+
+    def observed(
+        self, session: ThermalSession, recording: BagOverview, samples: Iterator[BagMessage]
+    ) -> Iterator[BagMessage]:
+        """Ask before each measurement; the session learns of a cycle only when it ends."""
+        for sample in samples:
+            kind = recording.inputs.get(sample.topic)
+            if kind in MEASURING and session.reference is not None:
+                now_ns = stamp_ns(sample.message.header.stamp)
+                if (error := session.accuracy(now_ns).error) is not None:
+                    self._known.append((now_ns, error.rms_m * 1e3, error.bound_m * 1e3))
+            yield sample
+
+    def at(self, first_ns: int) -> Document | None:
+        """The forecast when a cycle's first measurement came; None where there is none."""
+        found = next((known for known in self._known if known[0] >= first_ns), None)
+        return None if found is None else {"rms_mm": found[1], "bound_mm": found[2]}
+
+
+@dataclass(frozen=True, eq=False)
+class CycleErrors:
+    """Errors (m, 3), m: without correction, with the model in force before, and (truth) after."""
+
+    without: Array
+    in_force: Array
+    after: Array | None = None
+
+    def document(self) -> Document:
+        """Their figures; ``after`` only where it is known."""
+        found = {"without": figures_of(self.without), "in_force": figures_of(self.in_force)}
+        return found if self.after is None else found | {"after": figures_of(self.after)}
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedCycle:
+    """A candidate of the history, with the errors around it.
+
+    Attributes
+    ----------
+    hours : since the cold reference, else since the first joint reading.
+    measured : at the cycle's own poses, by models that it did not make; None for a calibration.
+    true : at check poses that were never measured; None without a truth.
+    drift, sigma : (k,) since the cold reference, SI.
+    """
+
+    entry: Entry
+    document: Document
+    hours: float
+    measured: CycleErrors | None
+    true: CycleErrors | None
+    forecast: Document | None
+    drift: Array
+    sigma: Array
+
+
+class ThermalHistory:
+    """The history of a replayed thermal session.
+
+    Parameters
+    ----------
+    nominal : the arm without any calibration.
+    start_ns : first joint reading.
+    """
+
+    def __init__(self, history: CalibrationHistory, nominal: SerialArm, start_ns: int) -> None:
+        self._history, self._nominal, self._start_ns = history, nominal, start_ns
+        entries = sorted(history.list(_EVERY_ENTRY), key=lambda entry: entry.id)
+        # what was in force when the recording began has no cycle of its own in it
+        self._candidates = [e for e in entries if e.kind == THERMAL and e.stamp_ns >= start_ns]
+        self._references = [e for e in entries if e.kind == REFERENCE]
+        changes = [
+            d for d in history.decisions() if d.kind == THERMAL and d.action is not Action.REJECT
+        ]
+        # calibration of each thermal revision; None for the nominal model
+        self._in_force: dict[int, int | None] = {0: None}
+        self._in_force |= {d.head_after: d.calibration_id for d in changes}
+
+    def _model(self, revision: int) -> SerialArm:
+        chosen = self._in_force[revision]
+        if chosen is None:
+            return self._nominal
+        return arm_of(self._history.model(chosen), self._nominal)
+
+    def _reference(self, model: Document) -> ColdReference | None:
+        """The cold reference that a model counts from; None for one that counts from none."""
+        for entry in reversed(self._references if holds_drift(model) else []):
+            reference = reference_of(self._history.model(entry.id), self._nominal)
+            if reference.data.middle_ns == model["reference_stamp_ns"]:
+                return reference
+        return None
+
+    def cycles(
+        self, forecasts: Forecasts, truth: CheckPoints | None, sigma_m: float
+    ) -> list[ReplayedCycle]:
+        """Every candidate, in the order in which they were made."""
+        last = self._history.head(THERMAL).revision
+        following = [entry.based_on for entry in self._candidates[1:]] + [last]
+        return [
+            self._cycle(entry, after, forecasts, truth, sigma_m)
+            for entry, after in zip(self._candidates, following, strict=True)
+        ]
+
+    def _cycle(
+        self,
+        entry: Entry,
+        after: int,
+        forecasts: Forecasts,
+        truth: CheckPoints | None,
+        sigma_m: float,
+    ) -> ReplayedCycle:
+        model, document = self._history.model(entry.id), self._history.document(entry.id)
+        reference = self._reference(model)
+        before, arm = self._model(entry.based_on), arm_of(model, self._nominal)
+        cold = self._nominal if reference is None else reference.cell.arm
+        start_ns = self._start_ns
+        measured = true = forecast = None
+        if reference is not None:
+            start_ns = reference.data.middle_ns
+            data = Measurements.of_arrays(self._history.inputs(entry.id))
+            rejected = document["held_out_rejected"]
+            errors = measured_errors(
+                reference, data, [cold, before], left_out=rejected, sigma_m=sigma_m
+            )
+            measured = CycleErrors(*errors) if len(errors[0]) else None
+            first_ns = entry.stamp_ns if data.stamp_ns is None else int(data.stamp_ns.min())
+            forecast = forecasts.at(first_ns)
+            moved = None if truth is None else truth.moved(entry.stamp_ns)
+            if truth is not None and moved is not None:
+                with_models = [
+                    true_errors(cold, arm_then, truth.q, truth.tool, moved)
+                    for arm_then in (before, self._model(after))
+                ]
+                true = CycleErrors(moved, *with_models)
+        sigma = np.sqrt(np.diag(model["covariance"]))
+        known = dict(zip(model["parameters"], sigma, strict=True))  # held ones have none
+        return ReplayedCycle(
+            entry=entry,
+            document=document,
+            hours=(entry.stamp_ns - start_ns) / HOUR_NS,
+            measured=measured,
+            true=true,
+            forecast=forecast,
+            drift=cold.parameters.read(arm.mdh - cold.mdh),
+            sigma=np.array([known.get(name, 0.0) for name in cold.parameters.names]),
+        )
+
+
+def thermal_document(cycles: Sequence[ReplayedCycle], arm: SerialArm) -> Document:
+    """Every cycle, the errors of all of them together, and how many the forecast bounded."""
+    measured = [(c, c.measured) for c in cycles if c.measured is not None]
+    true = [(c, c.true) for c in cycles if c.true is not None]
+    return {
+        "cycles": [_cycle_document(cycle, arm) for cycle in cycles],
+        "tolerance_mm": TOLERANCE_MM,
+        "measured": _together([errors for _, errors in measured]),
+        "true": _together([errors for _, errors in true]),
+        "bound": {
+            "measured_share": _share_below_bound(measured),
+            "true_share": _share_below_bound(true),
+        },
+    }
+
+
+def _together(errors: Sequence[CycleErrors]) -> Document | None:
+    """Figures over all cycles; None where there are none."""
+    if not errors:
+        return None
+    after = [e.after for e in errors if e.after is not None]
+    return CycleErrors(
+        np.concatenate([e.without for e in errors]),
+        np.concatenate([e.in_force for e in errors]),
+        np.concatenate(after) if after else None,
+    ).document()
+
+
+def _share_below_bound(cycles: Sequence[tuple[ReplayedCycle, CycleErrors]]) -> float | None:
+    """Share of the errors of the model in force below the 95 % bound expected beforehand."""
+    below = [
+        np.linalg.norm(errors.in_force, axis=1) <= cycle.forecast["bound_mm"] * 1e-3
+        for cycle, errors in cycles
+        if cycle.forecast is not None
+    ]
+    return float(np.mean(np.concatenate(below))) if below else None
+
+
+def _cycle_document(cycle: ReplayedCycle, arm: SerialArm) -> Document:
+    entry, found = cycle.entry, cycle.document
+    names, unit = arm.parameters.names, arm.parameters.to_display
+    return {
+        "cycle": entry.cycle_id,
+        "stamp": entry.stamp_ns * 1e-9,
+        "hours": cycle.hours,
+        "samples": found["samples"],
+        "nominal": found["nominal"]["held_out"],
+        "in_force": found["in_force"]["held_out"],
+        "candidate": found["calibrated"]["held_out"],
+        "predicted_rms_mm": found["calibrated"]["predicted"]["total_rms_mm"],
+        "forecast": cycle.forecast,
+        "measured": None if cycle.measured is None else cycle.measured.document(),
+        "true": None if cycle.true is None else cycle.true.document(),
+        "verdict": found["verdict"],
+        "revision": entry.revision,
+        "based_on": entry.based_on,
+        "rejected": found["rejected"],
+        "unobservable": found["unobservable"],
+        "drift": dict(zip(names, (cycle.drift * unit).tolist(), strict=True)),
+        "sigma": dict(zip(names, (cycle.sigma * unit).tolist(), strict=True)),
+    }
+
+
+def shift_errors(cycles: Sequence[ReplayedCycle]) -> ShiftErrors | None:
+    """Errors of the cycles that a truth judges; None without any."""
+    judged = [(c, c.true) for c in cycles if c.true is not None and c.true.after is not None]
+    if not judged:
+        return None
+    return ShiftErrors(
+        hours=np.array([c.hours for c, _ in judged]),
+        accepted=[c.entry.revision > 0 for c, _ in judged],
+        before=np.array([true.without for _, true in judged]),
+        after=np.array([true.after for _, true in judged]),
+        held=np.array([true.in_force for _, true in judged]),
+    )
+
+
+def cell_courses(reader: BagReader, truth: BagTruth) -> list[CellCourse]:
+    """The course of the true error of each cell that a bag tells of.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    if not truth.states:
+        return []
+    lines = {
+        truth.state_topic(above(topic)): topic
+        for topic in reader.info.topics
+        if topic_kind(topic) == ACCURACY
+    }
+    start_ns = reader.info.start_ns or 0
+    units = {str(fault): (factor, unit) for fault, (_, factor, unit) in SIZES.items()}
+    courses = []
+    for topic, states in truth.states.items():
+        stamps = np.array(states.stamp_ns)
+        series = {name: np.array(values) for name, values in states.series.items()}
+        bound_mm, tolerance_mm = _line_bound(reader, truth, lines.get(topic), stamps)
+        faults = []
+        for at_ns, fault, size in states.faults:
+            factor, unit = units.get(fault, (1.0, ""))
+            words = f"{size / factor:.4g} {unit}".strip() if size else ""
+            hours = (at_ns - start_ns) / HOUR_NS
+            faults.append({"hours": hours, "fault": fault, "size": size, "told": words})
+        courses.append(
+            CellCourse(
+                topic=topic,
+                hours=(stamps - start_ns) / HOUR_NS,
+                without_mm=1e3 * series["without_m"],
+                with_mm=1e3 * series["with_m"],
+                p95_mm=1e3 * series["p95_m"],
+                lambda_without=series["lambda_without"],
+                lambda_with=series["lambda_with"],
+                bound_mm=bound_mm,
+                tolerance_mm=tolerance_mm,
+                faults=faults,
+            )
+        )
+    return courses
+
+
+def _line_bound(
+    reader: BagReader, truth: BagTruth, topic: str | None, at_ns: Array
+) -> tuple[Array, float | None]:
+    """What the line read last at each time: 95 % bound, nan where not known; allowed error, mm."""
+    stamps, bounds_mm = array("q"), array("d", [math.nan])
+    tolerance_mm = None
+    if topic is not None:
+        with truth.reading(topic):
+            for recorded in reader.messages([topic]):
+                state = recorded.message
+                bound_mm = finite(state.bound_mm, "bound_mm")
+                stamps.append(recorded.log_time_ns)
+                bounds_mm.append(bound_mm if bound_mm >= 0.0 else math.nan)
+                tolerance_mm = finite(state.tolerance_mm, "tolerance_mm")
+    return np.array(bounds_mm)[np.searchsorted(stamps, at_ns, side="right")], tolerance_mm

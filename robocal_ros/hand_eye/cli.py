@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cli.arguments import positive, text, three_numbers
-from robocal_ros.cli.output import CliResult, Document
+from robocal_ros.cli.command import CliResult, Document, positive, text, three_numbers
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robocal_ros.bags.bags import BagReader
-from robocal_ros.bags.hand_eye_bags import DATA_SET, read_data_set
+from robocal_ros.bags.bags import DATA_SET, BagReader, read_data_set
 from robocal_ros.bags.replay import topic_kind
-from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, positive
-from robocal_ros.cli.output import Document
+from robocal_ros.cli.command import ROBOT_HELP, Document, input_topic, positive
 from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.estimation.polyline import CornerRule

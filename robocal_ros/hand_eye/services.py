@@ -252,7 +252,7 @@ class HandEyeFiles:
         self._saved = data, frozenset(() if data is None else data.samples)
 
     async def _load(self, request: Any, response: Any) -> Any:
-        from robocal_ros.bags.hand_eye_bags import read_data_set
+        from robocal_ros.bags.bags import read_data_set
 
         path = _path(request)
         document = read_data_set(path, self._session().nominal)
@@ -283,7 +283,7 @@ class HandEyeFiles:
 
     def _write(self, path: Path) -> tuple[int, str]:
         """Write the open data set; how many samples it has, and what to say."""
-        from robocal_ros.bags.hand_eye_bags import write_data_set
+        from robocal_ros.bags.bags import write_data_set
 
         session = self._session()
         document = session.document()

@@ -9,17 +9,31 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, text, warn
+from robocal_ros.cli.command import (
+    ROBOT_HELP,
+    CliResult,
+    Document,
+    add_sigma,
+    count,
+    describe_robot,
+    positive,
+    seed,
+    text,
+    warn,
+)
 from robocal_ros.cli.identify import show_identification
-from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import write_text
 from robocal_ros.identification.cell import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import read_measurements
+from robocal_ros.report.figures import draw_rounds
 from robocal_ros.thermal.cell_setup import (
     PlacedSensor,
+    SensorField,
     calibrate_sensor,
+    plan_cycle,
     read_sensor,
     sensor_document,
     write_sensor,
@@ -43,15 +57,10 @@ from robocal_ros.thermal.reference import (
     read_visits,
     require_cold_counterparts,
 )
+from robocal_ros.thermal.screening import DriftHistory, best_subset, screen, share_within
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-from robocal_ros.cli.arguments import count, positive, seed
-from robocal_ros.ground.files import write_text
-from robocal_ros.report.figures import draw_rounds
-from robocal_ros.thermal.cell_setup import SensorField, plan_cycle
-from robocal_ros.thermal.screening import DriftHistory, best_subset, screen, share_within
 
 Array = NDArray[np.float64]
 

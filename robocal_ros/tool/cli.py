@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cli.arguments import (
+from robocal_ros.cli.command import (
     ROBOT_HELP,
     SIGMA_MM,
+    CliResult,
+    Document,
     describe_robot,
     positive,
     text,
     three_numbers,
     warn,
 )
-from robocal_ros.cli.output import CliResult, Document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import transform_document

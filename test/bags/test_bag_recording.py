@@ -7,9 +7,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from robocal_ros.bags.bag_recording import BagRecording
-from robocal_ros.bags.bag_types import encode
+from robocal_ros.bags.bag_writer import BagRecording
 from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.mcap_files import encode
 from robocal_ros.ground.errors import StorageError
 
 BOOL, TEXT = "std_msgs/msg/Bool", "std_msgs/msg/String"

@@ -16,9 +16,9 @@ import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from robocal_ros.bags import bag_types
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagReader, BagWriter, bag_info, read_bag
+from robocal_ros.bags.mcap_files import ros_types
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import joint_sample, pose_sample
 
@@ -494,9 +494,7 @@ def test_the_messages_are_those_of_ros(tmp_path: Path) -> None:
 
     for name in ("AccuracyState", "BeamEvent", "CalibrationQuality", "KinematicModel"):
         own = getattr(robocal_msgs.msg, name)
-        fields = [
-            field for field, _ in bag_types.ros_types().fielddefs[f"robocal_msgs/msg/{name}"][1]
-        ]
+        fields = [field for field, _ in ros_types().fielddefs[f"robocal_msgs/msg/{name}"][1]]
         assert fields == list(own.get_fields_and_field_types())
     state = JointState(name=NAMES, position=[0.5, 1.5])
     state.header.stamp.sec = 7

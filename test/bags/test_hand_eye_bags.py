@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from robocal_ros.bags.bags import read_bag
-from robocal_ros.bags.hand_eye_bags import PROFILE, read_data_set, write_data_set
+from robocal_ros.bags.bags import PROFILE, read_bag, read_data_set, write_data_set
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.samples import cloud_points
 from robocal_ros.kinematics.robots import load_robot

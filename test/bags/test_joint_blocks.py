@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from robocal_ros.bags import bag_types, bag_writer
+from robocal_ros.bags import bag_writer
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
+from robocal_ros.bags.mcap_files import definition as known_definition
+from robocal_ros.bags.mcap_files import encode, ros_types
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import TAUGHT, JointBlock, joint_sample
 
@@ -115,7 +117,7 @@ def test_the_order_of_files_that_overlap_is_kept(tmp_path, monkeypatch):
 
 def written(path: Path, data: list[bytes], definition: str = "") -> Path:
     """A bag of joint states in other hands' bytes."""
-    text = definition or bag_types.definition(JOINT_STATE)
+    text = definition or known_definition(JOINT_STATE)
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE)
         writer.start(profile="ros2", library="test")
@@ -130,7 +132,7 @@ def written(path: Path, data: list[bytes], definition: str = "") -> Path:
 def a_joint_state(position: float = 1.0, frame: str = "") -> bytes:
     header = {"stamp": ros_time(5), "frame_id": frame}
     message = {"header": header, "name": ["ab"], "position": [position]}
-    return bytes(bag_types.encode(JOINT_STATE, message))
+    return bytes(encode(JOINT_STATE, message))
 
 
 def test_what_stands_in_padding_does_not_matter(tmp_path):
@@ -159,7 +161,7 @@ def test_a_message_cut_short_is_refused_as_ever(tmp_path, cut):
 
 
 def test_big_endian_joint_states_are_decoded_one_by_one(tmp_path):
-    types = bag_types.ros_types()
+    types = ros_types()
     message = types.deserialize_cdr(a_joint_state(2.0), JOINT_STATE)
     data = bytes(types.serialize_cdr(message, JOINT_STATE, little_endian=False))
     found = read(written(tmp_path / "x.mcap", [data, data]), blocks=True)

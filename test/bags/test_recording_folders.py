@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.bags.bag_recording import (
+from robocal_ros.bags.bag_writer import (
     MARKER,
     BagRecording,
     Maker,
@@ -22,8 +22,8 @@ from robocal_ros.bags.bag_recording import (
     recordings,
     size_bytes,
 )
-from robocal_ros.bags.bag_types import encode
 from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.mcap_files import encode
 from robocal_ros.ground.errors import StorageError
 
 TEXT = "std_msgs/msg/String"
@@ -275,7 +275,7 @@ def test_what_is_being_written_is_not_deleted(tmp_path: Path) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from robocal_ros.bags.bag_recording import BagRecording
+from robocal_ros.bags.bag_writer import BagRecording
 recording = BagRecording(Path(sys.argv[1]), latched=(), file_bytes=1000)
 print(flush=True)
 sys.stdin.read()

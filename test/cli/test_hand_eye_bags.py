@@ -11,8 +11,7 @@ import pytest
 from hand_eye_command import chi_square, pose_of, robocal, target
 from scipy.stats import chi2
 
-from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
-from robocal_ros.bags.hand_eye_bags import write_data_set
+from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter, write_data_set
 from robocal_ros.bags.replay import replay
 from robocal_ros.cli.recording import open_recording
 from robocal_ros.hand_eye.session import hand_eye_session_as_recorded, take_hand_eye_message

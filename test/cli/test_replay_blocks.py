@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from robocal_ros.cli.recording import BagOverview
-from robocal_ros.cli.replaying import ReplayRequest, replay_bag
+from robocal_ros.cli.replay import ReplayRequest, replay_bag
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 

@@ -11,7 +11,7 @@ import pytest
 
 from robocal_ros.bags.bag_writer import BagWriter
 from robocal_ros.bags.bags import BagReader
-from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth
+from robocal_ros.cli.recording import HAND_EYE, TOOL, BagTruth
 from robocal_ros.cli.validating import cell_courses
 from robocal_ros.ground.errors import InputError
 from robocal_ros.report.figures import CellCourse

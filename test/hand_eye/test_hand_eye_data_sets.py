@@ -13,7 +13,7 @@ from hand_eye_driver import (
 )
 from hand_eye_laser import SHOTS, WARM, begun, driver_of
 
-from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.bags.bags import read_data_set, write_data_set
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.hand_eye.data import data_set_of

@@ -19,7 +19,7 @@ from hand_eye_driver import ARM, CAMERA, FRAME, SPHERE, Driver, Recorded, namesp
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.bags.bags import read_data_set, write_data_set
 from robocal_ros.bags.replay import replay
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.hand_eye import shots as hand_eye_shots

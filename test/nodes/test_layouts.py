@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.bags.bag_types import recorded_name
+from robocal_ros.bags.mcap_files import message_class, recorded_name
 from robocal_ros.bags.recorder_node import TOPICS
-from robocal_ros.bags.replay_topics import message_class
 
 LAYOUTS = Path(__file__).parents[2] / "config" / "layouts"
 # Without the namespace; that nodes offer them is shown by the tests of the cell.

@@ -14,7 +14,7 @@ from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
 from robocal_ros.bags import recorder_node
-from robocal_ros.bags.bag_recording import (
+from robocal_ros.bags.bag_writer import (
     KEEP,
     MB,
     BagRecording,
@@ -23,8 +23,8 @@ from robocal_ros.bags.bag_recording import (
     recordings,
     size_bytes,
 )
-from robocal_ros.bags.bag_types import encode
 from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.mcap_files import encode
 from robocal_ros.bags.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode

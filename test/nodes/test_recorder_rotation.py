@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from tool_cell_live import LiveCell
 from tool_driver import TRUTH
 
-from robocal_ros.bags.bag_recording import recordings
+from robocal_ros.bags.bag_writer import recordings
 from robocal_ros.bags.recorder_node import LOOK_S
 from robocal_ros.cli.main import main
 from robocal_ros.ground.errors import Code

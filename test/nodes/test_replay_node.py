@@ -18,9 +18,9 @@ from shift import Shift, built, postures
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from robocal_ros.bags.bag_types import recorded_name
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.bags.replay_topics import chosen_topics, message_class
+from robocal_ros.bags.mcap_files import message_class, recorded_name
+from robocal_ros.bags.replay_node import chosen_topics
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics.robots import load_robot

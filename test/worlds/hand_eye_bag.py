@@ -5,8 +5,7 @@ from pathlib import Path
 from hand_eye_driver import ARM, FRAME, START_NS, TYPE, Driver, Recorded
 
 from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.bags.bags import BagWriter
-from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.bags.bags import BagWriter, read_data_set, write_data_set
 from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.session import HandEyeSession, configuration
 from robocal_ros.history.calibrations import CalibrationHistory
