@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.tool_cell import SmoothPath
-from robocal_ros.hand_eye.target_files import Target
-from robocal_ros.hand_eye.targets import KIND_OF, target_document
+from robocal_ros.hand_eye.targets import KIND_OF, LaserTarget, target_document
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
 
@@ -47,7 +46,7 @@ def way(q_start: Array, q: Array) -> SmoothPath:
     return SmoothPath(rests, departs, np.vstack([q_start, q]))
 
 
-def asked(marks: Sequence[str], target: Target) -> list[tuple[float, Command]]:
+def asked(marks: Sequence[str], target: LaserTarget) -> list[tuple[float, Command]]:
     """What the program asks of the session, each with its time, s; ``marks`` of the shots."""
     start = {
         "target": target_document(KIND_OF[type(target)], target),

@@ -60,10 +60,17 @@ from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
 from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.config import HandEyeConfig
-from robocal_ros.hand_eye.tables import write_shots
-from robocal_ros.hand_eye.target_files import Target, read_target, write_target
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.hand_eye.files import write_shots
+from robocal_ros.hand_eye.session import HandEyeConfig
+from robocal_ros.hand_eye.targets import (
+    LaserTarget,
+    LineTarget,
+    SphereTarget,
+    Staircase,
+    StepTarget,
+    read_target,
+    write_target,
+)
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session.events import Outcome
 
@@ -100,7 +107,7 @@ class Recording:
     scene: Scene
     robot: TrueRobot
     shots: SimulatedShots
-    target: Target
+    target: LaserTarget
     truth: dict[str, Any]
 
 
@@ -129,7 +136,7 @@ def _scene(kind: str) -> Scene:
 
 def _shown(
     kind: str, cell: HandEyeCell, T_known_true: Array, rng: np.random.Generator
-) -> tuple[SimulatedShots, Target, dict[str, Any]]:
+) -> tuple[SimulatedShots, LaserTarget, dict[str, Any]]:
     count = SHOTS + CHECKS
     if kind == "sphere":
         shots = sphere_shots(cell, CENTRE, RADIUS_M, count, rng)

@@ -30,7 +30,6 @@ from bench.hand_eye_worlds import (
 from bench.tables import Goal, Table
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import RankDeficientError
-from robocal_ros.hand_eye.mount_problem import PoseNoise
 from robocal_ros.hand_eye.planning import (
     PlannedLine,
     PlannedSphere,
@@ -39,8 +38,7 @@ from robocal_ros.hand_eye.planning import (
     SensorRange,
     check_plan,
 )
-from robocal_ros.hand_eye.quality import expected_error_m
-from robocal_ros.hand_eye.result import at_origin, increment
+from robocal_ros.hand_eye.result import PoseNoise, at_origin, expected_error_m, increment
 from robocal_ros.hand_eye.targets import StepTarget
 
 Array = NDArray[np.float64]

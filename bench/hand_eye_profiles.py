@@ -30,8 +30,7 @@ from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.mount_problem import pivot_of
-from robocal_ros.hand_eye.quality import expected_error_m
-from robocal_ros.hand_eye.result import HandEyeResult, at_origin, increment
+from robocal_ros.hand_eye.result import HandEyeResult, at_origin, expected_error_m, increment
 from robocal_ros.hand_eye.solve import field_of, solve_joint
 from robocal_ros.kinematics.robots import load_robot
 
@@ -89,7 +88,7 @@ def step_table() -> Table:
             made = step_set(cell, rng, poses, aim_m, known_m, known_m)
             fit, classic = made.both()
             away = field_of(made.data) - pivot_of(fit.views)
-            told = expected_error_m(fit.covariance[:6, :6], away)
+            told = float(expected_error_m(fit.covariance[:6, :6], away))
             for rows, T in zip(found.values(), (fit.state.T_flange_sensor, classic), strict=True):
                 error = unseen_errors(T, np.random.default_rng([71, seed]))
                 mean, spread = np.mean(np.linalg.norm(error, axis=1)), error.std(axis=0, ddof=1)

@@ -17,8 +17,8 @@ from bench.ur10_campaigns import data_folder
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.board import Chessboard, Image, decode_image
 from robocal_ros.hand_eye.camera_model import Placement, PosePairs, closed_form
+from robocal_ros.hand_eye.files import write_pose_table
 from robocal_ros.hand_eye.streams import PoseStream, stream_of
-from robocal_ros.hand_eye.tables import write_pose_table
 
 Array = NDArray[np.float64]
 

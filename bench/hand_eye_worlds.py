@@ -31,16 +31,21 @@ from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen
 from robocal_ros.hand_eye.mount_problem import (
+    Index,
+    LineModel,
     MountProblem,
     MountState,
-    PoseNoise,
+    Sightings,
+    SphereModel,
+    TargetModel,
     TargetView,
     pivot_of,
 )
-from robocal_ros.hand_eye.result import increment
-from robocal_ros.hand_eye.target_models import Index, LineModel, Sightings, SphereModel, TargetModel
+from robocal_ros.hand_eye.result import PoseNoise, increment
+from robocal_ros.hand_eye.solve import look
+from robocal_ros.hand_eye.staircase import StepTask
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.hand_eye.tasks import LineTask, SphereTask, StepTask, Task, look
+from robocal_ros.hand_eye.tasks import LineTask, SphereTask, Task
 
 Array = NDArray[np.float64]
 

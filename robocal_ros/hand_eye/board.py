@@ -12,7 +12,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.files import read_bytes
 from robocal_ros.hand_eye.camera_model import Mount, PosePairs, Shared
-from robocal_ros.hand_eye.tables import PoseTable
+from robocal_ros.hand_eye.files import PoseTable
 from robocal_ros.kinematics.robots import read_fields
 
 Array = NDArray[np.float64]

@@ -32,9 +32,8 @@ from robocal_ros.hand_eye.camera_model import (
     sample_sizes,
     score,
 )
-from robocal_ros.hand_eye.quality import HandEyeSettings, apart, judge_classic
-from robocal_ros.hand_eye.result import HandEyeResult
-from robocal_ros.hand_eye.target_models import same_pose
+from robocal_ros.hand_eye.mount_problem import same_pose
+from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings, apart, judge_classic
 
 # ---- camera mistakes ----------------------------------------------------------------------------
 

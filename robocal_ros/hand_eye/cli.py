@@ -38,8 +38,13 @@ from robocal_ros.hand_eye.cli_shots import (
     show_verdict,
     task_of,
 )
-from robocal_ros.hand_eye.files import exported, read_flange_mount, read_mount
-from robocal_ros.hand_eye.mount_problem import PoseNoise
+from robocal_ros.hand_eye.files import (
+    exported,
+    read_flange_mount,
+    read_mount,
+    read_pose_table,
+    write_pose_table,
+)
 from robocal_ros.hand_eye.planning import (
     PlannedLine,
     PlannedSphere,
@@ -49,12 +54,9 @@ from robocal_ros.hand_eye.planning import (
     SensorRange,
     check_plan,
 )
-from robocal_ros.hand_eye.quality import HandEyeSettings
-from robocal_ros.hand_eye.result import by_shot, hand_eye_document
+from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, by_shot, hand_eye_document
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
-from robocal_ros.hand_eye.tables import read_pose_table, write_pose_table
-from robocal_ros.hand_eye.target_files import Target
-from robocal_ros.hand_eye.targets import SphereTarget, StepTarget
+from robocal_ros.hand_eye.targets import LaserTarget, SphereTarget, StepTarget
 from robocal_ros.hand_eye.tasks import Task
 from robocal_ros.kinematics import SerialArm
 
@@ -379,7 +381,7 @@ def _noise(settings: "HandEyeSettings") -> "PoseNoise":
 
 
 def _planned(
-    target: "Target | None",
+    target: "LaserTarget | None",
     center_mm: tuple[float, float, float] | None,
     sensor: "SensorRange",
     marks: tuple[str, ...] | None,

@@ -33,11 +33,16 @@ from robocal_ros.hand_eye.cli_shots import (
     show_judged,
     show_placed,
 )
+from robocal_ros.hand_eye.files import (
+    PoseTable,
+    read_pose_table,
+    read_profiles,
+    read_tracker_points,
+)
 from robocal_ros.hand_eye.result import HandEyeResult, hand_eye_document
 from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.streams import PoseStream, calibrate_streams, stream_of
-from robocal_ros.hand_eye.tables import PoseTable, read_pose_table, read_profiles
-from robocal_ros.hand_eye.target_files import read_tracker_points, read_tracker_target
+from robocal_ros.hand_eye.targets import read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
 from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.kinematics import SerialArm

@@ -18,10 +18,10 @@ from robocal_ros.estimation.polyline import CornerRule
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.streams import StandstillRule
-from robocal_ros.hand_eye.config import HandEyeConfig, flange_poses
-from robocal_ros.hand_eye.data import data_set_of
-from robocal_ros.hand_eye.quality import HandEyeSettings
-from robocal_ros.hand_eye.session import is_hand_eye_session
+from robocal_ros.hand_eye.data import data_set_of, flange_poses
+from robocal_ros.hand_eye.files import PoseTable, read_pose_table, read_profiles
+from robocal_ros.hand_eye.result import HandEyeSettings
+from robocal_ros.hand_eye.session import HandEyeConfig, is_hand_eye_session
 from robocal_ros.hand_eye.shots import (
     PROFILE,
     Profile,
@@ -30,10 +30,16 @@ from robocal_ros.hand_eye.shots import (
     captured_marks,
     first_of_each,
 )
-from robocal_ros.hand_eye.tables import PoseTable, read_pose_table, read_profiles
-from robocal_ros.hand_eye.target_files import Target, read_target
-from robocal_ros.hand_eye.targets import KIND_OF, BoardTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
+from robocal_ros.hand_eye.staircase import StepTask
+from robocal_ros.hand_eye.targets import (
+    KIND_OF,
+    BoardTarget,
+    LaserTarget,
+    SphereTarget,
+    StepTarget,
+    read_target,
+)
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 
@@ -221,7 +227,7 @@ def require_unused(judges: "PoseTable", used: "PoseTable") -> None:
             judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
 
 
-def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Target | None":
+def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "LaserTarget | None":
     """What is known of a target: from its file, or a sphere's radius; None for an unknown line.
 
     Raises
@@ -244,7 +250,7 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Ta
     raise InputError(missing[kind])
 
 
-def read_target_of(kind: str, path: Path) -> "Target":
+def read_target_of(kind: str, path: Path) -> "LaserTarget":
     """Read a target file of this kind. Raises as `given_target`."""
     target = read_target(path)
     found = KIND_OF[type(target)]
@@ -253,7 +259,7 @@ def read_target_of(kind: str, path: Path) -> "Target":
     return target
 
 
-def task_of(target: "Target | None", feature: str | None, classic: bool = False) -> "Task":
+def task_of(target: "LaserTarget | None", feature: str | None, classic: bool = False) -> "Task":
     """The estimator's view of a target, of a line by its ``feature``.
 
     ``classic``: corners and edges in the published form.

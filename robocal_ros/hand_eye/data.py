@@ -1,27 +1,31 @@
 """The data set of a hand-eye calibration: its target, and what was captured of it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError
+from robocal_ros.ground.frames import Document
+from robocal_ros.ground.proposals import Head
 from robocal_ros.hand_eye.board import find_corners
-from robocal_ros.hand_eye.config import PoseModel, models_used, pose_model_of
+from robocal_ros.hand_eye.camera_model import Mount
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE, Shot, profile_of
 from robocal_ros.hand_eye.targets import BoardTarget, target_of
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.session.events import Command
 
 Array = NDArray[np.float64]
-Document = dict[str, Any]
 
-Mount = Literal["in-hand", "to-hand"]
 Feature = Literal["edge", "groove"]
 
 IN_HAND: Mount = "in-hand"
 TO_HAND: Mount = "to-hand"
+MOUNTS = (IN_HAND, TO_HAND)
+WITHOUT_FILE = ("line", "camera")  # solved with the sensor's place
 FEATURES: tuple[Feature, ...] = ("edge", "groove")
 TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
 
@@ -29,6 +33,52 @@ MOST_CAPTURES = 500
 MOST_HANDLE = 2**32 - 1
 MOST_POINTS = 250_000  # of a set that is loaded: some 10 MB of text in the recording
 UNIT = 1e-3  # length of a quaternion, from 1
+THERMAL_MODEL = "thermal_model"  # argument of a command
+
+
+@dataclass(frozen=True, eq=False)
+class PoseModel:
+    """A thermal model (None: nominal) and its revision; samples of one model share one object."""
+
+    revision: int
+    model: Document | None
+
+
+def flange_poses(q: Array, models: Sequence[PoseModel], nominal: SerialArm) -> Array:
+    """T_base_flange (k, 4, 4), m, of joints (k, n), each by its own model."""
+    found = np.zeros((len(q), 4, 4))
+    for one in dict.fromkeys(models):
+        rows = [i for i, model in enumerate(models) if model is one]
+        arm = nominal if one.model is None else arm_of(one.model, nominal)
+        found[rows] = arm.fk(q[rows])
+    return found
+
+
+class PoseModels:
+    """The models of a session; ``began_with`` was in force at its beginning."""
+
+    def __init__(self, began_with: Head) -> None:
+        self._began_with = began_with.revision
+        self._newest = PoseModel(began_with.revision, began_with.model)
+
+    def bound(self, command: Command, in_force: Head) -> Command:
+        """The command with the model, where another than at the beginning is in force.
+
+        So a replay, which knows that of the beginning, takes the same flange poses.
+        """
+        if THERMAL_MODEL in command.arguments or in_force.revision == self._began_with:
+            return command
+        told = {THERMAL_MODEL: {"revision": in_force.revision, "model": in_force.model}}
+        return replace(command, arguments={**command.arguments, **told})
+
+    def of(self, command: Command, in_force: Head) -> PoseModel:
+        """The model of a sample that the command, `bound`, takes."""
+        told = command.arguments.get(THERMAL_MODEL)
+        if told is None:
+            told = {"revision": in_force.revision, "model": in_force.model}
+        if self._newest.revision != told["revision"]:
+            self._newest = PoseModel(int(told["revision"]), told["model"])
+        return self._newest
 
 
 @dataclass(eq=False)
@@ -164,22 +214,18 @@ class DataSet:
         wanted = set(handles) or set(self.samples)
         return [self.samples[handle] for handle in sorted(wanted)]
 
-    def thermal_revisions(self) -> list[int]:
-        """Of the models that flange poses come from."""
-        return sorted({sample.thermal.revision for sample in self.samples.values()})
-
     def document(self) -> Document:
         """Plain values; `data_set_of` reads them back to the last bit.
 
         ``thermal`` of a sample: index of its model among ``thermal_models``.
         """
-        models = models_used(sample.thermal for sample in self.samples.values())
+        models = list(dict.fromkeys(sample.thermal for sample in self.samples.values()))
         return {
             "target": self.target,
             "method": self.method,
             "mount": self.mount,
             "feature": self.feature,
-            "thermal_models": [model.document() for model in models],
+            "thermal_models": [{"revision": one.revision, "model": one.model} for one in models],
             "samples": [
                 {
                     "handle": sample.handle,
@@ -218,8 +264,19 @@ def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
         found = data_set_begun(document)
         target_of(found.target)
         rows = document["samples"]
-        _require_few(rows)
-        models = [pose_model_of(one, arm) for one in document["thermal_models"]]
+        if len(rows) > MOST_CAPTURES:
+            raise LimitError(f"{len(rows)} samples: a data set has at most {MOST_CAPTURES}")
+        points = sum(len(row["values"]) for row in rows)
+        if points > MOST_POINTS:
+            raise LimitError(
+                f"{points} points in {len(rows)} samples: at most {MOST_POINTS} can be loaded, "
+                "since the recording holds them; save fewer samples, or profiles of fewer points"
+            )
+        models = []
+        for one in document["thermal_models"]:
+            models.append(PoseModel(int(one["revision"]), one["model"]))
+            if models[-1].model is not None:
+                arm_of(models[-1].model, arm)  # of this robot
         for row in rows:
             sample = _sample_of(row, found.topic, arm, models)
             if sample.handle in found.samples:
@@ -229,17 +286,6 @@ def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"the data set cannot be read: {error}") from error
     return found
-
-
-def _require_few(rows: Sequence[Document]) -> None:
-    if len(rows) > MOST_CAPTURES:
-        raise LimitError(f"{len(rows)} samples: a data set has at most {MOST_CAPTURES}")
-    points = sum(len(row["values"]) for row in rows)
-    if points > MOST_POINTS:
-        raise LimitError(
-            f"{points} points in {len(rows)} samples: at most {MOST_POINTS} can be loaded, since "
-            "the recording holds them; save fewer samples, or profiles of fewer points"
-        )
 
 
 def _sample_of(
@@ -265,9 +311,6 @@ def _sample_of(
     if type(thermal) is not int or not 0 <= thermal < len(models):
         raise InputError(f"sample {handle} of the data set is of thermal model {thermal}: no such")
     return HandEyeSample(handle, str(row["mark"]), at_ns, q, values, models[thermal])
-
-
-# ---- images of a board: what a sample keeps of them ---------------------------------------------
 
 
 def seen_corners(target: Mapping[str, Any], shot: Shot) -> Array:

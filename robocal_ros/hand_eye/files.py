@@ -1,39 +1,384 @@
-"""Files that tell where a sensor sits: what ``robocal hand-eye`` prints, or a rough place by hand.
+"""Files of a hand-eye calibration: tables of shots and profiles, of a laser tracker, and mounts.
+
+The contracts are written in docs/hand_eye.md and docs/hand_eye_tracker.md. A mount is what
+``robocal hand-eye`` prints, or a rough place by hand,
 
     T_flange_sensor: {xyz_mm: [60, -40, 110], rpy_deg: [0, 0, 45]}
 
 in YAML or JSON, with ``quat_xyzw`` or ``rpy_deg`` (about the fixed x, y, z).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePath
+from typing import Any, Literal, NoReturn
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, InputError
+from robocal_ros.ground.cells import Cells, read_cells, texts, write_cells
+from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
+from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
-from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
+from robocal_ros.hand_eye.shots import Profile, profile_of
+from robocal_ros.hand_eye.tracker_data import FACES, Arc, TrackerData
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import read_fields, read_pose
+from robocal_ros.kinematics.tables import (
+    POSITION,
+    QUATERNION,
+    TableLayout,
+    check_plain,
+    flange_unit_fault,
+    joint_texts,
+    read_layout,
+    read_pose_columns,
+    read_rotations,
+    read_samples,
+    read_stamps,
+    require_different,
+    stamp_texts,
+)
 
 Array = NDArray[np.float64]
 Parent = Literal["flange", "base"]
+Format = Literal["urdf", "xacro", "yaml", "static-transform"]
 
+PROFILE = ("x_mm", "z_mm")
+FILE_COLUMNS = ("profile", "image")
+ARCS = ("arc_a", "arc_b")
+SPHERE = "sphere"
+ROLES = (*ARCS, SPHERE, *FACES)
+BESIDE = ("sample", "stamp_s")  # for the user's own record
 FARTHEST_M = {"flange": 3.0, "base": 20.0}  # of a sensor from its parent
 
 
 @dataclass(frozen=True, eq=False)
-class Mount:
+class PoseTable:
+    """Shots: where the flange stood, and the file that each of them gave.
+
+    Attributes
+    ----------
+    names : (m,) of the shots; where the table gives none the file's name, or the row's number.
+    T_base_flange : (m, 4, 4), m.
+    files : (m,) relative to the folder of the shots; none where no such column was asked for.
+    q : (m, n) joint readings, rad (prismatic: m); None without them, or where no arm is known.
+    stamp_ns : (m,); None without a column.
+    mark : (m,) of the target, through which the laser plane was laid; None without a column.
+    path, rows, column : the table's file, the row of each shot there, the column of ``files``.
+    named : whether the table has a column ``sample``.
+    """
+
+    names: tuple[str, ...]
+    T_base_flange: Array
+    files: tuple[str, ...]
+    q: Array | None
+    stamp_ns: NDArray[np.int64] | None
+    mark: tuple[str, ...] | None
+    path: str
+    rows: tuple[int, ...]
+    column: str
+    named: bool = False
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def fail(self, index: int, message: str) -> NoReturn:
+        """Refuse the file of a shot.
+
+        Raises
+        ------
+        InputError
+            Always.
+        """
+        raise InputError(message, file=self.path, row=self.rows[index], column=self.column)
+
+    def files_in(self, folder: Path) -> list[Path]:
+        """Paths (m,) of the files.
+
+        Raises
+        ------
+        InputError
+            At the first that does not exist.
+        """
+        if not folder.is_dir():
+            raise InputError("no such folder", file=str(folder))
+        paths = [folder / file for file in self.files]
+        for index, path in enumerate(paths):
+            if not path.is_file():
+                self.fail(index, f"there is no file {quoted(self.files[index])} in {folder}")
+        return paths
+
+
+def read_pose_table(
+    path: Path, arm: SerialArm | None = None, file_column: str | None = "profile"
+) -> PoseTable:
+    """Read the table of shots; without ``file_column`` one of poses alone.
+
+    Without flange poses they are those of ``arm`` at its joint readings. Joint readings beside
+    poses are kept where ``arm`` is known.
+
+    Raises
+    ------
+    InputError
+        With file, row and column, when the table is not as its contract says.
+    """
+    found: list[TableLayout] = []
+    words = ("sample", "stamp_s", "mark", *((file_column,) if file_column else FILE_COLUMNS))
+
+    def check(header: list[str], file: str) -> None:
+        found.append(read_pose_columns(header, arm, file, words))
+        if file_column and file_column not in found[0].place:
+            raise InputError(
+                f"column {file_column} is missing: it names each shot's file", file=file, row=1
+            )
+
+    table = read_cells(path, check)
+    layout = found[0]
+    files = _files(table, file_column) if file_column else ()
+    q = None
+    if layout.joints:
+        q = np.column_stack([table.numbers(name) for name in layout.joints])
+        q = q * layout.joint_factors
+    return PoseTable(
+        names=read_samples(table, files or tuple(map(str, table.rows))),
+        T_base_flange=_poses(table, layout, arm, q),
+        files=files,
+        q=q,
+        stamp_ns=read_stamps(table) if "stamp_s" in layout.place else None,
+        mark=table.words("mark") or None,
+        path=table.file,
+        rows=table.rows,
+        column=file_column or "",
+        named="sample" in table.columns,
+    )
+
+
+def _files(table: Cells, column: str) -> tuple[str, ...]:
+    files = table.words(column)
+    for index, file in enumerate(files):
+        path = PurePath(file)
+        if path.is_absolute() or ".." in path.parts or not file.isprintable():
+            table.fail(
+                f"{quoted(file)} is not inside the folder of the shots: give a path in it",
+                index,
+                column,
+            )
+    require_different(table, column)
+    return files
+
+
+def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | None) -> Array:
+    if layout.orientation is None:
+        if arm is None or q is None:
+            raise ValueError("a layout without poses has joints")
+        return arm.fk(q)
+    columns = layout.position
+    position = np.column_stack([table.numbers(name) for name in columns])
+    position *= layout.position_factor
+    fault = flange_unit_fault(position, "mm" if columns == POSITION["mm"] else "m")
+    if fault is not None:
+        index, words = fault
+        table.fail(words, index, columns[int(np.argmax(np.abs(position[index])))])
+    return frames.transform(read_rotations(table, layout.orientation), position)
+
+
+def read_profile(path: Path, name: str) -> Profile:
+    """Read a profile; rows without a return (an empty cell, or nan) are left out.
+
+    Raises
+    ------
+    InputError
+        With file, row and column, when it is no table of ``x_mm`` and ``z_mm``, or is in another
+        unit.
+    TooFewSamplesError
+        When nearly nothing was seen.
+    """
+    lines = [line for line in read_bytes(path, "profile").splitlines() if line.strip()]
+    if len(lines) < 2:
+        raise TooFewSamplesError(f"profile {name} is empty ({path})")
+    table = read_cells(path, lambda header, file: check_plain(header, file, PROFILE))
+    points = 1e-3 * np.column_stack([table.numbers(column, gaps=True) for column in PROFILE])
+    try:
+        return profile_of(points, name)
+    except InputError as error:
+        raise InputError(str(error), file=str(path)) from error
+
+
+def read_profiles(folder: Path, table: PoseTable) -> list[Profile | TooFewSamplesError]:
+    """Profiles (m,) of the shots; for one that shows next to nothing the reason.
+
+    Raises
+    ------
+    InputError
+        When a file is missing (all are looked for first), or is no profile.
+    """
+    profiles: list[Profile | TooFewSamplesError] = []
+    for path, name in zip(table.files_in(folder), table.names, strict=True):
+        try:
+            profiles.append(read_profile(path, name))
+        except TooFewSamplesError as error:
+            profiles.append(error)
+    return profiles
+
+
+def write_profile(path: Path, points: Array) -> None:
+    """Write a profile (n, 2), m; what is not-a-number becomes an empty cell.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    seen = np.all(np.isfinite(points), axis=1)
+    columns = {}
+    for axis, column in enumerate(PROFILE):
+        cells = zip(texts(points[:, axis] * 1e3), seen, strict=True)
+        columns[column] = [cell if there else "" for cell, there in cells]
+    write_cells(path, columns)
+
+
+def write_pose_table(
+    path: Path,
+    T_base_flange: Array,
+    files: Sequence[str] | None = None,
+    *,
+    file_column: str = "profile",
+    names: Sequence[str] | None = None,
+    joints: tuple[SerialArm, Array] | None = None,
+    stamp_ns: NDArray[np.int64] | None = None,
+    mark: Sequence[str] | None = None,
+) -> None:
+    """Write a table of shots in millimetres and quaternions, ``joints`` (q (m, n)) beside them.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    columns: dict[str, list[str]] = {}
+    if names is not None:
+        columns["sample"] = list(names)
+    if files is not None:
+        columns[file_column] = list(files)
+    if mark is not None:
+        columns["mark"] = list(mark)
+    if stamp_ns is not None:
+        columns["stamp_s"] = stamp_texts(stamp_ns)
+    if joints is not None:
+        columns |= joint_texts(joints[1], joints[0])
+    columns |= dict(zip(POSITION["mm"], map(texts, T_base_flange[:, :3, 3].T * 1e3), strict=True))
+    columns |= dict(zip(QUATERNION, map(texts, frames.quat_xyzw(T_base_flange).T), strict=True))
+    write_cells(path, columns)
+
+
+def write_shots(
+    path: Path, folder: Path, T_base_flange: Array, profiles: Mapping[str, Array], **more: Any
+) -> None:
+    """Write a table of shots and, into ``folder``, the profile of each by the name of its shot.
+
+    ``more`` as in `write_pose_table`.
+
+    Raises
+    ------
+    InputError
+        When one of them cannot be written.
+    """
+    files = [f"{name}.csv" for name in profiles]
+    for file, points in zip(files, profiles.values(), strict=True):
+        write_profile(folder / file, points)
+    write_pose_table(path, T_base_flange, files, names=tuple(profiles), **more)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerPoints:
+    """Points of a laser tracker, m; see `TrackerData`."""
+
+    arcs: tuple[Arc, Arc]
+    sphere: Array
+    faces: tuple[Array, Array]
+
+
+def read_tracker_points(path: Path, arm: SerialArm) -> TrackerPoints:
+    """Read the tracker's table; the joints of points that are not on an arc may be empty.
+
+    Raises
+    ------
+    InputError
+        With file, row and column, when the table is not as docs/hand_eye_tracker.md says.
+    """
+    found: list[TableLayout] = []
+    table = read_cells(path, lambda header, file: found.append(_layout(header, arm, file)))
+    layout = found[0]
+    roles = np.array(table.words("role"))
+    for index, role in enumerate(roles.tolist()):
+        if role not in ROLES:
+            message = f"{quoted(role)} is not one of {', '.join(ROLES)}{nearest(role, ROLES)}"
+            table.fail(message, index, "role")
+    missing = [role for role in ROLES if role not in roles]
+    if missing:
+        raise InputError(f"no point has the role {', '.join(missing)}", file=table.file)
+    points = np.column_stack([table.numbers(name) for name in layout.position])
+    points = points * layout.position_factor
+    q = _joints(table, layout, np.isin(roles, ARCS))
+    first, second = (Arc(role, q[roles == role], points[roles == role]) for role in ARCS)
+    faces = (points[roles == FACES[0]], points[roles == FACES[1]])
+    return TrackerPoints((first, second), points[roles == SPHERE], faces)
+
+
+def _layout(header: list[str], arm: SerialArm, file: str) -> TableLayout:
+    names = [name.strip() for name in header]
+    if names.count("role") != 1:
+        raise InputError(
+            f"column role must be there once: it says what a point is of ({', '.join(ROLES)})",
+            file=file,
+            row=1,
+        )
+    layout = read_layout([name for name in names if name != "role"], arm, file)
+    for name in layout.place:
+        if name not in (*layout.joints, *layout.position, *BESIDE):
+            raise InputError("unknown column", file=file, row=1, column=name)
+    return layout
+
+
+def _joints(table: Cells, layout: TableLayout, on_arc: NDArray[np.bool_]) -> Array:
+    q = np.column_stack([table.numbers(name, gaps=True) for name in layout.joints])
+    for joint, name in enumerate(layout.joints):
+        empty = np.flatnonzero(on_arc & np.isnan(q[:, joint]))
+        if len(empty):
+            table.fail("the cell is empty; a point of an arc needs all joints", int(empty[0]), name)
+    return q * layout.joint_factors
+
+
+def write_tracker_points(path: Path, data: TrackerData) -> None:
+    """Write the tracker's table in millimetres and degrees.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    parts = [(arc.name, arc.points) for arc in data.arcs]
+    parts += [(SPHERE, data.sphere), *zip(FACES, data.faces, strict=True)]
+    columns = {"role": [role for role, points in parts for _ in points]}
+    points = np.concatenate([points for _, points in parts])
+    columns |= dict(zip(POSITION["mm"], map(texts, points.T * 1e3), strict=True))
+    joints = joint_texts(np.concatenate([arc.q for arc in data.arcs]), data.arm)
+    rest = [""] * (len(points) - sum(len(arc.q) for arc in data.arcs))
+    write_cells(path, columns | {name: [*cells, *rest] for name, cells in joints.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class SensorMount:
     """Where a sensor sits: ``T_parent_sensor`` (4, 4), m, on the flange or beside the robot."""
 
     parent: Parent
     T_parent_sensor: Array
 
 
-def read_mount(path: Path, *, accepted: bool = False) -> Mount:
+def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
     """Read a sensor's place; ``accepted``: refuse a result whose verdict does not accept it.
 
     Raises
@@ -56,7 +401,14 @@ def read_mount(path: Path, *, accepted: bool = False) -> Mount:
     if len(found) != 1:
         top.fail("must give the sensor's place: either T_flange_sensor or T_base_sensor")
     parent: Parent = "base" if found[0] == "base" else "flange"
-    return Mount(parent, _place(top.below(f"T_{parent}_sensor"), FARTHEST_M[parent]))
+    fields = top.below(f"T_{parent}_sensor")
+    if not {"quat_xyzw", "rpy_deg"} & set(fields.values):
+        fields.fail("needs an orientation: quat_xyzw or rpy_deg")
+    T = read_pose(fields)
+    far_m = float(np.linalg.norm(T[:3, 3]))
+    if far_m > FARTHEST_M[parent]:
+        fields.fail(f"is {far_m:.4g} m away: is it a thousand times too far?", "xyz_mm")
+    return SensorMount(parent, T)
 
 
 def read_flange_mount(path: Path) -> Array:
@@ -77,26 +429,11 @@ def read_flange_mount(path: Path) -> Array:
     return mount.T_parent_sensor
 
 
-def _place(fields: Fields, farthest_m: float) -> Array:
-    if not {"quat_xyzw", "rpy_deg"} & set(fields.values):
-        fields.fail("needs an orientation: quat_xyzw or rpy_deg")
-    T = read_pose(fields)
-    far_m = float(np.linalg.norm(T[:3, 3]))
-    if far_m > farthest_m:
-        fields.fail(f"is {far_m:.4g} m away: is it a thousand times too far?", "xyz_mm")
-    return T
-
-
-# ---- a sensor's place in the words of robot descriptions: URDF, xacro, a static transform -------
-#
-# URDF's rpy turn about the fixed x, then y, then z of the parent.
-
-
-Format = Literal["urdf", "xacro", "yaml", "static-transform"]
-
-
 def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) -> str:
     """Text of a sensor's pose (4, 4), m, below its parent, with 1e-4 mm and 1e-6 deg.
+
+    ``xacro``: properties, so that another calibration changes two lines only; ``yaml``: the fields
+    of a geometry_msgs/TransformStamped; ``static-transform``: the command that publishes it.
 
     Raises
     ------
@@ -106,51 +443,27 @@ def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) ->
     for name in (parent, child):
         if not name or quoteattr(name) != f'"{name}"' or any(c in name for c in " :#{}\n"):
             raise InputError(f"'{name}' is no name of a frame: letters, digits, _ and / are")
-    return _FORMATS[format](T_parent_sensor, parent, child)
-
-
-def _urdf(T: Array, parent: str, child: str) -> str:
-    return urdf_joint(parent, child, *urdf_origin(T))
-
-
-def _xacro(T: Array, parent: str, child: str) -> str:
-    """Properties, so that another calibration changes two lines only."""
-    name = "".join(c if c.isalnum() else "_" for c in child)
-    xyz, rpy = urdf_origin(T)
+    xyz, rpy = urdf_origin(T_parent_sensor)
+    if format == "urdf":
+        return urdf_joint(parent, child, xyz, rpy)
+    if format == "xacro":
+        name = "".join(c if c.isalnum() else "_" for c in child)
+        return (
+            f'<xacro:property name="{name}_xyz" value="{xyz}"/>\n'
+            f'<xacro:property name="{name}_rpy" value="{rpy}"/>\n'
+            + urdf_joint(parent, child, f"${{{name}_xyz}}", f"${{{name}_rpy}}")
+        )
+    x, y, z = fixed(T_parent_sensor[:3, 3], 7)
+    qx, qy, qz, qw = fixed(frames.quat_xyzw(T_parent_sensor), 10)
+    if format == "yaml":
+        return (
+            f"header: {{frame_id: {parent}}}\n"
+            f"child_frame_id: {child}\n"
+            "transform:\n"
+            f"  translation: {{x: {x}, y: {y}, z: {z}}}\n"
+            f"  rotation: {{x: {qx}, y: {qy}, z: {qz}, w: {qw}}}"
+        )
     return (
-        f'<xacro:property name="{name}_xyz" value="{xyz}"/>\n'
-        f'<xacro:property name="{name}_rpy" value="{rpy}"/>\n'
-        + urdf_joint(parent, child, f"${{{name}_xyz}}", f"${{{name}_rpy}}")
+        f"ros2 run tf2_ros static_transform_publisher --x {x} --y {y} --z {z} "
+        f"--qx {qx} --qy {qy} --qz {qz} --qw {qw} --frame-id {parent} --child-frame-id {child}"
     )
-
-
-def _yaml(T: Array, parent: str, child: str) -> str:
-    """The fields of a geometry_msgs/TransformStamped."""
-    x, y, z = fixed(T[:3, 3], 7)
-    qx, qy, qz, qw = fixed(frames.quat_xyzw(T), 10)
-    return (
-        f"header: {{frame_id: {parent}}}\n"
-        f"child_frame_id: {child}\n"
-        "transform:\n"
-        f"  translation: {{x: {x}, y: {y}, z: {z}}}\n"
-        f"  rotation: {{x: {qx}, y: {qy}, z: {qz}, w: {qw}}}"
-    )
-
-
-def _static_transform(T: Array, parent: str, child: str) -> str:
-    """The command that publishes it."""
-    values = [*fixed(T[:3, 3], 7), *fixed(frames.quat_xyzw(T), 10)]
-    words = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True)
-    place = " ".join(f"--{name} {value}" for name, value in words)
-    return (
-        f"ros2 run tf2_ros static_transform_publisher {place} "
-        f"--frame-id {parent} --child-frame-id {child}"
-    )
-
-
-_FORMATS: Mapping[Format, Callable[[Array, str, str], str]] = {
-    "urdf": _urdf,
-    "xacro": _xacro,
-    "yaml": _yaml,
-    "static-transform": _static_transform,
-}

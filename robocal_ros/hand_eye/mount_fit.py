@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +13,12 @@ from robocal_ros.hand_eye.mount_problem import (
     FIRST_NOISE,
     MountProblem,
     MountState,
-    PoseNoise,
+    SphereModel,
     TargetView,
     averaged_covariance,
     restricted_noise,
 )
-from robocal_ros.hand_eye.result import at_origin, increment, moved_origin
-from robocal_ros.hand_eye.target_models import SphereModel
-
-# ---- directions that poses leave open, in words, with the motion that would show them -----------
-
+from robocal_ros.hand_eye.result import PoseNoise, at_origin, increment
 
 Array = NDArray[np.float64]
 
@@ -32,74 +27,6 @@ ALONG = 0.9  # cosine from which a direction is named after an axis
 SMALL_TURN_RAD = float(np.radians(1.0))  # turns below this show nothing
 FARTHEST_AXIS_M = 100.0  # a turn about an axis beyond it is a translation
 ENOUGH = "by 20 deg or more"
-
-
-@dataclass(frozen=True, eq=False)
-class Turns:
-    """About how many axes poses turn; ``axis`` (3,), base, where it is one."""
-
-    count: int
-    axis: Array
-
-
-def turns_of(T_base_flange: Array) -> Turns:
-    """Turning axes of poses (m, 4, 4): of the rotations against the first one."""
-    R = T_base_flange[:, :3, :3]
-    turn = frames.log_rotation(R @ R[0].T)
-    _, s, Vt = np.linalg.svd(turn, full_matrices=False)
-    spread = s / np.sqrt(len(turn))
-    return Turns(int(np.sum(spread > SMALL_TURN_RAD)), Vt[0])
-
-
-def describe_motion(direction: Array, T_base_flange: Array) -> str:
-    """Words for an open direction (v, w) (6,) of the sensor, sensor axes, and what to do."""
-    return f"{_words(direction)}: {_remedy(turns_of(T_base_flange))}"
-
-
-def joined(words: Sequence[str]) -> str:
-    """Several `describe_motion` in one sentence, a remedy that they share said once."""
-    parts = [each.partition(": ") for each in words]
-    what = "; ".join(first for first, _, _ in parts)
-    remedies = dict.fromkeys(remedy for _, _, remedy in parts if remedy)
-    return ": ".join(filter(None, (what, "; ".join(remedies))))
-
-
-def _words(direction: Array) -> str:
-    v, w = direction[:3], direction[3:]
-    if np.linalg.norm(w) * FARTHEST_AXIS_M < max(float(np.linalg.norm(v)), 1e-300):
-        return f"translation along {_axis(v)}"
-    turn = float(np.linalg.norm(w))
-    centre = np.cross(w, v) / turn**2  # the point of the axis next to the origin
-    pitch = float(v @ w) / turn**2
-    words = f"rotation about {_axis(w)}"
-    if np.linalg.norm(centre) > 1e-3:
-        place = ", ".join(f"{1e3 * value:.0f}" for value in centre)
-        words += f" through ({place}) mm of the sensor"
-    if abs(pitch) > 1e-3:
-        words += ", with a translation along it"
-    return words
-
-
-def _axis(direction: Array) -> str:
-    unit = direction / np.linalg.norm(direction)
-    place = int(np.argmax(np.abs(unit)))
-    if abs(unit[place]) > ALONG:
-        return AXES[place]
-    return f"({', '.join(f'{value:.2f}' for value in unit)}) of the sensor"
-
-
-def _remedy(turns: Turns) -> str:
-    if turns.count == 0:
-        return f"the poses do not turn; turn the flange about two axes, {ENOUGH}"
-    if turns.count == 1:
-        axis = ", ".join(f"{value:.2f}" for value in turns.axis)
-        found = f"all poses turn about ({axis}) of the base"
-        return f"{found}; tilt the flange about another axis, {ENOUGH}"
-    return "show the target at other places of the profile, at other distances and tilts"
-
-
-# ---- mount fit ----------------------------------------------------------------------------------
-
 
 LOOKS = 3
 ROUNDS = 8
@@ -111,6 +38,61 @@ UNSETTLED = (
     f"mount and noise of the poses had not settled after {ROUNDS} rounds: measure more often"
 )
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
+
+CLEARLY = 0.4  # of the misfit as given: below it the undone data may be the right ones
+FITS_M = 5e-4  # misfit of data that are right
+FITS = 5.0  # times the rms of the others
+FARTHEST_M, NEAREST_M = 20.0, 0.02  # of a flange from its base
+
+CONDITION = 1e5
+SURE = 5.0  # standard deviations
+TOLERANCE_M = 5e-5  # of a sphere that is sold as a reference
+
+
+def describe_motion(direction: Array, T_base_flange: Array) -> str:
+    """Words for an open direction (v, w) (6,) of the sensor, sensor axes, and what to do.
+
+    ``T_base_flange`` (m, 4, 4): the poses that leave it open.
+    """
+    v, w = direction[:3], direction[3:]
+    turn = float(np.linalg.norm(w))
+    if turn * FARTHEST_AXIS_M < max(float(np.linalg.norm(v)), 1e-300):
+        words = f"translation along {_axis(v)}"
+    else:
+        centre = np.cross(w, v) / turn**2  # the point of the axis next to the origin
+        words = f"rotation about {_axis(w)}"
+        if np.linalg.norm(centre) > 1e-3:
+            place = ", ".join(f"{1e3 * value:.0f}" for value in centre)
+            words += f" through ({place}) mm of the sensor"
+        if abs(float(v @ w) / turn**2) > 1e-3:
+            words += ", with a translation along it"
+    R = T_base_flange[:, :3, :3]
+    turns = frames.log_rotation(R @ R[0].T)  # axes about which the poses turn
+    _, s, Vt = np.linalg.svd(turns, full_matrices=False)
+    axes = int(np.sum(s / np.sqrt(len(turns)) > SMALL_TURN_RAD))
+    if axes == 0:
+        return f"{words}: the poses do not turn; turn the flange about two axes, {ENOUGH}"
+    if axes == 1:
+        axis = ", ".join(f"{value:.2f}" for value in Vt[0])
+        found = f"all poses turn about ({axis}) of the base"
+        return f"{words}: {found}; tilt the flange about another axis, {ENOUGH}"
+    return f"{words}: show the target at other places of the profile, at other distances and tilts"
+
+
+def _axis(direction: Array) -> str:
+    unit = direction / np.linalg.norm(direction)
+    place = int(np.argmax(np.abs(unit)))
+    if abs(unit[place]) > ALONG:
+        return AXES[place]
+    return f"({', '.join(f'{value:.2f}' for value in unit)}) of the sensor"
+
+
+def joined(words: Sequence[str]) -> str:
+    """Several `describe_motion` in one sentence, a remedy that they share said once."""
+    parts = [each.partition(": ") for each in words]
+    what = "; ".join(first for first, _, _ in parts)
+    remedies = dict.fromkeys(remedy for _, _, remedy in parts if remedy)
+    return ": ".join(filter(None, (what, "; ".join(remedies))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,25 +121,19 @@ class MountFit:
         """Of the sightings that were used."""
         return tuple(name for view in self.views for name in view.sightings.names)
 
-    def distances(self) -> Array:
-        """Distance of each sighting that was used from its target, m."""
-        return distances(self.views, self.state)
-
 
 def distances(views: tuple[TargetView, ...], state: MountState) -> Array:
     """Distance of each sighting from its target, m."""
-    pairs = zip(views, state.places, strict=True)
-    return np.concatenate([_distance(view, state, place) for view, place in pairs])
+    far = []
+    for view, place in zip(views, state.places, strict=True):
+        T = view.sightings.T_base_flange @ state.T_flange_sensor
+        far.append(view.model.distance(T, place, view.sightings.value))
+    return np.concatenate(far)
 
 
 def misfit(views: tuple[TargetView, ...], state: MountState) -> float:
     """Median distance of sightings from their target, m."""
     return float(np.median(distances(views, state)))
-
-
-def _distance(view: TargetView, state: MountState, place: Array) -> Array:
-    T = view.sightings.T_base_flange @ state.T_flange_sensor
-    return view.model.distance(T, place, view.sightings.value)
 
 
 def fit_mount(
@@ -207,8 +183,7 @@ def first_look(views: tuple[TargetView, ...], start: MountState) -> MountState:
     for _ in range(LOOKS):
         off = max(misfit(views, state), FIRST_NOISE.sigma_m)
         noise = PoseNoise(off, FIRST_NOISE.sigma_rad, FIRST_NOISE.aim_m)
-        problem = MountProblem(views, noise, state, together=False)
-        state = _solved(problem, state).state
+        state = _solved(MountProblem(views, noise, state, together=False), state).state
     return state
 
 
@@ -225,23 +200,18 @@ def _settle(
     """
     for _ in range(ROUNDS):
         problem = MountProblem(views, noise, state, together)
-        estimate = _solved(
-            problem, state, max(noise_numbers(problem), 1) if given is None else np.inf
-        )
-        away = _away(problem.pivot, state, estimate)
-        state, before = estimate.state, noise
+        freedom = max(noise_numbers(problem), 1) if given is None else np.inf
+        estimate = _solved(problem, state, freedom)
+        X, before = state.T_flange_sensor, noise
+        step = increment(X, estimate.state.T_flange_sensor, problem.pivot)
+        away = float(np.sqrt(step @ np.linalg.solve(estimate.covariance[:6, :6], step)))
+        state = estimate.state
         noise, sure = restricted_noise(problem, state, ~estimate.rejected, given)
         change = np.log([noise.sigma_m / before.sigma_m, noise.aim_m / before.aim_m])
         settled = sure and away < SETTLED and bool(np.max(np.abs(change)) < SETTLED)
         if settled:
             break
     return estimate, estimate.rejected[problem.sample], noise, settled
-
-
-def _away(pivot: Array, before: MountState, estimate: Estimate[MountState]) -> float:
-    """How far the sensor has moved, in standard deviations."""
-    step = increment(before.T_flange_sensor, estimate.state.T_flange_sensor, pivot)
-    return float(np.sqrt(step @ np.linalg.solve(estimate.covariance[:6, :6], step)))
 
 
 def noise_numbers(problem: MountProblem) -> int:
@@ -251,49 +221,33 @@ def noise_numbers(problem: MountProblem) -> int:
     """
     poses = len(np.unique(np.concatenate([view.sightings.pose for view in problem.views])))
     told = min(POSE_NUMBERS * poses, int(problem.sizes.sum())) - len(problem.names)
-    if problem.aimed:
-        return min(told, 2 * poses - 3 + LEAST_AIM)
-    return told
+    return min(told, 2 * poses - 3 + LEAST_AIM) if problem.aimed else told
 
 
 def _solved(
     problem: MountProblem, state: MountState, freedom: float = np.inf
 ) -> Estimate[MountState]:
+    """Solve robustly; a refusal names the sensor's own open directions, where there are any."""
+    prior, sizes = problem.prior(), problem.sizes
     try:
-        estimate = solve(
-            problem,
-            state,
-            prior_information=problem.prior(),
-            sizes=problem.sizes,
-            freedom=freedom,
-        )
+        return solve(problem, state, prior_information=prior, sizes=sizes, freedom=freedom)
     except RankDeficientError as error:
-        raise _in_words(problem, state) or _few_agree(error) from error
-    return estimate
-
-
-def _in_words(problem: MountProblem, state: MountState) -> RankDeficientError | None:
-    """The refusal with the sensor's own open directions; None where it is another unknown's."""
-    _, jacobian = problem.linearise(state)
-    null = observability(jacobian.reshape(-1, jacobian.shape[2])).null[:6]
-    T = np.concatenate([view.sightings.T_base_flange for view in problem.views])
-    words = [
-        describe_motion(moved_origin(d, problem.pivot), T)
-        for d in null.T
-        if np.linalg.norm(d) > 1e-9
-    ]
-    return refuse_open(words) if words else None
-
-
-def _few_agree(error: RankDeficientError) -> RankDeficientError:
-    """The refusal where all samples would do, but not those of them that fit together."""
-    words = "those samples that fit together do not determine the sensor: measure again, more often"
-    return RankDeficientError(words, error.directions)
-
-
-def refuse_open(words: list[str]) -> RankDeficientError:
-    """The refusal for directions that are not seen, in words."""
-    return RankDeficientError(f"not determined: {joined(words)}", words)
+        _, jacobian = problem.linearise(state)
+        null = observability(jacobian.reshape(-1, jacobian.shape[2])).null[:6]
+        T = np.concatenate([view.sightings.T_base_flange for view in problem.views])
+        words = []
+        for d in null.T:
+            if np.linalg.norm(d) > 1e-9:
+                at_sensor = np.concatenate([d[:3] - np.cross(d[3:], problem.pivot), d[3:]])
+                words.append(describe_motion(at_sensor, T))
+        if words:
+            raise RankDeficientError(f"not determined: {joined(words)}", words) from error
+        # All samples would do, but not those of them that fit together.
+        raise RankDeficientError(
+            "those samples that fit together do not determine the sensor: measure again, more "
+            "often",
+            error.directions,
+        ) from error
 
 
 def require_seen(fit: MountFit) -> None:
@@ -307,15 +261,15 @@ def require_seen(fit: MountFit) -> None:
         Naming it, with the missing motion.
     """
     T = np.concatenate([view.sightings.T_base_flange for view in fit.views])
-    calm = replace(fit.noise, sigma_m=min(fit.noise.sigma_m, CALM_M))
-    calm = replace(calm, sigma_rad=min(calm.sigma_rad, CALM_M))
+    sigma_m, sigma_rad = min(fit.noise.sigma_m, CALM_M), min(fit.noise.sigma_rad, CALM_M)
+    calm = replace(fit.noise, sigma_m=sigma_m, sigma_rad=sigma_rad)
     problem = MountProblem(fit.views, calm, fit.state)
     J = problem.linearise(fit.state)[1].reshape(-1, len(problem.names))
     covariance = np.asarray(np.linalg.pinv(J.T @ J + problem.prior()))
     reach_m = np.abs(np.concatenate([view.sightings.value[:, 1] for view in fit.views])).mean()
     words = open_directions(at_origin(covariance[:6, :6], problem.pivot), float(reach_m), T)
     if words:
-        raise refuse_open(words)
+        raise RankDeficientError(f"not determined: {joined(words)}", words)
 
 
 def open_directions(covariance: Array, reach_m: float, T_base_flange: Array) -> list[str]:
@@ -338,26 +292,18 @@ def without(
         names = view.sightings.names
         out = wrong[first : first + len(names)]
         first += len(names)
-        rejected |= {
-            name: "does not fit the others" for name, bad in zip(names, out, strict=True) if bad
-        }
+        for name, bad in zip(names, out, strict=True):
+            if bad:
+                rejected[name] = "does not fit the others"
         kept.append(view.take(~out))
     return tuple(kept)
 
 
-# ---- how far each sighting is from what is found without its pose -------------------------------
-
-
-def solved_again(fit: MountFit) -> Callable[[tuple[TargetView, ...]], MountState]:
-    """How the mount is found from part of the views of a fit: nothing is rejected any more."""
-
-    def again(views: tuple[TargetView, ...]) -> MountState:
-        part = MountProblem(views, fit.noise, fit.state)
-        return solve(
-            part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
-        ).settled()
-
-    return again
+def solved_again(fit: MountFit, views: tuple[TargetView, ...]) -> MountState:
+    """The mount from part of the views of a fit: nothing is rejected any more."""
+    part = MountProblem(views, fit.noise, fit.state)
+    prior, sizes = part.prior(), part.sizes
+    return solve(part, fit.state, prior_information=prior, robust=False, sizes=sizes).settled()
 
 
 def leave_one_out(
@@ -381,76 +327,38 @@ def leave_one_out(
     return own
 
 
-# ---- common mistakes in the data, recognised because undoing them makes everything fit ----------
-
-
-CLEARLY = 0.4  # of the misfit as given: below it the undone data may be the right ones
-FITS_M = 5e-4  # misfit of data that are right
-FITS = 5.0  # times the rms of the others
-FARTHEST_M, NEAREST_M = 20.0, 0.02  # of a flange from its base
-
-LEFT_HANDED = "they come from a left-handed frame: turn one axis round"
-
-_FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
-
-
-def _mirrored(T: Array) -> Array:
-    return np.asarray(_FLIP @ T @ _FLIP)
-
-
-def _mirrored_place(T: Array, axis: int) -> Array:
-    mirrored = T.copy()
-    mirrored[:, axis, 3] *= -1.0
-    return mirrored
-
-
-def _real_first(T: Array) -> Array:
-    """Rotations as they are if the four numbers were w, x, y, z."""
-    return frames.transform_from_quat(T[:, :3, 3], np.roll(frames.quat_xyzw(T), -1, axis=1))
-
-
-def _scaled(T: Array, factor: float) -> Array:
-    return frames.transform(T[:, :3, :3], factor * T[:, :3, 3])
-
-
-MISTAKES: tuple[tuple[str, Callable[[Array], Array]], ...] = (
-    (
-        "each profile fits the pose after its own: the two lists are shifted by one",
-        partial(np.roll, shift=-1, axis=0),
-    ),
-    (
-        "each profile fits the pose before its own: the two lists are shifted by one",
-        partial(np.roll, shift=1, axis=0),
-    ),
-    ("the poses fit when inverted: give the flange in the base, not the base in it", frames.invert),
-    ("the poses fit when their quaternions are read as w, x, y, z: reorder them", _real_first),
-    (f"the poses fit when mirrored as a whole: {LEFT_HANDED}", _mirrored),
-    *(
-        (
-            f"the poses fit with {axis} of their positions negated: {LEFT_HANDED}",
-            partial(_mirrored_place, axis=number),
-        )
-        for number, axis in enumerate("xyz")
-    ),
-)
-"""What is wrong, in words, and what undoes it: poses (m, 4, 4) as they should have been."""
-
-
 def undone(T_base_flange: Array) -> Iterator[tuple[str, Array]]:
-    """Each mistake that may be in poses (m, 4, 4), in words, and the poses without it."""
-    for words, undo in MISTAKES:
-        yield words, undo(T_base_flange)
-    far = float(np.linalg.norm(T_base_flange[:, :3, 3], axis=1).max())
+    """Common mistakes that may be in poses (m, 4, 4), in words, and the poses without each."""
+    T = T_base_flange
+    for shift, where in ((-1, "after"), (1, "before")):
+        words = f"each profile fits the pose {where} its own: the two lists are shifted by one"
+        yield words, np.roll(T, shift, axis=0)
+    words = "the poses fit when inverted: give the flange in the base, not the base in it"
+    yield words, frames.invert(T)
+    words = "the poses fit when their quaternions are read as w, x, y, z: reorder them"
+    quat_xyzw = np.roll(frames.quat_xyzw(T), -1, axis=1)
+    yield words, frames.transform_from_quat(T[:, :3, 3], quat_xyzw)
+    left_handed = "they come from a left-handed frame: turn one axis round"
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])
+    yield f"the poses fit when mirrored as a whole: {left_handed}", np.asarray(flip @ T @ flip)
+    for number, axis in enumerate("xyz"):
+        mirrored = T.copy()
+        mirrored[:, number, 3] *= -1.0
+        yield f"the poses fit with {axis} of their positions negated: {left_handed}", mirrored
+    far = float(np.linalg.norm(T[:, :3, 3], axis=1).max())
     if far < NEAREST_M:
         words = "the poses fit when 1000 times larger: their positions are in m where mm are meant"
-        yield words, _scaled(T_base_flange, 1e3)
+        yield words, frames.transform(T[:, :3, :3], 1e3 * T[:, :3, 3])
     if far > FARTHEST_M:
         words = "the poses fit when 1000 times smaller: their positions are in mm where m are meant"
-        yield words, _scaled(T_base_flange, 1e-3)
+        yield words, frames.transform(T[:, :3, :3], 1e-3 * T[:, :3, 3])
 
 
 def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: float) -> str | None:
-    """The words of the suspect with the smallest misfit, m; None where none fits."""
+    """The words of the suspect with the smallest misfit, m; None where none fits.
+
+    A mistake is recognised because undoing it makes everything fit.
+    """
     best, least = None, min(CLEARLY * as_given_m, FITS_M)
     for words, misfit in suspects:
         try:
@@ -462,12 +370,13 @@ def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: flo
     return best
 
 
-def swapped(fit: MountFit, lost: TargetView, place: Array, shots: Sequence[str]) -> dict[str, str]:
-    """Which rejected sightings fit the pose of another rejected shot: names and reasons.
+def swapped(fit: MountFit, view: TargetView, place: Array, shots: Sequence[str]) -> dict[str, str]:
+    """Which rejected sightings of a view fit the pose of another rejected shot, with the reason.
 
-    ``lost`` holds the rejected sightings; ``shots``: the name of each.
+    ``shots``: the name of each.
     """
-    limit = FITS * float(np.sqrt(np.mean(fit.distances() ** 2)))
+    lost = view.take(np.array([name in fit.rejected for name in view.sightings.names]))
+    limit = FITS * float(np.sqrt(np.mean(distances(fit.views, fit.state) ** 2)))
     s = lost.sightings
     found: dict[str, str] = {}
     for shot in np.unique(s.shot):
@@ -482,16 +391,10 @@ def swapped(fit: MountFit, lost: TargetView, place: Array, shots: Sequence[str])
     return found
 
 
-# ---- a wrong radius of the sphere, seen where profiles at several heights of it disagree --------
-
-
-CONDITION = 1e5
-SURE = 5.0  # standard deviations
-TOLERANCE_M = 5e-5  # of a sphere that is sold as a reference
-
-
 def require_radius(fit: MountFit) -> None:
-    """Refuse a fit that would be clearly better with another radius (a score test).
+    """Refuse a fit that would be clearly better with another radius of its sphere (a score test).
+
+    It is seen where profiles at several heights of the sphere disagree.
 
     Raises
     ------
@@ -500,19 +403,20 @@ def require_radius(fit: MountFit) -> None:
     """
     problem = MountProblem(fit.views, fit.noise, fit.state)
     linear = problem.linear(fit.state)
-    radius = np.concatenate(
+    column = np.zeros_like(linear.jacobian[:, :, :1])
+    column[:, 2, 0] = np.concatenate(
         [
             view.model.radius_m / np.maximum(view.sightings.value[:, 2], 1e-6)
             if isinstance(view.model, SphereModel)
             else np.zeros(len(view.sightings.names))
             for view in fit.views
         ]
-    )
-    if not np.any(radius):
+    )  # dr / dR at a given height of the laser plane
+    if not np.any(column):
         return
-    column = np.zeros_like(linear.jacobian[:, :, :1])
-    column[:, 2, 0] = radius  # dr / dR at a given height of the laser plane
-    residual, jacobian = problem.whitened(linear, column)
+    jacobian = np.concatenate([linear.jacobian, column], axis=2)
+    residual, jacobian = problem.whitened(replace(linear, jacobian=jacobian))
+    residual, jacobian = residual.ravel(), jacobian.reshape(residual.size, -1)
     unit = np.linalg.norm(jacobian, axis=0)
     if np.any(unit == 0.0) or np.linalg.cond(jacobian / unit) > CONDITION:
         return  # the radius looks like another unknown

@@ -1,43 +1,335 @@
 """The pose of a sensor on the flange as an estimation problem, with the robot's error as nuisance.
 
+Each profile is reduced to features that hold all it says (Fisher information) about where the
+target is: the circle that the laser plane cuts out of a sphere (x0, z0, r), or the point where an
+edge pierces that plane (x, z), for a marked edge with the place along it.
+
 A sighting's residual is value(X, target, T (1 + d)) - measured: the pose error d is common to all
 that one profile shows. It is marginalised: its covariance is added to the features' own before the
 residuals are whitened, profile by profile.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.target_models import COMPONENTS, Index, Sightings, TargetModel
+from robocal_ros.hand_eye.result import PoseNoise
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
+SAME = 2e-4  # m, and rad: readings of a robot at rest differ by less, poses on purpose by more
+COMPONENTS = 3  # of every sighting; a model with fewer leaves the last ones empty
 COMMON = 8  # errors that all sightings of one pose have in common
 SENSOR_UNKNOWNS = ("sensor x", "sensor y", "sensor z", "turn x", "turn y", "turn z")
+EQUATOR = 0.995  # share of the radius beyond which the circle's radius goes on straight
+FLATTEST = 0.02  # sine of the angle between edge and laser plane below which nothing is seen
+
+FIRST_NOISE = PoseNoise(5e-5, 5e-5, 1e-4)  # turns count as shifts at an arm's length of 1 m
+NOISE_RANGE_M = (1e-6, 1e-2)
+FLAT = 0.02  # slope of the likelihood: a hundredth of the noise's own uncertainty
+NEAR = 0.2  # relative step in which the likelihood's bend is seen
+NODES = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # standard deviations of a noise's logarithm
+WIDEST = 1.0  # of them
 
 
-@dataclass(frozen=True)
-class PoseNoise:
-    """Standard deviations of what all sightings of one pose have in common.
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Features (m) of one target.
 
     Attributes
     ----------
-    sigma_m, sigma_rad : of a coordinate of the reported pose, and of its turn about an axis.
-    aim_m : of light that is laid on a mark by eye.
+    names : of the features, for reports.
+    shot : (m,) index of the shot that each was seen in.
+    pose : (m,) index of the pose that it was taken from, as of `same_pose`: those with one index
+        share its error.
+    T_base_flange : (m, 4, 4) reported pose of each.
+    value : (m, 3), m; covariance : (m, 3, 3). Empty components have value 0 and variance 1.
     """
 
-    sigma_m: float
-    sigma_rad: float
-    aim_m: float = 0.0
+    names: tuple[str, ...]
+    shot: Index
+    pose: Index
+    T_base_flange: Array
+    value: Array
+    covariance: Array
 
-    def covariance(self) -> Array:
-        """(8, 8) of (v, w), flange axes, and of the shift and the turn of the light."""
-        sigma = np.repeat([self.sigma_m, self.sigma_rad, self.aim_m], [3, 3, 2])
-        return np.diag(sigma**2)
+    def take(self, rows: NDArray[np.bool_] | Index) -> "Sightings":
+        """Those at ``rows`` (mask or index)."""
+        index = np.arange(len(self.names))[rows]
+        return Sightings(
+            tuple(self.names[i] for i in index),
+            self.shot[index],
+            self.pose[index],
+            self.T_base_flange[index],
+            self.value[index],
+            self.covariance[index],
+        )
+
+
+def same_pose(T_base_flange: Array) -> Index:
+    """Of poses (m, 4, 4) the index (m,) of the first that is the same to `SAME`.
+
+    What errs in a pose is common to all that is seen from it, however often: only what the sensor
+    itself errs by is drawn anew.
+    """
+    place = T_base_flange[:, :3].reshape(-1, 12)
+    near = cKDTree(place).query_ball_point(place, SAME, p=np.inf)
+    return np.array([min(rows) for rows in near], dtype=np.int64)
+
+
+def in_plane(value: Array) -> Array:
+    """Points (..., 3) of the laser plane, sensor frame, from features (..., 3) that begin x, z."""
+    return np.stack([value[..., 0], np.zeros(value.shape[:-1]), value[..., 1]], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a model predicts for m sightings.
+
+    Attributes
+    ----------
+    value : (m, 3) predicted features.
+    point : (m, 3) the point of the target that is seen, sensor frame, m.
+    slope : (m, 3, 3) change of the value as that point moves with the target, sensor axes.
+    spread : (m, 3, k) displacement of that point, base axes, for each unknown of the target.
+    aim : (m, 3, 2) change of the value with how the light was laid on the target by eye, which all
+        sightings of one pose have in common; None where nothing is laid by eye.
+    """
+
+    value: Array
+    point: Array
+    slope: Array
+    spread: Array
+    aim: Array | None = None
+
+
+class TargetModel(ABC):
+    """A target with k unknowns of its own; ``place`` is whatever says where it is.
+
+    ``components``: how many of the three components of a sighting it has.
+    """
+
+    components = COMPONENTS
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names (k) of the unknowns."""
+
+    @property
+    def prior(self) -> Array:
+        """Information (k, k) about the unknowns beforehand."""
+        return np.zeros((len(self.names), len(self.names)))
+
+    @abstractmethod
+    def see(self, T_base_sensor: Array, place: Array) -> Seen:
+        """Predict the sightings from sensor poses (m, 4, 4)."""
+
+    @abstractmethod
+    def moved(self, place: Array, step: Array) -> Array:
+        """The place after an increment (k,) of the unknowns."""
+
+    @abstractmethod
+    def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
+        """How far (m,) sightings (m, 3), put into base, are from the target, m."""
+
+    def deviation(self, place: Array) -> Array:
+        """Distance (k,) of the place from the prior's mean."""
+        return np.zeros(len(self.names))
+
+    def take(self, rows: NDArray[np.bool_] | Index) -> "TargetModel":
+        """The model for the sightings at ``rows``."""
+        return self
+
+
+def moved(T: Array, step: Array) -> Array:
+    """A pose (4, 4) after an increment (v, w) (6,), m and rad, along its own axes."""
+    return np.asarray(T @ frames.transform(frames.exp_rotation(step[3:]), step[:3]))
+
+
+def tangents(direction: Array) -> Array:
+    """Two unit vectors (3, 2) square to a unit vector (3,) and to each other."""
+    side = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    side /= np.linalg.norm(side)
+    return np.column_stack([side, np.cross(direction, side)])
+
+
+def _in_sensor(T_base_sensor: Array, point: Array) -> Array:
+    """Points of the base, (3,) or (m, 3), in each sensor frame (m, 3)."""
+    away = point - T_base_sensor[:, :3, 3]
+    return np.asarray(np.einsum("mji,mj->mi", T_base_sensor[:, :3, :3], away))
+
+
+def circle_centres(value: Array, radius_m: float, side: Array) -> Array:
+    """Sphere centres (m, 3), sensor frame, of circles (x0, z0, r) on the sides (m,) of +-y."""
+    y = side * np.sqrt(np.maximum(radius_m**2 - value[:, 2] ** 2, 0.0))
+    return np.column_stack([value[:, 0], y, value[:, 1]])
+
+
+@dataclass(frozen=True)
+class SphereModel(TargetModel):
+    """A sphere of known radius; sightings (x0, z0, r), place (3,) = its centre in base."""
+
+    radius_m: float
+
+    names = ("sphere x", "sphere y", "sphere z")
+
+    def see(self, T_base_sensor: Array, place: Array) -> Seen:
+        """Circles that the laser plane cuts out."""
+        s = _in_sensor(T_base_sensor, place)
+        y, R = s[:, 1], self.radius_m
+        near = np.clip(y, -EQUATOR * R, EQUATOR * R)
+        r = np.sqrt(R**2 - near**2)
+        fall = -near / r  # dr / dy
+        slope = np.zeros((len(s), 3, 3))
+        slope[:, 0, 0] = slope[:, 1, 2] = 1.0
+        slope[:, 2, 1] = fall
+        spread = np.broadcast_to(np.eye(3), (len(s), 3, 3))
+        value = np.column_stack([s[:, 0], s[:, 2], r + fall * (y - near)])
+        return Seen(value, s, slope, spread)
+
+    def moved(self, place: Array, step: Array) -> Array:
+        """The centre after a step."""
+        return np.asarray(place + step)
+
+    def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
+        """Distance of each profile's own sphere centre; its side is the predicted one."""
+        side = np.where(_in_sensor(T_base_sensor, place)[:, 1] < 0.0, -1.0, 1.0)
+        own = circle_centres(value, self.radius_m, side)
+        return np.asarray(np.linalg.norm(frames.apply(T_base_sensor, own) - place, axis=1))
+
+
+def _pierce(s: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Where edges through s (m, 3) along u (m, 3) pierce y = 0, how far along, and the slope."""
+    steep = np.where(np.abs(u[:, 1]) < FLATTEST, np.copysign(FLATTEST, u[:, 1]), u[:, 1])
+    along = -s[:, 1] / steep
+    slope = np.zeros((len(s), 3, 3))
+    slope[:, 0, 0] = slope[:, 1, 2] = 1.0
+    slope[:, 0, 1], slope[:, 1, 1] = -u[:, 0] / steep, -u[:, 2] / steep
+    slope[:, 2, 1] = -1.0 / steep
+    return s + along[:, None] * u, along, slope
+
+
+@dataclass(frozen=True, eq=False)
+class LineModel(TargetModel):
+    """A straight edge; sightings (x, z), place (2, 3) = a point and the unit direction in base.
+
+    ``known``: then it has no unknowns. Otherwise four: shifts and tilts across the edge.
+    """
+
+    known: bool = False
+
+    components = 2
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """None for a known edge."""
+        return () if self.known else ("line shift 1", "line shift 2", "line tilt 1", "line tilt 2")
+
+    def see(self, T_base_sensor: Array, place: Array) -> Seen:
+        """Points where the edge pierces the laser plane."""
+        point, direction = place
+        s = _in_sensor(T_base_sensor, point)
+        u = np.einsum("mji,j->mi", T_base_sensor[:, :3, :3], direction)
+        p, along, slope = _pierce(s, u)
+        slope[:, 2] = 0.0
+        spread = np.zeros((len(s), 3, len(self.names)))
+        if not self.known:
+            across = tangents(direction)
+            spread[:, :, :2] = across
+            spread[:, :, 2:] = along[:, None, None] * across
+        value = np.column_stack([p[:, 0], p[:, 2], np.zeros(len(p))])
+        return Seen(value, p, slope, spread)
+
+    def moved(self, place: Array, step: Array) -> Array:
+        """The line after a step across it."""
+        if self.known:
+            return place
+        across = tangents(place[1])
+        direction = place[1] + across @ step[2:]
+        return np.stack([place[0] + across @ step[:2], direction / np.linalg.norm(direction)])
+
+    def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
+        """Distance of each feature from the line."""
+        away = frames.apply(T_base_sensor, in_plane(value)) - place[0]
+        return np.asarray(np.linalg.norm(away - np.outer(away @ place[1], place[1]), axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class CornerModel(TargetModel):
+    """Marked edges of a staircase; sightings (x, z, 0): the light was laid on the mark by eye.
+
+    What the eye missed is a shift of the light along the edges and a turn across them.
+
+    Attributes
+    ----------
+    corner_user : (m, 3) mark that each sighting shows, user frame, m.
+    edge_user : (3,) unit direction of the edges.
+    T_base_user : (4, 4) as taught; ``information`` (6, 6) about its error (v, w), user axes, or
+        None where it is exact. Place (4, 4) = the user frame.
+    """
+
+    corner_user: Array
+    edge_user: Array
+    T_base_user: Array
+    information: Array | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """None for an exact user frame."""
+        turns = ("user frame x", "user frame y", "user frame z")
+        return () if self.information is None else (*turns, *(f"{name} turn" for name in turns))
+
+    @property
+    def prior(self) -> Array:
+        """About the teaching error."""
+        return np.zeros((0, 0)) if self.information is None else self.information
+
+    def see(self, T_base_sensor: Array, place: Array) -> Seen:
+        """Points where the edges pierce the laser plane, and how far from the mark."""
+        R = place[:3, :3]
+        s = _in_sensor(T_base_sensor, self.corner_user @ R.T + place[:3, 3])
+        u = np.einsum("mji,j->mi", T_base_sensor[:, :3, :3], R @ self.edge_user)
+        p, along, slope = _pierce(s, u)
+        spread = np.zeros((len(s), 3, len(self.names)))
+        if self.information is not None:
+            at_user = self.corner_user + along[:, None] * self.edge_user
+            spread[:, :, :3] = R
+            spread[:, :, 3:] = -R @ frames.skew(at_user)
+        away = self.corner_user - self.corner_user.mean(axis=0)
+        away = away - np.outer(away @ self.edge_user, self.edge_user)
+        across = away @ np.linalg.svd(away)[2][0]  # place of each corner across the edges
+        aim = np.zeros((len(s), 3, 2))
+        aim[:, 2, 0] = 1.0
+        aim[:, 2, 1] = across / max(float(np.abs(across).max()), 1e-9)  # from -1 to 1
+        return Seen(np.column_stack([p[:, 0], p[:, 2], along]), p, slope, spread, aim)
+
+    def moved(self, place: Array, step: Array) -> Array:
+        """The user frame after a step along its own axes."""
+        return place if self.information is None else moved(place, step)
+
+    def deviation(self, place: Array) -> Array:
+        """How far the user frame is from the taught one."""
+        if self.information is None:
+            return np.zeros(0)
+        T = frames.invert(self.T_base_user) @ place
+        return np.concatenate([T[:3, 3], frames.log_rotation(T[:3, :3])])
+
+    def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
+        """Distance of each corner from its mark."""
+        corner = self.corner_user @ place[:3, :3].T + place[:3, 3]
+        base = frames.apply(T_base_sensor, in_plane(value))
+        return np.asarray(np.linalg.norm(base - corner, axis=1))
+
+    def take(self, rows: NDArray[np.bool_] | Index) -> "CornerModel":
+        """The corners at ``rows``."""
+        return replace(self, corner_user=self.corner_user[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +394,21 @@ class MountProblem:
         pivot: Array | None = None,
     ) -> None:
         self.views, self.noise = views, noise
-        names = [name for view in views for name in view.model.names]
-        self.names = (*SENSOR_UNKNOWNS, *names)
+        names = list(SENSOR_UNKNOWNS)
+        self._columns = []  # of each target's unknowns
+        for view in views:
+            self._columns.append(slice(len(names), len(names) + len(view.model.names)))
+            names += view.model.names
+        self.names = tuple(names)
         self.pivot = pivot_of(views) if pivot is None else pivot
         poses = np.concatenate([view.sightings.pose for view in views])
         if not together:
             poses = np.arange(len(poses))
         self.poses, self.sample = np.unique(poses, return_inverse=True)
-        self._place = _place_in_sample(self.sample)
+        order = np.argsort(self.sample, kind="stable")
+        ordered = self.sample[order]
+        self._place = np.empty(len(order), dtype=np.int64)  # of each sighting in its sample
+        self._place[order] = np.arange(len(order)) - np.searchsorted(ordered, ordered)
         sizes = np.concatenate([np.full(len(v.sightings.names), v.model.components) for v in views])
         self.sizes = np.bincount(self.sample, weights=sizes).astype(np.int64)
         _, _, common, covariance = self.grouped(self.linear(near))
@@ -120,29 +419,22 @@ class MountProblem:
     def linear(self, state: MountState) -> Linear:
         """Linearise all sightings."""
         X, k = state.T_flange_sensor, len(self.names)
-        parts, first = [], len(SENSOR_UNKNOWNS)
-        for view, place in zip(self.views, state.places, strict=True):
+        parts = []
+        for view, place, columns in zip(self.views, state.places, self._columns, strict=True):
             seen_from = view.sightings.T_base_flange @ X
             seen = view.model.see(seen_from, place)
-            own = len(view.model.names)
             J = np.zeros((len(seen.value), COMPONENTS, k))
             J[:, :, :3] = -seen.slope
             J[:, :, 3:6] = seen.slope @ frames.skew(seen.point - self.pivot)
             turned = np.swapaxes(seen_from[:, :3, :3], 1, 2) @ seen.spread
-            J[:, :, first : first + own] = seen.slope @ turned
-            first += own
+            J[:, :, columns] = seen.slope @ turned
             flange = seen.point @ X[:3, :3].T + X[:3, 3]
             down = seen.slope @ X[:3, :3].T
             aim = np.zeros((len(flange), COMPONENTS, 2)) if seen.aim is None else seen.aim
             common = np.concatenate([-down, down @ frames.skew(flange), aim], axis=2)
             s = view.sightings
-            parts.append(Linear(seen.value - s.value, J, common, s.covariance))
-        return Linear(
-            np.concatenate([p.residual for p in parts]),
-            np.concatenate([p.jacobian for p in parts]),
-            np.concatenate([p.common for p in parts]),
-            np.concatenate([p.covariance for p in parts]),
-        )
+            parts.append((seen.value - s.value, J, common, s.covariance))
+        return Linear(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def grouped(self, linear: Linear) -> tuple[Array, Array, Array, Array]:
         """Samples (g, c ...): residual, Jacobian (k), common errors (8), covariance (c)."""
@@ -166,15 +458,10 @@ class MountProblem:
 
     def linearise(self, state: MountState) -> tuple[Array, Array]:
         """Whitened residual (g, c) and Jacobian (g, c, k)."""
-        return self._whitened(self.linear(state))
+        return self.whitened(self.linear(state))
 
-    def whitened(self, linear: Linear, column: Array) -> tuple[Array, Array]:
-        """Whitened rows (N,) and (N, k + 1) with one unknown more, whose column is (m, 3, 1)."""
-        more = replace(linear, jacobian=np.concatenate([linear.jacobian, column], axis=2))
-        residual, jacobian = self._whitened(more)
-        return residual.ravel(), jacobian.reshape(residual.size, -1)
-
-    def _whitened(self, linear: Linear) -> tuple[Array, Array]:
+    def whitened(self, linear: Linear) -> tuple[Array, Array]:
+        """`linearise` of what is linearised already, with any number of columns."""
         residual, jacobian, _, _ = self.grouped(linear)
         whitened = self._whitening @ np.concatenate([residual[..., None], jacobian], axis=2)
         return whitened[..., 0], whitened[..., 1:]
@@ -183,11 +470,8 @@ class MountProblem:
         """Move sensor and targets; the sensor turns about the pivot."""
         turn = frames.exp_rotation(step[3:6])
         move = frames.transform(turn, self.pivot + step[:3] - turn @ self.pivot)
-        places, first = [], len(SENSOR_UNKNOWNS)
-        for view, place in zip(self.views, state.places, strict=True):
-            own = len(view.model.names)
-            places.append(view.model.moved(place, step[first : first + own]))
-            first += own
+        targets = zip(self.views, state.places, self._columns, strict=True)
+        places = [view.model.moved(place, step[columns]) for view, place, columns in targets]
         return MountState(state.T_flange_sensor @ move, tuple(places))
 
     def deviation(self, state: MountState) -> Array:
@@ -199,12 +483,9 @@ class MountProblem:
 
     def prior(self) -> Array:
         """Information (k, k) about the unknowns beforehand; zero where nothing is known."""
-        k, first = len(self.names), len(SENSOR_UNKNOWNS)
-        information = np.zeros((k, k))
-        for view in self.views:
-            own = len(view.model.names)
-            information[first : first + own, first : first + own] = view.model.prior
-            first += own
+        information = np.zeros((len(self.names), len(self.names)))
+        for view, columns in zip(self.views, self._columns, strict=True):
+            information[columns, columns] = view.model.prior
         return information
 
 
@@ -214,32 +495,12 @@ def pivot_of(views: tuple[TargetView, ...]) -> Array:
     return np.array([value[:, 0].mean(), 0.0, value[:, 1].mean()])
 
 
-def _place_in_sample(sample: Index) -> Index:
-    """Number (m,) of each sighting within its sample."""
-    order = np.argsort(sample, kind="stable")
-    ordered = sample[order]
-    start = np.searchsorted(ordered, ordered)
-    place = np.empty(len(sample), dtype=np.int64)
-    place[order] = np.arange(len(sample)) - start
-    return place
-
-
-# ---- how well the robot repeats and the eye aims, from what a fit leaves over -------------------
-#
-# Restricted maximum likelihood (Patterson and Thompson 1971): the noise at which that part of the
-# measurements is most likely which the unknowns cannot explain.
-
-
-FIRST_NOISE = PoseNoise(5e-5, 5e-5, 1e-4)  # turns count as shifts at an arm's length of 1 m
-NOISE_RANGE_M = (1e-6, 1e-2)
-FLAT = 0.02  # slope of the likelihood: a hundredth of the noise's own uncertainty
-NEAR = 0.2  # relative step in which the likelihood's bend is seen
-NODES = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # standard deviations of a noise's logarithm
-WIDEST = 1.0  # of them
-
-
 class RestrictedLikelihood:
-    """The restricted likelihood of noises that are not known, by their logarithms."""
+    """How likely noises are that are not known: of the poses, and of how the eye aims.
+
+    Restricted maximum likelihood (Patterson and Thompson 1971): of that part of the measurements
+    which the unknowns cannot explain. Noises are given by their logarithms (n,).
+    """
 
     def __init__(
         self,
@@ -255,34 +516,20 @@ class RestrictedLikelihood:
         self._all = np.concatenate([r[..., None], J, G], axis=2)
         self._known = problem.prior()
         self._pull = self._known @ problem.deviation(state)
-
-    @property
-    def now(self) -> Array:
-        """Logarithms (n,) of the problem's own noise."""
-        return np.log([getattr(self._noise, field) for field in self.unknown])
+        self.now = np.log([getattr(self._noise, field) for field in self.unknown])
 
     def noise(self, log_sigma: Array) -> PoseNoise:
         """The noise that they stand for."""
-        return _with(self._noise, self.unknown, log_sigma)
+        sigma = dict(zip(self.unknown, np.exp(log_sigma).tolist(), strict=True))
+        if "sigma_m" in sigma:
+            sigma["sigma_rad"] = FIRST_NOISE.sigma_rad / FIRST_NOISE.sigma_m * sigma["sigma_m"]
+        return replace(self._noise, **sigma)
 
-    def at(self, log_sigma: Array) -> tuple[float, Array, Array]:
-        """-2 log likelihood, normal matrix (k, k) and the step (k,) to the best state there."""
-        cost, normal, step, _, _ = self._whitened(log_sigma)
-        return cost, normal, step
+    def at(self, log_sigma: Array) -> tuple[float, Array, Array, Array, Array]:
+        """-2 log likelihood, normal matrix (k, k), the step (k,) to the best state there.
 
-    def with_slope(self, log_sigma: Array) -> tuple[float, Array]:
-        """-2 log likelihood and its slope (n,)."""
-        cost, normal, step, white, common = self._whitened(log_sigma)
-        J, G = white[..., 1:-COMMON], white[..., -COMMON:]
-        left = white[..., 0] + J @ step
-        JG = np.swapaxes(J, 1, 2) @ G
-        grown = np.sum(G**2, axis=(0, 1)) - np.sum(JG * np.linalg.solve(normal, JG), axis=(0, 1))
-        fitted = np.sum((left[:, None, :] @ G) ** 2, axis=(0, 1))
-        each = 2.0 * np.diag(common) * (grown - fitted)
-        parts = {"sigma_m": each[:6].sum(), "aim_m": each[6:].sum()}
-        return cost, np.array([parts[field] for field in self.unknown])
-
-    def _whitened(self, log_sigma: Array) -> tuple[float, Array, Array, Array, Array]:
+        Then the whitened samples, and the covariance (8, 8) of what a pose has in common.
+        """
         common = self.noise(log_sigma).covariance()
         G = self._all[..., -COMMON:]
         L = np.linalg.cholesky(self._own + G @ common @ np.swapaxes(G, 1, 2))
@@ -294,6 +541,18 @@ class RestrictedLikelihood:
         spread = 2.0 * np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)))
         cost = r @ r + gradient @ step + spread + np.linalg.slogdet(normal)[1]
         return float(cost), normal, np.asarray(step), white, common
+
+    def with_slope(self, log_sigma: Array) -> tuple[float, Array]:
+        """-2 log likelihood and its slope (n,)."""
+        cost, normal, step, white, common = self.at(log_sigma)
+        J, G = white[..., 1:-COMMON], white[..., -COMMON:]
+        left = white[..., 0] + J @ step
+        JG = np.swapaxes(J, 1, 2) @ G
+        grown = np.sum(G**2, axis=(0, 1)) - np.sum(JG * np.linalg.solve(normal, JG), axis=(0, 1))
+        fitted = np.sum((left[:, None, :] @ G) ** 2, axis=(0, 1))
+        each = 2.0 * np.diag(common) * (grown - fitted)
+        parts = {"sigma_m": each[:6].sum(), "aim_m": each[6:].sum()}
+        return cost, np.array([parts[field] for field in self.unknown])
 
 
 def restricted_noise(
@@ -334,7 +593,7 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
     keep = np.ones(len(problem.poses), dtype=np.bool_)
     likely = RestrictedLikelihood(problem, state, keep, given)
     best = likely.now
-    least, normal, _ = likely.at(best)
+    least, normal = likely.at(best)[:2]
     if not likely.unknown:
         return np.asarray(np.linalg.inv(normal))
     width = []
@@ -344,16 +603,8 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
     total, weights = np.zeros_like(normal), 0.0
     for nodes in product(NODES, repeat=len(best)):
         away = np.array(width) * nodes
-        cost, normal, step = likely.at(best + away)
+        cost, normal, step = likely.at(best + away)[:3]
         weight = float(np.exp(0.5 * (least - cost) + away.sum()))
         total += weight * (np.linalg.inv(normal) + np.outer(step, step))
         weights += weight
     return np.asarray(total / weights)
-
-
-def _with(noise: PoseNoise, unknown: list[str], log_sigma: Array) -> PoseNoise:
-    found = replace(noise, **dict(zip(unknown, np.exp(log_sigma).tolist(), strict=True)))
-    if "sigma_m" in unknown:
-        ratio = FIRST_NOISE.sigma_rad / FIRST_NOISE.sigma_m
-        return replace(found, sigma_rad=ratio * found.sigma_m)
-    return found

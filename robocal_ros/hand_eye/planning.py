@@ -16,26 +16,42 @@ from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import OPEN_M, joined, open_directions
-from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, TargetView
-from robocal_ros.hand_eye.quality import expected_error_m, expected_errors_m
-from robocal_ros.hand_eye.result import at_origin
-from robocal_ros.hand_eye.starts import FEWEST_PROFILES
-from robocal_ros.hand_eye.target_models import (
+from robocal_ros.hand_eye.mount_problem import (
     LineModel,
+    MountProblem,
+    MountState,
     Seen,
     Sightings,
     SphereModel,
     TargetModel,
+    TargetView,
     same_pose,
 )
-from robocal_ros.hand_eye.targets import StepTarget
-from robocal_ros.hand_eye.tasks import StepTask, require_marks
+from robocal_ros.hand_eye.result import PoseNoise, at_origin, expected_error_m
+from robocal_ros.hand_eye.staircase import StepTask, require_marks
+from robocal_ros.hand_eye.targets import LaserTarget, SphereTarget, StepTarget
+from robocal_ros.hand_eye.tasks import FEWEST_SPHERES
 
 Array = NDArray[np.float64]
 
 VAGUE = 1.0  # m, rad: what is known without any measurement; an open direction has a large error
 MOST_PROPOSED = 12
 SPARE_POSES = 2  # beyond the fewest, so that one may be lost
+
+OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
+BEHIND = 0.7  # of the radius: how far the centre lies behind the arc that is seen
+MOST_ROUNDS = 100  # the best centres settle in a handful
+SETTLED_M = 1e-6
+
+SMALLEST = 0.2  # of the radius: a circle that the laser plane cuts out
+STEEPEST_RAD = float(np.radians(60.0))  # slope of a surface that still returns light
+NEEDED = 0.3  # of a circle's radius: how deep an arc must be seen to know its centre
+CUT = 0.3  # of that depth: what may be cut off at the near end
+EDGE_POINTS = 10.0  # on each side of an edge, by which its place is known
+TILTS_RAD = np.radians([-25.0, 0.0, 25.0])
+ROLLS_RAD = np.radians([-60.0, 0.0, 60.0])
+ASIDE = (-0.25, 0.25)  # of the field's width
+ALONG_M = (-0.04, 0.0, 0.04)  # of an edge
 
 
 @dataclass(frozen=True)
@@ -130,21 +146,23 @@ def check_plan(
     unseen = target.unseen(whole)
     rows = ~np.isin(whole.sightings.shot, list(unseen))
     seen = len(T_base_flange) - len(unseen)
-    shown = _shown(whole.take(rows), state, noise, sensor)
-    field = sensor.field_points - sensor.pivot
-    error = None
-    if shown.covariance is not None:
-        error = expected_error_m(shown.covariance[:6, :6], field)
-    verdict = _verdict(seen, target.fewest, shown.words, error, limit_m)
+    rank, information, covariance, words = _shown(whole.take(rows), state, noise, sensor)
+    sigma = error = None
+    if covariance is not None:
+        sigma = np.sqrt(np.diag(at_origin(covariance, sensor.pivot)))
+        error = float(expected_error_m(covariance, sensor.field_points - sensor.pivot))
+    verdict = _verdict(seen, target.fewest, words, error, limit_m)
     proposed, better = np.empty((0, 4, 4)), None
     if not verdict.accept:
-        known = shown.information, noise, sensor, limit_m
-        proposed, better = _propose(target, T_base_flange, state, known, seen)
+        wanted = target.fewest + SPARE_POSES - seen
+        proposed, better = _propose(
+            target, T_base_flange, state, information, noise, sensor, limit_m, wanted
+        )
     return PlanReport(
-        shown.rank,
-        len(shown.information),
-        tuple(shown.words),
-        shown.sigma(sensor),
+        rank,
+        len(information),
+        tuple(words),
+        sigma,
         error,
         unseen,
         proposed,
@@ -153,26 +171,16 @@ def check_plan(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """What sightings show: information (k, k), its inverse where there is one, open directions."""
+def _shown(
+    view: TargetView, state: MountState, noise: PoseNoise, sensor: SensorRange
+) -> tuple[int, Array, Array | None, list[str]]:
+    """What sightings show: rank, information (k, k), open directions in words.
 
-    rank: int
-    information: Array
-    covariance: Array | None
-    words: list[str]
-
-    def sigma(self, sensor: SensorRange) -> Array | None:
-        """Expected standard deviations (6,) at the sensor's origin."""
-        if self.covariance is None:
-            return None
-        return np.sqrt(np.diag(at_origin(self.covariance[:6, :6], sensor.pivot)))
-
-
-def _shown(view: TargetView, state: MountState, noise: PoseNoise, sensor: SensorRange) -> _Shown:
+    Before these the covariance (6, 6) of the sensor, where no direction is open.
+    """
     k = 6 + len(view.model.names)
     if not view.sightings.names:
-        return _Shown(0, np.zeros((k, k)), None, ["no pose sees the target"])
+        return 0, np.zeros((k, k)), None, ["no pose sees the target"]
     problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
     J = problem.linearise(state)[1].reshape(-1, k)
     information = J.T @ J + problem.prior()
@@ -182,7 +190,7 @@ def _shown(view: TargetView, state: MountState, noise: PoseNoise, sensor: Sensor
     rank = int(np.sum(np.linalg.eigvalsh(covariance * np.outer(size, size)) < OPEN_M**2))
     at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
     words = open_directions(at_sensor, sensor.middle_m, view.sightings.T_base_flange)
-    return _Shown(rank, information, None if words else covariance, words)
+    return rank, information, None if words else covariance[:6, :6], words
 
 
 def _verdict(
@@ -207,11 +215,16 @@ def _propose(
     target: PlannedTarget,
     T_base_flange: Array,
     state: MountState,
-    known: tuple[Array, PoseNoise, SensorRange, float],
-    seen: int,
+    information: Array,
+    noise: PoseNoise,
+    sensor: SensorRange,
+    limit_m: float,
+    wanted: int,
 ) -> tuple[Array, float | None]:
-    """Add, one by one, the candidate that lowers the expected error most, until they will do."""
-    information, noise, sensor, limit_m = known
+    """Add, one by one, the candidate that lowers the expected error most, until they will do.
+
+    ``information`` (k, k): what is known already; ``wanted``: at least so many are added.
+    """
     X, place = state.T_flange_sensor, state.places[0]
     candidates = target.candidates(T_base_flange @ X, place)
     view = target.view(candidates @ frames.invert(X), X, place)
@@ -223,27 +236,17 @@ def _propose(
     total = information + VAGUE**-2 * np.eye(len(information))
     chosen: list[int] = []
     error = np.inf
-    wanted = target.fewest + SPARE_POSES - seen
     while np.any(gain) and len(chosen) < MOST_PROPOSED:
         if error <= limit_m and len(chosen) >= wanted:
             break
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
-        errors = expected_errors_m(covariance, sensor.field_points - sensor.pivot)
+        errors = expected_error_m(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
         error = float(errors[best])
         total = total + gain[best]
         gain[best] = 0.0  # once: the same pose again shows the same error again
         chosen.append(best)
     return candidates[chosen] @ frames.invert(X), error if chosen else None
-
-
-# ---- where sensor poses look for a sphere that nobody has told the place of ---------------------
-
-
-OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
-BEHIND = 0.7  # of the radius: how far the centre lies behind the arc that is seen
-MOST_ROUNDS = 100  # the best centres settle in a handful
-SETTLED_M = 1e-6
 
 
 def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tuple[Array, Array]:
@@ -257,13 +260,8 @@ def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tup
     """
     R, origin = T_base_sensor[:, :3, :3], T_base_sensor[:, :3, 3]
     off = OFF_EQUATOR * radius_m
-    allowed = np.array(
-        [
-            0.5 * sensor.width_m,
-            radius_m - off,
-            0.5 * (sensor.far_m - sensor.near_m) + radius_m,
-        ]
-    )
+    depth_m = 0.5 * (sensor.far_m - sensor.near_m) + radius_m
+    allowed = np.array([0.5 * sensor.width_m, radius_m - off, depth_m])
     middle_m = sensor.middle_m + BEHIND * radius_m  # its surface is seen, not its centre
     starts = np.array([[0.0, side * off, middle_m] for side in (-1.0, 1.0)])
     centres = (np.einsum("mij,sj->smi", R, starts) + origin).reshape(-1, 3)
@@ -290,20 +288,6 @@ def _misses(
     at[..., 1] = np.where(s[..., 1] < 0.0, -off, off)
     at[..., 2] = middle_m
     return (s - at) / allowed, at
-
-
-# ---- how targets would be seen from planned poses, and from which others they could be ----------
-
-
-SMALLEST = 0.2  # of the radius: a circle that the laser plane cuts out
-STEEPEST_RAD = float(np.radians(60.0))  # slope of a surface that still returns light
-NEEDED = 0.3  # of a circle's radius: how deep an arc must be seen to know its centre
-CUT = 0.3  # of that depth: what may be cut off at the near end
-EDGE_POINTS = 10.0  # on each side of an edge, by which its place is known
-TILTS_RAD = np.radians([-25.0, 0.0, 25.0])
-ROLLS_RAD = np.radians([-60.0, 0.0, 60.0])
-ASIDE = (-0.25, 0.25)  # of the field's width
-ALONG_M = (-0.04, 0.0, 0.04)  # of an edge
 
 
 def _tilted(T_base_sensor: Array) -> Array:
@@ -357,8 +341,8 @@ class PlannedSphere:
 
     radius_m: float
     sensor: SensorRange
-    centre: tuple[float, float, float] | None = None
-    fewest: int = field(default=FEWEST_PROFILES, init=False)
+    centre: Sequence[float] | None = None
+    fewest: int = field(default=FEWEST_SPHERES, init=False)
 
     def place(self, T_base_sensor: Array) -> Array:
         """Its centre."""
@@ -481,13 +465,14 @@ class PlannedStairs:
 
     def lit(self, T_base_sensor: Array) -> tuple[str, ...]:
         """The mark that is nearest to the laser plane of each sensor pose (m, 4, 4)."""
-        known = self._known()
+        known = self._known
         middles = np.array([self.target.corners[mark].mean(axis=0) for mark in known])
         base = middles @ self.target.T_base_user[:3, :3].T + self.target.T_base_user[:3, 3]
         away = base[None] - T_base_sensor[:, None, :3, 3]
         y = np.abs(np.einsum("mki,mi->mk", away, T_base_sensor[:, :3, 1]))
         return tuple(known[nearest] for nearest in np.argmin(y, axis=1))
 
+    @property
     def _known(self) -> list[str]:
         known = list(self.target.corners)
         return known[:1] if self.marks is None else known
@@ -505,7 +490,7 @@ class PlannedStairs:
 
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
         """Light through the marks: tilted about their line, and within the plane of the light."""
-        every = [self.target.corners[mark] for mark in self._known()]
+        every = [self.target.corners[mark] for mark in self._known]
         mean = frames.nearest_rotation(T_base_sensor[:, :3, :3].mean(axis=0))
         x = mean[:, 0]
         if len(every[0]) > 1:  # a corner alone lies on no line
@@ -522,3 +507,22 @@ class PlannedStairs:
             middle = place[:3, :3] @ every[number % len(every)].mean(axis=0) + place[:3, 3]
             poses.append(_looking(R[None], at[None], middle)[0])
         return np.array(poses)
+
+
+def planned_target(
+    target: LaserTarget | None,
+    sensor: SensorRange,
+    centre: Sequence[float] | None,
+    marks: Sequence[str] | None,
+) -> PlannedTarget:
+    """How a line laser's target would be seen; None: a line whose place is not known.
+
+    ``centre`` (3,), base, of a sphere; ``marks``: of a staircase, see `PlannedStairs`.
+    """
+    if isinstance(target, SphereTarget):
+        return PlannedSphere(target.radius_m, sensor, centre)
+    if isinstance(target, StepTarget):
+        return PlannedStairs(target, sensor, marks)
+    if target is None:
+        return PlannedLine(sensor)
+    return PlannedLine(sensor, np.stack([target.point_base, target.direction_base]))

@@ -1,21 +1,73 @@
-"""The outcome of a hand-eye calibration, whatever the target."""
+"""The outcome of a hand-eye calibration, whatever the target, and whether it is good, in mm."""
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, summarise, verdict_document
 from robocal_ros.ground import frames
-from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.errors import Code
+from robocal_ros.ground.frames import Document, transform_document
 
 Array = NDArray[np.float64]
-Document = dict[str, Any]
 Method = Literal["best", "classic"]
 TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
+
+METHODS: tuple[Method, ...] = ("best", "classic")
+MOST_REJECTED = 1.0 / 3.0
+ARM_M = 1.0
+STRIDE = 8  # of the points that tell the field of view
+OUTSIDE = 0.02  # share of points beyond it on each side: spikes
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations of what all sightings of one pose have in common.
+
+    Attributes
+    ----------
+    sigma_m, sigma_rad : of a coordinate of the reported pose, and of its turn about an axis.
+    aim_m : of light that is laid on a mark by eye.
+    """
+
+    sigma_m: float
+    sigma_rad: float
+    aim_m: float = 0.0
+
+    def covariance(self) -> Array:
+        """(8, 8) of (v, w), flange axes, and of the shift and the turn of the light."""
+        sigma = np.repeat([self.sigma_m, self.sigma_rad, self.aim_m], [3, 3, 2])
+        return np.diag(sigma**2)
+
+
+@dataclass(frozen=True)
+class HandEyeSettings:
+    """What is known of the robot, and what is good enough.
+
+    Attributes
+    ----------
+    robot_sigma_m, robot_sigma_rad : standard deviation of a reported pose along and about each
+        axis; None to estimate both from the profiles. Where the first is given alone, the second
+        is that shift at an arm's length of 1 m.
+    limit_m : largest expected error (rms) of a point in the field that the profiles cover.
+    residual_m : largest distance (rms) of samples from the target.
+    """
+
+    robot_sigma_m: float | None = None
+    robot_sigma_rad: float | None = None
+    limit_m: float = 1e-3
+    residual_m: float = 2e-3
+
+    def noise(self) -> PoseNoise | None:
+        """Of reported poses; None where it is to be estimated."""
+        if self.robot_sigma_m is None:
+            return None
+        turn = self.robot_sigma_m / ARM_M if self.robot_sigma_rad is None else self.robot_sigma_rad
+        return PoseNoise(self.robot_sigma_m, turn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +76,6 @@ class HandEyeResult:
 
     Attributes
     ----------
-    kind, method : of the target and of the estimator.
     T_flange_sensor : (4, 4), m. For a sensor that does not move (eye-to-hand) ``parent`` is "base"
         and this is T_base_sensor.
     covariance : (6, 6) of the `increment` (v, w) to the true pose, m and rad, sensor axes: a turn
@@ -66,11 +117,6 @@ def increment(T_from: Array, T_to: Array, pivot: Array) -> Array:
     return np.concatenate([T[:3, :3] @ pivot + T[:3, 3] - pivot, frames.log_rotation(T[:3, :3])])
 
 
-def moved_origin(step: Array, pivot: Array) -> Array:
-    """An increment (v, w) (6,) about a pivot as one about the origin, to first order."""
-    return np.concatenate([step[:3] - np.cross(step[3:], pivot), step[3:]])
-
-
 def at_origin(covariance: Array, pivot: Array) -> Array:
     """Covariance (6, 6) of increments about a pivot as of those about the origin."""
     move = np.eye(6)
@@ -99,12 +145,50 @@ def point_covariance(result: HandEyeResult, points: Array) -> Array:
     return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
 
 
-def parent_covariance(result: HandEyeResult) -> Array | None:
-    """Covariance (6, 6) of the sensor's origin and of its turn, along the parent's axes."""
-    if result.covariance is None:
-        return None
-    turn = np.kron(np.eye(2), result.T_flange_sensor[:3, :3])
-    return np.asarray(turn @ at_origin(result.covariance, result.pivot) @ turn.T)
+def expected_error_m(covariance: Array, points: Array) -> Array:
+    """Root mean square error (...) of points (n, 3), counted from the pivot of (..., 6, 6)."""
+    J = point_jacobian(points)
+    spread = J @ covariance[..., None, :, :] @ np.swapaxes(J, 1, 2)
+    return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1).mean(axis=-1)))
+
+
+def apart(T_one: Array, T_other: Array, points: Array) -> float:
+    """Root mean square distance of sensor points (n, 3), m, under two poses of the sensor."""
+    away = points @ (T_one - T_other)[:3, :3].T + (T_one - T_other)[:3, 3]
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+
+
+def field_points(profiles: Sequence[Array]) -> Array:
+    """Middle and corners (5, 3) of the field that profiles (n, 2) cover, sensor frame, m."""
+    points = np.concatenate([profile[::STRIDE] for profile in profiles])
+    low, high = np.quantile(points, [OUTSIDE, 1.0 - OUTSIDE], axis=0)
+    x, z = np.stack([low, high]).T
+    corners = [[a, 0.0, b] for a in x for b in z]
+    return np.array([[x.mean(), 0.0, z.mean()], *corners])
+
+
+def judge_classic(apart_m: float, error_m: float, settings: HandEyeSettings) -> Verdict:
+    """The verdict on a classic estimate that is so far from the best one in the field of view."""
+    words = f"a closed form, {apart_m * 1e3:.3f} mm from the best estimate in the field of view; "
+    words += f"a point there is expected to be off by {error_m * 1e3:.3f} mm rms"
+    if error_m > settings.limit_m:
+        words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): use method best"
+        return Verdict(Code.POSES_NOT_INFORMATIVE, words)
+    return Verdict(Code.ACCEPT, words)
+
+
+def judge_residuals(
+    distances_m: Array, shots: int, lost: int, settings: HandEyeSettings
+) -> Verdict | None:
+    """Refuse samples that are too far off, or too few of them; None where they will do."""
+    rms = float(np.sqrt(np.mean(distances_m**2)))
+    if rms > settings.residual_m:
+        words = f"samples are off by {rms * 1e3:.2f} mm (allowed {settings.residual_m * 1e3:g} mm)"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    if lost > MOST_REJECTED * shots:
+        words = f"{lost} of {shots} samples do not fit the others: see the rejected ones"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    return None
 
 
 def hand_eye_document(result: HandEyeResult) -> Document:
@@ -116,24 +200,37 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     `increment` about ``pivot_mm``, a point of the sensor frame. A shot whose
     corners were all rejected is named once.
     """
-    covariance, rejected = parent_covariance(result), by_shot(result.rejected, result.samples)
+    covariance = sigma_document = left_out_document = None
+    if result.covariance is not None:
+        turn = np.kron(np.eye(2), result.T_flange_sensor[:3, :3])
+        covariance = np.asarray(turn @ at_origin(result.covariance, result.pivot) @ turn.T)
+        sigma = np.sqrt(np.diag(covariance))
+        sigma_document = {
+            "xyz_mm": (sigma[:3] * 1e3).tolist(),
+            "rot_deg": np.degrees(sigma[3:]).tolist(),
+        }
+    if result.leave_one_out_m is not None:
+        left_out = summarise(result.leave_one_out_m)
+        left_out_document = {
+            name: getattr(left_out, f"{name}_m") * 1e3 for name in ("mean", "rms", "p95", "max")
+        }
+    error_m, turned_rad = result.working_error_m, result.residual_rad
+    rejected = by_shot(result.rejected, result.samples)
     return {
         "kind": result.kind,
         "method": result.method,
         f"T_{result.parent}_sensor": transform_document(result.T_flange_sensor),
-        "sigma": _sigma_document(covariance),
+        "sigma": sigma_document,
         "covariance": None if covariance is None else covariance.tolist(),
         "pivot_mm": (result.pivot * 1e3).tolist(),
         "covariance_at_pivot": None if result.covariance is None else result.covariance.tolist(),
         "target": result.target,
         "residual_mm": _residual_document(result.samples, result.residual_m * 1e3),
         "residual_deg": None
-        if result.residual_rad is None
-        else _residual_document(result.samples, np.degrees(result.residual_rad)),
-        "leave_one_out_mm": _left_out_document(result.leave_one_out_m),
-        "working_error_mm": None
-        if result.working_error_m is None
-        else result.working_error_m * 1e3,
+        if turned_rad is None
+        else _residual_document(result.samples, np.degrees(turned_rad)),
+        "leave_one_out_mm": left_out_document,
+        "working_error_mm": None if error_m is None else error_m * 1e3,
         "rejected": list(rejected),
         "rejected_because": rejected,
         "unobservable": list(result.unobservable),
@@ -141,36 +238,6 @@ def hand_eye_document(result: HandEyeResult) -> Document:
         **result.more,
         "verdict": verdict_document(result.verdict),
     }
-
-
-def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, str]:
-    """Reasons by name; a shot that has no corner among the samples used stands there once."""
-    used = shots_of(samples)
-    found: dict[str, list[str]] = {}
-    for name, why in rejected.items():
-        shot = _shots_alone(name)
-        if shot in used:
-            found[name] = [why]
-        else:
-            found.setdefault(shot, []).append(_shots_alone(why))
-    return {name: max(reasons, key=reasons.count) for name, reasons in found.items()}
-
-
-def shots_of(names: Iterable[str]) -> set[str]:
-    """Names of the shots that samples are named after: several corners may be of one."""
-    return {_shots_alone(name) for name in names}
-
-
-def _shots_alone(words: str) -> str:
-    """Names of corners in words as those of their shots."""
-    return re.sub(r"/corner \d+\b", "", words)
-
-
-def _sigma_document(covariance: Array | None) -> Document | None:
-    if covariance is None:
-        return None
-    sigma = np.sqrt(np.diag(covariance))
-    return {"xyz_mm": (sigma[:3] * 1e3).tolist(), "rot_deg": np.degrees(sigma[3:]).tolist()}
 
 
 def _residual_document(samples: tuple[str, ...], residual: Array) -> Document:
@@ -181,13 +248,23 @@ def _residual_document(samples: tuple[str, ...], residual: Array) -> Document:
     }
 
 
-def _left_out_document(distance_m: Array | None) -> Document | None:
-    if distance_m is None:
-        return None
-    told = summarise(distance_m)
-    return {
-        "mean": told.mean_m * 1e3,
-        "rms": told.rms_m * 1e3,
-        "p95": told.p95_m * 1e3,
-        "max": told.max_m * 1e3,
-    }
+def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, str]:
+    """Reasons by name; a shot that has no corner among the samples used stands there once."""
+    used = shots_of(samples)
+    found: dict[str, list[str]] = {}
+    for name, why in rejected.items():
+        shot = _without_corner(name)
+        if shot in used:
+            found[name] = [why]
+        else:
+            found.setdefault(shot, []).append(_without_corner(why))
+    return {name: max(reasons, key=reasons.count) for name, reasons in found.items()}
+
+
+def shots_of(names: Iterable[str]) -> set[str]:
+    """Names of the shots that samples are named after: several corners may be of one."""
+    return {_without_corner(name) for name in names}
+
+
+def _without_corner(text: str) -> str:
+    return re.sub(r"/corner \d+\b", "", text)

@@ -30,6 +30,7 @@ from robocal_ros.hand_eye.data import (
     IN_HAND,
     MOST_POINTS,
     TO_HAND,
+    WITHOUT_FILE,
     Capture,
     DataSet,
     data_set_begun,
@@ -46,7 +47,8 @@ from robocal_ros.hand_eye.session_planning import (
     rough_mount,
     sphere_centre,
 )
-from robocal_ros.hand_eye.settings import start_arguments
+from robocal_ros.hand_eye.targets import KIND_OF, read_target, target_document
+from robocal_ros.hand_eye.targets import KINDS as TARGET_FILE_KINDS
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
 from robocal_ros.ros import conversions, endpoints
@@ -384,6 +386,45 @@ def _answered(response: Any, found: "PlanReport", who: str) -> Any:
 
 
 # ---- the services of the hand-eye node: each call becomes a command to the session --------------
+
+
+def start_arguments(
+    settings: Mapping[str, Any],
+    kind: str = "",
+    file: str = "",
+    feature: str = "",
+    method: str = "",
+    mount: str = "",
+) -> dict[str, Any]:
+    """Arguments of the command that begins a data set; what is empty comes from the settings.
+
+    The configured file counts for the target that it describes, and for no other.
+
+    Raises
+    ------
+    InputError
+        When the target's file is missing, or describes another target.
+    """
+    kind = kind or settings["target"]
+    configured = settings["target_file"]
+    if file:
+        target = target_document(kind, read_target(Path(file)))
+    else:
+        target, found = {"kind": kind}, ""
+        if configured and kind in TARGET_FILE_KINDS:
+            described = read_target(Path(configured))
+            found = KIND_OF[type(described)]
+            if found == kind:
+                target = target_document(kind, described)
+        if found != kind and kind not in WITHOUT_FILE:
+            words = f"'{configured}' describes a {found}" if found else "is empty"
+            raise InputError(f"target_file {words}: name the file that describes the {kind}")
+    return {
+        "target": target,
+        "feature": feature or settings["feature"],
+        "method": method or settings["method"],
+        "mount": mount or settings["mount"],
+    }
 
 
 class HandEyeServices:

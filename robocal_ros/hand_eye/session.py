@@ -1,32 +1,225 @@
 """The hand-eye session: samples and commands in, the sensor's place out. No clock, no ROS."""
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, cast
 
-from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
-from robocal_ros.ground.proposals import THERMAL, hand_eye_kind
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    LimitError,
+    RankDeficientError,
+    ResidualError,
+    RobocalError,
+    TooFewSamplesError,
+)
+from robocal_ros.ground.frames import Document
+from robocal_ros.ground.proposals import THERMAL, Head, Proposal, hand_eye_kind
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
-from robocal_ros.ground.streams import CLOCK_JUMP_NS, NotStillError
-from robocal_ros.hand_eye.config import HandEyeConfig, HandEyeInForce, PoseModels
+from robocal_ros.ground.streams import CLOCK_JUMP_NS, NotStillError, StandstillRule
 from robocal_ros.hand_eye.data import (
+    FEATURES,
     MOST_CAPTURES,
     MOST_HANDLE,
+    MOUNTS,
+    TO_HAND,
+    TOPIC_OF,
+    WITHOUT_FILE,
     Capture,
     DataSet,
     HandEyeSample,
+    PoseModels,
+    board_of,
     data_set_begun,
     data_set_of,
+    flange_poses,
     seen_corners,
 )
-from robocal_ros.hand_eye.results import HandEyeResults, require_known
-from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Shot, ShotLog, shot_of
+from robocal_ros.hand_eye.result import (
+    METHODS,
+    HandEyeResult,
+    HandEyeSettings,
+    Method,
+    hand_eye_document,
+)
+from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Profile, Shot, ShotLog, shot_of, target_poses
+from robocal_ros.hand_eye.targets import target_of
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
-from robocal_ros.session.base import Handler, SessionBase, configured_with, recorded_arguments
+from robocal_ros.session.base import (
+    Handler,
+    HistoryFollower,
+    SessionBase,
+    configured_with,
+    recorded_arguments,
+)
 from robocal_ros.session.events import Command, History, Outcome, seeded
 
-_NO_SET = "no data set is open: call start, or load one"
+Array = NDArray[np.float64]
+Samples = Sequence[HandEyeSample]
+
+OWN = "sensor"  # only a hand-eye session's configuration has it
+
+
+@dataclass(frozen=True)
+class HandEyeConfig:
+    """Settings of a hand-eye session; plain values, so that a recording carries them.
+
+    Attributes
+    ----------
+    base_frame, flange_frame, sensor_frame : names of the frames.
+    standstill : when the robot counts as standing still about a measurement.
+    capture_timeout_s : a capture without standstill or without a measurement for so long fails.
+    robot_sigma_m, robot_sigma_rad : error of a reported flange pose along and about each axis, one
+        sigma; None: found from the samples, but the second of a line laser as `HandEyeSettings`.
+    limit_m : largest expected error at the working distance that is accepted.
+    """
+
+    base_frame: str = "base"
+    flange_frame: str = "tool0"
+    sensor_frame: str = "sensor"
+    standstill: StandstillRule = field(default_factory=StandstillRule)
+    capture_timeout_s: float = 10.0
+    robot_sigma_m: float | None = None
+    robot_sigma_rad: float | None = None
+    limit_m: float = 1e-3
+
+    def document(self) -> dict[str, Any]:
+        """Plain values; `of_document` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
+        """Read what `document` gave, also after JSON.
+
+        Raises
+        ------
+        InputError
+            When it has other settings than this version knows.
+        """
+        try:
+            values = dict(document)
+            return cls(standstill=StandstillRule(**values.pop("standstill")), **values)
+        except (KeyError, TypeError) as error:
+            raise InputError(f"the recorded configuration cannot be read: {error}") from error
+
+
+class HandEyeInForce(HistoryFollower):
+    """What the history has in force for a sensor, as of the last look.
+
+    Attributes
+    ----------
+    head, thermal : heads of this sensor's calibrations and of the thermal models.
+    """
+
+    def __init__(self, history: History, nominal: SerialArm, sensor_frame: str) -> None:
+        self._nominal = nominal
+        super().__init__(history, hand_eye_kind(sensor_frame))
+
+    def _read(self) -> None:
+        super()._read()
+        self.thermal: Head = self._history.head(THERMAL)
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the thermal model in force."""
+        model = self.thermal.model
+        return self._nominal if model is None else arm_of(model, self._nominal)
+
+
+def require_known(data: DataSet, method: str) -> None:
+    """Refuse a target, a method or a mount that no estimator answers for.
+
+    Raises
+    ------
+    InputError
+        Naming those that there are.
+    """
+    for what, value, known in (
+        ("target", data.kind, tuple(TOPIC_OF)),
+        ("feature", data.feature, FEATURES),
+        ("method", method, METHODS),
+        ("mount", data.mount, MOUNTS),
+    ):
+        if value not in known:
+            raise InputError(f"{what} '{value}' is none of {', '.join(known)}")
+    if target_of(data.target) is None and data.kind not in WITHOUT_FILE:
+        raise InputError(f"nothing is known of the {data.kind}: name the file that describes it")
+    if data.mount == TO_HAND and data.kind != "camera":
+        raise InputError(
+            f"a {data.kind} is seen by a sensor on the flange: one that stands still is calibrated "
+            "with the target camera"
+        )
+
+
+def solved(
+    data: DataSet, samples: Samples, T_base_flange: Array, method: str, config: HandEyeConfig
+) -> HandEyeResult:
+    """Where the sensor sits; ``T_base_flange`` (k, 4, 4), m, of the samples.
+
+    The estimators are loaded when they are first used: a node's start does not need them.
+
+    Raises
+    ------
+    RobocalError
+        When the samples cannot answer.
+    """
+    require_known(data, method)
+    if not samples:
+        raise TooFewSamplesError("nothing was captured yet: capture the target from several poses")
+    if data.kind == "camera":
+        return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
+    from robocal_ros.estimation.edge import EdgeRule
+    from robocal_ros.hand_eye.solve import solve_task
+    from robocal_ros.hand_eye.staircase import StepTask
+    from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
+
+    names = tuple(str(sample.handle) for sample in samples)
+    shots = HandEyeData(
+        names,
+        T_base_flange,
+        [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
+        tuple(sample.mark for sample in samples) if data.kind == "step" else None,
+    )
+    settings = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad, config.limit_m)
+    target: Any = target_of(data.target)
+    task: Task = LineTask(target, EdgeRule(kind=data.feature))
+    if data.kind != "line":
+        task = SphereTask(target) if data.kind == "sphere" else StepTask(target)
+    return solve_task(task, shots, cast(Method, method), settings)
+
+
+def _solved_camera(
+    data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
+) -> HandEyeResult:
+    """From the corners of a board in images, or from poses of the target."""
+    from robocal_ros.hand_eye.board import board_pairs, boards_of_corners, intrinsics_document
+    from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+    from robocal_ros.hand_eye.camera_fit import GivenNoise
+    from robocal_ros.hand_eye.camera_model import PosePairs
+
+    names = tuple(str(sample.handle) for sample in samples)
+    noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)
+    settings = CameraSettings(method, noise, config.limit_m)
+    if data.topic != IMAGE:
+        poses = target_poses(np.concatenate([sample.values for sample in samples]))
+        return calibrate_camera(PosePairs(T_base_flange, poses, names, data.mount), settings)
+    target = board_of(data.target)
+    corners = np.array([sample.values[1:] for sample in samples])
+    width, height = samples[0].values[0]
+    size = int(width), int(height)
+    seen = boards_of_corners(names, corners, target.board, size, target.intrinsics)
+    return calibrate_camera(
+        board_pairs(seen, names, T_base_flange, data.mount),
+        settings,
+        rejected=seen.rejected,
+        more={"intrinsics": intrinsics_document(seen, target.intrinsics is None)},
+    )
 
 
 class HandEyeSession(SessionBase):
@@ -46,7 +239,7 @@ class HandEyeSession(SessionBase):
         self.config = config
         self.current = HandEyeInForce(history, nominal, config.sensor_frame)
         super().__init__(nominal, history, hand_eye_kind(config.sensor_frame), self.current)
-        self._results = HandEyeResults(nominal, history, config, software)
+        self._software = software
         self._shots = ShotLog()
         self._handle = 0
         self._why: RobocalError | None = None  # why the latest shot was of no use
@@ -55,8 +248,6 @@ class HandEyeSession(SessionBase):
         self._found: Command | None = None
         self._models = PoseModels(self.current.thermal)
         self.data: DataSet | None = None
-
-    # ---- samples --------------------------------------------------------------------------------
 
     def add(self, sample: JointSample | Shot) -> None:
         """Take a sample.
@@ -70,28 +261,22 @@ class HandEyeSession(SessionBase):
             if sample.stamp_ns <= 0:
                 raise InputError(f"{sample.topic} has no time stamp")
             self._shots.add(sample, self.config.sensor_frame, self.newest_joints_ns)
-            self._tell_early(sample)
+            waiting = self.data.waiting if self.data and self.data.topic == sample.topic else None
+            if waiting is not None and sample.stamp_ns < waiting.from_ns:
+                early_s = (waiting.from_ns - sample.stamp_ns) * 1e-9
+                words = f"{sample.topic} is stamped {early_s:.3f} s before the call"
+                self._why = InputError(f"{words}: is the sensor's clock behind?")
             self.received[sample.topic] += 1
             newest = self.newest_ns.get(sample.topic, 0)
             self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
         else:
-            self._add_joints(sample)
+            before_ns = self.newest_joints_ns or sample.stamp_ns
+            if self._take_joints(sample):
+                self._shots.clear()
+                words = "the clock jumped back: capture again"
+                self._found = self.broken_off(Code.CONFLICT, words)
+            self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
         self._look()
-
-    def _tell_early(self, shot: Shot) -> None:
-        """A shot that comes after a capture was asked for, and is stamped before, tells why."""
-        waiting = self.data is not None and self.data.topic == shot.topic and self.data.waiting
-        if waiting and shot.stamp_ns < waiting.from_ns:
-            early_s = (waiting.from_ns - shot.stamp_ns) * 1e-9
-            words = f"{shot.topic} is stamped {early_s:.3f} s before the call"
-            self._why = InputError(f"{words}: is the sensor's clock behind?")
-
-    def _add_joints(self, sample: JointSample) -> None:
-        before_ns = self.newest_joints_ns or sample.stamp_ns
-        if self._take_joints(sample):
-            self._shots.clear()
-            self._found = self.broken_off(Code.CONFLICT, "the clock jumped back: capture again")
-        self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
 
     def _watches_joints(self) -> bool:
         return self.data is not None and self.data.waiting is not None and self._found is None
@@ -155,8 +340,6 @@ class HandEyeSession(SessionBase):
         arguments = {"handle": capture.handle, "code": int(code), "reason": reason}
         return Command(events.BREAK_OFF, arguments, self.newest_joints_ns)
 
-    # ---- commands -------------------------------------------------------------------------------
-
     def recognised(self) -> Command | None:
         """The command that follows from the samples: a capture is complete, or has failed."""
         found, self._found = self._found, None
@@ -175,7 +358,7 @@ class HandEyeSession(SessionBase):
 
     def _require_set(self) -> DataSet:
         if self.data is None:
-            raise ConflictError(_NO_SET)
+            raise ConflictError("no data set is open: call start, or load one")
         return self.data
 
     def _start(self, command: Command, wall_ns: int) -> Outcome:
@@ -198,22 +381,17 @@ class HandEyeSession(SessionBase):
         mark = str(command.arguments.get("mark", ""))
         data.require_mark(mark)
         handle = int(command.arguments.get("handle", self._handle + 1))
-        from_ns = int(command.arguments.get("from_ns", self._after_all_ns(data.topic)))
+        # The earliest stamp of a shot that is newer than all that was received. No clock of ours is
+        # asked: those of robot and sensor need not be set to it. Who gives a command for a call
+        # gives the messages first that came before it.
+        after_ns = self.newest_ns.get(data.topic, -1) + 1
+        from_ns = int(command.arguments.get("from_ns", max(self.newest_joints_ns, after_ns)))
         self._handle, self._why, self._seen_ns, self._leap_ns = handle, None, 0, 0
         words = f"waits for {data.topic} with the robot at standstill"
         data.captures[handle] = Capture(handle, mark, from_ns, words)
         bound = {"handle": handle, "from_ns": from_ns}
         command = replace(command, arguments={**command.arguments, **bound})
         return Outcome(command, Code.ACCEPT, f"capture {handle} {words}")
-
-    def _after_all_ns(self, topic: str) -> int:
-        """The earliest stamp of a shot that is newer than all that was received.
-
-        No clock of ours is asked: those of robot and sensor need not be set to it. Who gives a
-        command for a call gives the messages first that came before it.
-        """
-        newest = self.newest_ns.get(topic)
-        return max(self.newest_joints_ns, 0 if newest is None else newest + 1)
 
     def _sample(self, command: Command, wall_ns: int) -> Outcome:
         data, at_ns = self._require_set(), int(command.arguments["shot_ns"])
@@ -259,11 +437,73 @@ class HandEyeSession(SessionBase):
         return Outcome(command, Code.ACCEPT, words, samples=len(data.samples))
 
     def _calibrate(self, command: Command, wall_ns: int) -> Outcome:
-        data = self._require_set()
+        """Solve for the samples that the command names, and propose the result."""
+        data, arguments = self._require_set(), command.arguments
         data.candidate = 0
-        outcome = self._results.calibrate(data, command, wall_ns)
-        data.candidate = outcome.calibration_id
-        return outcome
+        samples = data.chosen([int(handle) for handle in arguments.get("handles", ())])
+        method = str(arguments.get("method") or data.method)
+        q = np.array([sample.q for sample in samples]).reshape(-1, self.nominal.n)
+        T_base_flange = flange_poses(q, [sample.thermal for sample in samples], self.nominal)
+        try:
+            result = solved(data, samples, T_base_flange, method, self.config)
+        except RankDeficientError as error:
+            told = {"unobservable": list(error.directions)}
+            return Outcome(command, error.code, str(error), told, samples=len(samples))
+        except np.linalg.LinAlgError as error:
+            raise ResidualError(f"no pose of the sensor explains the samples: {error}") from error
+        document = hand_eye_document(result)
+        proposal = self._proposal(data, samples, T_base_flange, result, document, command, wall_ns)
+        data.candidate = self._history.propose(proposal)
+        verdict = result.verdict
+        used = len({name.partition("/")[0] for name in result.samples})  # a step names corners
+        return Outcome(
+            command, verdict.code, verdict.reason, document, data.candidate, samples=used
+        )
+
+    def _proposal(
+        self,
+        data: DataSet,
+        samples: Samples,
+        T_base_flange: Array,
+        result: HandEyeResult,
+        document: Document,
+        command: Command,
+        wall_ns: int,
+    ) -> Proposal:
+        config, left_out = self.config, result.leave_one_out_m
+        left_out_mm = None if left_out is None else float(np.sqrt(np.mean(left_out**2))) * 1e3
+        model = {  # what comes into force: in full precision, with the names of its frames
+            "parent": config.base_frame if result.parent == "base" else config.flange_frame,
+            "child": config.sensor_frame,
+            "T_parent_sensor": result.T_flange_sensor.tolist(),
+            "covariance": None if result.covariance is None else result.covariance.tolist(),
+            "thermal_revisions": sorted({sample.thermal.revision for sample in samples}),
+        }
+        inputs = {
+            "handle": np.array([sample.handle for sample in samples]),
+            "mark": np.array([sample.mark for sample in samples]),
+            "stamp_ns": np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
+            "q": np.array([sample.q for sample in samples]),
+            "T_base_flange": T_base_flange,
+            "count": np.array([len(sample.values) for sample in samples]),
+            data.topic: np.concatenate([sample.values for sample in samples]),
+        }
+        return Proposal(
+            kind=self._kind,
+            model_hash=self.nominal.model_hash,
+            based_on=self._history.head(self._kind).revision,
+            cycle_id="",
+            stamp_ns=command.stamp_ns or 0,
+            created_ns=wall_ns,
+            software=self._software,
+            method=f"{result.kind}, {result.method}",
+            code=result.verdict.code,
+            reason=result.verdict.reason,
+            candidate_rms_mm=left_out_mm,
+            document=document,
+            model=model,
+            inputs=inputs,
+        )
 
     def document(self) -> dict[str, Any]:
         """The open data set for a file, with the models that its flange poses come from.
@@ -285,14 +525,11 @@ class HandEyeSession(SessionBase):
         self._handle = max(self._handle, *data.samples, 0)
         count = len(data.samples)
         words = f"{count} samples of a {data.kind} loaded from {arguments.get('path', 'a file')}"
-        taken = data.thermal_revisions()
+        taken = sorted({sample.thermal.revision for sample in data.samples.values()})
         if taken != [self.current.thermal.revision]:
             told = ", ".join(map(str, taken))
             words += f"; their flange poses are those of thermal revision {told}"
         return Outcome(command, Code.ACCEPT, words, samples=count)
-
-
-# ---- messages into the hand-eye session: the same for live topics and for recorded ones ---------
 
 
 def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> None:
@@ -304,12 +541,6 @@ def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> N
             session.add(shot_of(kind, message))
     except RobocalError as error:
         session.refuse(kind, error)
-
-
-# ---- recorded -----------------------------------------------------------------------------------
-
-
-OWN = "sensor"  # only a hand-eye session's configuration has it
 
 
 def configuration(session: HandEyeSession, topics: Mapping[str, str]) -> Command:

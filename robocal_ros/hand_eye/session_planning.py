@@ -10,9 +10,8 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.ground.proposals import CalibrationState
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import DataSet
-from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget, target_of
 from robocal_ros.kinematics import SerialArm
@@ -222,9 +221,8 @@ def judged_plan(
     InputError
         For a target whose plans cannot be judged, and for marks that it does not have.
     """
-    from robocal_ros.hand_eye.mount_problem import PoseNoise
     from robocal_ros.hand_eye.planning import check_plan
-    from robocal_ros.hand_eye.quality import HandEyeSettings
+    from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise
 
     given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
     noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)

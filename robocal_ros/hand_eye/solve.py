@@ -1,31 +1,37 @@
 """Where a line-laser sensor sits: profiles of a target and flange poses in, its pose out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, errors_document, summarise
-from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.estimation.estimation import solve
 from robocal_ros.ground.errors import (
     Code,
     InputError,
     RankDeficientError,
+    ResidualError,
     RobocalError,
     TooFewSamplesError,
 )
+from robocal_ros.ground.frames import Document
 from robocal_ros.hand_eye.mount_fit import (
     MountFit,
     distances,
+    explain,
+    first_look,
     fit_mount,
     leave_one_out,
+    misfit,
+    noise_numbers,
     require_radius,
     require_seen,
     solved_again,
     swapped,
+    undone,
     without,
 )
 from robocal_ros.hand_eye.mount_problem import (
@@ -33,59 +39,37 @@ from robocal_ros.hand_eye.mount_problem import (
     SENSOR_UNKNOWNS,
     MountProblem,
     MountState,
-    PoseNoise,
     TargetView,
     pivot_of,
 )
-from robocal_ros.hand_eye.quality import (
+from robocal_ros.hand_eye.result import (
+    HandEyeResult,
     HandEyeSettings,
+    Method,
+    PoseNoise,
+    TargetKind,
     apart,
     expected_error_m,
     field_points,
-    judge,
     judge_classic,
     judge_residuals,
+    shots_of,
 )
-from robocal_ros.hand_eye.result import HandEyeResult, Method, TargetKind
 from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import (
-    HandEyeData,
-    LineTask,
-    Read,
-    SphereTask,
-    StepTask,
-    Task,
-    features,
-    looked,
-)
+from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task
 
 Array = NDArray[np.float64]
+Part = tuple[Task, HandEyeData]
 
-
-def solve_sphere(
-    data: HandEyeData, target: SphereTarget, method: Method, settings: HandEyeSettings
-) -> HandEyeResult:
-    """From profiles across a sphere that stands still. Raises as `solve_task`."""
-    return solve_task(SphereTask(target), data, method, settings)
-
-
-def solve_step(
-    data: HandEyeData, target: StepTarget, method: Method, settings: HandEyeSettings
-) -> HandEyeResult:
-    """From profiles along the marks of a staircase. Raises as `solve_task`."""
-    return solve_task(StepTask(target), data, method, settings)
-
-
-def solve_line(
-    data: HandEyeData,
-    target: LineTarget | None,
-    method: Method,
-    settings: HandEyeSettings,
-    rule: EdgeRule,
-) -> HandEyeResult:
-    """From profiles across a straight edge, unknown where ``target`` is None. Raises as above."""
-    return solve_task(LineTask(target, rule), data, method, settings)
+HELD = len(SENSOR_UNKNOWNS)
+DOUBTFUL_M = 2e-4  # median distance from which a mistake in the data is looked for
+SHOWN = 0.5  # of the profiles
+WRONG_M = 2e-3  # the same, from which something is wrong, whatever it is
+FEWEST_TOLD = 6  # numbers that tell the noise of poses, where it is found from the data
+LARGEST_POSE_M = 2e-3  # error of a pose in space that a robot may have
+CONTRADICTED = 2.0  # times the given noise
+MOST_MISFITS = 0.2  # of those that show the target
+FEWEST_SPARE = 3  # measured numbers beyond the unknowns, without which nothing is judged
 
 
 def solve_task(
@@ -111,15 +95,10 @@ def solve_task(
     require_seen(fit)
     if method == "classic":
         return _classic(task, read, fit, data, settings)
-    return result_of([task], fit, [read], data, settings)
+    return _result_of([task], fit, [read], data, settings)
 
 
-def _swapped(view: TargetView, fit: MountFit, place: Array, shots: Sequence[str]) -> dict[str, str]:
-    names = np.array([name in fit.rejected for name in view.sightings.names])
-    return swapped(fit, view.take(names), place, shots) if np.sum(names) > 1 else {}
-
-
-def result_of(
+def _result_of(
     tasks: Sequence[Task],
     fit: MountFit,
     reads: Sequence[Read],
@@ -128,21 +107,20 @@ def result_of(
 ) -> HandEyeResult:
     """The result of a fit to one target or several, judged."""
     field, pivot = field_of(data), pivot_of(fit.views)
-    error_m = expected_error_m(fit.covariance[:6, :6], field - pivot)
+    error_m = float(expected_error_m(fit.covariance[:6, :6], field - pivot))
     shots = len(data.names)
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
     rejected |= dict(fit.rejected)
-    for read, place in zip(reads, fit.state.places, strict=True):
-        rejected |= _swapped(read.view, fit, place, data.names)
-    found = [task.found(place) for task, place in zip(tasks, fit.state.places, strict=True)]
-    more = {
+    more: Document = {
         "robot_sigma_mm": fit.noise.sigma_m * 1e3,
         "working_distance_mm": float(field[0, 2]) * 1e3,
     }
+    found: Document = {}
     for task, view, place, read in zip(tasks, fit.views, fit.state.places, reads, strict=True):
-        more |= task.more(
-            replace(fit, views=(view,), state=replace(fit.state, places=(place,))), read
-        )
+        rejected |= swapped(fit, read.view, place, data.names)
+        found[task.kind] = task.found(place)
+        state = replace(fit.state, places=(place,))
+        more |= task.more(replace(fit, views=(view,), state=state), read)
     alone = len(tasks) == 1
     return HandEyeResult(
         kind=tasks[0].kind if alone else "joint",
@@ -150,10 +128,10 @@ def result_of(
         T_flange_sensor=fit.state.T_flange_sensor,
         covariance=fit.covariance[:6, :6],
         samples=fit.names,
-        residual_m=fit.distances(),
-        leave_one_out_m=leave_one_out(fit.views, solved_again(fit)),
+        residual_m=distances(fit.views, fit.state),
+        leave_one_out_m=leave_one_out(fit.views, partial(solved_again, fit)),
         rejected=rejected,
-        target=found[0] if alone else {t.kind: f for t, f in zip(tasks, found, strict=True)},
+        target=found[tasks[0].kind] if alone else found,
         working_error_m=error_m,
         pivot=pivot,
         place=fit.state.places[0] if alone else None,
@@ -182,7 +160,7 @@ def _classic(
     state = task.classic(read.view, best.state)
     residual = distances(views, state)
     field, pivot = field_of(data), pivot_of(best.views)
-    own_m = expected_error_m(best.covariance[:6, :6], field - pivot)
+    own_m = float(expected_error_m(best.covariance[:6, :6], field - pivot))
     apart_m = apart(state.T_flange_sensor, best.state.T_flange_sensor, field)
     error_m = float(np.hypot(apart_m, own_m))
     refused = judge_residuals(residual, shots, shots - _shots(views), settings)
@@ -202,12 +180,174 @@ def _classic(
     )
 
 
-# ---- verification -------------------------------------------------------------------------------
+def judge(
+    fit: MountFit, shots: int, lost: int, error_m: float, settings: HandEyeSettings
+) -> Verdict:
+    """The verdict on a mount; ``lost`` of ``shots`` gave nothing or did not fit."""
+    far_m = distances(fit.views, fit.state)
+    refused = (
+        _too_few(fit, settings)
+        or judge_residuals(far_m, shots, lost, settings)
+        or _inconsistent(fit)
+    )
+    if refused is not None:
+        return refused
+    if fit.creeping:
+        return Verdict(Code.POSES_NOT_INFORMATIVE, fit.creeping)
+    figures = f"a point in the field of view is expected to be off by {error_m * 1e3:.3f} mm rms"
+    if error_m > settings.limit_m:
+        words = (
+            f"{figures} (allowed {settings.limit_m * 1e3:g} mm): tilt the flange more, show the "
+            "target at more distances, or measure more often; check-plan proposes poses"
+        )
+        return Verdict(Code.POSES_NOT_INFORMATIVE, words)
+    rms = float(np.sqrt(np.mean(far_m**2)))
+    words = f"{figures}; samples are off by {rms * 1e3:.3f} mm rms"
+    if fit.scale > CONTRADICTED:
+        words += f", {fit.scale:.1f} times what the given noise explains"
+    return Verdict(Code.ACCEPT, words)
 
 
-Document = dict[str, Any]
+def _too_few(fit: MountFit, settings: HandEyeSettings) -> Verdict | None:
+    """Refuse data that leave too little to judge by; None where they do not."""
+    problem = MountProblem(fit.views, fit.noise, fit.state)
+    spare = int(problem.sizes.sum()) - len(fit.covariance)
+    if spare < FEWEST_SPARE:
+        words = f"only {spare} measured numbers beyond the unknowns: show the target more often"
+        return Verdict(Code.TOO_FEW_SAMPLES, words)
+    if settings.noise() is None and (told := noise_numbers(problem)) < FEWEST_TOLD:
+        words = f"{len(problem.poses)} poses leave {max(told, 0)} numbers to tell the robot's noise"
+        words += f" (at least {FEWEST_TOLD}): show the target more often, or give the robot's noise"
+        return Verdict(Code.TOO_FEW_SAMPLES, words)
+    return None
 
-HELD = len(SENSOR_UNKNOWNS)
+
+def _inconsistent(fit: MountFit) -> Verdict | None:
+    """Refuse poses that contradict each other by more than a robot; None where they do not."""
+    off_m = float(np.sqrt(3.0)) * fit.noise.sigma_m * fit.scale
+    if off_m > LARGEST_POSE_M:
+        words = f"from pose to pose robot and target are off by {off_m * 1e3:.2f} mm: has the "
+        words += "target moved, does the robot repeat, are the poses those of the profiles?"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    wrong = len(fit.rejected)
+    if wrong > MOST_MISFITS * (wrong + len(fit.names)) and len(shots_of(fit.rejected)) > 1:
+        words = f"{wrong} of {wrong + len(fit.names)} features do not fit the others: see the "
+        return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}rejected ones")
+    return None
+
+
+def features(task: Task, data: HandEyeData) -> Read:
+    """Features of the profiles.
+
+    Raises
+    ------
+    ResidualError
+        When poses must tell which feature is which, and do not: with the mistake that explains it.
+    RobocalError
+        When too little is seen.
+    """
+    try:
+        return task.read(data)
+    except InputError:
+        raise
+    except RobocalError as error:
+        if task.read_by_poses:
+            _name_mistake(task, data, None, np.inf, error)
+        raise
+
+
+def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
+    """A state near the solution.
+
+    Raises
+    ------
+    ResidualError
+        When the data do not fit: with the mistake that explains it, where one does.
+    RobocalError
+        When too little is seen, or the poses leave a direction open.
+    """
+    try:
+        near = look(task, read.view)
+    except RobocalError as error:
+        _name_mistake(task, data, read, np.inf, error)
+        raise
+    as_given = misfit((read.view,), near) if _shown(read.view, data) else np.inf
+    if as_given > DOUBTFUL_M:
+        _name_mistake(task, data, read, as_given, None)
+    if as_given > WRONG_M:
+        off = f"samples are off by {misfit((read.view,), near) * 1e3:.3g} mm"
+        raise ResidualError(
+            f"{off} or do not show the target where it must be, and no common mistake explains it: "
+            "has the target moved, are poses and profiles of the same run, is it the right target?"
+        )
+    return near
+
+
+def _shown(view: TargetView, data: HandEyeData) -> bool:
+    """Whether most of the profiles show the target where it must be."""
+    usable = sum(isinstance(profile, Profile) for profile in data.profiles)
+    return len(np.unique(view.sightings.shot)) > SHOWN * usable
+
+
+def look(task: Task, view: TargetView) -> MountState:
+    """The state nearest to the sightings to which a start leads, before the noise is known.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        When none leads anywhere.
+    """
+    states: list[MountState] = []
+    failure: RobocalError | None = None
+    for start in task.starts(view):
+        try:
+            states.append(first_look((view,), start))
+        except RobocalError as error:
+            failure = failure or error
+            if isinstance(error, RankDeficientError):
+                break  # it lies in the poses, not in the start
+    if not states:
+        raise failure or RobocalError("no start was found")
+    return min(states, key=lambda state: misfit((view,), state))
+
+
+def _name_mistake(
+    task: Task, data: HandEyeData, read: Read | None, as_given: float, error: RobocalError | None
+) -> None:
+    """Raise with the mistake that explains a misfit, m, or an error; nothing where none does."""
+
+    def followed(task: Task, view: TargetView) -> float:
+        if not _shown(view, data):
+            return np.inf
+        first = task.starts(view)[0]
+        if (off := misfit((view,), first)) > as_given:  # not worth following
+            return off
+        return misfit((view,), first_look((view,), first))
+
+    def with_poses(T_base_flange: Array) -> float:
+        other = replace(data, T_base_flange=T_base_flange)
+        view = task.read(other).view if read is None else task.posed(read.view, other)
+        return followed(task, view)
+
+    def with_target(other: Task) -> float:
+        if read is None or task.read_by_poses:
+            return followed(other, other.read(data).view)
+        return followed(other, other.posed(read.view, data))
+
+    def suspects() -> Iterator[tuple[str, Callable[[], float]]]:
+        for words, poses in undone(data.T_base_flange):
+            yield words, partial(with_poses, poses)
+        if read is not None and error is not None:
+            return  # open directions lie in the poses, whatever is told of the target
+        for words, other in task.suspects():
+            yield words, partial(with_target, other)
+
+    words = explain(suspects(), as_given)
+    if words is None:
+        return
+    if not np.isfinite(as_given):
+        raise ResidualError(f"the samples do not fit: {words}") from error
+    raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,29 +360,21 @@ class HeldOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Verification:
+class Verification(HeldOut):
     """What other data say of a mount.
 
-    Attributes
-    ----------
-    samples, distance_m : (n,) distance of each from the target, m.
-    target : what was found of the target with the mount held.
-    rejected : shots and features that were not used, and why.
+    ``target``: what was found of the target with the mount held; ``rejected``: shots and features
+    that were not used, and why.
     """
 
-    samples: tuple[str, ...]
-    distance_m: Array
     target: Document
-    rejected: Mapping[str, str]
     verdict: Verdict
 
 
 def held_out(task: Task, data: HandEyeData, T_flange_sensor: Array, place: Array) -> HeldOut:
     """How far other shots of the same target, which has not moved, are off.
 
-    Parameters
-    ----------
-    place : of the target, as `HandEyeResult` holds it.
+    ``place``: of the target, as `HandEyeResult` holds it.
 
     Raises
     ------
@@ -293,46 +425,34 @@ def verify(
     read = task.read(data)
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
     rejected = dict(read.rejected)
-    view, state = fit_place(read.view, start, settings.noise() or FIRST_NOISE, rejected)
+    view, state = _fit_place(read.view, start, settings.noise() or FIRST_NOISE, rejected)
     far = distances((view,), state)
+    rms = float(np.sqrt(np.mean(far**2)))
+    words, code = f"{len(far)} samples are off by {rms * 1e3:.3f} mm rms", Code.ACCEPT
+    if len(rejected) > len(far):
+        code = Code.RESIDUAL_TOO_LARGE
+        words = f"{words}, but {len(rejected)} do not fit at all"
+    elif rms > settings.limit_m:
+        code = Code.RESIDUAL_TOO_LARGE
+        words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): the mount is not this one"
     return Verification(
-        view.sightings.names,
-        far,
-        task.found(state.places[0]),
-        rejected,
-        _verdict(far, len(rejected), settings),
+        samples=view.sightings.names,
+        distance_m=far,
+        rejected=rejected,
+        target=task.found(state.places[0]),
+        verdict=Verdict(code, words),
     )
 
 
-def _verdict(far: Array, lost: int, settings: HandEyeSettings) -> Verdict:
-    rms = float(np.sqrt(np.mean(far**2)))
-    words = f"{len(far)} samples are off by {rms * 1e3:.3f} mm rms"
-    if lost > len(far):
-        return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}, but {lost} do not fit at all")
-    if rms > settings.limit_m:
-        words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): the mount is not this one"
-        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
-    return Verdict(Code.ACCEPT, words)
-
-
-def fit_place(
+def _fit_place(
     view: TargetView, start: MountState, noise: PoseNoise, rejected: dict[str, str]
 ) -> tuple[TargetView, MountState]:
-    """The target's most likely place with the sensor held; outliers are named in ``rejected``.
-
-    Raises
-    ------
-    RankDeficientError
-        When the sightings do not tell it.
-    """
+    """The target's most likely place with the sensor held; outliers are named in ``rejected``."""
     if not view.model.names:
         return view, start
     problem = MountProblem((view,), noise, start)
     estimate = solve(
-        _PlaceProblem(problem),
-        start,
-        prior_information=view.model.prior,
-        sizes=problem.sizes,
+        _PlaceProblem(problem), start, prior_information=view.model.prior, sizes=problem.sizes
     )
     kept = without((view,), estimate.rejected[problem.sample], rejected)
     return kept[0], estimate.settled()
@@ -358,21 +478,16 @@ class _PlaceProblem:
         return self._problem.deviation(state)[HELD:]
 
 
-# ---- one mount from several targets at once: what one leaves open, another shows ----------------
-
-
-Part = tuple[Task, HandEyeData]
-
-
 def solve_joint(
     parts: Sequence[Part],
     settings: HandEyeSettings,
     checks: Mapping[TargetKind, HandEyeData] | None = None,
 ) -> HandEyeResult:
-    """Calibrate with all shots of several targets; names of samples begin with their target's kind.
+    """Calibrate with all shots of several targets: what one leaves open, another shows.
 
-    At least one target must suffice for a first pose of the sensor. ``checks``: by kind, other
-    shots of targets, which have not moved; they judge the result.
+    At least one target must suffice for a first pose of the sensor. Names of samples begin with
+    their target's kind. ``checks``: by kind, other shots of targets, which have not moved; they
+    judge the result.
 
     Raises
     ------
@@ -383,75 +498,47 @@ def solve_joint(
     TooFewSamplesError, RankDeficientError
         When no target gives a first pose, the first one's reason; as `solve_task` otherwise.
     """
-    kinds = [task.kind for task, _ in parts]
+    tasks = [task for task, _ in parts]
+    kinds = [task.kind for task in tasks]
     if len(kinds) < 2 or len(set(kinds)) < len(kinds):
         raise InputError(f"several targets of different kinds are needed, not: {', '.join(kinds)}")
-    alone = [_alone(*part) for part in parts]
-    X = _first(alone, settings)
-    reads = _named(parts, [read for read, _ in alone])
+    own, X = _alone(parts, settings)
+    data, reads = _together(parts, own)
     views = tuple(read.view for read in reads)
-    places = [
-        task.placed(view, X.T_flange_sensor) for (task, _), view in zip(parts, views, strict=True)
-    ]
-    fit = fit_mount(views, MountState(X.T_flange_sensor, tuple(places)), settings.noise())
+    places = tuple(task.placed(view, X) for task, view in zip(tasks, views, strict=True))
+    fit = fit_mount(views, MountState(X, places), settings.noise())
     require_radius(fit)
     require_seen(fit)
-    tasks = [task for task, _ in parts]
-    result = result_of(tasks, fit, reads, _data(parts), settings)
+    result = _result_of(tasks, fit, reads, data, settings)
     if not checks:
         return result
     shots = sum(len(data.names) for data in checks.values())
     return judged(result, _held_out(tasks, fit.state, checks), shots, settings)
 
 
-def _held_out(
-    tasks: Sequence[Task], state: MountState, checks: Mapping[TargetKind, HandEyeData]
-) -> HeldOut:
-    """How far all other shots are off."""
-    found = {
-        task.kind: held_out(task, checks[task.kind], state.T_flange_sensor, place)
-        for task, place in zip(tasks, state.places, strict=True)
-        if task.kind in checks
-    }
-    return HeldOut(
-        tuple(f"{kind}/{name}" for kind, one in found.items() for name in one.samples),
-        np.concatenate([one.distance_m for one in found.values()]),
-        {
-            f"{kind}/{name}": why
-            for kind, one in found.items()
-            for name, why in one.rejected.items()
-        },
-    )
-
-
-def _alone(task: Task, data: HandEyeData) -> tuple[Read, MountState | RobocalError]:
-    """Features of one target, and where they lead alone, or why nowhere: others may show more."""
-    read = features(task, data)
-    try:
-        return read, looked(task, data, read)
-    except (TooFewSamplesError, RankDeficientError) as error:
-        return read, error
-
-
-def _first(
-    alone: Sequence[tuple[Read, MountState | RobocalError]], settings: HandEyeSettings
-) -> MountState:
-    """The pose of the sensor from the target that shows it best alone."""
-    failures = [near for _, near in alone if isinstance(near, RobocalError)]
-    fits = []
-    for read, near in alone:
-        if isinstance(near, MountState):
-            try:
-                fits.append(fit_mount((read.view,), near, settings.noise()))
-            except (TooFewSamplesError, RankDeficientError) as error:
-                failures.append(error)
+def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read], Array]:
+    """Features of each target, and the pose of the sensor from the one that shows it best alone."""
+    reads, starts, fits = [], [], []
+    unseen: list[RobocalError] = []
+    for task, data in parts:
+        reads.append(features(task, data))
+        try:
+            starts.append((reads[-1].view, looked(task, data, reads[-1])))
+        except (TooFewSamplesError, RankDeficientError) as error:
+            unseen.append(error)  # others may show more
+    for view, near in starts:
+        try:
+            fits.append(fit_mount((view,), near, settings.noise()))
+        except (TooFewSamplesError, RankDeficientError) as error:
+            unseen.append(error)
     if not fits:
-        raise failures[0]
-    return min(fits, key=lambda fit: float(np.trace(fit.covariance[:3, :3]))).state
+        raise unseen[0]
+    best = min(fits, key=lambda fit: float(np.trace(fit.covariance[:3, :3])))
+    return reads, best.state.T_flange_sensor
 
 
-def _named(parts: Sequence[Part], reads: Sequence[Read]) -> list[Read]:
-    """Samples called after their target; shots of all are numbered through."""
+def _together(parts: Sequence[Part], reads: Sequence[Read]) -> tuple[HandEyeData, list[Read]]:
+    """All shots as one data set, numbered through, and samples called after their target."""
     named, first = [], 0
     for (task, data), read in zip(parts, reads, strict=True):
         s = read.view.sightings
@@ -461,21 +548,29 @@ def _named(parts: Sequence[Part], reads: Sequence[Read]) -> list[Read]:
             shot=s.shot + first,
             pose=s.pose + first,
         )
-        named.append(
-            Read(
-                replace(read.view, sightings=s),
-                {f"{task.kind}/{name}": why for name, why in read.rejected.items()},
-                {f"{task.kind}/{name}": points for name, points in read.points.items()},
-            )
-        )
+        rejected = {f"{task.kind}/{name}": why for name, why in read.rejected.items()}
+        points = {f"{task.kind}/{name}": points for name, points in read.points.items()}
+        named.append(Read(replace(read.view, sightings=s), rejected, points))
         first += len(data.names)
-    return named
-
-
-def _data(parts: Sequence[Part]) -> HandEyeData:
-    """All shots together."""
-    return HandEyeData(
+    together = HandEyeData(
         tuple(f"{task.kind}/{name}" for task, data in parts for name in data.names),
         np.concatenate([data.T_base_flange for _, data in parts]),
         [profile for _, data in parts for profile in data.profiles],
     )
+    return together, named
+
+
+def _held_out(
+    tasks: Sequence[Task], state: MountState, checks: Mapping[TargetKind, HandEyeData]
+) -> HeldOut:
+    """How far all other shots are off."""
+    names: list[str] = []
+    far: list[Array] = []
+    rejected: dict[str, str] = {}
+    for task, place in zip(tasks, state.places, strict=True):
+        if task.kind in checks:
+            one = held_out(task, checks[task.kind], state.T_flange_sensor, place)
+            names += [f"{task.kind}/{name}" for name in one.samples]
+            far.append(one.distance_m)
+            rejected |= {f"{task.kind}/{name}": why for name, why in one.rejected.items()}
+    return HeldOut(tuple(names), np.concatenate(far), rejected)

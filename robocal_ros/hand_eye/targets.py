@@ -1,22 +1,41 @@
-"""Targets that a sensor is shown, as they are known before the calibration."""
+"""Targets that a sensor is shown, as they are known before the calibration, and their files.
+
+Files are YAML, in millimetres and degrees; the contract is written in docs/hand_eye.md,
+hand_eye_tracker.md and, of a board, hand_eye_node.md.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.hand_eye.board import Chessboard, Intrinsics
+from robocal_ros.ground.files import write_text
+from robocal_ros.ground.frames import Document, transform_document
+from robocal_ros.hand_eye.board import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics
+from robocal_ros.hand_eye.tracker_data import TrackerTarget
+from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
 Array = NDArray[np.float64]
-
 CornerKind = Literal["convex", "concave", "both"]
 FirstStep = Literal["lowest", "highest"]
 
 MACHINING_M = 1e-4 / 3.0  # one sigma of a target that is machined to 0.1 mm
 NEAR, FAR = "near", "far"
+KINDS = ("sphere", "step", "line", "board")
+CORNERS: dict[str, CornerKind] = {"convex": "convex", "concave": "concave", "both": "both"}
+FIRST: dict[str, FirstStep] = {"lowest": "lowest", "highest": "highest"}
+SMALLEST_MM, LARGEST_MM = 1.0, 1000.0  # of a sphere's radius
+FARTHEST_MM = 20e3  # of a target from the base
+FARTHEST_REFLECTOR_MM = 1e3  # of the reflector from the flange's origin
+ROUNDING = 1e-3  # of the axes of a frame, from unit vectors at right angles
+MOST_STEPS = 100
+MOST_CORNERS = 100  # along a side of a board
 
 
 @dataclass(frozen=True)
@@ -133,11 +152,8 @@ class Staircase:
         return {mark: np.insert(section, 0, x, axis=1) for mark, x in places.items()}
 
 
-# ---- target documents ---------------------------------------------------------------------------
-
-
-Document = dict[str, Any]
-Target = SphereTarget | StepTarget | LineTarget | BoardTarget
+LaserTarget = SphereTarget | StepTarget | LineTarget
+Target = LaserTarget | BoardTarget
 
 KIND_OF: dict[type[Target], str] = {
     SphereTarget: "sphere",
@@ -216,3 +232,219 @@ def _array(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _array(part) for name, part in value.items()}
     return np.array(value, dtype=np.float64) if isinstance(value, list) else value
+
+
+def read_target(path: Path) -> Target:
+    """Read a target file.
+
+    Raises
+    ------
+    InputError
+        Naming file and key, when it is not as its contract says.
+    """
+    top = read_fields(path, "target file")
+    kind = top.choice("kind", KINDS)
+    if kind == "sphere":
+        top.only("kind", "radius_mm")
+        return SphereTarget(_radius(top, "radius_mm"))
+    if kind == "board":
+        return _board(top, path.parent)
+    if kind == "step":
+        return _step(top)
+    top.only("kind", "point_mm", "direction")
+    point_mm = np.array(top.numbers("point_mm", 3))
+    _check_near(top, "point_mm", point_mm)
+    return LineTarget(point_mm * 1e-3, _direction(top, "direction"))
+
+
+def _radius(top: Fields, key: str) -> float:
+    radius_mm = top.number(key)
+    if not SMALLEST_MM <= radius_mm <= LARGEST_MM:
+        top.fail(
+            f"is {radius_mm:g}; it must be {SMALLEST_MM:g} to {LARGEST_MM:g}: is it off by a "
+            "thousand?",
+            key,
+        )
+    return radius_mm * 1e-3
+
+
+def _board(top: Fields, folder: Path) -> BoardTarget:
+    top.only("kind", "columns", "rows", "square_mm", "intrinsics")
+    columns, rows = (top.whole(key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows"))
+    square_m = top.positive("square_mm") * 1e-3
+    if "intrinsics" not in top.values:
+        return BoardTarget(columns, rows, square_m)
+    camera = read_intrinsics(folder / top.text("intrinsics"))
+    size = np.array(camera.size, dtype=np.float64)
+    return BoardTarget(columns, rows, square_m, camera.matrix, camera.distortion, size)
+
+
+def _step(top: Fields) -> StepTarget:
+    top.only(
+        "kind", "T_base_user", "staircase", "corners_mm", "edge_user",
+        "sigma_mm", "user_sigma_mm", "user_sigma_deg",
+    )  # fmt: skip
+    if ("staircase" in top.values) == ("corners_mm" in top.values):
+        top.fail("must give either staircase, or corners_mm with edge_user")
+    if "staircase" in top.values:
+        if "edge_user" in top.values:
+            top.fail("is x for a staircase: leave it out", "edge_user")
+        staircase = _staircase(top.below("staircase"))
+        corners, edge = staircase.marked_corners(), staircase.edge_user
+    else:
+        corners, edge = _corners(top.below("corners_mm")), _direction(top, "edge_user")
+    T_base_user = _user_frame(top.below("T_base_user"))
+    sigma_m = top.positive("sigma_mm", MACHINING_M * 1e3) * 1e-3
+    taught = {}
+    for key in ("user_sigma_mm", "user_sigma_deg"):
+        taught[key] = top.number(key)
+        if taught[key] < 0.0:
+            top.fail(f"is {taught[key]:g}; it must not be below 0", key)
+    user_sigma_rad = float(np.radians(taught["user_sigma_deg"]))
+    return StepTarget(
+        T_base_user, corners, edge, sigma_m, taught["user_sigma_mm"] * 1e-3, user_sigma_rad
+    )
+
+
+def _staircase(fields: Fields) -> Staircase:
+    lengths = ("length_mm", "height_mm", "depth_mm")
+    fields.only("steps", *lengths, "corners", "first")
+    steps = fields.whole("steps", 1, MOST_STEPS)
+    length, height, depth = (fields.positive(key) * 1e-3 for key in lengths)
+    corners = CORNERS[fields.choice("corners", tuple(CORNERS), "convex")]
+    if corners == "concave" and steps < 2:
+        fields.fail("is 1; only between two steps there is a concave corner", "steps")
+    first = FIRST[fields.choice("first", tuple(FIRST), "lowest")]
+    return Staircase(steps, length, height, depth, corners, first)
+
+
+def _corners(fields: Fields) -> dict[str, Array]:
+    if not fields.values:
+        fields.fail("must name at least one mark")
+    corners = {}
+    for mark, rows in fields.values.items():
+        if not isinstance(mark, str) or not mark.strip():
+            fields.fail("is no name of a mark: give a word", str(mark))
+        if not isinstance(rows, list) or not rows:
+            fields.fail("must be a list of corners [x, y, z]", mark)
+        corners[mark] = 1e-3 * _points(rows, "corner", fields, mark)
+    return corners
+
+
+def _user_frame(fields: Fields) -> Array:
+    """Transform (4, 4), m, of ``{xyz_mm, quat_xyzw or rpy_deg or rotation}``."""
+    if "rotation" in fields.values:
+        fields.only("xyz_mm", "rotation")
+        rows = fields.values["rotation"]
+        if not isinstance(rows, list) or len(rows) != 3:
+            fields.fail("must be a list of 3 rows of a matrix", "rotation")
+        R = _points(rows, "row", fields, "rotation")
+        error = float(np.abs(R.T @ R - np.eye(3)).max())
+        if error > ROUNDING:
+            fields.fail(
+                f"has columns that are not unit vectors at right angles (off by {error:.3g})",
+                "rotation",
+            )
+        if np.linalg.det(R) < 0.0:
+            fields.fail("is left-handed: its third column must be first x second", "rotation")
+        xyz_mm = np.array(fields.numbers("xyz_mm", 3))
+        T = frames.transform(frames.nearest_rotation(R), xyz_mm * 1e-3)
+    else:
+        if not {"quat_xyzw", "rpy_deg"} & set(fields.values):
+            fields.fail("needs an orientation: quat_xyzw, rpy_deg or rotation")
+        T = read_pose(fields)
+    _check_near(fields, "xyz_mm", T[:3, 3] * 1e3)
+    return T
+
+
+def _points(rows: list[Any], name: str, fields: Fields, key: str) -> Array:
+    """A list of points (n, 3); ``name`` is what one of them is called."""
+    values = {f"{name} {i}": row for i, row in enumerate(rows, start=1)}
+    numbered = Fields(values, fields.file, f"{fields.place}, {key}")
+    return np.array([numbered.numbers(key, 3) for key in values])
+
+
+def _direction(fields: Fields, key: str) -> Array:
+    vector = np.array(fields.numbers(key, 3))
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        fields.fail("has no length", key)
+    return vector / length
+
+
+def _check_near(fields: Fields, key: str, point_mm: Array) -> None:
+    distance = float(np.linalg.norm(point_mm))
+    if distance > FARTHEST_MM:
+        fields.fail(
+            f"is {distance:.4g} mm from the base: is it a thousand times too far, in µm?", key
+        )
+
+
+def write_target(path: Path, target: LaserTarget) -> None:
+    """Write a target file, corners in full; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    document: Document = {"kind": KIND_OF[type(target)]}
+    if isinstance(target, SphereTarget):
+        document["radius_mm"] = target.radius_m * 1e3
+    elif isinstance(target, LineTarget):
+        document["point_mm"] = (target.point_base * 1e3).tolist()
+        document["direction"] = target.direction_base.tolist()
+    else:
+        marks = target.corners.items()
+        document |= {
+            "T_base_user": transform_document(target.T_base_user),
+            "corners_mm": {mark: (rows * 1e3).tolist() for mark, rows in marks},
+            "edge_user": target.edge_user.tolist(),
+            "sigma_mm": target.sigma_m * 1e3,
+            "user_sigma_mm": target.user_sigma_m * 1e3,
+            "user_sigma_deg": float(np.degrees(target.user_sigma_rad)),
+        }
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**16)
+    write_text(path, text)
+
+
+def read_tracker_target(path: Path) -> TrackerTarget:
+    """Read the target file of a calibration by laser tracker.
+
+    Raises
+    ------
+    InputError
+        Naming file and key, when it is not as docs/hand_eye_tracker.md says.
+    """
+    top = read_fields(path, "target file")
+    top.only("kind", "sphere_radius_mm", "reflector_radius_mm", "height_mm", "height_sigma_mm")
+    top.choice("kind", ("tracker",))
+    target = TrackerTarget(_radius(top, "sphere_radius_mm"), _radius(top, "reflector_radius_mm"))
+    if "height_mm" not in top.values:
+        if "height_sigma_mm" in top.values:
+            top.fail("is given without height_mm", "height_sigma_mm")
+        return target
+    height_mm = top.number("height_mm")
+    if abs(height_mm) > FARTHEST_REFLECTOR_MM:
+        top.fail(f"is {height_mm:g}; the reflector is on the flange: is it in µm?", "height_mm")
+    sigma_mm = top.positive("height_sigma_mm", target.height_sigma_m * 1e3)
+    return replace(target, height_m=height_mm * 1e-3, height_sigma_m=sigma_mm * 1e-3)
+
+
+def write_tracker_target(path: Path, target: TrackerTarget) -> None:
+    """Write a target file.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    document: Document = {
+        "kind": "tracker",
+        "sphere_radius_mm": target.sphere_radius_m * 1e3,
+        "reflector_radius_mm": target.reflector_radius_m * 1e3,
+    }
+    if target.height_m is not None:
+        document["height_mm"] = target.height_m * 1e3
+        document["height_sigma_mm"] = target.height_sigma_m * 1e3
+    write_text(path, yaml.safe_dump(document, sort_keys=False))

@@ -1,56 +1,55 @@
-"""One task per target: read its features from profiles, start, solve in the classic way."""
+"""A task per target: read its features from profiles, start, solve in the classic way."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
-from typing import Any, Literal, Protocol
+from itertools import product
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.arc import ArcRule, fit_arc
 from robocal_ros.estimation.edge import EdgeRule, fit_edge
-from robocal_ros.estimation.polyline import CornerFit, CornerRule, fit_corners
+from robocal_ros.estimation.estimation import solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     InputError,
-    RankDeficientError,
-    ResidualError,
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import transform_document
-from robocal_ros.hand_eye.mount_fit import MountFit, explain, first_look, misfit, undone
-from robocal_ros.hand_eye.mount_problem import MountState, TargetView
-from robocal_ros.hand_eye.result import TargetKind
-from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.starts import (
-    FEWEST_PROFILES,
-    Match,
-    agreed_centre,
-    along,
-    classic_sphere,
-    closed_corners,
-    least_distances,
-    line_starts,
-    nearest,
-    robust_corners,
-    sphere_starts,
-)
-from robocal_ros.hand_eye.target_models import (
-    CornerModel,
+from robocal_ros.ground.frames import Document
+from robocal_ros.hand_eye.mount_fit import MountFit
+from robocal_ros.hand_eye.mount_problem import (
     LineModel,
+    MountProblem,
+    MountState,
     Sightings,
     SphereModel,
-    TargetModel,
+    TargetView,
+    circle_centres,
+    in_plane,
     same_pose,
 )
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.hand_eye.result import PoseNoise, TargetKind
+from robocal_ros.hand_eye.shots import Profile
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget
 
 Array = NDArray[np.float64]
-Document = dict[str, Any]
+Fit = TypeVar("Fit")
 
+FEWEST_SPHERES = 5  # profiles
+SUBSET = 6  # profiles whose sides are tried in all patterns
+DRAWS = 24  # one of them holds no wrong pair, very likely, even with four among 15
+MIRROR = np.array([1.0, -1.0, 1.0])
+KEPT_SPHERES = 3  # starts of each draw, and in the end
 RADII = (0.8, 0.83, 0.86, 0.89, *np.arange(0.91, 1.1, 0.01), 1.12, 1.15, 1.2, 1.25)  # as told: 1
+
+TURNS = 400  # rotations of the sensor that are tried
+DIRECTIONS = 60  # directions of an unknown line that are tried
+KEPT_LINES = 8
+ALIKE_M = 1e-6  # small, so that the descent goes to the very minimum
+SEED = 5  # of the fixed set of trials
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,21 +84,21 @@ class Read:
     points: Mapping[str, Array] = field(default_factory=dict)
 
 
-class Task(Protocol):
-    """A kind of target."""
+class Task(ABC):
+    """A kind of target.
+
+    ``read_by_poses``: whether poses tell which feature of a profile is which.
+    """
+
+    kind: ClassVar[TargetKind]
+    read_by_poses = False
 
     @property
-    def kind(self) -> TargetKind:
-        """Its name."""
-
-    @property
+    @abstractmethod
     def fewest(self) -> int:
         """Profiles without which nothing is solved."""
 
-    @property
-    def read_by_poses(self) -> bool:
-        """Whether poses tell which feature of a profile is which."""
-
+    @abstractmethod
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Features of profiles. Raises `RobocalError` when fewer give any than solving needs.
 
@@ -108,27 +107,37 @@ class Task(Protocol):
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """The same features from other poses, those of ``data``."""
+        s, T = view.sightings, data.T_base_flange
+        return replace(
+            view, sightings=replace(s, pose=same_pose(T)[s.shot], T_base_flange=T[s.shot])
+        )
 
+    @abstractmethod
     def starts(self, view: TargetView) -> list[MountState]:
         """First states, best first."""
 
+    @abstractmethod
     def classic(self, view: TargetView, near: MountState) -> MountState:
         """The classic estimate; ``near`` is a state near the solution."""
 
+    @abstractmethod
     def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """Where the target is, roughly, if the sensor sits there."""
 
+    @abstractmethod
     def found(self, place: Array) -> Document:
         """What was found of the target."""
 
     def more(self, fit: MountFit, read: Read) -> Document:
         """Further figures of a fit."""
+        return {}
 
     def suspects(self) -> Iterable[tuple[str, "Task"]]:
         """Mistakes in what is told of the target: in words, and the task without it."""
+        return ()
 
 
-def usable(rows: Collection[str], rejected: Mapping[str, str], fewest: int, what: str) -> None:
+def usable(rows: Collection[object], rejected: Mapping[str, str], fewest: int, what: str) -> None:
     """Refuse when fewer than ``fewest`` shots gave a feature.
 
     Raises
@@ -146,52 +155,132 @@ def usable(rows: Collection[str], rejected: Mapping[str, str], fewest: int, what
     )
 
 
+def fitted(
+    data: HandEyeData, fit: Callable[[Profile], Fit]
+) -> tuple[dict[int, Fit], dict[str, RobocalError]]:
+    """What is fitted to each profile, by its number; by its name why nothing is."""
+    found, errors = {}, {}
+    for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
+        if isinstance(profile, RobocalError):
+            errors[name] = profile
+            continue
+        try:
+            found[i] = fit(profile)
+        except RobocalError as error:
+            errors[name] = error
+    return found, errors
+
+
+def sightings_of(
+    data: HandEyeData, shots: Iterable[int], names: Iterable[str], value: Array, covariance: Array
+) -> Sightings:
+    """Features (m, 3) with their covariance (m, 3, 3), of these shots (m)."""
+    shot, T = np.array(list(shots), dtype=np.int64), data.T_base_flange
+    return Sightings(tuple(names), shot, same_pose(T)[shot], T[shot], value, covariance)
+
+
 @dataclass(frozen=True)
-class SphereTask:
-    """A sphere that stands still, somewhere."""
+class SphereTask(Task):
+    """A sphere that stands still, somewhere.
+
+    A circle tells the sphere's centre but for the side: y = +-sqrt(R^2 - r^2). The sides are found
+    with the pose: of all patterns of a few profiles, the right one agrees best (with rotation
+    columns that are a rotation; the mirrored pattern has the determinant -1).
+    """
 
     target: SphereTarget
-    kind: Literal["sphere"] = field(default="sphere", init=False)
-    fewest: int = field(default=FEWEST_PROFILES, init=False)
-    read_by_poses: bool = field(default=False, init=False)
+
+    kind = "sphere"
+    fewest = FEWEST_SPHERES
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Circles."""
         rule = ArcRule(self.target.radius_m)
-        found: dict[str, tuple[int, Array, Array]] = {}
-        rejected, points = {}, {}
-        unit: InputError | None = None
-        for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
-            try:
-                arc = fit_arc(seen(profile), rule)
-            except RobocalError as error:
-                unit = error if isinstance(error, InputError) else unit
-                rejected[name] = str(error)
-                continue
-            points[name] = seen(profile)[arc.used]
-            found[name] = i, np.array([*arc.centre, arc.radius_m]), arc.covariance
-        fewest = self.fewest if T_flange_sensor is None else 1
-        if unit is not None and not found:
-            raise unit  # no profile's fault: the radius is in another unit
-        usable(found, rejected, fewest, "the sphere")
-        view = TargetView(SphereModel(self.target.radius_m), _gathered(data, found))
-        return Read(view, rejected, points)
+        arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
+        rejected = {name: str(error) for name, error in errors.items()}
+        wrong = [error for error in errors.values() if isinstance(error, InputError)]
+        if wrong and not arcs:
+            raise wrong[-1]  # no profile's fault: the radius is in another unit
+        usable(arcs, rejected, self.fewest if T_flange_sensor is None else 1, "the sphere")
+        points, names = {}, [data.names[i] for i in arcs]
+        for (i, arc), name in zip(arcs.items(), names, strict=True):
+            profile = data.profiles[i]
+            if isinstance(profile, Profile):
+                points[name] = profile.points[arc.used]
+        value = np.array([[*arc.centre, arc.radius_m] for arc in arcs.values()])
+        covariance = np.array([arc.covariance for arc in arcs.values()])
+        sightings = sightings_of(data, arcs, names, value, covariance)
+        return Read(TargetView(SphereModel(self.target.radius_m), sightings), rejected, points)
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Circles depend neither on poses nor on the radius."""
-        return with_poses(view, SphereModel(self.target.radius_m), data.T_base_flange)
+        return replace(super().posed(view, data), model=SphereModel(self.target.radius_m))
 
     def starts(self, view: TargetView) -> list[MountState]:
-        """All sides of the laser plane are tried."""
-        return sphere_starts(view.sightings, self.target.radius_m)
+        """The most promising, each from a few profiles, judged on all of them."""
+        s, rng = view.sightings, np.random.default_rng(0)
+        m, T = len(s.names), s.T_base_flange
+        parts = []
+        for draw in range(DRAWS if m > SUBSET else 1):
+            if m <= SUBSET:
+                rows = np.arange(m)
+            elif draw == 0:  # spread over the whole set
+                rows = np.linspace(0, m - 1, SUBSET).round().astype(np.int64)
+            else:
+                rows = np.sort(rng.permutation(m)[:SUBSET])
+            parts.append(self._by_patterns(s.take(rows)))
+        X, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+        centres = self._on_sides(s, _sides(T, X, place))
+        score = np.median(_misses(T, X, place, centres), axis=1)
+        return [MountState(X[i], (place[i],)) for i in np.argsort(score)[:KEPT_SPHERES]]
+
+    def _by_patterns(self, s: Sightings) -> tuple[Array, Array]:
+        """The best poses (p, 4, 4) and spheres (p, 3) from these profiles, over all patterns."""
+        m, T = len(s.names), s.T_base_flange
+        R, origin = T[:, :3, :3], T[:, :3, 3]
+        patterns = np.array([(1.0, *rest) for rest in product((1.0, -1.0), repeat=m - 1)])
+        M, _ = _linear_mounts(T, self._on_sides(s, patterns))
+        turn = frames.nearest_rotation(np.concatenate([M, M * MIRROR]))  # of the opposite too
+        centres = self._on_sides(s, np.concatenate([patterns, -patterns]))
+        # With a rotation held the rest is linear: R_i t - c = -(R_i M s_i + t_i)
+        lhs = np.concatenate([R, np.broadcast_to(-np.eye(3), (m, 3, 3))], axis=2).reshape(3 * m, 6)
+        rhs = np.einsum("mij,pjk,pmk->pmi", R, turn, centres) + origin
+        inverse = np.linalg.pinv(lhs, rcond=1e-9)
+        solution = -(inverse @ rhs.reshape(len(centres), 3 * m).T).T
+        X, place = frames.transform(turn, solution[:, :3]), solution[:, 3:]
+        miss = _misses(T, X, place, centres)
+        best = np.argsort(np.sum(miss**2, axis=1))[:KEPT_SPHERES]
+        return X[best], place[best]
+
+    def _on_sides(self, s: Sightings, sides: Array) -> Array:
+        """Sphere centres (p, m, 3), sensor frame, for many patterns of sides (p, m)."""
+        value = np.broadcast_to(s.value, (*sides.shape, 3)).reshape(-1, 3)
+        centres = circle_centres(value, self.target.radius_m, sides.ravel())
+        return centres.reshape(*sides.shape, 3)
 
     def classic(self, view: TargetView, near: MountState) -> MountState:
-        """Linear differences."""
-        return classic_sphere(view.sightings, self.target.radius_m, near)
+        """The closed form from all profiles, their sides as in a state near the solution."""
+        s = view.sightings
+        side = _sides(s.T_base_flange, near.T_flange_sensor[None], near.places[0][None])[0]
+        centres = circle_centres(s.value, self.target.radius_m, side)
+        M, t = _linear_mounts(s.T_base_flange, centres[None])
+        found = frames.transform(frames.nearest_rotation(M[0]), t[0])
+        T = s.T_base_flange @ found
+        return MountState(found, (frames.apply(T, centres).mean(axis=0),))
 
     def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """The centre on which the profiles agree best, each on either side."""
-        return agreed_centre(view.sightings, self.target.radius_m, T_flange_sensor)
+        s = view.sightings
+        T = s.T_base_flange @ T_flange_sensor
+        both = []
+        for side in (1.0, -1.0):
+            own = circle_centres(s.value, self.target.radius_m, np.full(len(T), side))
+            both.append(frames.apply(T, own))
+        points = np.concatenate(both)
+        gap = np.linalg.norm(points[:, None, None] - np.stack(both)[None], axis=3).min(axis=1)
+        near = points[int(np.argmin(np.median(gap, axis=1)))]
+        nearer = np.argmin(np.linalg.norm(np.stack(both) - near, axis=2), axis=0)
+        return np.asarray(np.median(np.stack(both)[nearer, np.arange(len(T))], axis=0))
 
     def found(self, place: Array) -> Document:
         """Its centre in base."""
@@ -216,14 +305,43 @@ class SphereTask:
         return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
 
 
+def _linear_mounts(T_base_flange: Array, centres: Array) -> tuple[Array, Array]:
+    """Classic closed form for many patterns (p) of sides: M (p, 3, 3), t (p, 3).
+
+    R_i (M s_i + t) + t_i = c is linear in M and t; differences from the mean leave out c. M is
+    near the rotation of the sensor. ``centres`` (p, m, 3): the sphere in each sensor frame.
+    """
+    R, place = T_base_flange[:, :3, :3], T_base_flange[:, :3, 3]
+    p, m = centres.shape[:2]
+    A = np.concatenate([np.einsum("mij,pmk->pmijk", R, centres).reshape(p, m, 3, 9),
+                        np.broadcast_to(R, (p, m, 3, 3))], axis=3)  # fmt: skip
+    A = (A - A.mean(axis=1, keepdims=True)).reshape(p, 3 * m, 12)
+    b = -(place - place.mean(axis=0)).reshape(-1)
+    solution = np.linalg.pinv(A, rcond=1e-9) @ b
+    return solution[:, :9].reshape(p, 3, 3), solution[:, 9:]
+
+
+def _misses(T_base_flange: Array, X: Array, place: Array, centres: Array) -> Array:
+    """Distances (p, m) of centres (p, m, 3), put into base, from each sphere (p, 3)."""
+    T = T_base_flange[None] @ X[:, None]
+    return np.asarray(np.linalg.norm(frames.apply(T, centres) - place[:, None], axis=2))
+
+
+def _sides(T_base_flange: Array, X: Array, place: Array) -> Array:
+    """Sides (p, m) of the laser planes on which each solution's sphere lies."""
+    T = T_base_flange[None] @ X[:, None]
+    y = np.einsum("pmj,pmj->pm", T[..., :3, 1], place[:, None] - T[..., :3, 3])
+    return np.where(y < 0.0, -1.0, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
-class LineTask:
+class LineTask(Task):
     """A straight edge or groove; ``target`` None where its place is unknown."""
 
     target: LineTarget | None
     rule: EdgeRule
-    kind: Literal["line"] = field(default="line", init=False)
-    read_by_poses: bool = field(default=False, init=False)
+
+    kind = "line"
 
     @property
     def fewest(self) -> int:
@@ -232,42 +350,64 @@ class LineTask:
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Points of the edge."""
-        found: dict[str, tuple[int, Array, Array]] = {}
-        rejected = {}
-        for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
-            try:
-                edge = fit_edge(seen(profile), self.rule)
-            except RobocalError as error:
-                rejected[name] = str(error)
-                continue
-            covariance = np.eye(3)
-            covariance[:2, :2] = edge.covariance
-            found[name] = i, np.array([*edge.point, 0.0]), covariance
-        fewest = self.fewest if T_flange_sensor is None else 1
-        usable(found, rejected, fewest, "the line")
-        return Read(
-            TargetView(LineModel(self.target is not None), _gathered(data, found)), rejected
-        )
-
-    def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
-        """Points do not depend on poses."""
-        return with_poses(view, view.model, data.T_base_flange)
+        edges, errors = fitted(data, lambda profile: fit_edge(profile.points, self.rule))
+        rejected = {name: str(error) for name, error in errors.items()}
+        usable(edges, rejected, self.fewest if T_flange_sensor is None else 1, "the line")
+        value = np.array([[*edge.point, 0.0] for edge in edges.values()])
+        covariance = np.tile(np.eye(3), (len(edges), 1, 1))
+        covariance[:, :2, :2] = [edge.covariance for edge in edges.values()]
+        names = [data.names[i] for i in edges]
+        sightings = sightings_of(data, edges, names, value, covariance)
+        return Read(TargetView(LineModel(self.target is not None), sightings), rejected)
 
     def starts(self, view: TargetView) -> list[MountState]:
-        """Rotations, and directions of an unknown line, are tried."""
-        line = None
-        if self.target is not None:
-            line = np.stack([self.target.point_base, self.target.direction_base])
-        return line_starts(view.sightings, line)
+        """The most promising of a fixed set of rotations, and of directions of an unknown line.
+
+        With the sensor's rotation and the line's direction held, all the rest is linear.
+        """
+        from scipy.spatial.transform import Rotation
+
+        rng = np.random.default_rng(SEED)
+        quat = rng.standard_normal((TURNS, 4))
+        turns = np.asarray(Rotation.from_quat(quat).as_matrix())
+        known = self._known()
+        if known is not None:
+            directions = known[1][None]
+        else:
+            sphere = rng.standard_normal((DIRECTIONS, 3))
+            directions = sphere / np.linalg.norm(sphere, axis=1)[:, None]
+        T = view.sightings.T_base_flange
+        R, origin = T[:, :3, :3], T[:, :3, 3]
+        flange = in_plane(view.sightings.value) @ np.swapaxes(turns, 1, 2)
+        seen = (R @ flange[..., None])[..., 0] + origin  # of a sensor at the flange's origin
+        held = [_held(R, seen, u, None if known is None else known[0]) for u in directions]
+        costs = np.array([cost for cost, _, _ in held])  # (directions, turns)
+        starts = []
+        for flat in np.argsort(costs, axis=None)[:KEPT_LINES]:
+            d, r = (int(i) for i in np.unravel_index(int(flat), costs.shape))
+            _, t, point = held[d]
+            X = frames.transform(turns[r], t[r])
+            starts.append(MountState(X, (np.stack([point[r], directions[d]]),)))
+        return starts
+
+    def _known(self) -> Array | None:
+        """A point and the direction (2, 3), base, where the line's place is known."""
+        if self.target is None:
+            return None
+        return np.stack([self.target.point_base, self.target.direction_base])
 
     def classic(self, view: TargetView, near: MountState) -> MountState:
-        """Least squares of the distances from the line, all alike."""
-        return least_distances(view, near)
+        """The least sum of squared distances from the line, every feature alike."""
+        alike = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
+        view = TargetView(view.model, replace(view.sightings, covariance=alike))
+        problem = MountProblem((view,), PoseNoise(0.0, 0.0), near)
+        return solve(problem, near, robust=False, sizes=problem.sizes).settled()
 
     def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
-        """The known line, or the one along the points."""
-        if self.target is not None:
-            return np.stack([self.target.point_base, self.target.direction_base])
+        """Where it is known to be, or along the middle of the points that were seen."""
+        known = self._known()
+        if known is not None:
+            return known
         s = view.sightings
         T = s.T_base_flange @ T_flange_sensor
         x, z = s.value[:, :1], s.value[:, 1:2]
@@ -280,354 +420,22 @@ class LineTask:
         line = {"point_mm": (place[0] * 1e3).tolist(), "direction": place[1].tolist()}
         return {"line": line, "known": self.target is not None}
 
-    def more(self, fit: MountFit, read: Read) -> Document:
-        """None."""
-        return {}
 
-    def suspects(self) -> Iterable[tuple[str, Task]]:
-        """None."""
-        return ()
+def _held(
+    R: Array, seen: Array, direction: Array, point: Array | None
+) -> tuple[Array, Array, Array]:
+    """With rotations and a direction held: costs (p,), t (p, 3), points (p, 3) of the line.
 
-
-def seen(profile: Profile | RobocalError) -> Array:
-    """Points (n, 2) of a profile.
-
-    Raises
-    ------
-    RobocalError
-        When there is none.
+    ``R`` (m, 3, 3) of the flange; ``seen`` (p, m, 3) in base, of a sensor at the flange's origin.
     """
-    if isinstance(profile, RobocalError):
-        raise profile
-    return profile.points
-
-
-def with_poses(view: TargetView, model: TargetModel, T_base_flange: Array) -> TargetView:
-    """A view of a target from other poses (m, 4, 4)."""
-    s = view.sightings
-    pose = same_pose(T_base_flange)[s.shot]
-    return TargetView(model, replace(s, pose=pose, T_base_flange=T_base_flange[s.shot]))
-
-
-def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:
-    shot = np.array([i for i, _, _ in found.values()], dtype=np.int64)
-    return Sightings(
-        tuple(found),
-        shot,
-        same_pose(data.T_base_flange)[shot],
-        data.T_base_flange[shot],
-        np.array([value for _, value, _ in found.values()]),
-        np.array([covariance for _, _, covariance in found.values()]),
-    )
-
-
-# ---- the staircase: corners at known places, laid under the laser mark by mark ------------------
-
-
-TURNED_M, TURNED = 5e-4, 0.3  # the order of the target file is kept unless it misses by so much
-PROFILES = 256  # whose corners are remembered
-SMALLEST_SIGMA = 1e-7  # m, rad: of a teaching error that is not zero in the other
-
-
-@dataclass(frozen=True, eq=False)
-class StepTask:
-    """Corners of a staircase; ``rule`` says how they are found."""
-
-    target: StepTarget
-    rule: CornerRule = field(default_factory=CornerRule)
-    kind: Literal["step"] = field(default="step", init=False)
-    fewest: int = field(default=1, init=False)
-    read_by_poses: bool = field(default=True, init=False)
-
-    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
-        """Corners, each with its mark."""
-        reader = _Reader(self, data)
-        if T_flange_sensor is None:
-            T_flange_sensor = self._rough(reader)
-        view = reader.view(reader.predicted(T_flange_sensor))
-        usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
-        return Read(view, reader.rejected)
-
-    def _rough(self, reader: "_Reader") -> Array:
-        """Where the sensor sits, by the profiles that show the whole target."""
-        matches = reader.sure()
-        view = reader.view(matches)
-        near = self._look(view)
-        if (miss := misfit((view,), near)) > TURNED_M:
-            other = reader.view({name: match.turned for name, match in matches.items()})
-            turned = self._look(other)
-            near = turned if misfit((other,), turned) < TURNED * miss else near
-        return near.T_flange_sensor
-
-    def _look(self, view: TargetView) -> MountState:
-        """Where the closed form leads: alone it may be far off where corners are nearly in line."""
-        return first_look((view,), self.starts(view)[0])
-
-    def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
-        """Which corner is which depends on the poses."""
-        return self.read(data).view
-
-    def starts(self, view: TargetView) -> list[MountState]:
-        """The closed form of the corners that agree."""
-        X = robust_corners(view.sightings.value, _in_flange(view))
-        return [MountState(X, (self.target.T_base_user,))]
-
-    def classic(self, view: TargetView, near: MountState) -> MountState:
-        """The closed form of all corners."""
-        X = closed_corners(view.sightings.value, _in_flange(view))
-        return MountState(X, (self.target.T_base_user,))
-
-    def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
-        """The taught user frame."""
-        return self.target.T_base_user
-
-    def found(self, place: Array) -> Document:
-        """The user frame."""
-        return {"T_base_user": transform_document(place)}
-
-    def more(self, fit: MountFit, read: Read) -> Document:
-        """How well the light was laid on the marks."""
-        return {"aim_sigma_mm": fit.noise.aim_m * 1e3}
-
-    def suspects(self) -> Iterable[tuple[str, Task]]:
-        """The corners in a left-handed frame; the marks exchanged."""
-        marks = self.target.corners
-        mirror = np.array([-1.0, 1.0, 1.0])
-        words = "the corners fit when their x is negated: the target file is left-handed"
-        yield words, self._with({mark: mirror * places for mark, places in marks.items()})
-        if len(marks) == 2:
-            words = f"they fit with the marks {' and '.join(marks)} exchanged"
-            yield words, self._with(dict(zip(marks, list(marks.values())[::-1], strict=True)))
-
-    def _with(self, corners: Mapping[str, Array]) -> Task:
-        return replace(self, target=replace(self.target, corners=corners))
-
-    def model(self, corner_user: Array) -> CornerModel:
-        """Corners (m, 3), user frame, with what is known of that frame."""
-        target = self.target
-        sigma = np.repeat([target.user_sigma_m, target.user_sigma_rad], 3)
-        information = None
-        if np.any(sigma):
-            information = np.diag(np.maximum(sigma, SMALLEST_SIGMA) ** -2.0)
-        return CornerModel(corner_user, target.edge_user, target.T_base_user, information)
-
-
-@lru_cache(maxsize=PROFILES)
-def _corners(profile: Profile | RobocalError, rule: CornerRule) -> CornerFit:
-    """Corners of a profile: they do not depend on poses, which may be tried in many ways."""
-    return fit_corners(seen(profile), rule)
-
-
-class _Reader:
-    """Corners of all profiles; ``rejected`` collects shots that show none of the target's."""
-
-    def __init__(self, task: StepTask, data: HandEyeData) -> None:
-        self._task, self._data = task, data
-        known = task.target.corners
-        marks = data.marks or (next(iter(known)),) * len(data.names)
-        require_marks(task.target, marks)
-        self._corners = {name: known[m] for name, m in zip(data.names, marks, strict=True)}
-        self.rejected: dict[str, str] = {}
-        self._fits: dict[str, CornerFit] = {}
-        for name, profile in zip(data.names, data.profiles, strict=True):
-            try:
-                self._fits[name] = _corners(profile, task.rule)
-            except RobocalError as error:
-                self.rejected[name] = str(error)
-        usable(self._fits, self.rejected, task.fewest, "corners")
-
-    def sure(self) -> dict[str, Match]:
-        """Profiles that show the whole target, and only in one way."""
-        found = {name: along(fit, self._corners[name]) for name, fit in self._fits.items()}
-        sure = {name: match for name, match in found.items() if match is not None}
-        if not sure:
-            seen_ones = ", ".join(f"{len(fit.points)}" for fit in self._fits.values())
-            wanted = len(next(iter(self._corners.values())))
-            raise ResidualError(
-                f"no profile shows all {wanted} corners of the target alone (they show {seen_ones} "
-                "corners, concave ones too): check the target file and the field of view"
-            )
-        return sure
-
-    def predicted(self, T_flange_sensor: Array) -> dict[str, Match]:
-        """Corners of all profiles by where the target must be."""
-        matches = {}
-        for name, fit in self._fits.items():
-            corners = self._corners[name]
-            T = self._data.T_base_flange[self._data.names.index(name)] @ T_flange_sensor
-            model = self._task.model(corners)
-            place = self._task.target.T_base_user
-            where = model.see(np.broadcast_to(T, (len(corners), 4, 4)), place).value
-            match = nearest(fit, where[:, :2])
-            if len(match.rows):
-                matches[name] = match
-            else:
-                self.rejected[name] = "shows no corner where the target's must be"
-        return matches
-
-    def view(self, matches: Mapping[str, Match]) -> TargetView:
-        """The matched corners as sightings."""
-        names, shots, values, covariances, corners = [], [], [], [], []
-        for name, match in matches.items():
-            fit = self._fits[name]
-            for row, k in zip(match.rows, match.corners, strict=True):
-                names.append(f"{name}/corner {k + 1}")
-                shots.append(self._data.names.index(name))
-                values.append([*fit.points[row], 0.0])
-                spread = self._task.target.sigma_m**2 * np.eye(3)
-                spread[:2, :2] += fit.covariance[row]
-                covariances.append(spread)
-                corners.append(self._corners[name][k])
-        shot, T_base_flange = np.array(shots, dtype=np.int64), self._data.T_base_flange
-        sightings = Sightings(
-            tuple(names),
-            shot,
-            same_pose(T_base_flange)[shot],
-            T_base_flange[shot],
-            np.array(values).reshape(-1, 3),
-            np.array(covariances).reshape(-1, 3, 3),
-        )
-        return TargetView(self._task.model(np.array(corners).reshape(-1, 3)), sightings)
-
-
-def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
-    """Refuse marks that the target does not have.
-
-    Raises
-    ------
-    InputError
-        Naming the first of them.
-    """
-    strange = next((mark for mark in marks if mark not in target.corners), None)
-    if strange is not None:
-        raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
-
-
-def _in_flange(view: TargetView) -> Array:
-    """Marks (m, 3) of a view in the flange frame of their pose."""
-    if not isinstance(view.model, CornerModel):
-        raise ValueError("a view of corners is needed")
-    T = frames.invert(view.sightings.T_base_flange) @ view.model.T_base_user
-    return frames.apply(T, view.model.corner_user)
-
-
-# ---- what is wrong with data that do not fit: the common mistakes, tried one by one -------------
-
-
-DOUBTFUL_M = 2e-4  # median distance from which a mistake in the data is looked for
-SHOWN = 0.5  # of the profiles
-WRONG_M = 2e-3  # the same, from which something is wrong, whatever it is
-
-
-def features(task: Task, data: HandEyeData) -> Read:
-    """Features of the profiles.
-
-    Raises
-    ------
-    ResidualError
-        When poses must tell which feature is which, and do not: with the mistake that explains it.
-    RobocalError
-        When too little is seen.
-    """
-    try:
-        return task.read(data)
-    except InputError:
-        raise
-    except RobocalError as error:
-        if task.read_by_poses:
-            _name_mistake(task, data, None, np.inf, error)
-        raise
-
-
-def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
-    """A state near the solution.
-
-    Raises
-    ------
-    ResidualError
-        When the data do not fit: with the mistake that explains it, where one does.
-    RobocalError
-        When too little is seen, or the poses leave a direction open.
-    """
-    try:
-        near = look(task, read.view)
-    except RobocalError as error:
-        _name_mistake(task, data, read, np.inf, error)
-        raise
-    as_given = misfit((read.view,), near) if _shown(read.view, data) else np.inf
-    if as_given > DOUBTFUL_M:
-        _name_mistake(task, data, read, as_given, None)
-    if as_given > WRONG_M:
-        off = f"samples are off by {misfit((read.view,), near) * 1e3:.3g} mm"
-        raise ResidualError(
-            f"{off} or do not show the target where it must be, and no common mistake explains it: "
-            "has the target moved, are poses and profiles of the same run, is it the right target?"
-        )
-    return near
-
-
-def _shown(view: TargetView, data: HandEyeData) -> bool:
-    """Whether most of the profiles show the target where it must be."""
-    usable = sum(isinstance(profile, Profile) for profile in data.profiles)
-    return len(np.unique(view.sightings.shot)) > SHOWN * usable
-
-
-def look(task: Task, view: TargetView) -> MountState:
-    """The state nearest to the sightings to which a start leads, before the noise is known.
-
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When none leads anywhere.
-    """
-    states: list[MountState] = []
-    failure: RobocalError | None = None
-    for start in task.starts(view):
-        try:
-            states.append(first_look((view,), start))
-        except RobocalError as error:
-            failure = failure or error
-            if isinstance(error, RankDeficientError):
-                break  # it lies in the poses, not in the start
-    if not states:
-        raise failure or RobocalError("no start was found")
-    return min(states, key=lambda state: misfit((view,), state))
-
-
-def _name_mistake(
-    task: Task, data: HandEyeData, read: Read | None, as_given: float, error: RobocalError | None
-) -> None:
-    """Raise with the mistake that explains a misfit, m, or an error; nothing where none does."""
-
-    def followed(task: Task, view: TargetView) -> float:
-        if not _shown(view, data):
-            return np.inf
-        first = task.starts(view)[0]
-        if (off := misfit((view,), first)) > as_given:  # not worth following
-            return off
-        return misfit((view,), first_look((view,), first))
-
-    def with_poses(T_base_flange: Array) -> float:
-        other = replace(data, T_base_flange=T_base_flange)
-        return followed(
-            task, task.read(other).view if read is None else task.posed(read.view, other)
-        )
-
-    def as_told(other: Task) -> float:
-        known = None if read is None or task.read_by_poses else read.view
-        return followed(other, other.read(data).view if known is None else other.posed(known, data))
-
-    def suspects() -> Iterator[tuple[str, Callable[[], float]]]:
-        for words, poses in undone(data.T_base_flange):
-            yield words, partial(with_poses, poses)
-        if read is not None and error is not None:
-            return  # open directions lie in the poses, whatever is told of the target
-        for words, other in task.suspects():
-            yield words, partial(as_told, other)
-
-    words = explain(suspects(), as_given)
-    if words is None:
-        return
-    if not np.isfinite(as_given):
-        raise ResidualError(f"the samples do not fit: {words}") from error
-    raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")
+    across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)
+    lhs = across @ R
+    if point is None:
+        lhs = np.concatenate([lhs, np.broadcast_to(-np.eye(2), (len(R), 2, 2))], axis=2)
+    lhs = lhs.reshape(2 * len(R), -1)
+    known = np.zeros(3) if point is None else point
+    rhs = ((seen - known) @ across.T).reshape(len(seen), -1)
+    solution = -(np.linalg.pinv(lhs, rcond=1e-9) @ rhs.T).T
+    cost = np.sum((solution @ lhs.T + rhs) ** 2, axis=1)
+    points = np.broadcast_to(known, (len(seen), 3))
+    return cost, solution[:, :3], points if point is not None else solution[:, 3:] @ across

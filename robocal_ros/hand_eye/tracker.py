@@ -17,9 +17,16 @@ from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
-from robocal_ros.hand_eye.quality import HandEyeSettings, apart, field_points, judge_classic
-from robocal_ros.hand_eye.result import HandEyeResult, Method, point_covariance
-from robocal_ros.hand_eye.target_models import moved, tangents
+from robocal_ros.hand_eye.mount_problem import moved, tangents
+from robocal_ros.hand_eye.result import (
+    HandEyeResult,
+    HandEyeSettings,
+    Method,
+    apart,
+    field_points,
+    judge_classic,
+    point_covariance,
+)
 from robocal_ros.hand_eye.tracker_data import (
     FACES,
     MOVED,

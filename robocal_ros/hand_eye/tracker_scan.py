@@ -22,7 +22,7 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.hand_eye.target_models import tangents
+from robocal_ros.hand_eye.mount_problem import tangents
 from robocal_ros.hand_eye.tracker_data import (
     PARALLEL_FACES,
     Axis,

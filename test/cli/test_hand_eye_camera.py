@@ -19,7 +19,7 @@ from robocal_ros.hand_eye.camera import distances
 from robocal_ros.hand_eye.camera_fit import fit_pairs
 from robocal_ros.hand_eye.camera_model import CLOSED_FORMS
 from robocal_ros.hand_eye.cli_sensors import CAMERA_METHODS as METHODS
-from robocal_ros.hand_eye.tables import write_pose_table
+from robocal_ros.hand_eye.files import write_pose_table
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.tables import joint_texts
 

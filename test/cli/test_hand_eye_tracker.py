@@ -11,7 +11,8 @@ from tracker_files import SCAN, tracker_files
 from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.laser_tracker import TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.target_files import read_tracker_points, read_tracker_target
+from robocal_ros.hand_eye.files import read_tracker_points
+from robocal_ros.hand_eye.targets import read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
 from robocal_ros.kinematics.robots import load_robot
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.hand_eye.target_files import read_target
-from robocal_ros.hand_eye.targets import target_document
+from robocal_ros.hand_eye.targets import read_target, target_document
 
 BOARD = "kind: board\ncolumns: 9\nrows: 6\nsquare_mm: 25.5\n"
 CAMERA = """\

@@ -32,7 +32,7 @@ from robocal_ros.hand_eye.camera_model import (
     linearised,
     robust_start,
 )
-from robocal_ros.hand_eye.target_models import moved
+from robocal_ros.hand_eye.mount_problem import moved
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

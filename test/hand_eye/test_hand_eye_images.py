@@ -23,13 +23,11 @@ from robocal_ros.bags.bags import read_data_set, write_data_set
 from robocal_ros.bags.replay import replay
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.hand_eye import shots as hand_eye_shots
-from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import data_set_begun, data_set_of
-from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
+from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.session_planning import judged_plan
 from robocal_ros.hand_eye.shots import shot_of
-from robocal_ros.hand_eye.target_files import read_target
-from robocal_ros.hand_eye.targets import target_document
+from robocal_ros.hand_eye.targets import read_target, target_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
 from robocal_ros.session.events import arguments_text, digest, outcome_text, read_command

@@ -14,9 +14,9 @@ from hand_eye_laser import TARGETS
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.data import data_set_begun
 from robocal_ros.hand_eye.planning import SensorRange
+from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.session_planning import judged_plan
 
 WIDE = SensorRange(0.17, 0.26, 0.1)

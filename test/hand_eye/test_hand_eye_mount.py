@@ -11,17 +11,18 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import SETTLED, fit_mount
 from robocal_ros.hand_eye.mount_problem import (
+    LineModel,
     MountProblem,
     MountState,
-    PoseNoise,
     RestrictedLikelihood,
+    Sightings,
+    SphereModel,
     TargetView,
     pivot_of,
 )
-from robocal_ros.hand_eye.quality import HandEyeSettings, judge
-from robocal_ros.hand_eye.result import increment
-from robocal_ros.hand_eye.target_models import LineModel, Sightings, SphereModel
-from robocal_ros.hand_eye.tasks import StepTask
+from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, increment
+from robocal_ros.hand_eye.solve import judge
+from robocal_ros.hand_eye.staircase import StepTask
 
 X = CELL.T_flange_sensor
 FEATURE_M = 5e-6

@@ -25,7 +25,6 @@ from robocal_ros.cell_sim.hand_eye_cell import (
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
-from robocal_ros.hand_eye.mount_problem import PoseNoise
 from robocal_ros.hand_eye.planning import (
     PlannedLine,
     PlannedSphere,
@@ -33,10 +32,16 @@ from robocal_ros.hand_eye.planning import (
     SensorRange,
     check_plan,
 )
-from robocal_ros.hand_eye.quality import HandEyeSettings, apart, expected_error_m
-from robocal_ros.hand_eye.result import at_origin
-from robocal_ros.hand_eye.solve import solve_sphere
+from robocal_ros.hand_eye.result import (
+    HandEyeSettings,
+    PoseNoise,
+    apart,
+    at_origin,
+    expected_error_m,
+)
+from robocal_ros.hand_eye.solve import solve_task
 from robocal_ros.hand_eye.targets import SphereTarget, Staircase, StepTarget
+from robocal_ros.hand_eye.tasks import SphereTask
 
 SENSOR = SensorRange(width_m=0.09)
 NOISE = PoseNoise(POSE_M, 1e-6, 1e-4)
@@ -73,7 +78,7 @@ def test_expected_error_is_that_of_a_calibration_from_these_poses():
     """The information of a plan against the covariance that profiles from it give."""
     shots = sphere_shots(CELL, CENTRE, RADIUS_M, 15, np.random.default_rng(3))
     settings = HandEyeSettings(POSE_M, 1e-6)
-    result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", settings)
+    result = solve_task(SphereTask(SphereTarget(RADIUS_M)), data_of(shots), "best", settings)
     plan = judged(BALL, shots.true_T_base_flange)
     assert plan.rank == plan.unknowns == 9
     achieved = np.sqrt(np.diag(at_origin(result.covariance, result.pivot)))
@@ -94,7 +99,7 @@ def test_a_sphere_of_unknown_place_is_where_the_poses_see_it(seed, strays):
     assert sorted(plan.unseen) == list(range(12 - strays, 12))
     if not strays:  # against what is achieved, at the same points of the field
         settings = HandEyeSettings(POSE_M, 1e-6)
-        result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", settings)
+        result = solve_task(SphereTask(SphereTarget(RADIUS_M)), data_of(shots), "best", settings)
         covariance = at_origin(result.covariance, result.pivot)
         achieved_m = expected_error_m(covariance, SENSOR.field_points)
         # The place is found to 3 mm, and how well a circle tells it grows with the 11 mm or so by
@@ -198,7 +203,9 @@ def test_proposed_poses_do_what_they_promise(turned):
     stands = [CELL.robot.stand(T, rng) for T in every]
     reported = np.array([stand.T_base_flange for stand in stands])
     shots = SimulatedShots(every, reported, profiles, [""] * len(every), None)
-    result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", HandEyeSettings())
+    result = solve_task(
+        SphereTask(SphereTarget(RADIUS_M)), data_of(shots), "best", HandEyeSettings()
+    )
     assert result.verdict.accept
     assert len(result.rejected) <= 1  # nothing that is proposed is out of view
     off_m = apart(result.T_flange_sensor, CELL.T_flange_sensor, SENSOR.field_points)

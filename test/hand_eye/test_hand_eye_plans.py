@@ -8,8 +8,8 @@ from hand_eye_laser import driver_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.hand_eye.config import HandEyeConfig
 from robocal_ros.hand_eye.planning import SensorRange
+from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.session_planning import (
     MOST_POSES,
     judged_plan,

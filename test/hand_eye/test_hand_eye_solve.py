@@ -39,17 +39,15 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.hand_eye.quality import HandEyeSettings
-from robocal_ros.hand_eye.result import hand_eye_document, point_covariance
+from robocal_ros.hand_eye.result import HandEyeSettings, hand_eye_document, point_covariance
 from robocal_ros.hand_eye.shots import profile_of
 from robocal_ros.hand_eye.solve import (
     held_out,
     solve_joint,
-    solve_line,
-    solve_sphere,
-    solve_step,
+    solve_task,
     verify,
 )
+from robocal_ros.hand_eye.staircase import StepTask
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
 
@@ -62,7 +60,7 @@ def sphere_data(seed=0, count=15, cell=CELL):
 
 
 def solve(data, method="best"):
-    return solve_sphere(data, SPHERE, method, SETTINGS)
+    return solve_task(SphereTask(SPHERE), data, method, SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +149,7 @@ class TestMistakes:
 
     def refused(self, data, *words, error=ResidualError, target=SPHERE):
         with pytest.raises(error) as caught:
-            solve_sphere(data, target, "best", SETTINGS)
+            solve_task(SphereTask(target), data, "best", SETTINGS)
         for word in words:
             assert word in str(caught.value), str(caught.value)
 
@@ -232,7 +230,9 @@ class TestStep:
     @pytest.mark.parametrize("aim_m", [0.0, 2e-4])
     def test_recovers_the_sensor(self, aim_m):
         for seed in range(4):
-            found = solve_step(self.shots(seed, 8, aim_m=aim_m), stairs_target(), "best", SETTINGS)
+            found = solve_task(
+                StepTask(stairs_target()), self.shots(seed, 8, aim_m=aim_m), "best", SETTINGS
+            )
             assert found.verdict.accept
             assert chi_square(found, TRUE) < FAR_OFF
 
@@ -243,32 +243,34 @@ class TestStep:
         )
         known = stairs_target(taught, user_sigma_m=2e-4, user_sigma_rad=1e-3)
         shots = self.shots(8, 8)
-        found = solve_step(shots, known, "best", SETTINGS)
-        exact = solve_step(shots, stairs_target(), "best", SETTINGS)
+        found = solve_task(StepTask(known), shots, "best", SETTINGS)
+        exact = solve_task(StepTask(stairs_target()), shots, "best", SETTINGS)
         assert chi_square(found, TRUE) < FAR_OFF
         assert np.trace(found.covariance[:3, :3]) > 2.0 * np.trace(exact.covariance[:3, :3])
 
     def test_one_line_of_corners_from_one_pose_is_refused(self):
         with pytest.raises(RankDeficientError, match="one line"):
-            solve_step(self.shots(1, 1), stairs_target(), "best", SETTINGS)
+            solve_task(StepTask(stairs_target()), self.shots(1, 1), "best", SETTINGS)
 
     def test_a_left_handed_target_file(self):
         drawn = stairs_target()
         mirror = np.array([-1.0, 1.0, 1.0])
         corners = {mark: mirror * places for mark, places in drawn.corners.items()}
         with pytest.raises(ResidualError, match="left-handed"):
-            solve_step(self.shots(3, 8), replace(drawn, corners=corners), "best", SETTINGS)
+            solve_task(
+                StepTask(replace(drawn, corners=corners)), self.shots(3, 8), "best", SETTINGS
+            )
 
     def test_poses_mirrored_as_a_whole(self):
         data, mirror = self.shots(4, 8), np.diag([1.0, -1.0, 1.0, 1.0])
         wrong = replace(data, T_base_flange=mirror @ data.T_base_flange @ mirror)
         with pytest.raises(ResidualError, match="left-handed"):
-            solve_step(wrong, stairs_target(), "best", SETTINGS)
+            solve_task(StepTask(stairs_target()), wrong, "best", SETTINGS)
 
     def test_an_unknown_mark(self):
         data = replace(self.shots(2), marks=("middle",) * 5)
         with pytest.raises(InputError, match=r"'middle' is not one of near, far"):
-            solve_step(data, stairs_target(), "best", SETTINGS)
+            solve_task(StepTask(stairs_target()), data, "best", SETTINGS)
 
 
 class TestLine:
@@ -276,7 +278,9 @@ class TestLine:
     @pytest.mark.parametrize(("kind", "shoot"), [("edge", edge_shots), ("groove", groove_shots)])
     def test_recovers_the_sensor(self, kind, shoot, known):
         shots = data_of(shoot(CELL, T_BASE_USER, 20, np.random.default_rng(3)))
-        found = solve_line(shots, LINE if known else None, "best", SETTINGS, EdgeRule(kind=kind))
+        found = solve_task(
+            LineTask(LINE if known else None, EdgeRule(kind=kind)), shots, "best", SETTINGS
+        )
         assert chi_square(found, TRUE) < FAR_OFF
         seen_at = (T_BASE_USER @ [0.1, 0.0, 0.0, 1.0])[:3]  # the middle of what is shown
         away = seen_at - found.place[0]
@@ -310,7 +314,7 @@ class TestLine:
         assert most_deg <= extent_deg <= 2.0 * most_deg + 1e-6
         data = data_of(SimulatedShots(reported, reported, profiles, [""] * 20, None))
         with pytest.raises(RankDeficientError, match=words):
-            solve_line(data, LINE, "best", SETTINGS, EdgeRule())
+            solve_task(LineTask(LINE, EdgeRule()), data, "best", SETTINGS)
 
 
 def test_targets_together_beat_each_alone():
@@ -319,7 +323,7 @@ def test_targets_together_beat_each_alone():
     edge = data_of(edge_shots(CELL, T_BASE_USER, 12, rng))
     parts = [(SphereTask(SPHERE), ball), (LineTask(None, EdgeRule()), edge)]
     both = solve_joint(parts, SETTINGS)
-    alone = solve_sphere(ball, SPHERE, "best", SETTINGS)
+    alone = solve_task(SphereTask(SPHERE), ball, "best", SETTINGS)
     assert chi_square(both, TRUE) < FAR_OFF
     assert both.working_error_m < alone.working_error_m
     assert {name.partition("/")[0] for name in both.samples} == {"sphere", "line"}
@@ -374,17 +378,19 @@ class TestStepMistakes:
     def test_poses(self, shots, words, undo):
         wrong = replace(shots, T_base_flange=undo(shots.T_base_flange))
         with pytest.raises(ResidualError, match=words):
-            solve_step(wrong, stairs_target(), "best", SETTINGS)
+            solve_task(StepTask(stairs_target()), wrong, "best", SETTINGS)
 
     def test_marks_exchanged(self, shots):
         other = tuple({"near": "far", "far": "near"}[mark] for mark in shots.marks)
         with pytest.raises(ResidualError, match="near and far exchanged"):
-            solve_step(replace(shots, marks=other), stairs_target(), "best", SETTINGS)
+            solve_task(StepTask(stairs_target()), replace(shots, marks=other), "best", SETTINGS)
 
     def test_two_shots_swapped(self, shots):
         T = shots.T_base_flange.copy()
         T[[1, 3]] = T[[3, 1]]  # of one mark
-        found = solve_step(replace(shots, T_base_flange=T), stairs_target(), "best", SETTINGS)
+        found = solve_task(
+            StepTask(stairs_target()), replace(shots, T_base_flange=T), "best", SETTINGS
+        )
         assert {name.partition("/")[0] for name in found.rejected} == {"p2", "p4"}
         assert all("swapped" in words for words in found.rejected.values())
 
@@ -416,6 +422,6 @@ def test_a_sphere_that_was_knocked_is_not_the_poses_fault():
 
 def test_two_poses_cannot_tell_the_robots_noise():
     shots = data_of(step_shots(CELL, STAIRS, 2, np.random.default_rng(13), level=True))
-    found = solve_step(shots, stairs_target(), "best", SETTINGS)
+    found = solve_task(StepTask(stairs_target()), shots, "best", SETTINGS)
     assert found.verdict.code is Code.TOO_FEW_SAMPLES
     assert "robot's noise" in found.verdict.reason

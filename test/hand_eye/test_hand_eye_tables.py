@@ -10,8 +10,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
-from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.tables import (
+from robocal_ros.hand_eye.files import (
     PoseTable,
     read_pose_table,
     read_profile,
@@ -19,8 +18,15 @@ from robocal_ros.hand_eye.tables import (
     write_pose_table,
     write_profile,
 )
-from robocal_ros.hand_eye.target_files import read_target, write_target
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.hand_eye.shots import Profile
+from robocal_ros.hand_eye.targets import (
+    LineTarget,
+    SphereTarget,
+    Staircase,
+    StepTarget,
+    read_target,
+    write_target,
+)
 from robocal_ros.kinematics.robots import load_robot
 
 UR10 = load_robot("ur10")

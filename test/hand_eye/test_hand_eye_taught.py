@@ -7,7 +7,8 @@ from hand_eye_sets import CELL, STAIRS, T_BASE_USER, data_of, stairs_target
 from robocal_ros.cell_sim.hand_eye_cell import step_shots
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.mount_fit import fit_mount
-from robocal_ros.hand_eye.tasks import StepTask, features, looked
+from robocal_ros.hand_eye.solve import features, looked
+from robocal_ros.hand_eye.staircase import StepTask
 
 SHIFT_M = 2e-3
 

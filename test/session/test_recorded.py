@@ -26,8 +26,7 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.ground.streams import JointStream, StandstillRule
 from robocal_ros.hand_eye import session as hand_eye_session
-from robocal_ros.hand_eye.config import HandEyeConfig
-from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached

@@ -6,8 +6,7 @@ from hand_eye_driver import ARM, FRAME, START_NS, TYPE, Driver, Recorded
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter, read_data_set, write_data_set
-from robocal_ros.hand_eye.config import HandEyeConfig
-from robocal_ros.hand_eye.session import HandEyeSession, configuration
+from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession, configuration
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text

@@ -18,9 +18,15 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     step_shots,
 )
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.tables import write_shots
-from robocal_ros.hand_eye.target_files import Target, write_target
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.hand_eye.files import write_shots
+from robocal_ros.hand_eye.targets import (
+    LaserTarget,
+    LineTarget,
+    SphereTarget,
+    Staircase,
+    StepTarget,
+    write_target,
+)
 
 Array = NDArray[np.float64]
 
@@ -50,7 +56,7 @@ def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 0) -> Simulated
     return (groove_shots if kind == "groove" else edge_shots)(CELL, T_BASE_USER, count, rng)
 
 
-def target_of(kind: str) -> Target:
+def target_of(kind: str) -> LaserTarget:
     """What is known of a target."""
     if kind == "sphere":
         return SphereTarget(RADIUS_M)
