@@ -22,7 +22,7 @@ from robocal_msgs.srv import (
 )
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.errors import Code, InputError, RobocalError
+from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.files import made_folder_beside
 from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.samples import joint_sample
@@ -43,7 +43,6 @@ from robocal_ros.hand_eye.session_planning import (
     poses_of_joints,
     require_count,
     require_near,
-    require_target,
     rough_mount,
     sphere_centre,
 )
@@ -60,9 +59,6 @@ from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, 
 
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.planning import PlanReport
-
-
-# ---- what the hand-eye node says: its topics, and how results get onto them ---------------------
 
 
 AddOutput = Callable[[type, str, QoSProfile], Any]
@@ -178,9 +174,6 @@ def calibration_transform(model: dict[str, Any], stamp_ns: int) -> TransformStam
         child_frame_id=model["child"],
         transform=conversions.transform_message(np.array(model["T_parent_sensor"])),
     )
-
-
-# ---- data files ---------------------------------------------------------------------------------
 
 
 Ask = Callable[[Command], Awaitable[Outcome]]
@@ -310,9 +303,6 @@ def _path(request: Any) -> Path:
         raise InputError(f"{error}: name the whole path", file=request.path) from error
 
 
-# ---- the service of the hand-eye node that judges planned poses ---------------------------------
-
-
 Array = NDArray[np.float64]
 
 ROUGH = "rough"  # the parameters that say about where the sensor sits
@@ -340,7 +330,8 @@ class HandEyePlan:
         from robocal_ros.hand_eye.planning import SensorRange
 
         session = self._session()
-        data = require_target(session)
+        if (data := session.data) is None:
+            raise ConflictError("no data set is open: call start, so that the target is known")
         poses = _poses(request, session)
         near, far, width = (1e-3 * x for x in self._settings["sensor_range_mm"])
         sensor = SensorRange(near, far, width, noise_m=self._settings["sensor_noise_mm"] * 1e-3)
@@ -383,9 +374,6 @@ def _answered(response: Any, found: "PlanReport", who: str) -> Any:
     response.unseen = [f"pose {i + 1}: {why}" for i, why in sorted(found.unseen.items())]
     response.proposed = [pose_message(T) for T in found.proposed]
     return response
-
-
-# ---- the services of the hand-eye node: each call becomes a command to the session --------------
 
 
 def start_arguments(

@@ -1,38 +1,34 @@
 """What planned poses would say about a sensor's place, before the robot is moved."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.ground.errors import InputError, LimitError, RobocalError
 from robocal_ros.ground.proposals import CalibrationState
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.data import DataSet
+from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget, target_of
+from robocal_ros.hand_eye.targets import BoardTarget, SphereTarget, target_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
 from robocal_ros.session.events import History
 
 if TYPE_CHECKING:
-    from robocal_ros.hand_eye.planning import PlannedTarget, PlanReport, SensorRange
+    from robocal_ros.hand_eye.planning import PlanReport, SensorRange
 
 Array = NDArray[np.float64]
 
 ROBOT_SIGMA_M = 5e-5  # of a reported pose in each axis, where it is not given
 MOST_POSES = 200
 FEWEST_SEEN = 3  # samples that tell on which side of the laser plane a sphere lies
-TO_GO_BY = (
-    CalibrationState.PENDING,
-    CalibrationState.STALE,
-)  # what was refused or taken back tells nothing
-
-
-# ---- what a request holds -----------------------------------------------------------------------
+# What was refused or taken back tells nothing.
+TO_GO_BY = (CalibrationState.PENDING, CalibrationState.STALE)
 
 
 def require_count(joints: int, flange: int) -> None:
@@ -117,9 +113,6 @@ def require_near(place: ArrayLike, name: str) -> Array:
     return point
 
 
-# ---- what is known already ----------------------------------------------------------------------
-
-
 def rough_mount(
     session: HandEyeSession, history: History, given: Array | None, configured: Array | None
 ) -> tuple[Array, str]:
@@ -135,24 +128,19 @@ def rough_mount(
     """
     if given is not None:
         return given, "the request"
-    head, data = session.in_force, session.data
-    if (T := _on_flange(head.model, session.config)) is not None:
-        return T, f"calibration {head.calibration_id} in force"
-    number = _candidate(data, history)
-    if number and (T := _on_flange(history.model(number), session.config)) is not None:
-        return T, f"candidate {number}"
+    head, number = session.in_force, _candidate(session.data, history)
+    for model, name in (
+        (head.model, f"calibration {head.calibration_id} in force"),
+        (history.model(number) if number else None, f"candidate {number}"),
+    ):
+        if model is not None and model["parent"] == session.config.flange_frame:
+            return np.array(model["T_parent_sensor"]), name
     if configured is not None:
         return configured, "rough_xyz_mm and rough_quat_xyzw"
     raise InputError(
         "nothing says where the sensor sits: set rough_xyz_mm and rough_quat_xyzw to a few "
         "millimetres and degrees, or give sensor in the request"
     )
-
-
-def _on_flange(model: dict[str, Any] | None, config: HandEyeConfig) -> Array | None:
-    if model is None or model["parent"] != config.flange_frame:
-        return None
-    return np.array(model["T_parent_sensor"])
 
 
 def _candidate(data: DataSet | None, history: History) -> int:
@@ -186,22 +174,6 @@ def sphere_centre(
     return task.placed(view, T_flange_sensor) if len(view.sightings.names) >= FEWEST_SEEN else None
 
 
-# ---- the judgement ------------------------------------------------------------------------------
-
-
-def require_target(session: HandEyeSession) -> DataSet:
-    """The open data set.
-
-    Raises
-    ------
-    ConflictError
-        Without one.
-    """
-    if session.data is None:
-        raise ConflictError("no data set is open: call start, so that the target is known")
-    return session.data
-
-
 def judged_plan(
     data: DataSet,
     T_base_flange: Array,
@@ -221,36 +193,19 @@ def judged_plan(
     InputError
         For a target whose plans cannot be judged, and for marks that it does not have.
     """
-    from robocal_ros.hand_eye.planning import check_plan
-    from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise
+    from robocal_ros.hand_eye.planning import check_plan, planned_target
 
-    given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
-    noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)
     if marks and len(marks) != len(T_base_flange):
         raise InputError(f"{len(marks)} marks for {len(T_base_flange)} poses: give each its own")
     for mark in marks:
         data.require_mark(mark)
     if centre is not None and data.kind != "sphere":
         raise InputError(f"center is a sphere's, not a {data.kind}'s: leave it out")
-    target = _planned(data, marks, sensor, centre)
-    return check_plan(target, T_base_flange, T_flange_sensor, sensor, noise, config.limit_m)
-
-
-def _planned(
-    data: DataSet, marks: Sequence[str], sensor: "SensorRange", centre: Array | None
-) -> "PlannedTarget":
-    from robocal_ros.hand_eye.planning import PlannedLine, PlannedSphere, PlannedStairs
-
     target = target_of(data.target)
-    if isinstance(target, SphereTarget):
-        if centre is None:
-            return PlannedSphere(target.radius_m, sensor)
-        x, y, z = centre.tolist()
-        return PlannedSphere(target.radius_m, sensor, (x, y, z))
-    if isinstance(target, StepTarget):
-        return PlannedStairs(target, sensor, tuple(marks) or None)
-    if isinstance(target, LineTarget):
-        return PlannedLine(sensor, np.stack([target.point_base, target.direction_base]))
-    if data.kind == "line":
-        return PlannedLine(sensor)
-    raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
+    if data.kind == "camera" or isinstance(target, BoardTarget):
+        raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
+    given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
+    noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)
+    middle = None if centre is None else centre.tolist()
+    planned = planned_target(target, sensor, middle, tuple(marks) or None)
+    return check_plan(planned, T_base_flange, T_flange_sensor, sensor, noise, config.limit_m)
