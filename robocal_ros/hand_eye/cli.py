@@ -7,9 +7,6 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robocal_ros.cli.command import CliResult, Document, positive, text, three_numbers
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
 from robocal_ros.ground.errors import InputError
@@ -17,7 +14,6 @@ from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.cli_shots import (
     KINDS,
-    ReadShots,
     add_feature,
     add_limits,
     add_robot,
@@ -46,28 +42,33 @@ from robocal_ros.hand_eye.files import (
     write_pose_table,
 )
 from robocal_ros.hand_eye.planning import (
-    PlannedLine,
-    PlannedSphere,
     PlannedStairs,
-    PlannedTarget,
     PlanReport,
     SensorRange,
     check_plan,
+    planned_target,
 )
-from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, by_shot, hand_eye_document
+from robocal_ros.hand_eye.result import (
+    METHODS,
+    PoseNoise,
+    by_shot,
+    hand_eye_document,
+)
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
-from robocal_ros.hand_eye.targets import LaserTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import Task
-from robocal_ros.kinematics import SerialArm
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-# ---- what all targets have in common ------------------------------------------------------------
-
-
-METHODS = ("best", "classic")
+FORMATS = ("urdf", "xacro", "yaml", "static-transform")
+PARENTS = {"flange": "tool0", "base": "base"}
+SENSOR = {
+    "near": (190.0, "nearest distance that the sensor sees"),
+    "far": (210.0, "farthest"),
+    "width": (60.0, "of the field, half way"),
+    "noise": (0.037, "of a point along the beam, one sigma"),
+}
+ROBOT_SIGMA_MM = 0.05
 
 
 def add_target_action(parser: argparse.ArgumentParser) -> None:
@@ -92,7 +93,10 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
     shots = given_shots(args, arm)
     judges = None if args.check is None else given_shots(args, arm, args.check)
     if judges is not None:
-        _require_unused(args, judges, shots)
+        if judges.table is not None and shots.table is not None:
+            require_unused(judges.table, shots.table)
+        elif args.check.resolve() == args.bag.resolve():
+            raise InputError("--check is --bag: other shots must judge", file=str(args.check))
     result = solve_task(task, shots.data, args.method, settings)
     result = replace(result, rejected={**shots.rejected, **result.rejected})
     if judges is not None:
@@ -102,16 +106,6 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
         result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
     document: Document = hand_eye_document(result)
     return CliResult(document, partial(show_mount, document=document))
-
-
-def _require_unused(args: argparse.Namespace, judges: ReadShots, used: ReadShots) -> None:
-    if judges.table is not None and used.table is not None:
-        require_unused(judges.table, used.table)
-    elif args.check.resolve() == args.bag.resolve():
-        raise InputError("--check is --bag: other shots must judge", file=str(args.check))
-
-
-# ---- ``robocal hand-eye sphere``: a line laser from profiles across a sphere --------------------
 
 
 def add_sphere(parser: argparse.ArgumentParser) -> None:
@@ -125,9 +119,6 @@ def run_sphere(args: argparse.Namespace) -> CliResult:
     return run_target("sphere", args, args.radius_mm)
 
 
-# ---- robocal hand-eye step ----------------------------------------------------------------------
-
-
 def add_step(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``step``."""
     add_target_action(parser)
@@ -137,9 +128,6 @@ def add_step(parser: argparse.ArgumentParser) -> None:
 def run_step(args: argparse.Namespace) -> CliResult:
     """Do ``step``. Raises `RobocalError` for what a user can mend."""
     return run_target("step", args)
-
-
-# ---- robocal hand-eye line ----------------------------------------------------------------------
 
 
 def add_line(parser: argparse.ArgumentParser) -> None:
@@ -152,9 +140,6 @@ def add_line(parser: argparse.ArgumentParser) -> None:
 def run_line(args: argparse.Namespace) -> CliResult:
     """Do ``line``. Raises `RobocalError` for what a user can mend."""
     return run_target("line", args)
-
-
-# ---- ``robocal hand-eye joint``: one place of a line laser from several targets -----------------
 
 
 def add_joint(parser: argparse.ArgumentParser) -> None:
@@ -187,10 +172,13 @@ def run_joint(args: argparse.Namespace) -> CliResult:
         raise InputError("give the folders of at least two of --sphere, --step, --line")
     parts, checks = [], {}
     for kind, folder in folders.items():
-        task, shots = _task(kind, folder, args.line_kind), _shots(folder, "poses.csv", arm)
+        file, profiles = folder / "target.yaml", folder / "profiles"
+        known = kind != "line" or file.exists()
+        task = task_of(given_target(kind, file if known else None, None), args.line_kind)
+        shots = read_shots(folder / "poses.csv", profiles, arm)
         parts.append((task, shots.data))
         if args.check is not None and (folder / args.check).exists():
-            judges = _shots(folder, args.check, arm)
+            judges = read_shots(folder / args.check, profiles, arm)
             if judges.table is not None and shots.table is not None:
                 require_unused(judges.table, shots.table)
             checks[task.kind] = judges.data
@@ -199,19 +187,6 @@ def run_joint(args: argparse.Namespace) -> CliResult:
     result = solve_joint(parts, settings, checks)
     document: Document = hand_eye_document(result)
     return CliResult(document, partial(show_mount, document=document))
-
-
-def _task(kind: str, folder: Path, line_kind: str) -> "Task":
-    file = folder / "target.yaml"
-    known = kind != "line" or file.exists()
-    return task_of(given_target(kind, file if known else None, None), line_kind)
-
-
-def _shots(folder: Path, table: str, arm: "SerialArm | None") -> ReadShots:
-    return read_shots(folder / table, folder / "profiles", arm)
-
-
-# ---- ``robocal hand-eye verify``: a line laser's place against other shots, of any target -------
 
 
 def add_verify(parser: argparse.ArgumentParser) -> None:
@@ -256,13 +231,6 @@ def _show_verify(console: "Console", document: Document) -> None:
     show_held_out(console, document["held_out"])
 
 
-# ---- ``robocal hand-eye export``: a sensor's place for a robot description, or for tf2 ----------
-
-
-FORMATS = ("urdf", "xacro", "yaml", "static-transform")
-PARENTS = {"flange": "tool0", "base": "base"}
-
-
 def add_export(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``export``."""
     parser.add_argument(
@@ -291,23 +259,7 @@ def run_export(args: argparse.Namespace) -> CliResult:
         "text": exported(T, parent, args.child, args.format),
         f"T_{mount.parent}_sensor": transform_document(T),
     }
-    return CliResult(document, partial(_show_export, document=document))
-
-
-def _show_export(console: "Console", document: Document) -> None:
-    console.out(document["text"], highlight=False)
-
-
-# ---- ``robocal hand-eye check-plan``: will planned poses do, and which would do better ----------
-
-
-SENSOR = {
-    "near": (190.0, "nearest distance that the sensor sees"),
-    "far": (210.0, "farthest"),
-    "width": (60.0, "of the field, half way"),
-    "noise": (0.037, "of a point along the beam, one sigma"),
-}
-ROBOT_SIGMA_MM = 0.05
+    return CliResult(document, lambda console: console.out(document["text"], highlight=False))
 
 
 def add_check_plan(parser: argparse.ArgumentParser) -> None:
@@ -351,57 +303,32 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
 
 def run_check_plan(args: argparse.Namespace) -> CliResult:
     """Do ``check-plan``. Raises `RobocalError` for what a user can mend."""
-    settings, sensor = settings_of(args), _sensor(args)
-    known = given_target(args.target_kind, args.target, args.radius_mm)
-    table = read_pose_table(args.poses, arm_of(args), None)
-    target = _planned(known, args.center_mm, sensor, table.mark)
-    X = read_flange_mount(args.mount)
-    report = check_plan(target, table.T_base_flange, X, sensor, _noise(settings), settings.limit_m)
-    marks = None if table.mark is None else _lit(target, report.proposed @ X)
-    if args.propose is not None:
-        names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
-        write_pose_table(args.propose, report.proposed, names=names, mark=marks)
-    document = _document(report, table.names) | {"proposed_marks": marks}
-    return CliResult(document, partial(_show_check_plan, document=document))
-
-
-def _sensor(args: argparse.Namespace) -> "SensorRange":
+    settings = settings_of(args)
     if args.near_mm >= args.far_mm:
         raise InputError(f"--near-mm {args.near_mm:g} must be below --far-mm {args.far_mm:g}")
-    return SensorRange(
+    sensor = SensorRange(
         near_m=args.near_mm * 1e-3,
         far_m=args.far_mm * 1e-3,
         width_m=args.width_mm * 1e-3,
         noise_m=args.noise_mm * 1e-3,
     )
-
-
-def _noise(settings: "HandEyeSettings") -> "PoseNoise":
-    return settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
-
-
-def _planned(
-    target: "LaserTarget | None",
-    center_mm: tuple[float, float, float] | None,
-    sensor: "SensorRange",
-    marks: tuple[str, ...] | None,
-) -> "PlannedTarget":
-    if isinstance(target, SphereTarget):
-        if center_mm is None:
-            return PlannedSphere(target.radius_m, sensor)
-        x, y, z = center_mm
-        return PlannedSphere(target.radius_m, sensor, (x * 1e-3, y * 1e-3, z * 1e-3))
-    if center_mm is not None:
+    known = given_target(args.target_kind, args.target, args.radius_mm)
+    table = read_pose_table(args.poses, arm_of(args), None)
+    centre = None if args.center_mm is None else tuple(x * 1e-3 for x in args.center_mm)
+    if centre is not None and args.target_kind != "sphere":
         raise InputError("--center-mm is a sphere's")
-    if isinstance(target, StepTarget):
-        return PlannedStairs(target, sensor, marks)
-    line = None if target is None else np.stack([target.point_base, target.direction_base])
-    return PlannedLine(sensor, line)
-
-
-def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[str] | None:
-    """Marks of the stairs on which proposed poses lay the light."""
-    return list(target.lit(T_base_sensor)) if isinstance(target, PlannedStairs) else None
+    target = planned_target(known, sensor, centre, table.mark)
+    X = read_flange_mount(args.mount)
+    noise = settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
+    report = check_plan(target, table.T_base_flange, X, sensor, noise, settings.limit_m)
+    marks = None
+    if table.mark is not None and isinstance(target, PlannedStairs):
+        marks = list(target.lit(report.proposed @ X))  # on which the light is laid
+    if args.propose is not None:
+        names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
+        write_pose_table(args.propose, report.proposed, names=names, mark=marks)
+    document = _document(report, table.names) | {"proposed_marks": marks}
+    return CliResult(document, partial(_show_check_plan, document=document))
 
 
 def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:

@@ -18,7 +18,7 @@ from robocal_ros.estimation.polyline import CornerRule
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.streams import StandstillRule
-from robocal_ros.hand_eye.data import data_set_of, flange_poses
+from robocal_ros.hand_eye.data import FEATURES, data_set_of, flange_poses
 from robocal_ros.hand_eye.files import PoseTable, read_pose_table, read_profiles
 from robocal_ros.hand_eye.result import HandEyeSettings
 from robocal_ros.hand_eye.session import HandEyeConfig, is_hand_eye_session
@@ -47,9 +47,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+BagShots = tuple[HandEyeData, dict[str, str]]
+
 KINDS = ("sphere", "step", "line")
-FEATURES = ("edge", "groove")
 LIMIT_MM = 1.0
+MOST_NAMED = 5  # samples left out for one reason
 
 
 def add_shots(parser: argparse.ArgumentParser) -> None:
@@ -157,7 +159,7 @@ def robot_sigma_of(args: argparse.Namespace) -> tuple[float | None, float | None
     )
 
 
-def settings_of(args: argparse.Namespace) -> "HandEyeSettings":
+def settings_of(args: argparse.Namespace) -> HandEyeSettings:
     """What is known of the robot, and what is good enough.
 
     Raises
@@ -170,7 +172,7 @@ def settings_of(args: argparse.Namespace) -> "HandEyeSettings":
     return HandEyeSettings(*robot_sigma_of(args), limit_m=args.limit_mm * 1e-3)
 
 
-def arm_of(args: argparse.Namespace) -> "SerialArm | None":
+def arm_of(args: argparse.Namespace) -> SerialArm | None:
     """The robot that is named, if any. Raises as `load_robot`."""
     return None if args.robot is None else load_robot(args.robot)
 
@@ -179,13 +181,13 @@ def arm_of(args: argparse.Namespace) -> "SerialArm | None":
 class ReadShots:
     """Shots, the table that holds them (None: a bag), and its profiles that are none, with why."""
 
-    data: "HandEyeData"
-    table: "PoseTable | None" = None
+    data: HandEyeData
+    table: PoseTable | None = None
     rejected: Mapping[str, str] = field(default_factory=dict)
 
 
 def given_shots(
-    args: argparse.Namespace, arm: "SerialArm | None", judges: Path | None = None
+    args: argparse.Namespace, arm: SerialArm | None, judges: Path | None = None
 ) -> ReadShots:
     """Read the shots that are given, or those like them in the file of ``judges``.
 
@@ -207,14 +209,14 @@ def given_shots(
     return ReadShots(data, None, rejected)
 
 
-def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> ReadShots:
+def read_shots(poses: Path, profiles: Path, arm: SerialArm | None) -> ReadShots:
     """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table)
     return ReadShots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
 
 
-def require_unused(judges: "PoseTable", used: "PoseTable") -> None:
+def require_unused(judges: PoseTable, used: PoseTable) -> None:
     """Refuse judges that helped to solve.
 
     Raises
@@ -227,7 +229,7 @@ def require_unused(judges: "PoseTable", used: "PoseTable") -> None:
             judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
 
 
-def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "LaserTarget | None":
+def given_target(kind: str, target: Path | None, radius_mm: float | None) -> LaserTarget | None:
     """What is known of a target: from its file, or a sphere's radius; None for an unknown line.
 
     Raises
@@ -250,7 +252,7 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "La
     raise InputError(missing[kind])
 
 
-def read_target_of(kind: str, path: Path) -> "LaserTarget":
+def read_target_of(kind: str, path: Path) -> LaserTarget:
     """Read a target file of this kind. Raises as `given_target`."""
     target = read_target(path)
     found = KIND_OF[type(target)]
@@ -259,7 +261,7 @@ def read_target_of(kind: str, path: Path) -> "LaserTarget":
     return target
 
 
-def task_of(target: "LaserTarget | None", feature: str | None, classic: bool = False) -> "Task":
+def task_of(target: LaserTarget | None, feature: str | None, classic: bool = False) -> Task:
     """The estimator's view of a target, of a line by its ``feature``.
 
     ``classic``: corners and edges in the published form.
@@ -270,12 +272,6 @@ def task_of(target: "LaserTarget | None", feature: str | None, classic: bool = F
         return StepTask(target, CornerRule(classic=classic))
     rule = EdgeRule(kind="groove" if feature == "groove" else "edge", classic=classic)
     return LineTask(target, rule)
-
-
-# ---- shots of a line laser from a bag: a recording, or a data file of hand_eye_node -------------
-
-
-BagShots = tuple[HandEyeData, dict[str, str]]
 
 
 def read_bag_shots(path: Path, arm: SerialArm, topics: Mapping[str, str]) -> BagShots:
@@ -308,16 +304,17 @@ def _saved(path: Path, arm: SerialArm) -> HandEyeData:
         raise InputError(f"holds shots of a {data.kind}, not profiles", file=str(path))
     samples = data.chosen([])
     names = tuple(str(sample.handle) for sample in samples)
+    marks = tuple(sample.mark for sample in samples)
     q = np.array([sample.q for sample in samples])
     return HandEyeData(
         names,
         flange_poses(q, [sample.thermal for sample in samples], arm),
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
-        _marks([sample.mark for sample in samples]),
+        marks if any(marks) else None,
     )
 
 
-def _recorded(recording: "BagOverview", arm: SerialArm) -> BagShots:
+def _recorded(recording: BagOverview, arm: SerialArm) -> BagShots:
     path = recording.reader.info.path
     if PROFILE not in recording.inputs.values():
         raise InputError(
@@ -337,16 +334,17 @@ def _recorded(recording: "BagOverview", arm: SerialArm) -> BagShots:
     if not kept:
         why = next(iter(rejected.values()), "there is none")
         raise TooFewSamplesError(f"{path}: no profile is of use, of {len(rejected)}: {why}")
+    marks = tuple(one.mark for one in kept)
     return HandEyeData(
         tuple(one.name for one in kept),
         np.array([arm.fk(one.q) for one in kept]),
         [Profile(one.shot.read(), one.name) for one in kept],
-        _marks([one.mark for one in kept]),
+        marks if any(marks) else None,
     ), rejected
 
 
 def _chosen(
-    recording: "BagOverview", found: list[StandingShot], rule: StandstillRule
+    recording: BagOverview, found: list[StandingShot], rule: StandstillRule
 ) -> tuple[list[StandingShot], dict[str, str]]:
     """What the recorded session holds; without one, a shot of each standstill."""
     marks = captured_marks(recording.commands)
@@ -357,16 +355,6 @@ def _chosen(
     ]
     why = "not captured, or removed, in the recorded session"
     return kept, {one.name: why for one in found if one.shot.stamp_ns not in marks}
-
-
-def _marks(marks: list[str]) -> tuple[str, ...] | None:
-    return tuple(marks) if any(marks) else None
-
-
-# ---- results of ``robocal hand-eye`` for people -------------------------------------------------
-
-
-MOST_NAMED = 5  # samples left out for one reason
 
 
 def show_mount(console: "Console", document: Document) -> None:
