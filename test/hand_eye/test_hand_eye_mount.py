@@ -1,12 +1,22 @@
-"""The mount as an estimation problem: its Jacobian, its invariance, its covariance."""
+"""The mount as an estimation problem: its Jacobian, its covariance, what it rejects."""
 
 from dataclasses import replace
 from itertools import count
 
 import numpy as np
 import pytest
-from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_target
+from hand_eye_sets import (
+    CELL,
+    CENTRE,
+    POSE_M,
+    RADIUS_M,
+    STAIRS,
+    T_BASE_USER,
+    data_of,
+    stairs_target,
+)
 
+from robocal_ros.cell_sim.hand_eye_cell import step_shots
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import SETTLED, fit_mount
@@ -20,8 +30,8 @@ from robocal_ros.hand_eye.mount_problem import (
     TargetView,
     pivot_of,
 )
-from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, increment
-from robocal_ros.hand_eye.solve import judge
+from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, by_shot, increment
+from robocal_ros.hand_eye.solve import features, judge, looked
 from robocal_ros.hand_eye.staircase import StepTask
 
 X = CELL.T_flange_sensor
@@ -241,3 +251,48 @@ def test_one_wrong_corner_is_left_out_and_the_others_of_its_profile_stay():
     wrong = TargetView(view.model, replace(view.sightings, value=value))
     fit = fit_mount((wrong,), MountState(X, (place,)))
     assert list(fit.rejected) == [view.sightings.names[8]]
+
+
+SHIFT_M = 2e-3
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_badly_taught_origin_shows_in_tilted_shots(axis):
+    """Along the edges too: tilts about the laser line tell it from a shift of the sensor."""
+    shots = step_shots(CELL, STAIRS, 12, np.random.default_rng(3))
+    taught = T_BASE_USER @ frames.transform(np.eye(3), SHIFT_M * np.eye(3)[axis])
+    target = stairs_target(taught, user_sigma_m=SHIFT_M, user_sigma_rad=1e-4)
+    task, data = StepTask(target), data_of(shots)
+    read = features(task, data)
+    fit = fit_mount((read.view,), looked(task, data, read))
+    off_m = (frames.invert(fit.state.places[0]) @ T_BASE_USER)[:3, 3]
+    covariance = fit.covariance[6:9, 6:9]
+    assert off_m @ np.linalg.solve(covariance, off_m) < 16.27  # chi-square of 3, once in 1000
+    # At least 15 of 16 parts of what is then known of it are the poses', not the teacher's.
+    assert np.sqrt(np.diag(covariance).max()) < SHIFT_M / 4.0
+
+
+def test_a_single_corner_keeps_its_name():
+    samples = ("a/corner 1", "a/corner 3")
+    rejected = {"a/corner 2": "does not fit the others"}
+    assert by_shot(rejected, samples) == rejected
+
+
+def test_a_shot_without_a_corner_left_is_named_once_with_the_commonest_reason():
+    swapped = "fits the pose of {}/corner 2, not its own: swapped?"
+    rejected = {
+        "step/b/corner 1": "does not fit the others",
+        "step/b/corner 2": swapped.format("step/c"),
+        "step/b/corner 10": swapped.format("step/c"),
+        "empty": "profile empty has 0 points",
+    }
+    found = by_shot(rejected, ("step/a/corner 1",))
+    assert found == {
+        "step/b": "fits the pose of step/c, not its own: swapped?",
+        "empty": "profile empty has 0 points",
+    }
+
+
+def test_folders_in_names_are_no_shots():
+    rejected = {"sphere/s1": "too short", "day 1/p2": "dark"}
+    assert by_shot(rejected, ()) == rejected

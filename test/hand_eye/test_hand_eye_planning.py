@@ -1,4 +1,4 @@
-"""Planned poses: judged before the robot moves, and mended."""
+"""Planned poses: judged before the robot moves, and mended; where they look for a sphere."""
 
 from dataclasses import dataclass, replace
 
@@ -14,6 +14,7 @@ from hand_eye_sets import (
     data_of,
     stairs_target,
 )
+from scipy.optimize import minimize
 
 from robocal_ros.cell_sim.hand_eye_cell import (
     SimulatedShots,
@@ -26,11 +27,14 @@ from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.planning import (
+    BEHIND,
+    OFF_EQUATOR,
     PlannedLine,
     PlannedSphere,
     PlannedStairs,
     SensorRange,
     check_plan,
+    looked_at,
 )
 from robocal_ros.hand_eye.result import (
     HandEyeSettings,
@@ -210,3 +214,37 @@ def test_proposed_poses_do_what_they_promise(turned):
     assert len(result.rejected) <= 1  # nothing that is proposed is out of view
     off_m = apart(result.T_flange_sensor, CELL.T_flange_sensor, SENSOR.field_points)
     assert off_m < 3.0 * plan.proposed_error_m
+
+
+def misfit(centre, T_base_sensor):
+    """Of a centre (3,) with Cauchy's loss, one pose after the other."""
+    off = OFF_EQUATOR * RADIUS_M
+    allowed = [0.045, RADIUS_M - off, 0.01 + RADIUS_M]
+    total = 0.0
+    for T in T_base_sensor:
+        s = T[:3, :3].T @ (centre - T[:3, 3])
+        wanted = [0.0, np.copysign(off, s[1]), 0.2 + BEHIND * RADIUS_M]
+        total += np.log1p(np.sum(((s - wanted) / allowed) ** 2))
+    return total
+
+
+@pytest.mark.parametrize("strays", [0, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_centre_is_the_most_likely_one(seed, strays):
+    shots = sphere_shots(CELL, CENTRE, RADIUS_M, 12, np.random.default_rng(seed))
+    T = shots.true_T_base_flange @ CELL.T_flange_sensor
+    T[12 - strays :, :3, 3] += 0.3
+    centres, misfits = looked_at(T, RADIUS_M, SENSOR)
+    best = np.argmin(misfits)
+    least = minimize(misfit, CENTRE, (T,), method="Nelder-Mead", options={"xatol": 1e-7})
+    assert misfits[best] == pytest.approx(least.fun, rel=1e-6)
+    assert np.linalg.norm(centres[best] - least.x) < 1e-5  # both ends stop at 1e-6 or finer
+
+
+def test_poses_that_look_alike_leave_both_sides_possible():
+    """Without a turn the sphere may be before the laser planes or behind them."""
+    sides = looked_at(np.tile(np.eye(4), (3, 1, 1)), RADIUS_M, SENSOR)
+    y = np.sort(sides[0][:, 1])
+    assert np.allclose(np.abs(y), OFF_EQUATOR * RADIUS_M, atol=1e-6)
+    assert y[0] < 0.0 < y[-1]
+    assert np.allclose(sides[1], 0.0, atol=1e-6)

@@ -1,7 +1,10 @@
-"""Tables and target files of a hand-eye calibration: read, written, and refused by name."""
+"""Tables of shots, target files and documents, exports of mounts: read as written, or refused."""
 
+import json
 import re
 import textwrap
+import xml.etree.ElementTree as ET
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +12,11 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.hand_eye.files import (
     PoseTable,
+    exported,
     read_pose_table,
     read_profile,
     read_profiles,
@@ -20,11 +25,14 @@ from robocal_ros.hand_eye.files import (
 )
 from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.targets import (
+    BoardTarget,
     LineTarget,
     SphereTarget,
     Staircase,
     StepTarget,
     read_target,
+    target_document,
+    target_of,
     write_target,
 )
 from robocal_ros.kinematics.robots import load_robot
@@ -347,3 +355,121 @@ def test_the_files_in_the_docs_are_read(tmp_path, kind):
             TooFewSamplesError, match="has 2 points"
         ):  # three rows, one of them a gap
             read_profile(tmp_path / "a.csv", "a")
+
+
+T = frames.transform(frames.exp_rotation([0.1, 0.2, 0.3]), [0.7, 0.1, 1 / 3])
+STAIRS = Staircase(5, 0.09, 0.01, 0.01, "both")
+FULL_STEP = StepTarget(T, STAIRS.marked_corners(), STAIRS.edge_user, 1e-5, 2e-4, 1e-3)
+FULL_LINE = LineTarget(T[:3, 3], T[:3, 0])
+K = np.array([[610.0 / 3, 0.0, 322.0], [0.0, 612.0, 236.0], [0.0, 0.0, 1.0]])
+GIVEN = BoardTarget(9, 6, 0.025 / 3, K, np.array([0.1 / 3, 0, 0, 0, 0]), np.array([640.0, 480.0]))
+TARGETS = [
+    ("sphere", SphereTarget(0.1 / 3)), ("step", FULL_STEP), ("line", FULL_LINE),
+    ("camera", BoardTarget(9, 6, 0.025 / 3)), ("camera", GIVEN),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "target"), TARGETS)
+def test_a_target_comes_back_to_the_last_bit(kind, target):
+    document = json.loads(json.dumps(target_document(kind, target), allow_nan=False))
+    assert document["kind"] == kind
+    found = target_of(document)
+    assert type(found) is type(target)
+    for field in fields(target):
+        before, after = getattr(target, field.name), getattr(found, field.name)
+        if field.name == "corners":
+            assert list(after) == list(before)
+            before, after = list(before.values()), list(after.values())
+        assert np.array_equal(after, before)
+
+
+def test_nothing_known_stays_nothing_known():
+    assert target_of(target_document("line", None)) is None
+    assert target_of({"kind": "camera"}) is None
+
+
+def test_a_board_with_its_camera_is_known_whole():
+    assert BoardTarget(9, 6, 0.025).intrinsics is None
+    assert GIVEN.intrinsics.size == (640, 480)
+    assert np.array_equal(GIVEN.intrinsics.matrix, K)
+    assert (GIVEN.board.columns, GIVEN.board.rows, GIVEN.board.square_m) == (9, 6, 0.025 / 3)
+
+
+def test_another_target_than_named_is_refused():
+    with pytest.raises(InputError, match="describes a line, not a sphere"):
+        target_document("sphere", FULL_LINE)
+    step, line = target_document("step", FULL_STEP), target_document("line", FULL_LINE)
+    for broken in (
+        {"kind": "cone", "x": 1}, {"kind": "sphere", "width_m": 1}, {"radius_m": 1},
+        {"kind": "sphere", "radius_m": "x"}, {"kind": "sphere", "radius_m": 0.0},
+        {"kind": "sphere", "radius_m": float("nan")}, {"kind": "sphere", "radius_m": [0.02]},
+        line | {"point_base": [0.0, 1.0]}, line | {"direction_base": 3.0},
+        step | {"corners": {}}, step | {"corners": {"near": []}}, step | {"corners": 3.0},
+        step | {"corners": {"near": [[0.0, 1.0]]}}, step | {"sigma_m": None},
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="cannot be read"):
+            target_of(broken)
+
+
+TURNS = [
+    *Rotation.random(20, random_state=7).as_matrix(),
+    np.eye(3),
+    np.diag([1.0, -1.0, -1.0]),
+    *(Rotation.from_euler("ZYX", [40.0, p, 25.0], degrees=True).as_matrix() for p in (90, -90)),
+]
+PLACE = np.array([0.0123456, -0.2, 1.5])
+PRINTED_M, PRINTED_RAD = 1e-7, 1e-7
+XACRO = "http://www.ros.org/wiki/xacro"
+
+
+def agrees(xyz, rotation: Rotation, turn: np.ndarray) -> None:
+    assert np.array(xyz) == pytest.approx(PLACE, abs=PRINTED_M)
+    assert (Rotation.from_matrix(turn).inv() * rotation).magnitude() < PRINTED_RAD
+
+
+def of_joint(joint: ET.Element) -> tuple[list[float], Rotation]:
+    assert joint.attrib == {"name": "tool0-laser", "type": "fixed"}
+    assert joint.find("parent").attrib["link"] == "tool0"
+    assert joint.find("child").attrib["link"] == "laser"
+    origin = joint.find("origin").attrib
+    xyz, rpy = ([float(x) for x in origin[name].split()] for name in ("xyz", "rpy"))
+    return xyz, Rotation.from_euler("xyz", rpy)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_urdf_and_xacro_are_read_back(turn):
+    T = frames.transform(turn, PLACE)
+    robot = ET.fromstring(f"<robot>{exported(T, 'tool0', 'laser', 'urdf')}</robot>")
+    assert robot.find("link").attrib["name"] == "laser"
+    agrees(*of_joint(robot.find("joint")), turn)
+    text = f'<robot xmlns:xacro="{XACRO}">{exported(T, "tool0", "laser", "xacro")}</robot>'
+    for given in ET.fromstring(text).findall(f"{{{XACRO}}}property"):
+        text = text.replace(f"${{{given.attrib['name']}}}", given.attrib["value"])
+    agrees(*of_joint(ET.fromstring(text).find("joint")), turn)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_static_transform_is_read_back(turn):
+    found = yaml.safe_load(exported(frames.transform(turn, PLACE), "base", "cell/laser", "yaml"))
+    assert found["header"]["frame_id"] == "base"
+    assert found["child_frame_id"] == "cell/laser"
+    t, r = found["transform"]["translation"], found["transform"]["rotation"]
+    rotation = Rotation.from_quat([r[name] for name in "xyzw"])
+    agrees([t[name] for name in "xyz"], rotation, turn)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_command_line_is_read_back(turn):
+    text = exported(frames.transform(turn, PLACE), "tool0", "laser", "static-transform")
+    program, *words = text.split(" --")
+    assert program == "ros2 run tf2_ros static_transform_publisher"
+    given = dict(word.split() for word in words)
+    assert (given.pop("frame-id"), given.pop("child-frame-id")) == ("tool0", "laser")
+    rotation = Rotation.from_quat([float(given[f"q{axis}"]) for axis in "xyzw"])
+    agrees([float(given[axis]) for axis in "xyz"], rotation, turn)
+
+
+@pytest.mark.parametrize("name", ["", 'a"b', "two words", "a: b", "<x>"])
+def test_a_name_that_would_break_the_text_is_refused(name):
+    with pytest.raises(InputError, match="no name of a frame"):
+        exported(np.eye(4), "tool0", name, "urdf")
