@@ -61,7 +61,12 @@ if TYPE_CHECKING:
     from robocal_ros.hand_eye.planning import PlanReport
 
 
+Array = NDArray[np.float64]
 AddOutput = Callable[[type, str, QoSProfile], Any]
+Ask = Callable[[Command], Awaitable[Outcome]]
+
+KEPT, SUFFIX = "hand_eye", ".mcap"
+ROUGH = "rough"  # the parameters that say about where the sensor sits
 
 TARGETS = {
     HandEyeStatus.SPHERE: "sphere",
@@ -174,11 +179,6 @@ def calibration_transform(model: dict[str, Any], stamp_ns: int) -> TransformStam
         child_frame_id=model["child"],
         transform=conversions.transform_message(np.array(model["T_parent_sensor"])),
     )
-
-
-Ask = Callable[[Command], Awaitable[Outcome]]
-
-KEPT, SUFFIX = "hand_eye", ".mcap"
 
 
 class HandEyeFiles:
@@ -301,11 +301,6 @@ def _path(request: Any) -> Path:
         return Path(request.path).expanduser().absolute()
     except RuntimeError as error:
         raise InputError(f"{error}: name the whole path", file=request.path) from error
-
-
-Array = NDArray[np.float64]
-
-ROUGH = "rough"  # the parameters that say about where the sensor sits
 
 
 class HandEyePlan:

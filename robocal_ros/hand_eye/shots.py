@@ -28,13 +28,15 @@ from robocal_ros.session import events
 from robocal_ros.session.base import GAP_NS, Ignored
 from robocal_ros.session.events import Command
 
-# ---- a profile: what a line-laser sensor sees in one shot, in its own x-z plane -----------------
-
-
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 10
 NARROWEST_M, WIDEST_M = 1e-3, 20.0  # no line laser's field of view is outside of this
+PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
+SHOTS = (PROFILE, TARGET_POSE, IMAGE)
+PLANE_M = 1e-5  # a profile's points lie so near to y = 0
+MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
+AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,16 +82,6 @@ def profile_of(points: ArrayLike, name: str) -> Profile:
             f"{'small' if small else 'large'}? A table's x_mm and z_mm hold mm, a message m"
         )
     return Profile(rows, name)
-
-
-# ---- shots --------------------------------------------------------------------------------------
-
-
-PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
-SHOTS = (PROFILE, TARGET_POSE, IMAGE)
-PLANE_M = 1e-5  # a profile's points lie so near to y = 0
-MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
-AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +212,6 @@ class ShotLog:
         """Forget all."""
         self._shots.clear()
         self._bytes = 0
-
-
-# ---- shots of a recording: profiles that were taken while the robot stood still -----------------
 
 
 @dataclass(frozen=True, eq=False)
