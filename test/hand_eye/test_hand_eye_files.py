@@ -337,8 +337,8 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @pytest.mark.parametrize("kind", ["sphere", "step", "line"])
 def test_the_files_in_the_docs_are_read(tmp_path, kind):
-    text = (DOCS / f"hand_eye_{kind}.md").read_text()
-    files = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    text = (DOCS / "hand_eye.md").read_text()
+    files = re.findall(rf"```yaml\n(kind: {kind}\n.*?)```", text, re.DOTALL)
     for file in files:
         (tmp_path / "target.yaml").write_text(file)
         found = read_target(tmp_path / "target.yaml")
