@@ -16,9 +16,9 @@ from bench.speed import medians, pinocchio_model
 from bench.tables import Cell, Goal, Table
 from robocal_ros.correction import solution
 from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.damping import LENGTH
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, TrajectoryCommand
 from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
-from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimiter
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.staged import StagedCorrection

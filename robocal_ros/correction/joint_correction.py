@@ -45,8 +45,8 @@ from robocal_ros.correction import solution
 from robocal_ros.correction.solution import (
     RATE_STEP_S,
     STEP_AHEAD_S,
+    work_size,
 )
-from robocal_ros.correction.straight import work_size
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 

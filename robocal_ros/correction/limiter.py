@@ -24,7 +24,7 @@ steps of dt, and no more than the limit at rest. Then each joint's v is held to 
 joint that may reach s d and stay with it does so exactly.
 """
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,21 +60,21 @@ MOST_STEPS = 10_000
 # A joint that was given no faster than this stands, rad/s (prismatic: m/s).
 STILL = 1e-3
 ROUNDING = 1e-9
+NOT_WITHIN = -2.0  # a target that is not solved within all bounds
+# What is said of the targets: how many were corrected in part; of the last one the error at the
+# tool that the drift would have made, the largest offset wanted and the error that is left; whether
+# anything is added, and whether a joint's velocity is too high.
+REDUCED, SHIFT, LARGEST, REMAINING, ADDS, TOO_FAST = range(6)
+FIGURES = 6
 
 
 @dataclass(frozen=True)
 class OffsetLimits:
-    """Fastest change of the offset of one joint: rad/s and rad/s^2 (prismatic: m/s, m/s^2).
+    """Fastest change of the offset of one joint: rad/s and rad/s^2 (prismatic: m/s, m/s^2)."""
 
-    Attributes
-    ----------
-    rest, rest_acceleration : while the joints are given no motion.
-    motion, motion_acceleration : while they are.
-    """
-
-    rest: float
+    rest: float  # while the joints are given no motion
     rest_acceleration: float
-    motion: float
+    motion: float  # while they are
     motion_acceleration: float
 
     def __post_init__(self) -> None:
@@ -85,10 +85,6 @@ class OffsetLimits:
             raise ValueError(
                 f"limits of the offset must be positive, and greatest in motion: {self}"
             )
-
-    def row(self) -> tuple[float, float, float, float]:
-        """In the order of the limits' rows."""
-        return self.rest, self.rest_acceleration, self.motion, self.motion_acceleration
 
 
 TURNING = OffsetLimits(*np.radians([2.0, 20.0, 10.0, 200.0]).tolist())
@@ -169,14 +165,6 @@ def advance(
             state[OFFSET, j], state[OFFSET_RATE, j] = offset + v * dt, v
         state[DESIRED_RATE, j] = (desired[j] - state[DESIRED, j]) / dt
         state[DESIRED, j], state[SHARE, j] = desired[j], share
-
-
-@kernel
-def step(
-    state: Array, desired: Array, dt: float, moves: bool, limits: Array, active: Array
-) -> None:
-    """`advance`, for one message of a stream."""
-    advance(state, desired, dt, moves, limits, active)
 
 
 @lean
@@ -274,6 +262,65 @@ def follow(
             offsets[k, j], rates[k, j] = state[OFFSET, j], state[OFFSET_RATE, j]
 
 
+@lean
+def step_out(
+    goal: Array, velocity: Array, elapsed: float, longest: float, memory: Array, limits: Array,
+    active: Array, speeds: Array, span: Array, bounds: Array, tcp: Array, largest: Array,
+    free: bool, works: Array, reports: Array, figures: Array,
+) -> float:  # fmt: skip
+    """Correct a target ``goal`` (n,) with its ``velocity`` (n,), and put it out: see `put_out`.
+
+    Parameters
+    ----------
+    speeds : (2, n) fastest of the joints, in this step and ever.
+    bounds, tcp : (k, n) and (2,) largest shifts, see `within`.
+    largest, free, works : of `correct_staged`.
+    reports : (2, k, n + 7) scratch; the first is that of the target.
+    figures : (6,) what is said of it.
+
+    Returns
+    -------
+    float
+        As `put_out`, or `NOT_WITHIN`. The velocities that go out are in the memory then.
+    """
+    n, report, whole = goal.shape[0], reports[0], True
+    correct_staged(goal, largest, free, works, report)
+    if not within(goal, report, bounds, tcp, memory[WANTED]):
+        return NOT_WITHIN
+    share = put_out(memory, goal, memory[WANTED], elapsed, longest, limits, active, speeds[0], span)
+    figures[SHIFT], figures[LARGEST] = report[0, n + TCP_SHIFT], 0.0
+    figures[REMAINING], figures[ADDS], figures[TOO_FAST] = 0.0, 0.0, 0.0
+    for stage in range(report.shape[0]):
+        whole = whole and report[stage, n + WEAK] == 0.0
+        figures[REMAINING] += report[stage, n + POSITION_ERROR]
+    for j in range(n):
+        figures[LARGEST] = max(figures[LARGEST], abs(memory[WANTED, j]))
+        if memory[OFFSET, j] != 0.0:
+            figures[ADDS] = 1.0
+    if not whole:
+        figures[REDUCED] += 1.0
+    if not 0.0 <= share <= 1.0 + ROUNDING:
+        return share
+    out, exact = memory[VELOCITY], True
+    for j in range(n):
+        exact = exact and memory[OFFSET, j] == memory[DESIRED, j]
+        out[j] = velocity[j] + memory[OFFSET_RATE, j]
+    if exact:
+        taught, corrected, last = memory[TAUGHT], memory[OUT], works.shape[0] - 1
+        if not (
+            whole and n == 6 and not free
+            and velocity_by_chain(taught, velocity, corrected, works[0], works[last], out)
+        ):  # fmt: skip
+            velocity_by_differences(
+                taught, velocity, corrected, largest, free, works, memory[VELOCITY + 1],
+                reports[1], out,
+            )  # fmt: skip
+    for j in range(n):
+        if active[j] != 0.0 and abs(out[j]) > speeds[1, j] * (1.0 + ROUNDING):
+            figures[TOO_FAST] = 1.0
+    return share
+
+
 class OffsetLimiter:
     """The offset of each joint, which never jumps.
 
@@ -285,9 +332,8 @@ class OffsetLimiter:
 
     def __init__(self, prismatic: NDArray[np.bool_], turning: OffsetLimits, sliding: OffsetLimits):
         n = len(prismatic)
-        self.limits = np.ascontiguousarray(
-            np.where(prismatic, np.array(sliding.row())[:, None], np.array(turning.row())[:, None])
-        )
+        rows = (np.array(astuple(of))[:, None] for of in (sliding, turning))
+        self.limits = np.ascontiguousarray(np.where(prismatic, *rows))
         self.memory = np.zeros((MEMORY, n))
         self.memory[SHARE] = 1.0
         self.memory[[TAUGHT, OUT]] = np.nan
@@ -311,7 +357,7 @@ class OffsetLimiter:
 
     def step(self, desired: Array, dt_s: float, active: Array) -> None:
         """A step of ``dt_s`` > 0 at rest."""
-        step(self.state, desired, dt_s, False, self.limits, active)
+        advance(self.state, desired, dt_s, False, self.limits, active)
 
     def follow(
         self, desired: Array, times: Array, speed: Array, active: Array
@@ -331,83 +377,3 @@ def load_kernels(n: int) -> None:
         limiter.memory, zeros, zeros, 0.004, 0.004, limiter.limits, ones, ones, np.zeros((2, n))
     )
     limiter.follow(np.zeros((2, n)), np.arange(2.0), np.zeros(2), np.ones(n))
-
-
-# ---- one target of a stream, from taught joints to what goes out: compiled in one piece ---------
-
-
-NOT_WITHIN = -2.0  # a target that is not solved within all bounds
-# What is said of the targets: how many were corrected in part; of the last one the error at the
-# tool that the drift would have made, the largest offset wanted and the error that is left; whether
-# anything is added, and whether a joint's velocity is too high.
-REDUCED, SHIFT, LARGEST, REMAINING, ADDS, TOO_FAST = range(6)
-
-
-FIGURES = 6
-
-
-@lean
-def _say(goal: Array, reports: Array, memory: Array, figures: Array) -> bool:
-    """Fill in what is said of a target; whether all of it was corrected."""
-    n, whole = goal.shape[0], True
-    figures[SHIFT], figures[LARGEST] = reports[0, n + TCP_SHIFT], 0.0
-    figures[REMAINING], figures[ADDS], figures[TOO_FAST] = 0.0, 0.0, 0.0
-    for stage in range(reports.shape[0]):
-        whole = whole and reports[stage, n + WEAK] == 0.0
-        figures[REMAINING] += reports[stage, n + POSITION_ERROR]
-    for j in range(n):
-        figures[LARGEST] = max(figures[LARGEST], abs(memory[WANTED, j]))
-        if memory[OFFSET, j] != 0.0:
-            figures[ADDS] = 1.0
-    if not whole:
-        figures[REDUCED] += 1.0
-    return whole
-
-
-@lean
-def step_out(
-    goal: Array, velocity: Array, elapsed: float, longest: float, memory: Array, limits: Array,
-    active: Array, speeds: Array, span: Array, bounds: Array, tcp: Array, largest: Array,
-    free: bool, works: Array, reports: Array, figures: Array,
-) -> float:  # fmt: skip
-    """Correct a target ``goal`` (n,) with its ``velocity`` (n,), and put it out: see `put_out`.
-
-    Parameters
-    ----------
-    speeds : (2, n) fastest of the joints, in this step and ever.
-    bounds, tcp : (k, n) and (2,) largest shifts, see `within`.
-    largest, free, works : of `correct_staged`.
-    reports : (2, k, n + 7) scratch; the first is that of the target.
-    figures : (6,) what is said of it.
-
-    Returns
-    -------
-    float
-        As `put_out`, or `NOT_WITHIN`. The velocities that go out are in the memory then.
-    """
-    n, report = goal.shape[0], reports[0]
-    correct_staged(goal, largest, free, works, report)
-    if not within(goal, report, bounds, tcp, memory[WANTED]):
-        return NOT_WITHIN
-    share = put_out(memory, goal, memory[WANTED], elapsed, longest, limits, active, speeds[0], span)
-    whole = _say(goal, report, memory, figures)
-    if not 0.0 <= share <= 1.0 + ROUNDING:
-        return share
-    out, exact = memory[VELOCITY], True
-    for j in range(n):
-        exact = exact and memory[OFFSET, j] == memory[DESIRED, j]
-        out[j] = velocity[j] + memory[OFFSET_RATE, j]
-    if exact:
-        taught, corrected, last = memory[TAUGHT], memory[OUT], works.shape[0] - 1
-        if not (
-            whole and n == 6 and not free
-            and velocity_by_chain(taught, velocity, corrected, works[0], works[last], out)
-        ):  # fmt: skip
-            velocity_by_differences(
-                taught, velocity, corrected, largest, free, works, memory[VELOCITY + 1],
-                reports[1], out,
-            )  # fmt: skip
-    for j in range(n):
-        if active[j] != 0.0 and abs(out[j]) > speeds[1, j] * (1.0 + ROUNDING):
-            figures[TOO_FAST] = 1.0
-    return share

@@ -1,27 +1,20 @@
 """Compiled solution of the joint correction: one point, a point through all stages, or many.
 
-Nearly all points of six joints are solved by `straight` and, with weak directions, by
-`straight_damped`; the others, and all other arms, here. ``work``
-is that of `room`, with settled models. Equations: see `joint_correction`.
+Nearly all points of six joints are solved by `six_axis`; the others, and all other arms, here.
+``work`` holds `work_size` numbers, so that a point allocates nothing; `prepare` puts the models and
+the constants of a correction there, once. Equations: see `joint_correction`.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction import kernels as k
-from robocal_ros.correction import straight, straight_damped
-from robocal_ros.correction import straight as six
-from robocal_ros.correction.straight import (
-    IS_STRAIGHT,
-    PER_ERROR,
-    STEEPNESS,
-    Workspace,
-    room_in,
-    settle,
-)
+from robocal_ros.correction import damping, six_axis
+from robocal_ros.correction.six_axis import CONSTANTS, LANES, ROWS, N
 from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
-from robocal_ros.kinematics.kernels import walk
+from robocal_ros.kinematics.kernels import turns_size, walk
 
 Array = NDArray[np.float64]
 
@@ -37,6 +30,108 @@ MOST_OVER = 3.0
 # What is written after the n joints.
 POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, WEAK = range(7)
 REPORT = 7
+# Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
+RATE_STEP_S = 2e-4
+# Where they do in a velocity from one side: some 1e-6 rad/s.
+STEP_AHEAD_S = 5e-7
+VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
+MOST_STEPS = 20
+POSES, SQUARES, TWISTS = 6, 3, 5
+STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
+
+
+class Workspace(NamedTuple):
+    """Where a solution is worked out: parts of ``work``.
+
+    Poses have the axes of the flange, their origin is the tool's.
+    """
+
+    taught_links: Array  # (n, 9) joints of the reference model, and of the actual one
+    links: Array
+    taught_root: Array  # (4, 4) T_base_root and T_flange_tool of both
+    taught_tool: Array
+    root: Array
+    tool: Array
+    goal: Array  # (4, 4) where the tool must go, and where it is at the joints tried last
+    here: Array
+    turns: Array  # scratch of `walk`
+    frames: Array
+    J: Array  # (n, 6) Jacobian at the taught joints, and at those tried last
+    there: Array
+    M: Array  # (6, 6) J J^T
+    U: Array  # (3, 3) vectors of a part of M
+    D: Array  # (6, 6) the damping
+    B: Array  # (6, 6) matrix of a step
+    e: Array  # (6,) residual, multipliers, their step, and scratch
+    y: Array
+    step: Array
+    spare: Array
+    order: Array
+    x: Array  # (n,) shift of the joints
+    settings: Array  # steepness, its rise, whether `six_axis` serves; see `joint_correction` (3)
+    constants: Array  # of `six_axis`, for sixteen points
+    came: Array
+    goes: Array
+    late: Array
+
+
+def work_size(n: int) -> int:
+    """How many scratch numbers a solution for n joints needs."""
+    many = CONSTANTS + LANES * (N + ROWS + 1)
+    small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 9 + 6 * TWISTS + SETTINGS
+    return 18 * n + 18 * n + n + small + many
+
+
+@lean
+def room_in(work: Array, n: int) -> Workspace:
+    """Divide ``work``."""
+    links, at = work[: 18 * n].reshape(2, n, 9), 18 * n
+    poses, at = work[at : at + 16 * POSES].reshape(POSES, 4, 4), at + 16 * POSES
+    turns, at = work[at : at + turns_size(n)], at + turns_size(n)
+    frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
+    J, at = work[at : at + 12 * n].reshape(2, n, 6), at + 12 * n
+    squares, at = work[at : at + 36 * SQUARES].reshape(SQUARES, 6, 6), at + 36 * SQUARES
+    U, at = work[at : at + 9].reshape(3, 3), at + 9
+    twists, at = work[at : at + 6 * TWISTS].reshape(TWISTS, 6), at + 6 * TWISTS
+    x, at = work[at : at + n], at + n
+    settings, at = work[at : at + SETTINGS], at + SETTINGS
+    constants, at = work[at : at + CONSTANTS], at + CONSTANTS
+    came, at = work[at : at + LANES * N], at + LANES * N
+    goes, at = work[at : at + LANES * ROWS], at + LANES * ROWS
+    return Workspace(
+        links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
+        turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
+        twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
+        constants, came, goes, work[at : at + LANES],
+    )  # fmt: skip
+
+
+@lean
+def prepare(
+    models: Array, largest: Array, steepness: float, per_error: float, free: bool, work: Array
+) -> None:
+    """Put models (2, n + 2, 9), reference and actual, and the damping's settings into ``work``."""
+    n = models.shape[1] - 2
+    room = room_in(work, n)
+    newton.copy(models[0, :n], room.taught_links)
+    newton.copy(models[1, :n], room.links)
+    newton.pose(models[0, n], room.taught_root)
+    newton.pose(models[0, n + 1], room.taught_tool)
+    newton.pose(models[1, n], room.root)
+    newton.pose(models[1, n + 1], room.tool)
+    room.settings[STEEPNESS], room.settings[PER_ERROR] = steepness, per_error
+    turning = not free and n == N
+    for i in range(n):
+        turning = turning and room.links[i, 8] < 0.5
+    room.settings[IS_STRAIGHT] = 1.0 if turning else 0.0
+    if not turning:
+        return
+    for i in range(N):
+        room.constants[six_axis.LARGEST + i] = largest[i]
+    room.constants[six_axis.DAMPING], room.constants[six_axis.DAMPING + 1] = steepness, per_error
+    taught, tool = room.taught_tool, room.tool
+    six_axis.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
+    six_axis.constants(room.links, room.root, tool, taught, six_axis.ACTUAL, room.constants)
 
 
 @lean
@@ -48,7 +143,7 @@ def _residual_at(q: Array, free: bool, room: Workspace) -> None:
     for i in range(q.shape[0]):
         room.x[i] -= q[i]
     newton.at_tool(room.here, room.tool)
-    k.residual(room.goal, room.here, room.tool, free, room.e)
+    damping.residual(room.goal, room.here, room.tool, free, room.e)
 
 
 @lean
@@ -57,9 +152,9 @@ def _jacobian(free: bool, room: Workspace, J: Array) -> None:
     newton.columns(room.links, room.frames, room.here, J)
     for i in range(J.shape[0]):
         for r in range(3):
-            J[i, r] *= k.WEIGHT
+            J[i, r] *= damping.WEIGHT
     if free:
-        z0, z1, z2 = k.tool_axis(room.here, room.tool)
+        z0, z1, z2 = damping.tool_axis(room.here, room.tool)
         for i in range(J.shape[0]):
             about = J[i, 3] * z0 + J[i, 4] * z1 + J[i, 5] * z2
             J[i, 3] -= about * z0
@@ -73,27 +168,30 @@ def _damp(free: bool, room: Workspace) -> bool:
     n, M, D, settings = room.x.shape[0], room.M, room.D, room.settings
     position, both = 0.0, 0.0
     for r in range(3):
-        position += room.e[r] * k.WEIGHT * room.e[r] * k.WEIGHT
+        position += room.e[r] * damping.WEIGHT * room.e[r] * damping.WEIGHT
         both += room.e[3 + r] * room.e[3 + r]
     both += position
-    position = k.lambda_square(position, settings[STEEPNESS], settings[PER_ERROR])
-    rotation = k.lambda_square(both, settings[STEEPNESS], settings[PER_ERROR])
-    k.product(room.J, room.J, M)
+    position = damping.lambda_square(position, settings[STEEPNESS], settings[PER_ERROR])
+    rotation = damping.lambda_square(both, settings[STEEPNESS], settings[PER_ERROR])
+    damping.product(room.J, room.J, M)
     absent = max(6 - n, 1 if free else 0)  # directions in which no joint moves the tool
     if n >= 6:
         for r in range(6):
             for c in range(6):
                 D[r, c] = 0.0
         if free:  # of which J knows nothing: a one fills its place
-            z = k.tool_axis(room.here, room.tool)
+            z = damping.tool_axis(room.here, room.tool)
             for r in range(3):
                 for c in range(3):
                     D[3 + r, 3 + c] = z[r] * z[c]
                     M[3 + r, 3 + c] += z[r] * z[c]
-        if k.WINDOW * rotation * (k.inverse_norm(M, room.B, room.spare) - absent) <= 1.0:
+        if (
+            damping.WINDOW * rotation * (damping.inverse_norm(M, room.B, room.spare) - absent)
+            <= 1.0
+        ):
             return False
-        k.product(room.J, room.J, M)
-    return k.damping(M, position, rotation, D, room.U) > absent
+        damping.product(room.J, room.J, M)
+    return damping.damping(M, position, rotation, D, room.U) > absent
 
 
 @lean
@@ -101,10 +199,10 @@ def _add_step(q: Array, free: bool, room: Workspace) -> float:
     """One step with the factored matrix; returns its largest component in the joints."""
     step, size = room.step, 0.0
     for r in range(6):
-        step[r] = room.e[r] * k.WEIGHT if r < 3 else room.e[r]
+        step[r] = room.e[r] * damping.WEIGHT if r < 3 else room.e[r]
         for c in range(6):
             step[r] -= room.D[r, c] * room.y[c]
-    k.substitute(room.B, room.order, step)
+    damping.substitute(room.B, room.order, step)
     for r in range(6):
         room.y[r] += step[r]
     for i in range(room.x.shape[0]):
@@ -123,11 +221,11 @@ def _newton(q: Array, free: bool, room: Workspace) -> int:
     for iteration in range(1, MOST_ITERATIONS + 1):
         if iteration > 1:
             _jacobian(free, room, room.there)
-        k.product(room.J if iteration == 1 else room.there, room.J, room.B)
+        damping.product(room.J if iteration == 1 else room.there, room.J, room.B)
         for r in range(6):
             for c in range(6):
                 room.B[r, c] += room.D[r, c]
-        if not k.eliminate(room.B, room.order):
+        if not damping.eliminate(room.B, room.order):
             return 0
         size = _add_step(q, free, room)
         if size <= SMALL_STEP:
@@ -145,7 +243,7 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
     n, e = q.shape[0], room.e
     walk(q, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
     newton.at_tool(room.goal, room.taught_tool)
-    k.swap_tool(room.goal, room.taught_tool, room.tool)
+    damping.swap_tool(room.goal, room.taught_tool, room.tool)
     for i in range(n):
         room.x[i] = 0.0
     for r in range(6):
@@ -172,24 +270,24 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
 
 @lean
 def _put(q: Array, lane: int, lanes: int, room: Workspace) -> None:
-    """A point becomes one of those that `straight` solves."""
-    for i in range(six.N):
+    """A point becomes one of those that `six_axis` solves."""
+    for i in range(N):
         room.came[i * lanes + lane] = q[i]
 
 
 @lean
 def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
-    """A point of `straight`, with its report; False where it must be solved here."""
-    goes, n = room.goes, six.N
+    """A point of `six_axis`, with its report; False where it must be solved here."""
+    goes, n = room.goes, N
     for i in range(n):
         out[i] = goes[i * lanes + lane]
-    out[n + POSITION_ERROR] = goes[straight.POSITION_LEFT * lanes + lane]
-    out[n + ROTATION_ERROR] = goes[straight.ROTATION_LEFT * lanes + lane]
-    out[n + ITERATIONS] = straight.ITERATIONS
-    out[n + WEAK] = goes[straight.WEAK * lanes + lane]
-    out[n + CONVERGED] = goes[straight.FINE * lanes + lane]
-    out[n + TCP_SHIFT] = goes[straight.TCP_SHIFT * lanes + lane]
-    out[n + TCP_ROTATION] = goes[straight.TCP_ROTATION * lanes + lane]
+    out[n + POSITION_ERROR] = goes[six_axis.POSITION_LEFT * lanes + lane]
+    out[n + ROTATION_ERROR] = goes[six_axis.ROTATION_LEFT * lanes + lane]
+    out[n + ITERATIONS] = six_axis.ITERATIONS
+    out[n + WEAK] = goes[six_axis.WEAK * lanes + lane]
+    out[n + CONVERGED] = goes[six_axis.FINE * lanes + lane]
+    out[n + TCP_SHIFT] = goes[six_axis.TCP_SHIFT * lanes + lane]
+    out[n + TCP_ROTATION] = goes[six_axis.TCP_ROTATION * lanes + lane]
     return bool(out[n + CONVERGED] > 0.5)
 
 
@@ -197,10 +295,10 @@ def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
 def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
     if room.settings[IS_STRAIGHT] > 0.5:
         _put(q, 0, 1, room)
-        straight.correct_one(room.constants, room.came, room.goes)
+        six_axis.correct_one(room.constants, room.came, room.goes)
         if _take_over(room, 0, 1, out):
             return
-        straight_damped.correct_one(room.constants, room.came, room.goes)
+        six_axis.correct_one_damped(room.constants, room.came, room.goes)
         if _take_over(room, 0, 1, out):
             return
     _correct(q, largest, free, room, out)
@@ -209,15 +307,15 @@ def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Arr
 @lean
 def _correct_weak(q: Array, largest: Array, room: Workspace, out: Array) -> None:
     """Those of the points (m, 6) of which ``out`` says that they are not solved."""
-    count, n = 0, six.N
+    count, n = 0, N
     for i in range(q.shape[0]):
         if out[i, n + CONVERGED] > 0.5:
             continue
-        _put(q[i], count, straight.LANES, room)
+        _put(q[i], count, LANES, room)
         room.late[count] = i
         count += 1
-        if count == straight.LANES:
-            straight_damped.correct_lanes(room.constants, room.came, room.goes)
+        if count == LANES:
+            six_axis.correct_lanes_damped(room.constants, room.came, room.goes)
             for lane in range(count):
                 k = int(room.late[lane])
                 if not _take_over(room, lane, count, out[k]):
@@ -226,15 +324,6 @@ def _correct_weak(q: Array, largest: Array, room: Workspace, out: Array) -> None
     for lane in range(count):
         k = int(room.late[lane])
         _correct_one(q[k], largest, False, room, out[k])
-
-
-@lean
-def prepare(
-    models: Array, largest: Array, steepness: float, per_error: float, free: bool, work: Array
-) -> None:
-    """Settle a correction's models (2, n + 2, 9) in its ``work``."""
-    n = models.shape[1] - 2
-    settle(models, largest, steepness, per_error, free, room_in(work, n))
 
 
 @lean
@@ -256,13 +345,13 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
     """
     room, first = room_in(work, q.shape[1]), 0
     if room.settings[IS_STRAIGHT] > 0.5:
-        while q.shape[0] - first >= straight.LANES:
-            for lane in range(straight.LANES):
-                _put(q[first + lane], lane, straight.LANES, room)
-            straight.correct_lanes(room.constants, room.came, room.goes)
-            for lane in range(straight.LANES):
-                _take_over(room, lane, straight.LANES, out[first + lane])
-            first += straight.LANES
+        while q.shape[0] - first >= LANES:
+            for lane in range(LANES):
+                _put(q[first + lane], lane, LANES, room)
+            six_axis.correct_lanes(room.constants, room.came, room.goes)
+            for lane in range(LANES):
+                _take_over(room, lane, LANES, out[first + lane])
+            first += LANES
         _correct_weak(q[:first], largest, room, out)
     for i in range(first, q.shape[0]):
         _correct_one(q[i], largest, free, room, out[i])
@@ -291,20 +380,6 @@ def uncorrect_staged(
         if not size > exact:
             return size <= exact
     return False
-
-
-# Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
-RATE_STEP_S = 2e-4
-
-
-# Where they do in a velocity from one side: some 1e-6 rad/s.
-STEP_AHEAD_S = 5e-7
-
-
-VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
-
-
-MOST_STEPS = 20
 
 
 @lean

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.correction import solution, straight
+from robocal_ros.correction import six_axis, solution
+from robocal_ros.correction.damping import LENGTH
 from robocal_ros.correction.joint_correction import JointCorrection, pack_model
-from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.solution import MOST_OVER, RATE_STEP_S, REPORT, rates_batch
 from robocal_ros.correction.staged import EXACT, StagedCorrection
 from robocal_ros.ground import frames
@@ -121,7 +121,7 @@ def test_reaches_the_taught_pose(
     error = np.hypot(result.tcp_shift_m / LENGTH, result.tcp_rotation_rad)
     most = at_most_iterations(actual, q, error)
     assert np.all(whole[most > 0])
-    assert np.all(result.iterations[most > 0] <= np.maximum(most, straight.ITERATIONS)[most > 0])
+    assert np.all(result.iterations[most > 0] <= np.maximum(most, six_axis.ITERATIONS)[most > 0])
     assert np.mean(most > 0) > 0.3 or turn_deg > 1.0
     assert np.allclose(result.joint_shift, result.q - q)
     apart = (actual.fk(q) @ actual.T_flange_tool - goal)[:, :3, 3]

@@ -1,7 +1,7 @@
 """A robot, its models and its tools, for the tests of the joint correction's session."""
 
 import itertools
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ LIMITS = {
 REST, FASTEST = np.radians(2.0), np.radians(10.0)
 REST_A, LARGEST_A = np.radians(20.0), np.radians(200.0)
 ROUNDING = 1e-9
-assert pytest.approx(TURNING.row()) == (REST, REST_A, FASTEST, LARGEST_A)
+assert pytest.approx(astuple(TURNING)) == (REST, REST_A, FASTEST, LARGEST_A)
 
 
 def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:

@@ -2,25 +2,21 @@
 
 Newton's method as in `solution`, three factored matrices with two steps each, written with single
 numbers: the compiler works on several points at a time in vector registers. Each gets the
-bits that it gets alone. Where that does not do (a direction may be weak, or a shift is so large
-that it needs more steps) a point is left to `straight_damped`.
-"""
+bits that it gets alone. What that does not solve, as a direction may be weak or a shift so large
+that it needs more steps, is left to the second half: there the damping of `solution` in closed
+form, two matrices of three by three, whose eigenvectors come of so many rotations each. What that
+does not solve is left to `solution`.
 
-from typing import NamedTuple
+Frames are twelve numbers: axes x, y, z and origin. Twists and joints are six. A model's
+constants stand in one array, at places that are known when this is compiled.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.kernels import WEIGHT, WINDOW, lambda_square
+from robocal_ros.correction.damping import WEIGHT, WINDOW, lambda_square
 from robocal_ros.ground.compiled import kernel, lean
-from robocal_ros.kinematics import newton
-from robocal_ros.kinematics.kernels import LARGEST_ANGLE, reduced_cos_sin, turns_size
-
-# ---- compiled kinematics of six turning joints with single numbers, for `straight` --------------
-#
-# Frames are twelve numbers: axes x, y, z and origin. Twists and joints are six. A model's
-# constants stand in one array, at places that are known when this is compiled.
-
+from robocal_ros.kinematics.kernels import LARGEST_ANGLE, reduced_cos_sin
 
 Array = NDArray[np.float64]
 Six = tuple[float, float, float, float, float, float]
@@ -28,6 +24,12 @@ Frame = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float
 ]  # fmt: skip
 Frames = tuple[Frame, Frame, Frame, Frame, Frame, Frame, Frame]
+Factor = tuple[Six, Six, Six, Six, Six, Six, Six, Six, Six, Six]
+Three = tuple[float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]  # row by row
+Rows = tuple[Six, Six, Six, Six, Six, Six]
+# Inverses of the position's block and of what the turn's is without it; those beside the diagonal.
+BlockFactor = tuple[Nine, Nine, Nine, Nine]
 
 N = 6
 # of a model's constants: nine for each joint, twelve of the root's frame, three of the tool's place
@@ -37,6 +39,22 @@ ROOT, TOOL, MODEL = 54, 66, 69
 ACTUAL, SWAP, LARGEST, DAMPING, CONSTANTS = (2 * MODEL + k for k in (-MODEL, 0, 9, 15, 17))
 # The angle by its sine's series: largest square of the sine.
 SERIES = 1e-3
+LANES = 16
+# what is written for each point
+ROWS = 12
+POSITION_LEFT, ROTATION_LEFT, FINE, WEAK, TCP_SHIFT, TCP_ROTATION = range(N, ROWS)
+ITERATIONS = 3.0
+
+# A residual (m, rad) that is left alone.
+AT_GOAL = 1e-12
+# Longest second step as a share of the first: see `solution`.
+AHEAD, BESIDE = 0.2, 0.5
+# The last matrix was made so near to the solution that its second step, this short, is the last:
+# what is left is their product, times a curvature that even beside a singularity is below 1e4.
+NEAR, SHORT = 1e-6, 1e-11
+SINGULAR = 1e-13  # square of a column's part that no column before has, beside the first's
+FAR = 2.0  # a solution so many times beyond the bound is another posture
+TINY = 1e-300
 
 
 @lean
@@ -146,26 +164,6 @@ def column(sign: float, frame: Frame, end: Frame) -> Six:
     return z1 * r2 - z2 * r1, z2 * r0 - z0 * r2, z0 * r1 - z1 * r0, z0, z1, z2
 
 
-# ---- compiled correction of six turning joints without a branch, for many points at once --------
-
-
-LANES = 16
-# what is written for each point
-ROWS = 12
-POSITION_LEFT, ROTATION_LEFT, FINE, WEAK, TCP_SHIFT, TCP_ROTATION = range(N, ROWS)
-ITERATIONS = 3.0
-
-# A residual (m, rad) that is left alone.
-AT_GOAL = 1e-12
-# Longest second step as a share of the first: see `solution`.
-AHEAD, BESIDE = 0.2, 0.5
-# The last matrix was made so near to the solution that its second step, this short, is the last:
-# what is left is their product, times a curvature that even beside a singularity is below 1e4.
-NEAR, SHORT = 1e-6, 1e-11
-SINGULAR = 1e-13  # square of a column's part that no column before has, beside the first's
-FAR = 2.0  # a solution so many times beyond the bound is another posture
-
-
 @lean
 def dot(a: Six, b: Six) -> float:
     """Scalar product."""
@@ -179,9 +177,6 @@ def more(a: Six, s: float, b: Six) -> Six:
         a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2],
         a[3] + s * b[3], a[4] + s * b[4], a[5] + s * b[5],
     )  # fmt: skip
-
-
-Factor = tuple[Six, Six, Six, Six, Six, Six, Six, Six, Six, Six]
 
 
 @lean
@@ -230,7 +225,7 @@ def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
 
 @lean
 def weighed(e: Six) -> Six:
-    """A twist with lengths in units of `kernels.LENGTH`."""
+    """A twist with lengths in units of `damping.LENGTH`."""
     return WEIGHT * e[0], WEIGHT * e[1], WEIGHT * e[2], e[3], e[4], e[5]
 
 
@@ -388,117 +383,275 @@ def correct_lanes(c: Array, q: Array, out: Array) -> None:
         _correct(c, q, k, LANES, out)
 
 
-# ---- where the joint correction is worked out: its two models, and scratch numbers --------------
-#
-# ``work`` holds `work_size` numbers, so that a point allocates nothing; `settle` puts the models
-# and the constants of a correction there, once.
-
-
-POSES, SQUARES, TWISTS = 6, 3, 5
-STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
-
-
-class Workspace(NamedTuple):
-    """Where a solution is worked out: parts of ``work``.
-
-    Attributes
-    ----------
-    taught_links, links : (n, 9) joints of the reference and of the actual model.
-    taught_root, taught_tool, root, tool : their (4, 4) ends, T_base_root and T_flange_tool.
-    goal, here : (4, 4) where the tool must go, and where it is at the joints tried last. Such
-        poses have the axes of the flange, their origin is the tool's.
-    turns, frames : scratch of `walk`.
-    J, there : (n, 6) Jacobian at the taught joints, and at those tried last.
-    M, D, B : (6, 6) J J^T, the damping, and the matrix of a step.
-    U : (3, 3) vectors of a part of M.
-    e, y, step, spare, order : (6,) residual, multipliers, their step, and scratch.
-    x : (n,) shift of the joints.
-    settings : steepness and its rise, and whether `straight` serves; see `joint_correction` (3).
-    constants, came, goes, late : of `straight` and `straight_damped`, for sixteen points.
-    """
-
-    taught_links: Array
-    links: Array
-    taught_root: Array
-    taught_tool: Array
-    root: Array
-    tool: Array
-    goal: Array
-    here: Array
-    turns: Array
-    frames: Array
-    J: Array
-    there: Array
-    M: Array
-    U: Array
-    D: Array
-    B: Array
-    e: Array
-    y: Array
-    step: Array
-    spare: Array
-    order: Array
-    x: Array
-    settings: Array
-    constants: Array
-    came: Array
-    goes: Array
-    late: Array
-
-
-def work_size(n: int) -> int:
-    """How many scratch numbers a solution for n joints needs."""
-    many = CONSTANTS + LANES * (N + ROWS + 1)
-    small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 9 + 6 * TWISTS + SETTINGS
-    return 18 * n + 18 * n + n + small + many
+@lean
+def _rows(c: Array, f: Frames) -> Rows:
+    """The Jacobian's rows, lengths in units of `damping.LENGTH`."""
+    s, e = ACTUAL + 7, f[6]
+    a = weighed(column(c[s], f[0], e))
+    b, d = weighed(column(c[s + 9], f[1], e)), weighed(column(c[s + 18], f[2], e))
+    g, h = weighed(column(c[s + 27], f[3], e)), weighed(column(c[s + 36], f[4], e))
+    k = weighed(column(c[s + 45], f[5], e))
+    # fmt: off
+    return (
+        (a[0], b[0], d[0], g[0], h[0], k[0]), (a[1], b[1], d[1], g[1], h[1], k[1]),
+        (a[2], b[2], d[2], g[2], h[2], k[2]), (a[3], b[3], d[3], g[3], h[3], k[3]),
+        (a[4], b[4], d[4], g[4], h[4], k[4]), (a[5], b[5], d[5], g[5], h[5], k[5]),
+    )
+    # fmt: on
 
 
 @lean
-def room_in(work: Array, n: int) -> Workspace:
-    """Divide ``work``."""
-    links, at = work[: 18 * n].reshape(2, n, 9), 18 * n
-    poses, at = work[at : at + 16 * POSES].reshape(POSES, 4, 4), at + 16 * POSES
-    turns, at = work[at : at + turns_size(n)], at + turns_size(n)
-    frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
-    J, at = work[at : at + 12 * n].reshape(2, n, 6), at + 12 * n
-    squares, at = work[at : at + 36 * SQUARES].reshape(SQUARES, 6, 6), at + 36 * SQUARES
-    U, at = work[at : at + 9].reshape(3, 3), at + 9
-    twists, at = work[at : at + 6 * TWISTS].reshape(TWISTS, 6), at + 6 * TWISTS
-    x, at = work[at : at + n], at + n
-    settings, at = work[at : at + SETTINGS], at + SETTINGS
-    constants, at = work[at : at + CONSTANTS], at + CONSTANTS
-    came, at = work[at : at + LANES * N], at + LANES * N
-    goes, at = work[at : at + LANES * ROWS], at + LANES * ROWS
-    return Workspace(
-        links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
-        turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
-        twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
-        constants, came, goes, work[at : at + LANES],
+def _product(a: Six, b: Six, d: Six, x: Six, y: Six, z: Six) -> Nine:
+    """Products of three rows with three others."""
+    # fmt: off
+    return (
+        dot(a, x), dot(a, y), dot(a, z), dot(b, x), dot(b, y), dot(b, z),
+        dot(d, x), dot(d, y), dot(d, z),
+    )
+    # fmt: on
+
+
+@lean
+def _turn(p: float, q: float, o: float) -> tuple[float, float, float]:
+    """Cosine, sine and tangent of Jacobi's rotation for two diagonal elements and theirs beside."""
+    apart = q - p
+    t = 2.0 * o / (abs(apart) + np.sqrt(apart * apart + 4.0 * o * o) + TINY)
+    t = t if apart >= 0.0 else -t
+    cosine = 1.0 / np.sqrt(t * t + 1.0)
+    return cosine, t * cosine, t
+
+
+@lean
+def _both(cosine: float, sine: float, x: float, y: float) -> tuple[float, float]:
+    return cosine * x - sine * y, sine * x + cosine * y
+
+
+@lean
+def _spread(u: Nine, a: float, b: float, c: float) -> Nine:
+    """U diag(a, b, c) U^T."""
+    u0, u1, u2, u3, u4, u5, u6, u7, u8 = u
+    xy = a * u0 * u3 + b * u1 * u4 + c * u2 * u5
+    xz = a * u0 * u6 + b * u1 * u7 + c * u2 * u8
+    yz = a * u3 * u6 + b * u4 * u7 + c * u5 * u8
+    return (
+        a * u0 * u0 + b * u1 * u1 + c * u2 * u2, xy, xz,
+        xy, a * u3 * u3 + b * u4 * u4 + c * u5 * u5, yz,
+        xz, yz, a * u6 * u6 + b * u7 * u7 + c * u8 * u8,
     )  # fmt: skip
 
 
 @lean
-def settle(
-    models: Array, largest: Array, steepness: float, per_error: float, free: bool, room: Workspace
-) -> None:
-    """Put models (2, n + 2, 9), reference and actual, and the damping's settings into a room."""
-    n = room.links.shape[0]
-    newton.copy(models[0, :n], room.taught_links)
-    newton.copy(models[1, :n], room.links)
-    newton.pose(models[0, n], room.taught_root)
-    newton.pose(models[0, n + 1], room.taught_tool)
-    newton.pose(models[1, n], room.root)
-    newton.pose(models[1, n + 1], room.tool)
-    room.settings[STEEPNESS], room.settings[PER_ERROR] = steepness, per_error
-    turning = not free and n == N
-    for i in range(n):
-        turning = turning and room.links[i, 8] < 0.5
-    room.settings[IS_STRAIGHT] = 1.0 if turning else 0.0
-    if not turning:
-        return
-    for i in range(N):
-        room.constants[LARGEST + i] = largest[i]
-    room.constants[DAMPING], room.constants[DAMPING + 1] = steepness, per_error
-    taught, tool = room.taught_tool, room.tool
-    constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
-    constants(room.links, room.root, tool, taught, ACTUAL, room.constants)
+def _damp(s: float, square: float) -> float:
+    rest = 1.0 - s / (WINDOW * square)
+    rest = rest if rest > 0.0 else 0.0
+    return square * rest * rest * rest
+
+
+@lean
+def _sweep(m: Six, u: Nine) -> tuple[Six, Nine]:
+    """A rotation for each element beside the diagonal: ``m`` is the diagonal, then ab, ac, bc."""
+    a, b, c, x, y, z = m
+    u0, u1, u2, u3, u4, u5, u6, u7, u8 = u
+    cosine, sine, t = _turn(a, b, x)
+    a, b, x = a - t * x, b + t * x, 0.0
+    y, z = _both(cosine, sine, y, z)
+    u0, u1 = _both(cosine, sine, u0, u1)
+    u3, u4 = _both(cosine, sine, u3, u4)
+    u6, u7 = _both(cosine, sine, u6, u7)
+    cosine, sine, t = _turn(a, c, y)
+    a, c, y = a - t * y, c + t * y, 0.0
+    x, z = _both(cosine, sine, x, z)
+    u0, u2 = _both(cosine, sine, u0, u2)
+    u3, u5 = _both(cosine, sine, u3, u5)
+    u6, u8 = _both(cosine, sine, u6, u8)
+    cosine, sine, t = _turn(b, c, z)
+    b, c, z = b - t * z, c + t * z, 0.0
+    x, y = _both(cosine, sine, x, y)
+    u1, u2 = _both(cosine, sine, u1, u2)
+    u4, u5 = _both(cosine, sine, u4, u5)
+    u7, u8 = _both(cosine, sine, u7, u8)
+    return (a, b, c, x, y, z), (u0, u1, u2, u3, u4, u5, u6, u7, u8)
+
+
+@lean
+def _damping(m: Nine, square: float) -> tuple[Nine, float]:
+    """Damping of a symmetric matrix, see `damping.damped`, and its trace."""
+    s, u = (m[0], m[4], m[8], m[1], m[2], m[5]), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    s, u = _sweep(s, u)
+    s, u = _sweep(s, u)
+    s, u = _sweep(s, u)
+    s, u = _sweep(s, u)
+    a, b, c = _damp(s[0], square), _damp(s[1], square), _damp(s[2], square)
+    return _spread(u, a, b, c), a + b + c
+
+
+@lean
+def _inverse(m: Nine) -> Nine:
+    a, b, c, d, e, f, g, h, i = m
+    x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
+    s = 1.0 / (a * x + b * y + c * z)
+    return (
+        s * x, s * (c * h - b * i), s * (b * f - c * e),
+        s * y, s * (a * i - c * g), s * (c * d - a * f),
+        s * z, s * (b * g - a * h), s * (a * e - b * d),
+    )  # fmt: skip
+
+
+@lean
+def _times(m: Nine, n: Nine) -> Nine:
+    a, b, c, d, e, f, g, h, i = m
+    return (
+        a * n[0] + b * n[3] + c * n[6], a * n[1] + b * n[4] + c * n[7],
+        a * n[2] + b * n[5] + c * n[8], d * n[0] + e * n[3] + f * n[6],
+        d * n[1] + e * n[4] + f * n[7], d * n[2] + e * n[5] + f * n[8],
+        g * n[0] + h * n[3] + i * n[6], g * n[1] + h * n[4] + i * n[7],
+        g * n[2] + h * n[5] + i * n[8],
+    )  # fmt: skip
+
+
+@lean
+def _turned_over(m: Nine) -> Nine:
+    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
+
+
+@lean
+def _root(T: Nine) -> Nine:
+    """Lower factor L of I + T^T T = L L^T."""
+    n = _times(_turned_over(T), T)
+    a = np.sqrt(1.0 + n[0])
+    b, c = n[1] / a, n[2] / a
+    d = np.sqrt(1.0 + n[4] - b * b)
+    e = (n[5] - b * c) / d
+    return a, 0.0, 0.0, b, d, 0.0, c, e, np.sqrt(1.0 + n[8] - c * c - e * e)
+
+
+@lean
+def _on(m: Nine, x: float, y: float, z: float) -> Three:
+    return (
+        m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )  # fmt: skip
+
+
+@lean
+def _sum(m: Nine, s: float, n: Nine) -> Nine:
+    """M + s N."""
+    return (
+        m[0] + s * n[0], m[1] + s * n[1], m[2] + s * n[2], m[3] + s * n[3], m[4] + s * n[4],
+        m[5] + s * n[5], m[6] + s * n[6], m[7] + s * n[7], m[8] + s * n[8],
+    )  # fmt: skip
+
+
+@lean
+def _damped_factor(there: Rows, at: Rows, P: Nine, R: Nine) -> BlockFactor:
+    """Factor the matrix of a step, J' J^T + D."""
+    a, b, c, d, e, f = there
+    p, q, r, s, t, u = at
+    upper, lower = _product(a, b, c, s, t, u), _product(d, e, f, p, q, r)
+    first = _inverse(_sum(_product(a, b, c, p, q, r), 1.0, P))
+    turn = _sum(_product(d, e, f, s, t, u), 1.0, R)
+    return first, _inverse(_sum(turn, -1.0, _times(_times(lower, first), upper))), upper, lower
+
+
+@lean
+def _multiplier_step(factor: BlockFactor, e: Six) -> Six:
+    """Step of the multipliers for what is left."""
+    first, second, upper, lower = factor
+    p = _on(first, e[0], e[1], e[2])
+    w = _on(lower, p[0], p[1], p[2])
+    w = _on(second, e[3] - w[0], e[4] - w[1], e[5] - w[2])
+    u = _on(upper, w[0], w[1], w[2])
+    p = _on(first, e[0] - u[0], e[1] - u[1], e[2] - u[2])
+    return p[0], p[1], p[2], w[0], w[1], w[2]
+
+
+@lean
+def _joints(J: Rows, y: Six) -> Six:
+    """J^T y."""
+    a, b, c, d, e, f = J
+    x = more(more((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), y[0], a), y[1], b)
+    return more(more(more(more(x, y[2], c), y[3], d), y[4], e), y[5], f)
+
+
+@lean
+def _left(e: Six, y: Six, P: Nine, R: Nine) -> Six:
+    """What is left to do, e - D y."""
+    e = weighed(e)
+    p, w = _on(P, y[0], y[1], y[2]), _on(R, y[3], y[4], y[5])
+    return e[0] - p[0], e[1] - p[1], e[2] - p[2], e[3] - w[0], e[4] - w[1], e[5] - w[2]
+
+
+@lean
+def _again(
+    c: Array, q: Six, aim: Frame, J: Rows, y: Six, P: Nine, R: Nine
+) -> tuple[Six, Six, float, float, bool]:
+    """Multipliers after two steps with one matrix, shift, the steps' squares, all near enough."""
+    x = _joints(J, y)
+    frames = walk(c, ACTUAL, more(q, 1.0, x))
+    e, near = residual(aim, frames[6])
+    factor = _damped_factor(_rows(c, frames), J, P, R)
+    y = more(y, 1.0, _multiplier_step(factor, _left(e, y, P, R)))
+    moved = _joints(J, y)
+    step = more(moved, -1.0, x)
+    e, still = residual(aim, walk(c, ACTUAL, more(q, 1.0, moved))[6])
+    y = more(y, 1.0, _multiplier_step(factor, _left(e, y, P, R)))
+    x = _joints(J, y)
+    last = more(x, -1.0, moved)
+    return y, x, dot(step, step), dot(last, last), near & still
+
+
+@lean
+def _solve_damped(c: Array, q: Six) -> tuple[Six, Six, Six, bool, bool]:
+    """Shift, first and last residual, whether it is the solution, and whether something is weak."""
+    aim = goal(c, q)
+    frames = walk(c, ACTUAL, q)
+    first, near = residual(aim, frames[6])
+    fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
+    fine &= dot(first, first) > AT_GOAL * AT_GOAL * N
+    J = _rows(c, frames)
+    i, j, k, l, m, n = J
+    e = weighed(first)
+    position = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
+    turn = position + e[3] * e[3] + e[4] * e[4] + e[5] * e[5]
+    A, B = _product(i, j, k, i, j, k), _product(i, j, k, l, m, n)
+    P, weak = _damping(A, lambda_square(position, c[DAMPING], c[DAMPING + 1]))
+    T = _times(_inverse(_sum(A, 1.0, P)), B)
+    C = _sum(_product(l, m, n, l, m, n), -1.0, _times(_product(l, m, n, i, j, k), T))
+    L = _root(T)
+    inverse = _inverse(L)
+    C = _times(_times(inverse, C), _turned_over(inverse))
+    R, more_weak = _damping(C, lambda_square(turn, c[DAMPING], c[DAMPING + 1]))
+    R = _times(_times(L, R), _turned_over(L))
+    y = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    y, x, _, _, good = _again(c, q, aim, J, y, P, R)
+    fine &= good
+    y, x, _, _, good = _again(c, q, aim, J, y, P, R)
+    fine &= good
+    y, x, before, size, good = _again(c, q, aim, J, y, P, R)
+    fine &= good & (before <= NEAR * NEAR) & (size <= SHORT * SHORT) & within(c, x, FAR)
+    last, _ = residual(aim, walk(c, ACTUAL, more(q, 1.0, x))[6])
+    return x, first, last, fine, weak + more_weak > 0.0
+
+
+@lean
+def _correct_damped(c: Array, q: Array, k: int, lanes: int, out: Array) -> None:
+    """Point ``k`` of ``lanes``."""
+    at = (
+        q[k], q[lanes + k], q[2 * lanes + k],
+        q[3 * lanes + k], q[4 * lanes + k], q[5 * lanes + k],
+    )  # fmt: skip
+    x, first, last, fine, weak = _solve_damped(c, at)
+    write(more(at, 1.0, x), first, last, fine, weak, k, lanes, out)
+
+
+@kernel
+def correct_one_damped(c: Array, q: Array, out: Array) -> None:
+    """Corrected joints of one point (6,) and its report: ``out`` (12,)."""
+    _correct_damped(c, q, 0, 1, out)
+
+
+@kernel
+def correct_lanes_damped(c: Array, q: Array, out: Array) -> None:
+    """`correct_one_damped` for sixteen points: ``q`` (96,) and ``out`` (192,), joint by joint."""
+    for k in range(LANES):
+        _correct_damped(c, q, k, LANES, out)
