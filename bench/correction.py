@@ -17,11 +17,15 @@ from bench.tables import Cell, Goal, Table
 from robocal_ros.correction import solution
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.damping import LENGTH
-from robocal_ros.correction.inputs import JointCommand, OfferedModel, TrajectoryCommand
-from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
+from robocal_ros.correction.interface import JointCommand, OfferedModel, TrajectoryCommand
+from robocal_ros.correction.joint_correction import (
+    CorrectionResult,
+    JointCorrection,
+    StagedCorrection,
+    pack_model,
+)
 from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimiter
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description, load_robot

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.correction.inputs import Reason
+from robocal_ros.correction.interface import Reason
 from robocal_ros.ground.errors import Code
 
 ROOT = Path(__file__).parents[1]

@@ -20,7 +20,7 @@ import numpy as np
 
 from robocal_ros.cli.main import main
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, OfferedModel, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, OfferedModel, TrajectoryCommand
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.kinematics.robots import load_description
 

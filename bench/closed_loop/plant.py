@@ -13,7 +13,7 @@ from bench.closed_loop import setting
 from bench.closed_loop.suite import Clock, Record, Suite, unrecorded
 from robocal_ros.cell_sim.cell import CellSamples, Happened, Sample, SimulatedCell, poses
 from robocal_ros.cell_sim.tool_cell import programme
-from robocal_ros.correction.inputs import RefusedError, TrajectoryCommand
+from robocal_ros.correction.interface import RefusedError, TrajectoryCommand
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm

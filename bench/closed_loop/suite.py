@@ -13,7 +13,7 @@ from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
 from robocal_ros import __version__
 from robocal_ros.cell_sim.cell import Sample
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.interface import JointCommand
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ground.samples import (

@@ -22,8 +22,8 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 
-from robocal_ros.correction.inputs import Reason, RefusedError
-from robocal_ros.correction.output import SentPath
+from robocal_ros.correction.interface import Reason, RefusedError
+from robocal_ros.correction.robot_state import SentPath
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.samples import TAUGHT

@@ -1,19 +1,39 @@
-"""Bounds of the joint correction, and what is checked against them."""
+"""Models and tools that are corrected with, the correction's bounds, and the offset it asks for.
 
-from dataclasses import dataclass, field
+What becomes of a correction beyond its bounds says the policy; the limiter comes after it.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.inputs import Reason, RefusedError
-from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection
-from robocal_ros.correction.limiter import SLIDING, TURNING, OffsetLimits
+from robocal_ros.correction.interface import Array, OfferedModel, OfferedTool, Reason, RefusedError
+from robocal_ros.correction.joint_correction import (
+    CorrectionResult,
+    JointCorrection,
+    StagedCorrection,
+    StagedResult,
+    pack_model,
+)
+from robocal_ros.correction.limiter import (
+    FIGURES,
+    LARGEST,
+    NOT_WITHIN,
+    REDUCED,
+    REMAINING,
+    SHIFT,
+    SLIDING,
+    TURNING,
+    OffsetLimiter,
+    OffsetLimits,
+    put_out,
+)
 from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
-from robocal_ros.correction.staged import StagedCorrection, StagedResult
+from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
 
 # What floating point adds to a value that lies on its bound.
 ROUNDING = 1e-9
@@ -278,3 +298,341 @@ def correction_between(
         return ClampedCorrection(reference, actual, arm, config)
     thermal, tool = config.thermal.of_joints(arm), config.tool.of_joints(arm)
     return StagedCorrection(reference, actual, FADES_FROM * thermal, tool, config.free_axis)
+
+
+SAME_MODEL = 1e-12  # of packed models that are the same
+
+
+class DesiredOffset:
+    """Corrected less taught joints, as the model and the tool in use want it.
+
+    Attributes
+    ----------
+    stage : the correction in use; None while nothing is to be corrected.
+    known : the same as if it were on: a robot may show it that was corrected before.
+    figures : what is said of the messages, see `limiter`.
+    clamped, passed : how many messages were corrected in part, or not at all, for what bound.
+    made : whether the last message was corrected with ``stage``.
+    fast : whether `put_out` worked out the velocities too.
+    """
+
+    def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
+        self._arm, self._config = reference, config
+        self._reference = pack_model(reference)
+        self._actual = self._reference
+        self.stage: StagedCorrection | None = None
+        self.known: StagedCorrection | None = None
+        self.figures = np.zeros(FIGURES)
+        self.clamped: Counter[Reason] = Counter()
+        self.passed: Counter[Reason] = Counter()
+        self.made = self.fast = False
+        self._zero = np.zeros(reference.n)
+        self._span = np.array([reference.lower, reference.upper], dtype=np.float64)
+        bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
+        self._bounds = np.array(bounds, dtype=np.float64)
+        self._tcp = np.array([config.thermal.tcp_m, config.thermal.tcp_rad])
+
+    def want(self, actual: SerialArm, on: bool) -> None:
+        """Correct for an arm with its tool from the next command on, or for nothing."""
+        packed = pack_model(actual)
+        if not np.allclose(packed, self._actual, rtol=0.0, atol=SAME_MODEL):
+            self._actual = packed
+            same = np.allclose(packed, self._reference, rtol=0.0, atol=SAME_MODEL)
+            self.known = None
+            if not same:
+                self.known = correction_between(self._reference, packed, self._arm, self._config)
+        self.stage = self.known if on else None
+
+    def at(self, q: Array) -> tuple[Array, StagedResult | None]:
+        """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
+        self.made = self.fast = False
+        self.figures[[SHIFT, LARGEST, REMAINING]] = 0.0
+        if self.stage is None:
+            return np.zeros_like(q), None
+        result = self.stage.correct(q)
+        require_solved(result)
+        policy = self._config.policy
+        if policy is Policy.REFUSE:
+            require_within(result, self._config, self._arm)
+        elif isinstance(result, ClampedResult) and result.reason is not None:
+            if policy is Policy.PASS:
+                self.passed[result.reason] += 1
+                return np.zeros_like(q), None
+            self.clamped[result.reason] += 1
+        offset, self.made = result.q - q, True
+        self.figures[REDUCED] += np.count_nonzero(result.weak)
+        self.figures[SHIFT] = result.arm.tcp_shift_m.max()
+        self.figures[LARGEST] = np.abs(offset).max()
+        self.figures[REMAINING] = result.remaining_m.max()
+        return offset, result
+
+    def put_out(
+        self,
+        q: Array,
+        velocity: Array,
+        times: tuple[float, float],
+        limiter: OffsetLimiter,
+        active: Array,
+        speeds: Array,
+    ) -> float:
+        """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
+
+        In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`, and
+        leaves the velocities to the caller.
+        """
+        stage, limits, span = self.stage, limiter.limits, self._span
+        if stage is not None and self._config.policy is Policy.REFUSE:
+            share = stage.step_out(
+                q, velocity, *times, limiter.memory, limits, active, speeds, span, self._bounds,
+                self._tcp, self.figures,
+            )  # fmt: skip
+            if share != NOT_WITHIN:
+                self.made = self.fast = True
+                return share
+        desired = self.at(q[None])[0][0] if stage is not None else self._nothing()
+        return put_out(limiter.memory, q, desired, *times, limits, active, speeds[0], span)
+
+    def _nothing(self) -> Array:
+        self.made = self.fast = False
+        self.figures[SHIFT] = self.figures[LARGEST] = self.figures[REMAINING] = 0.0
+        return self._zero
+
+    def begins(self, q: Array) -> Array:
+        """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.
+
+        Nothing is counted: the command itself is looked at after its begin.
+        """
+        rows = np.zeros((3, len(q)))
+        for row, stage in zip(rows, (self.stage, self.known), strict=False):
+            if stage is not None:
+                row[:] = stage.correct(q[None]).q[0] - q
+        return rows
+
+
+class CorrectionGate:
+    """Judges offered models and tools, and keeps the last good ones."""
+
+    def __init__(
+        self, nominal: SerialArm, reference: SerialArm, serial: str, config: CorrectionConfig
+    ) -> None:
+        if nominal.joint_names != reference.joint_names or np.any(
+            (nominal.sign != reference.sign) | (nominal.prismatic != reference.prismatic)
+        ):
+            raise ValueError("nominal and reference model have different joints")
+        self._nominal = nominal
+        self._reference = reference
+        self._serial = serial
+        self._config = config
+        self._model: OfferedModel | None = None
+        self.revision: int | None = None  # of the model taken over
+        self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
+        self.waiting: OfferedModel | None = None  # refused, and to be taken over if looked at again
+        self.stale = ""  # why the model is too old to be used
+        self.tools = ToolGate(reference.T_flange_tool, config)
+
+    @property
+    def actual(self) -> SerialArm:
+        """The actual arm with its tool, as far as they are known; else the reference's."""
+        arm = self._reference
+        if self._model is not None and not self.stale:
+            arm = self._arm_of(self._model)
+        tool = self.tools.T_flange_tool
+        return arm if tool is None else replace(arm, T_flange_tool=tool)
+
+    def take_model(self, model: OfferedModel, places: Array, *, again: bool = False) -> None:
+        """Take over a model; ``places`` (k, n) are where the robot is, and goes.
+
+        A revision lower than the one in use comes from a history that began again: it must be
+        newer by its stamp, or be looked at (``again``). One that is refused for this, or for its
+        size here, waits for `look_again`.
+
+        Raises `RefusedError` when it is not accepted, made for another robot, older than the one
+        in use, or would move the tool beyond the bounds where the robot is or goes.
+        """
+        if not model.accepted:
+            raise RefusedError(Reason.NOT_ACCEPTED, f"revision {model.revision}")
+        self._require_robot(model)
+        if model.joint_names != self._nominal.joint_names:
+            detail = f"joints {model.joint_names}, this has {self._nominal.joint_names}"
+            raise RefusedError(Reason.WRONG_ROBOT, detail)
+        self.waiting = None
+        if self._model is not None and not again:
+            if _same(model, self._model):
+                self._model = model
+                return
+            if not _later(model, self._model):
+                self.waiting = model
+                raise RefusedError(
+                    Reason.OLD_REVISION,
+                    f"revision {model.revision} with other numbers after {self.revision}, and not "
+                    "newer by its stamp; ~/take_over takes it over",
+                )
+        arm = self._arm_of(model)
+        if len(places):
+            self._require_small(model, arm, places)
+        self._model, self.revision = model, model.revision
+        self.survey = survey(self._reference, arm, self._config.thermal)
+
+    def watch_age(self, now_ns: int) -> bool:
+        """Compare the model's stamp with the clock; returns whether it became stale, or fresh."""
+        was, limit_s = bool(self.stale), self._config.model_age_s
+        self.stale = ""
+        if self._model is not None and limit_s > 0.0:
+            age_ns = now_ns - self._model.stamp_ns
+            if abs(age_ns) > limit_s * 1e9:
+                old = f"{abs(age_ns) * 1e-9:.1f} s " + ("old" if age_ns > 0 else "in the future")
+                self.stale = (
+                    f"model revision {self._model.revision} is {old}, allowed {limit_s:g} s"
+                )
+        return was != bool(self.stale)
+
+    def look_again(self, places: Array) -> None:
+        """Take over the model that waits for it, if there is one; raises as `take_model`."""
+        if self.waiting is not None:
+            self.take_model(self.waiting, places, again=True)
+
+    @property
+    def serial(self) -> str:
+        """Of the model in use; empty without one."""
+        return "" if self._model is None else self._model.serial
+
+    def _require_robot(self, offered: OfferedModel | OfferedTool) -> None:
+        expected = {
+            "robot": (offered.robot, self._nominal.name),
+            "serial": (offered.serial, self._serial),
+            "nominal model's hash": (offered.model_hash, self._nominal.model_hash),
+        }
+        for what, (found, own) in expected.items():
+            if found != own:
+                raise RefusedError(Reason.WRONG_ROBOT, f"{what} {found}, this is {own}")
+        own = self._config.robot_file_hash
+        if own and offered.robot_file_hash != own:
+            raise RefusedError(
+                Reason.WRONG_ROBOT,
+                f"no serial is set and the robot files differ (hash "
+                f"{offered.robot_file_hash or 'not given'}, this is {own}): set the serial of each "
+                "robot",
+            )
+
+    def _arm_of(self, model: OfferedModel) -> SerialArm:
+        """The offered arm; the nominal one says that no drift is known: then the reference."""
+        nominal = self._nominal
+        # The root travels as a quaternion: equal up to rounding.
+        if np.array_equal(model.mdh, nominal.mdh) and np.allclose(
+            model.T_base_root, nominal.T_base_root, rtol=0.0, atol=1e-12
+        ):
+            return self._reference
+        return replace(self._reference, mdh=model.mdh, T_base_root=model.T_base_root)
+
+    def _require_small(self, model: OfferedModel, arm: SerialArm, places: Array) -> None:
+        bound = self._config.thermal
+        shift = JointCorrection.between(self._reference, arm).correct(places)
+        if not np.all(bound.hold(shift)):
+            self.waiting = model
+            raise RefusedError(
+                Reason.TCP_BOUND,
+                f"{np.max(shift.tcp_shift_m) * 1e3:.3f} mm and "
+                f"{np.degrees(np.max(shift.tcp_rotation_rad)):.3f} deg where the robot is or "
+                f"goes, allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg; "
+                f"over its joint range {survey(self._reference, arm, bound)}",
+            )
+
+    def take_tool(self, tool: OfferedTool) -> None:
+        """As `ToolGate.take`; raises `RefusedError` also when it was made for another robot."""
+        self._require_robot(tool)
+        self.tools.take(tool)
+
+
+class ToolGate:
+    """Judges the measured tools of this robot, and keeps the last good one until it may be used.
+
+    One that is ``waiting`` is adopted when the robot stands or a trajectory begins; one that was
+    ``refused`` is older than the one before by revision and stamp, and is to be looked at again.
+    """
+
+    def __init__(self, taught: Array, config: CorrectionConfig) -> None:
+        self._taught = taught
+        self._config = config
+        self.in_use: OfferedTool | None = None
+        self.waiting: OfferedTool | None = None
+        self.refused: OfferedTool | None = None
+
+    @property
+    def T_flange_tool(self) -> Array | None:
+        """The tool in use; None: the taught one."""
+        return None if self.in_use is None else self.in_use.T_flange_tool
+
+    def take(self, tool: OfferedTool, *, again: bool = False) -> None:
+        """Let a tool wait for its adoption; one that is in use already only ends the wait.
+
+        A revision that is not newer than the last one must be newer by its stamp, or be looked
+        at (``again``).
+
+        Raises `RefusedError` when it is not accepted, its frames are not the configured ones, it
+        is older than the last one, or too far from the taught tool.
+        """
+        if not tool.accepted:
+            raise RefusedError(Reason.NOT_ACCEPTED, f"tool revision {tool.revision}")
+        self._require_frames(tool)
+        if tool.T_flange_tool is not None:
+            self._require_small(tool.T_flange_tool)
+        self.refused = None
+        last = self.waiting or self.in_use
+        known = last is not None and _same_tool(tool, last)
+        later = last is None or _later(tool, last)
+        if not (known or later or again):
+            self.refused = tool
+            raise RefusedError(
+                Reason.OLD_REVISION,
+                f"tool revision {tool.revision} is another tool than the last one and not newer "
+                "by its stamp; ~/take_over takes it over",
+            )
+        if self.in_use is not None and _same_tool(tool, self.in_use):
+            self.in_use, self.waiting = tool, None
+        else:
+            self.waiting = tool
+
+    def look_again(self) -> None:
+        """Take the tool that was refused for its revision, if there is one."""
+        if self.refused is not None:
+            self.take(self.refused, again=True)
+
+    def adopt(self) -> None:
+        """Use the tool that waits, if there is one."""
+        self.in_use, self.waiting = self.waiting or self.in_use, None
+
+    def _require_frames(self, tool: OfferedTool) -> None:
+        parent, child = self._config.flange_frame, self._config.tool_frame
+        if child and tool.child != child:
+            raise RefusedError(Reason.BAD_TOOL, f"child '{tool.child}', expected '{child}'")
+        if tool.parent != parent:
+            raise RefusedError(Reason.BAD_TOOL, f"parent '{tool.parent}', expected '{parent}'")
+
+    def _require_small(self, T_flange_tool: Array) -> None:
+        taught, bound = self._taught, self._config.tool
+        shift = float(np.linalg.norm(T_flange_tool[:3, 3] - taught[:3, 3]))
+        turn = float(np.linalg.norm(frames.log_rotation(T_flange_tool[:3, :3] @ taught[:3, :3].T)))
+        if shift > bound.tcp_m + ROUNDING or turn > bound.tcp_rad + ROUNDING:
+            raise RefusedError(
+                Reason.TOOL_BOUND,
+                f"{shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg from the taught tool, "
+                f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
+            )
+
+
+def _same(a: OfferedModel, b: OfferedModel) -> bool:
+    return (
+        a.revision == b.revision
+        and np.array_equal(a.mdh, b.mdh)
+        and np.array_equal(a.T_base_root, b.T_base_root)
+    )
+
+
+def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:
+    if a.T_flange_tool is None or b.T_flange_tool is None:
+        return a.revision == b.revision and a.T_flange_tool is b.T_flange_tool
+    return a.revision == b.revision and np.array_equal(a.T_flange_tool, b.T_flange_tool)
+
+
+def _later(a: OfferedModel | OfferedTool, b: OfferedModel | OfferedTool) -> bool:
+    return a.revision > b.revision or a.stamp_ns > b.stamp_ns

@@ -15,7 +15,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
-from robocal_ros.correction.inputs import Reason
+from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.wire import joint_names
 from robocal_ros.ros.graph import KILLED, clients, own_endpoint, publishers, strangers
 

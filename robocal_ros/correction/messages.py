@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.correction.inputs import (
+from robocal_ros.correction.interface import (
     Array,
     JointCommand,
     TrajectoryCommand,

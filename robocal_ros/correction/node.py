@@ -23,7 +23,8 @@ from robocal_ros.correction.graph import (
     JointSources,
     Leases,
 )
-from robocal_ros.correction.inputs import (
+from robocal_ros.correction.interface import (
+    CorrectionState,
     Reason,
     RefusedError,
     TrajectoryCommand,
@@ -31,8 +32,8 @@ from robocal_ros.correction.inputs import (
     offered_tool,
 )
 from robocal_ros.correction.messages import ArrayMessage, JointMessage, PathMessage, tail_message
-from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
+from robocal_ros.correction.robot_state import SentPath
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
@@ -42,7 +43,6 @@ from robocal_ros.correction.settings import (
     joint_limits,
     session_config,
 )
-from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns

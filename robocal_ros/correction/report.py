@@ -15,11 +15,10 @@ from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset
 
 from robocal_ros import __version__
-from robocal_ros.correction.inputs import Reason
+from robocal_ros.correction.interface import CorrectionStatus, Reason
 from robocal_ros.correction.messages import doubles
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
-from robocal_ros.correction.status import CorrectionStatus
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.history.history_records import CALIBRATED, NOMINAL, CorrectionRecord

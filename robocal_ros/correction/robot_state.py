@@ -1,17 +1,34 @@
-"""What is known of the robot: its joints by name, where it was read, where its controller is."""
+"""Where the robot was read, where its controller is, and what was put out last."""
 
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, require_finite
-from robocal_ros.correction.joint_correction import plain
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.interface import (
+    Array,
+    Index,
+    JointCommand,
+    Reason,
+    RefusedError,
+    require_finite,
+)
+from robocal_ros.correction.joint_correction import StagedCorrection, plain
+from robocal_ros.correction.limiter import (
+    DESIRED,
+    DESIRED_RATE,
+    OFFSET,
+    OFFSET_RATE,
+    OUT,
+    ROUNDING,
+    SHARE,
+    TAUGHT,
+    OffsetLimiter,
+)
 from robocal_ros.correction.solution import ordinary
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # A robot follows what it was sent within this: drives lag, messages travel, s.
 RESPONSE_S = 0.2
@@ -224,3 +241,329 @@ def _require_single(names: tuple[str, ...]) -> None:
     if len(set(names)) != len(names):
         doubled = next(name for name in names if names.count(name) > 1)
         raise RefusedError(Reason.DOUBLED_JOINT, doubled)
+
+
+@dataclass
+class SentPath:
+    """A trajectory that was put out, and the controller's clock on it."""
+
+    index: Index  # (k,) its joints
+    begin_s: float  # zero of ``times`` on the session's clock
+    times: Array  # (m,) of its points, s
+    out: Array  # (m, k) as put out
+    velocity: Array | None  # (m, k); None for straight lines between the points
+    acceleration: Array | None  # (m, k); None for cubics
+    known_times: Array  # (r,) of the next rows: its points, before them where it leads in
+    offsets: Array  # (r, n)
+    rates: Array  # (r, n) of the offset
+    bends: Array  # (r, n) its accelerations, where the path has some
+    withheld: Array  # (r, n) what of it the limiter adds
+    stage: StagedCorrection | None  # that it was made with
+    led_from: Array  # (k,) where the controller leads in from
+    put_s: float  # since when
+    at_once: bool  # it begins as it goes out
+    replaced: "SentPath | None" = None  # by it, until the controller accepts it
+    rejected: bool = False
+    _scaling: float = 1.0
+    _lost_s: float = 0.0  # by a clock that runs slower
+    _since_s: float = field(default=-np.inf)
+    _stopped_s: float = np.inf
+
+    def begin(self, now_s: float) -> None:
+        """It goes out now: one that begins at once begins now, not when it was corrected."""
+        if self.at_once:
+            self.begin_s = now_s
+
+    def accept(self) -> None:
+        """The controller took it: there is no way back."""
+        self.replaced = None
+
+    def end(self, now_s: float) -> None:
+        """It ended early: the controller stays where it is on it."""
+        self._stopped_s = min(self._stopped_s, now_s)
+
+    def scale(self, scaling: float, now_s: float) -> None:
+        """From now on the controller's clock runs so fast, 0 to 1."""
+        since = max(self._since_s, self.begin_s)
+        if now_s > since:
+            self._lost_s += (1.0 - self._scaling) * (now_s - since)
+        self._since_s, self._scaling = now_s, scaling
+
+    def time(self, now_s: float) -> float:
+        """Where the controller's clock is on it, s from its begin."""
+        now_s = min(now_s, self._stopped_s)
+        if now_s == np.inf:  # when it has been driven, at whatever speed
+            return np.inf
+        since = max(self._since_s, self.begin_s)
+        lost = self._lost_s + (1.0 - self._scaling) * max(now_s - since, 0.0)
+        return now_s - self.begin_s - lost
+
+    def live(self, now_s: float) -> bool:
+        """Whether the robot may still be moving by it."""
+        return self.time(now_s) <= self.times[-1] + RESPONSE_S and (
+            now_s <= self._stopped_s + RESPONSE_S
+        )
+
+    def place(self, now_s: float) -> Array:
+        """Where the controller is (k,), between the points as it drives there."""
+        t = self.time(now_s)
+        if t < self.times[0]:
+            lead = self.times[0] + self.begin_s - self.put_s
+            part = np.clip((self.times[0] - t) / lead, 0.0, 1.0) if lead > 0.0 else 0.0
+            return np.asarray(self.out[0] + part * (self.led_from - self.out[0]))
+        k = int(np.searchsorted(self.times, t, side="right")) - 1
+        if k + 1 >= len(self.times):
+            return self.out[-1].copy()
+        ends = slice(k, k + 2)
+        rates = None if self.velocity is None else self.velocity[ends]
+        bends = None if self.acceleration is None else self.acceleration[ends]
+        return spline(self.times, self.out[ends], rates, bends, k, t)[0]
+
+    def at(self, rows: Array, now_s: float) -> Array:
+        """Rows (r, n) of it now (n,)."""
+        t, times = self.time(now_s), self.known_times
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        if not 0 <= k < len(times) - 1:
+            return rows[max(k, 0)].copy()
+        return np.asarray(
+            rows[k] + (t - times[k]) / (times[k + 1] - times[k]) * (rows[k + 1] - rows[k])
+        )
+
+    def offset(self, now_s: float) -> tuple[Array, Array]:
+        """Offset and its rate (n,) now, as the controller drives them between the points."""
+        t, times = self.time(now_s), self.known_times
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        if self.velocity is None or not 0 <= k < len(times) - 1:
+            return self.at(self.offsets, now_s), self.at(self.rates, now_s)
+        ends = slice(k, k + 2)
+        # it comes in by a cubic
+        comes_in = k < len(times) - len(self.times)
+        bends = None if self.acceleration is None or comes_in else self.bends[ends]
+        return spline(times, self.offsets[ends], self.rates[ends], bends, k, t)
+
+
+def spline_terms(
+    way: Array, v0: Array, v1: Array, bends: Array | None
+) -> tuple[Array, Array, Array, Array]:
+    """Factors of u^2 to u^5 of a cubic, with ``bends`` (2, ...) a quintic, from u = 0 to 1."""
+    if bends is None:
+        return 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0 * way, 0.0 * way
+    b0, b1 = bends
+    return (
+        0.5 * b0,
+        10.0 * way - 6.0 * v0 - 4.0 * v1 - 1.5 * b0 + 0.5 * b1,
+        -15.0 * way + 8.0 * v0 + 7.0 * v1 + 1.5 * b0 - b1,
+        6.0 * way - 3.0 * (v0 + v1) - 0.5 * (b0 - b1),
+    )
+
+
+def spline(
+    times: Array, ends: Array, rates: Array | None, bends: Array | None, k: int, t: float
+) -> tuple[Array, Array]:
+    """Place and speed (n,) at ``t`` between the points k and k + 1, as a controller drives.
+
+    ``ends``, ``rates`` and ``bends`` (2, n) are those of the two: a line through the places, a
+    cubic with their speeds, a quintic with their accelerations too.
+    """
+    h = times[k + 1] - times[k]
+    u, way = (t - times[k]) / h, ends[1] - ends[0]
+    if rates is None:
+        return ends[0] + u * way, way / h
+    v0, v1 = rates * h
+    c2, c3, c4, c5 = spline_terms(way, v0, v1, None if bends is None else bends * (h * h))
+    place = ends[0] + u * (v0 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
+    speed = v0 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))
+    return place, speed / h
+
+
+class Output:
+    """What was put out last for each joint."""
+
+    def __init__(self, arm: SerialArm, config: CorrectionConfig, state: RobotState) -> None:
+        self._state, self._near = state, config.start_near(arm)
+        self._fastest = config.velocity_limits
+        # the offsets of a stream, and of the begin of what comes next
+        self.limiter = OffsetLimiter(arm.prismatic, config.turning, config.sliding)
+        self.stage: StagedCorrection | None = None  # of the last target
+        self.out_s = -np.inf  # when
+        self.path: SentPath | None = None  # put out since; None after a target
+        self.mismatch = ""  # why nothing goes out until it is acknowledged
+        self._track: deque[tuple[float, Array]] = deque()  # where the controller was sent lately
+
+    @property
+    def taught(self) -> Array:
+        """(n,) the last target, as it was followed; NaN before any."""
+        return self.limiter.memory[TAUGHT]
+
+    @property
+    def out(self) -> Array:
+        """(n,) what went out for it."""
+        return self.limiter.memory[OUT]
+
+    # ---- the offset -----------------------------------------------------------------------------
+
+    def correction(self, now_s: float) -> tuple[StagedCorrection | None, Array]:
+        """The correction in what is put out now, and what the limiter adds to it (n,)."""
+        if self.path is not None:
+            return self.path.stage, self.path.at(self.path.withheld, now_s)
+        return self.stage, self.limiter.withheld
+
+    def uncorrected(self, corrected: Array, now_s: float) -> Array:
+        """Taught joints (n,) of corrected ones; of readings in part as they are."""
+        stage, withheld = self.correction(now_s)
+        bare = corrected - withheld
+        if stage is None or not np.isfinite(bare).all():
+            return bare
+        return stage.uncorrect_one(bare)
+
+    # ---- where a command may begin --------------------------------------------------------------
+
+    def place(self, index: Index, q: Array, now_s: float) -> tuple[Array, bool]:
+        """Where the controller is (k,), and whether that is known better than by readings.
+
+        Its reference where it tells it; else what it was sent, where the robot is there or on its
+        way; else where the robot stands, joints without limits at the turn nearest to ``q`` (k,):
+        what reads them may count no turns, what drives them does.
+
+        Raises `RefusedError` when readings are missing or old, or the robot moves and not by what
+        was put out.
+        """
+        state = self._state
+        known = state.reference(index, now_s)
+        if known is not None:
+            return known, True
+        state.require_fresh(index, now_s)
+        measured, near = state.measured[index], self._near[index]
+        stands, sent = state.stands(index, now_s), self._sent(now_s)[index]
+        if np.isfinite(sent).all():
+            lately = [p[index] for t, p in self._track if t >= now_s - RESPONSE_S]
+            places = np.array([sent, *(p for p in lately if np.isfinite(p).all())])
+            here = state.unwrapped(index, measured, sent)
+            beside = np.maximum(places.min(axis=0) - here, here - places.max(axis=0))
+            if np.all(beside <= near):  # it is there, or lags on its way
+                return sent, True
+        if stands:
+            return state.unwrapped(index, measured, q), False
+        raise self.refuse("the robot moves, and where its controller is is not known")
+
+    def note_place(self, now_s: float) -> None:
+        """Keep where the controller is sent now, for robots that lag."""
+        track = self._track
+        if not track or now_s - track[-1][0] >= TRACK_S or now_s < track[-1][0]:
+            track.append((now_s, self._sent(now_s)))
+            while len(track) > 1 and track[1][0] <= now_s - RESPONSE_S:
+                track.popleft()
+
+    def _sent(self, now_s: float) -> Array:
+        """Where the controller was sent by now (n,); NaN where nothing was."""
+        sent = self.out.copy()
+        if self.path is not None:
+            sent[self.path.index] = self.path.place(now_s)
+        return sent
+
+    def begin_at(self, index: Index, q: Array, begins: Array, now_s: float) -> Array:
+        """Offsets (k,) with which joints may begin at once at taught ones ``q`` (n,).
+
+        The controller must be where they begin with an offset between the last one, the one that
+        readings are un-corrected with, and those that a robot may show, ``begins`` (r, n). Raises
+        `RefusedError` as `place`, and when it is elsewhere.
+        """
+        place, exact = self.place(index, q[index], now_s)
+        here = self._state.measured.copy()
+        here[index] = place
+        known = np.vstack([begins, here - self.uncorrected(here, now_s)])  # as readings are told
+        offset, beside = self._taken_up(index, place - q[index], known, exact=exact)
+        if np.any(beside > 1.0):
+            j = int(np.argmax(beside))
+            raise self.refuse(
+                f"{self._state.names[index[j]]} is at {place[j]:.6f}, and the command begins at "
+                f"{q[index[j]]:.6f}, corrected at {(q + begins[0])[index[j]]:.6f}"
+            )
+        return offset
+
+    def _taken_up(
+        self, index: Index, offset: Array, begins: Array, *, exact: bool
+    ) -> tuple[Array, Array]:
+        """Offsets (k,) to begin with, and how far (k,) beside those known, in units of ``near``.
+
+        Readings have noise and drives sag: one that is not exact is the nearest one known.
+        """
+        near = self._near[index]
+        known = np.vstack([self.limiter.state[OFFSET], begins])[:, index]
+        beside = np.maximum(known.min(axis=0) - offset, offset - known.max(axis=0)) / near
+        miss = np.max(np.abs(known - offset) / near, axis=1)
+        if not exact and np.min(miss) <= 1.0:
+            offset = known[int(np.argmin(miss))].copy()
+        return np.asarray(offset), np.asarray(beside)
+
+    def lead_in(
+        self, index: Index, q: Array, begins: Array, now_s: float
+    ) -> tuple[Array | None, Array]:
+        """Taught joints (n,) and offset (n,) from where a command leads in to ``q`` (n,).
+
+        The taught joints are None where the controller is at its first point already. Where it is
+        not known where the controller is, it is where the robot was read.
+        """
+        everything, before = np.arange(self._state.count), self.mismatch
+        try:
+            place, exact = self.place(everything, q, now_s)
+        except RefusedError:
+            self.mismatch = before
+            place, exact = self._state.measured.copy(), False
+        offset, beside = self._taken_up(index, (place - q)[index], begins, exact=exact)
+        if np.all(beside <= 1.0):
+            whole = place - q
+            whole[index] = offset
+            return None, whole
+        if exact and self.path is not None and self.path.live(now_s):
+            taught = place - self.path.offset(now_s)[0]
+        else:  # with the offset that readings are told with
+            taught = self.uncorrected(place, now_s)
+        return taught, place - taught
+
+    def refuse(self, detail: str) -> RefusedError:
+        """A mismatch, which lasts until it is acknowledged."""
+        self.mismatch = f"{detail}; call ~/acknowledge when it may begin there"
+        return RefusedError(Reason.START_MISMATCH, self.mismatch)
+
+    def acknowledge(self, now_s: float) -> None:
+        """The next command may begin where the robot stands; readings are told as before."""
+        self.take_up(now_s)
+        self.stage, _ = self.correction(now_s)
+        self.mismatch, self.path = "", None
+        self.limiter.state[OFFSET_RATE] = 0.0
+        self._track.clear()
+        self.taught[:], self.out[:] = np.nan, np.nan
+
+    # ---- what goes out --------------------------------------------------------------------------
+
+    def take_up(self, now_s: float) -> None:
+        """The offset goes on from the path that was put out last."""
+        if self.path is not None:
+            state, path = self.limiter.state, self.path
+            state[OFFSET], rate = path.offset(now_s)
+            moving = path.time(now_s) < path.times[-1] and path.live(now_s)
+            state[OFFSET_RATE] = rate if moving else 0.0
+            state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
+            state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
+
+    def reject(self, path: SentPath) -> None:
+        """The controller did not take a path: what it took the place of goes on there."""
+        path.rejected = True
+        while self.path is not None and self.path.rejected:
+            self.path = self.path.replaced
+
+
+def hold_speeds(
+    names: Sequence[str], out: Array, dt_s: Array, fastest: Array, what: str = "would move"
+) -> None:
+    """Refuse steps (m, k) that take less than the joints' speeds (k,) allow in ``dt_s`` (m,)."""
+    speed = np.abs(out) / dt_s[:, None]
+    over = speed > fastest * (1.0 + ROUNDING)
+    if over.any():
+        point, j = np.argwhere(over)[0]
+        raise RefusedError(
+            Reason.VELOCITY_LIMIT,
+            f"{names[j]} {what} at {speed[point, j]:.6f}, allowed {fastest[j]:.6f} "
+            f"(point {point + 1})",
+        )

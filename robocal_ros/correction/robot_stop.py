@@ -11,9 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robocal_ros.correction.inputs import Array, JointCommand, TrajectoryCommand
-from robocal_ros.correction.output import SentPath
-from robocal_ros.correction.robot_state import RESPONSE_S
+from robocal_ros.correction.interface import Array, JointCommand, TrajectoryCommand
+from robocal_ros.correction.robot_state import RESPONSE_S, SentPath
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits, stop
 

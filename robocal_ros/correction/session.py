@@ -14,15 +14,16 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from robocal_ros.correction import limiter, staged, wire
-from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import (
+from robocal_ros.correction import joint_correction, limiter, wire
+from robocal_ros.correction.bounds import CorrectionConfig, CorrectionGate, DesiredOffset
+from robocal_ros.correction.interface import (
     Array,
+    CorrectionStatus,
     Index,
     JointCommand,
     OfferedModel,
     OfferedTool,
+    Offset,
     Reason,
     RefusedError,
     TrajectoryCommand,
@@ -36,10 +37,7 @@ from robocal_ros.correction.limiter import (
     WORST,
     WORST_OUT,
 )
-from robocal_ros.correction.offers import CorrectionGate
-from robocal_ros.correction.output import Output, SentPath
-from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.status import CorrectionStatus, Offset
+from robocal_ros.correction.robot_state import Output, RobotState, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
@@ -518,7 +516,7 @@ class CorrectionSession:
 
 def load_kernels(arm: SerialArm) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
-    staged.load_kernels(arm)
+    joint_correction.load_kernels(arm)
     limiter.load_kernels(arm.n)
     wire.load_kernels()
     config, q, ones = CorrectionConfig(), np.zeros(arm.n), np.ones(arm.n)

@@ -8,9 +8,13 @@ from itertools import accumulate
 
 import numpy as np
 
-from robocal_ros.correction.bounds import ClampedCorrection, CorrectionConfig, require_limits
-from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import Array, Index, JointCommand, Reason, RefusedError
+from robocal_ros.correction.bounds import (
+    ClampedCorrection,
+    CorrectionConfig,
+    DesiredOffset,
+    require_limits,
+)
+from robocal_ros.correction.interface import Array, Index, JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
     ADDS,
     DESIRED,
@@ -21,8 +25,7 @@ from robocal_ros.correction.limiter import (
     TOO_FAST,
     VELOCITY,
 )
-from robocal_ros.correction.output import Output, hold_speeds
-from robocal_ros.correction.robot_state import RobotState
+from robocal_ros.correction.robot_state import Output, RobotState, hold_speeds
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.bounds import CorrectionConfig, require_limits
-from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import (
+from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset, require_limits
+from robocal_ros.correction.interface import (
     Array,
     Index,
     Reason,
@@ -16,6 +15,7 @@ from robocal_ros.correction.inputs import (
     require_few,
     require_finite,
 )
+from robocal_ros.correction.joint_correction import StagedResult
 from robocal_ros.correction.limiter import (
     ACCELERATION,
     DESIRED,
@@ -27,9 +27,14 @@ from robocal_ros.correction.limiter import (
     REST_RATE,
     STILL,
 )
-from robocal_ros.correction.output import Output, SentPath, hold_speeds, spline, spline_terms
-from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.staged import StagedResult
+from robocal_ros.correction.robot_state import (
+    Output,
+    RobotState,
+    SentPath,
+    hold_speeds,
+    spline,
+    spline_terms,
+)
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 

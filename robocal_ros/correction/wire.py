@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.inputs import JointCommand, require_few
+from robocal_ros.correction.interface import JointCommand, require_few
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 
 Array = NDArray[np.float64]

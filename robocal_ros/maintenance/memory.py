@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.correction.status import ToldCorrection, uncorrected
+from robocal_ros.correction.interface import ToldCorrection, uncorrected
 from robocal_ros.ground.errors import Code, InputError, StateLostError, StorageError
 from robocal_ros.ground.proposals import Head
 from robocal_ros.motion.cell import DrivingConfig

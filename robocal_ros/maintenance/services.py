@@ -15,7 +15,7 @@ from robocal_msgs.msg import AccuracyState, MaintenanceResult, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
 
-from robocal_ros.correction.status import CorrectionState, ToldCorrection
+from robocal_ros.correction.interface import CorrectionState, ToldCorrection
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance import (

@@ -15,7 +15,7 @@ from traceback import extract_tb
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.status import ToldCorrection
+from robocal_ros.correction.interface import ToldCorrection
 from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm

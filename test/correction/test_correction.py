@@ -23,7 +23,7 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import TrajectoryCommand
+from robocal_ros.correction.interface import TrajectoryCommand
 from robocal_ros.correction.session import CorrectionSession
 
 # ---- off, on, off --------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, Reason, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCommand
 from robocal_ros.correction.session import CorrectionSession
 
 FAR = np.radians(0.021)  # beyond the tolerance of 0.02 deg

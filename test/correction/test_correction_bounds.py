@@ -12,9 +12,8 @@ from robocal_ros.correction.bounds import (
     Policy,
     correction_between,
 )
-from robocal_ros.correction.inputs import Reason
-from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.correction.interface import Reason
+from robocal_ros.correction.joint_correction import StagedCorrection, pack_model
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_correction_over_time import Watch
 
-from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError
+from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
 
 PERIODS = 0.002, DT, 0.008, 0.01, 0.02, 0.04
 TIMER_S = 1e-3  # the node looks for a tail no faster

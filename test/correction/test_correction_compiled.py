@@ -13,7 +13,7 @@ from correction_robot import HOME, NOMINAL, Robot, bent_tool, drifted, good_here
 from numba.core.dispatcher import Dispatcher
 
 from robocal_ros.correction.bounds import Policy
-from robocal_ros.correction.inputs import RefusedError
+from robocal_ros.correction.interface import RefusedError
 from robocal_ros.correction.session import load_kernels
 
 TOOLS = Path(__file__).parents[2] / "tools"

@@ -8,10 +8,9 @@ import pytest
 from correction_robot import FASTEST, LARGEST_A, ROUNDING
 
 from robocal_ros.correction.damping import LENGTH
-from robocal_ros.correction.joint_correction import JointCorrection, pack_model
+from robocal_ros.correction.joint_correction import JointCorrection, StagedCorrection, pack_model
 from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimiter
 from robocal_ros.correction.six_axis import ITERATIONS
-from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

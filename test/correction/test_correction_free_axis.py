@@ -12,8 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.correction.damping import LENGTH
-from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
-from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.correction.joint_correction import (
+    CorrectionResult,
+    JointCorrection,
+    StagedCorrection,
+    pack_model,
+)
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

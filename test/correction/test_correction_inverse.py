@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.correction.bounds import FADES_FROM, CorrectionConfig
-from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.correction.joint_correction import StagedCorrection, pack_model
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 

@@ -13,7 +13,7 @@ from correction_robot import (
     refused,
 )
 
-from robocal_ros.correction.inputs import (
+from robocal_ros.correction.interface import (
     JointCommand,
     Reason,
     finite_command,

@@ -9,7 +9,7 @@ import pytest
 from correction_robot import HOME, NAMES, REST, Robot, bent_tool, drifted, offer, refused, still
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import Reason, TrajectoryCommand
+from robocal_ros.correction.interface import Reason, TrajectoryCommand
 
 LIMIT = 1.0
 NEAR = CorrectionConfig().start_rad

@@ -21,7 +21,7 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import Reason, TrajectoryCommand
+from robocal_ros.correction.interface import Reason, TrajectoryCommand
 from robocal_ros.correction.joint_correction import JointCorrection
 
 

@@ -29,8 +29,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, TrajectoryCommand
-from robocal_ros.correction.output import SentPath
+from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.robot_state import SentPath
 
 WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
 

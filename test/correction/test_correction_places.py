@@ -20,7 +20,7 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
 from robocal_ros.correction.session import CorrectionSession
 
 TELLS_S = 0.02  # period of joint_trajectory_controller's state: 50 Hz

@@ -24,7 +24,7 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import Policy, ShiftBounds
-from robocal_ros.correction.inputs import JointCommand, Reason, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCommand
 from robocal_ros.ground.samples import CORRECTED
 
 TIGHT = ShiftBounds(0.2e-3, np.radians(0.1), np.radians(0.3))

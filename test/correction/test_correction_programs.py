@@ -8,7 +8,7 @@ from correction_robot import FASTEST
 
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool
+from robocal_ros.correction.interface import JointCommand, OfferedModel, OfferedTool
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_description

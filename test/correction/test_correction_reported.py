@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from robocal_ros.correction.status import CorrectionState, ToldCorrection, uncorrected
+from robocal_ros.correction.interface import CorrectionState, ToldCorrection, uncorrected
 from robocal_ros.ground.proposals import THERMAL, TOOL, Head
 
 NOMINAL, TAUGHT = Head(THERMAL, 0, None, None), Head(TOOL, 0, None, None)

@@ -25,7 +25,7 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import JointCommand, Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
 from robocal_ros.correction.session import CorrectionSession
 
 PAUSES_S = 0.2, 0.5, 0.8

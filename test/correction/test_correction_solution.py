@@ -11,9 +11,13 @@ from hypothesis import strategies as st
 
 from robocal_ros.correction import six_axis, solution
 from robocal_ros.correction.damping import LENGTH
-from robocal_ros.correction.joint_correction import JointCorrection, pack_model
+from robocal_ros.correction.joint_correction import (
+    EXACT,
+    JointCorrection,
+    StagedCorrection,
+    pack_model,
+)
 from robocal_ros.correction.solution import MOST_OVER, RATE_STEP_S, REPORT, rates_batch
-from robocal_ros.correction.staged import EXACT, StagedCorrection
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot

@@ -22,7 +22,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from robocal_ros.correction.inputs import Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.interface import Reason, RefusedError, TrajectoryCommand
 
 TOLERANCE = 1e-6  # relative; of the seventeen places of each piece that are looked at
 Motion = tuple[np.ndarray, np.ndarray]

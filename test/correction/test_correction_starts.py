@@ -16,7 +16,7 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.correction.inputs import JointCommand, Reason, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCommand
 
 SECOND = 1_000_000_000
 

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
 
 AHEAD_S = 0.06
 LIMIT = NOMINAL.upper[0] - 0.02  # of the program, which leaves room for the correction

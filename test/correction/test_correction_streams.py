@@ -21,8 +21,8 @@ from correction_robot import (
 )
 
 from robocal_ros.correction.bounds import Policy, ShiftBounds
-from robocal_ros.correction.inputs import JointCommand, Reason
-from robocal_ros.correction.output import spline
+from robocal_ros.correction.interface import JointCommand, Reason
+from robocal_ros.correction.robot_state import spline
 
 SECOND = 1_000_000_000
 

@@ -17,7 +17,7 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.correction.inputs import Reason, TrajectoryCommand, offered_tool
+from robocal_ros.correction.interface import Reason, TrajectoryCommand, offered_tool
 
 
 def waiting(robot: Robot) -> int | None:

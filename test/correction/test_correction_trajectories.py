@@ -16,7 +16,7 @@ from correction_robot import (
     swing,
 )
 
-from robocal_ros.correction.inputs import JointCommand, Reason
+from robocal_ros.correction.interface import JointCommand, Reason
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from robocal_ros.correction.inputs import JointCommand
-from robocal_ros.correction.output import SentPath
+from robocal_ros.correction.interface import JointCommand
+from robocal_ros.correction.robot_state import SentPath
 from robocal_ros.correction.robot_stop import (
     LAG_S,
     PAUSED_S,

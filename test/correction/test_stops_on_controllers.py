@@ -15,7 +15,7 @@ from robocal_ros.cell_sim.trajectory_controller import (
     JointMotion,
     Trajectory,
 )
-from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.kinematics.robots import load_description

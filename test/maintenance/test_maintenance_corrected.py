@@ -15,7 +15,7 @@ from maintenance_cell import (
     proposed,
 )
 
-from robocal_ros.correction.status import CorrectionState, ToldCorrection
+from robocal_ros.correction.interface import CorrectionState, ToldCorrection
 from robocal_ros.ground.proposals import TOOL
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.thermal.accuracy import AccuracyLevel

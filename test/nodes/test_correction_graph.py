@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
-from robocal_ros.correction.inputs import Reason
+from robocal_ros.correction.interface import Reason
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.graph import own_endpoint
 

@@ -9,8 +9,8 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from test_maintenance_calls import HOME_DEG, proposed
 
+from robocal_ros.correction.interface import CorrectionState
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.correction.status import CorrectionState
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot

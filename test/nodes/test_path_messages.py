@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.correction.inputs import Reason, RefusedError, trajectory_command
+from robocal_ros.correction.interface import Reason, RefusedError, trajectory_command
 from robocal_ros.correction.messages import PathMessage
 from robocal_ros.correction.wire import read_path
 

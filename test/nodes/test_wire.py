@@ -11,7 +11,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from robocal_ros.correction.inputs import JointCommand, finite_command
+from robocal_ros.correction.interface import JointCommand, finite_command
 from robocal_ros.correction.wire import JointWire
 
 NAMES = (("a", "b"), ("joint_a1", "joint_a2", "x"), ("only",))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.inputs import (
+from robocal_ros.correction.interface import (
     JointCommand,
     OfferedModel,
     OfferedTool,
