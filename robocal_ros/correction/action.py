@@ -138,8 +138,6 @@ class TrajectoryProxy:
     def _when_done(self, future: Future, act: Callable[[_Goal, Any], None], goal: _Goal) -> None:
         future.add_done_callback(self._safe(lambda done: act(goal, done.result())))
 
-    # ---- stops ----------------------------------------------------------------------------------
-
     def stop(self, message: Any, why: str) -> bool:
         """Send a trajectory that stops the robot; it preempts the goals, which end for ``why``.
 
@@ -181,8 +179,6 @@ class TrajectoryProxy:
         """End the goals for their callers; the controller's were stopped before."""
         for goal in list(self._goals):
             self._fail(goal, goal.stopped or why)
-
-    # ---- from the caller ------------------------------------------------------------------------
 
     def _asked(self, request: Any) -> GoalResponse:
         why = ""
@@ -246,8 +242,6 @@ class TrajectoryProxy:
             goal.asked_s = time.monotonic()
             self._when_done(goal.accepted.cancel_goal_async(), self._cancel_answered, goal)
 
-    # ---- from the controller --------------------------------------------------------------------
-
     def _answered(self, goal: _Goal, accepted: ClientGoalHandle) -> None:
         goal.asked_s = None
         if not accepted.accepted:
@@ -257,7 +251,7 @@ class TrajectoryProxy:
             return
         goal.accepted = accepted
         if goal.path is not None:
-            goal.path.accept()
+            goal.path.replaced = None  # there is no way back
         if goal.cancel or goal.over:
             self._forward_cancel(goal)
         if not goal.over:
@@ -272,16 +266,22 @@ class TrajectoryProxy:
             self._fail(goal, f"{self.controller} does not know the goal any more")
 
     def _feedback(self, goal: _Goal, feedback: Any) -> None:
+        """Un-correct feedback and pass it on; what one of its points lacks has no error."""
         if goal.over:
             return
-        names = tuple(feedback.joint_names)
+        names, error = tuple(feedback.joint_names), feedback.error
         try:
             for point in (feedback.desired, feedback.actual):
                 self._make_taught(names, point)
         except RobocalError:
             return
         feedback.header.frame_id = TAUGHT
-        _subtract(feedback.desired, feedback.actual, feedback.error)
+        error.accelerations = []
+        error.effort = []
+        for name in ("positions", "velocities"):
+            desired, actual = getattr(feedback.desired, name), getattr(feedback.actual, name)
+            there = len(desired) == len(actual)
+            setattr(error, name, (np.array(desired) - np.array(actual)).tolist() if there else [])
         goal.caller.publish_feedback(feedback)
 
     def _make_taught(self, names: tuple[str, ...], point: Any) -> None:
@@ -343,8 +343,6 @@ class TrajectoryProxy:
         infos = self._node.get_publishers_info_by_topic(f"{self.controller}/_action/status")
         return frozenset(bytes(info.endpoint_gid) for info in infos)
 
-    # ---- the end --------------------------------------------------------------------------------
-
     def _fail(self, goal: _Goal, why: str, code: int = Result.INVALID_GOAL) -> None:
         if not goal.over:
             self._node.get_logger().warning(f"goal aborted: {why}")
@@ -362,13 +360,3 @@ class TrajectoryProxy:
     def _stopped(self, goal: _Goal) -> None:
         if goal.path is not None and not goal.stopped:
             goal.path.end(time.monotonic())
-
-
-def _subtract(desired: Any, actual: Any, error: Any) -> None:
-    """Make the error that of two un-corrected points; what one of them lacks is left out."""
-    error.accelerations = []
-    error.effort = []
-    for name in ("positions", "velocities"):
-        pair = [np.array(getattr(point, name)) for point in (desired, actual)]
-        there = len(pair[0]) == len(pair[1])
-        setattr(error, name, (pair[0] - pair[1]).tolist() if there else [])

@@ -142,19 +142,28 @@ def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialAr
 
     Near a singularity the weak direction is corrected in part; what remains is reported.
     """
-    drift = result.arm
-    bound = config.thermal
+    drift, bound = result.arm, config.thermal
     fine = bound.hold(drift)
     if not np.all(fine):
-        detail = (
+        raise RefusedError(
+            Reason.TCP_BOUND,
             f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
             f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "
-            f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg"
+            f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg "
+            f"(point {int(np.argmin(fine)) + 1})",
         )
-        _require(fine, Reason.TCP_BOUND, detail)
-    _require_joints(drift.joint_shift, bound.of_joints(arm), arm)
-    if result.tool is not None:
-        _require_joints(result.tool.joint_shift, config.tool.of_joints(arm), arm)
+    for part, bounds in ((drift, bound), (result.tool, config.tool)):
+        if part is None:
+            continue
+        largest = bounds.of_joints(arm)
+        over = np.abs(part.joint_shift) > largest + ROUNDING
+        if over.any():
+            point, joint = np.argwhere(over)[0]
+            raise RefusedError(
+                Reason.JOINT_BOUND,
+                f"{arm.joint_names[joint]} by {part.joint_shift[point, joint]:.6f}, allowed "
+                f"{largest[joint]:.6f} (point {point + 1})",
+            )
 
 
 def require_solved(result: StagedResult) -> None:
@@ -162,7 +171,10 @@ def require_solved(result: StagedResult) -> None:
     solved = result.arm.converged
     if result.tool is not None:
         solved = solved & result.tool.converged
-    _require(solved, Reason.NOT_SOLVED, "the pose is at the edge of the reach")
+    if not solved.all():
+        point = int(np.argmin(solved)) + 1
+        detail = f"the pose is at the edge of the reach (point {point})"
+        raise RefusedError(Reason.NOT_SOLVED, detail)
 
 
 def require_limits(q: Array, arm: SerialArm) -> None:
@@ -174,22 +186,6 @@ def require_limits(q: Array, arm: SerialArm) -> None:
             Reason.JOINT_LIMIT,
             f"{arm.joint_names[joint]} would be at {q[point, joint]:.6f}, allowed "
             f"{arm.lower[joint]:.6f} to {arm.upper[joint]:.6f} (point {point + 1})",
-        )
-
-
-def _require(fine: NDArray[np.bool_], reason: Reason, detail: str) -> None:
-    if not fine.all():
-        raise RefusedError(reason, f"{detail} (point {int(np.argmin(fine)) + 1})")
-
-
-def _require_joints(shift: Array, largest: Array, arm: SerialArm) -> None:
-    over = np.abs(shift) > largest + ROUNDING
-    if over.any():
-        point, joint = np.argwhere(over)[0]
-        raise RefusedError(
-            Reason.JOINT_BOUND,
-            f"{arm.joint_names[joint]} by {shift[point, joint]:.6f}, allowed "
-            f"{largest[joint]:.6f} (point {point + 1})",
         )
 
 
@@ -389,13 +385,12 @@ class DesiredOffset:
             if share != NOT_WITHIN:
                 self.made = self.fast = True
                 return share
-        desired = self.at(q[None])[0][0] if stage is not None else self._nothing()
+        if stage is not None:
+            desired = self.at(q[None])[0][0]
+        else:
+            desired, self.made, self.fast = self._zero, False, False
+            self.figures[SHIFT] = self.figures[LARGEST] = self.figures[REMAINING] = 0.0
         return put_out(limiter.memory, q, desired, *times, limits, active, speeds[0], span)
-
-    def _nothing(self) -> Array:
-        self.made = self.fast = False
-        self.figures[SHIFT] = self.figures[LARGEST] = self.figures[REMAINING] = 0.0
-        return self._zero
 
     def begins(self, q: Array) -> Array:
         """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.

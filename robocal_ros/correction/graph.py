@@ -221,10 +221,7 @@ class GraphWatch:
         self.leases.look(now_s, stood_s)
         self.lease, self.lost = self.leases.words(now_s), self.leases.lost(now_s)
         if self.commanders:
-            return GraphViolation(
-                Reason.OTHER_COMMANDER,
-                f"{self.commanders}. End it; {KILLED}",
-            )
+            return GraphViolation(Reason.OTHER_COMMANDER, f"{self.commanders}. End it; {KILLED}")
         return GraphViolation(Reason.LEASED, self.lease) if self.lease else None
 
     def close(self) -> None:

@@ -19,8 +19,6 @@ from robocal_ros.ground.samples import stamp_ns
 if TYPE_CHECKING:  # who hears a status needs no compiled code
     from robocal_ros.correction.bounds import Policy, Survey
 
-# ---- why an input of the joint correction is refused --------------------------------------------
-
 
 class Reason(StrEnum):
     """Why an input was refused; counted one by one."""
@@ -80,9 +78,6 @@ class RefusedError(RobocalError):
         super().__init__(f"refused, {reason.value}: {detail}")
         self.reason, self.detail = reason, detail
         self.code = _CODES.get(reason, Code.BAD_INPUT)
-
-
-# ---- what the correction session takes in -------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -384,22 +379,21 @@ class CorrectionStatus:
 
     def in_words(self) -> str:
         """What the correction does now, in one line."""
-        said = self._said()
-        return f"shadow, nothing is changed; it would be {said}" if self.shadow else said
-
-    def _said(self) -> str:
-        for reason, detail in self.held.items():
-            return f"nothing goes out, {reason.value}: {detail}"
-        if self.mismatch:
-            return f"nothing goes out, {Reason.START_MISMATCH.value}: {self.mismatch}"
-        if not self.enabled:
-            return "off, the offset goes to zero with the next commands" if self.active else "off"
         parts = [] if self.revision is None else [f"model revision {self.revision}"]
         parts += [f"tool revision {self.tool_revision}"] if self.new_tool else []
-        if not parts:
-            return "on, but there is no model and no tool yet: nothing is corrected"
         settled = "on" if self.settled else "on, the offset changes with the next commands"
-        return f"{settled}: {' and '.join(parts)}"
+        if self.held:
+            reason, detail = next(iter(self.held.items()))
+            words = f"nothing goes out, {reason.value}: {detail}"
+        elif self.mismatch:
+            words = f"nothing goes out, {Reason.START_MISMATCH.value}: {self.mismatch}"
+        elif not self.enabled:
+            words = "off, the offset goes to zero with the next commands" if self.active else "off"
+        elif parts:
+            words = f"{settled}: {' and '.join(parts)}"
+        else:
+            words = "on, but there is no model and no tool yet: nothing is corrected"
+        return f"shadow, nothing is changed; it would be {words}" if self.shadow else words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -431,45 +425,38 @@ def uncorrected(
     told : None: the correction is silent.
     follows : something came into force so lately that the correction may not know of it yet.
     """
-    needed = not (_is_plain(thermal) and _is_plain(tool))
+    no_model = thermal.calibration_id is None
+    needed = not (no_model and tool.calibration_id is None)
     if told is None:
         return f"{NODE} is silent: start it, it corrects nothing" if needed else ""
-    if needed and (why := _idle(told, thermal)):
-        return f"{NODE} {why}"
+    idle = ""  # why nothing is corrected, whatever the revisions in use
+    if told.shadow:
+        idle = "is in shadow mode, nothing is corrected: start it with shadow false"
+    elif told.state is CorrectionState.MISMATCH:
+        idle = f"puts nothing out, {told.mismatch}: see where the robot stands, call ~/acknowledge"
+    elif told.state is CorrectionState.OTHER_COMMANDER:
+        idle = f"puts nothing out, {told.commanders}: end them"
+    elif not told.enabled:
+        idle = "is OFF: call ~/enable"
+    elif told.state is CorrectionState.WITHOUT_MODEL:
+        idle = "has heard of no model and no tool: wire its inputs kinematic_model and tool"
+    elif told.stale and not no_model:
+        idle = f"corrects without the model, {told.stale}: accept a newer one"
+    if needed and idle:
+        return f"{NODE} {idle}"
     silent = told.state in (CorrectionState.MISMATCH, CorrectionState.OTHER_COMMANDER)
     if follows or not told.enabled or told.shadow or silent:
         return ""
     pairs = [
-        _other("thermal model", "kinematic_model", told.model_revision, thermal, told),
-        _other("tool", "tool", told.tool_revision, tool, told),
+        _other_revision("thermal model", "kinematic_model", told.model_revision, thermal, told),
+        _other_revision("tool", "tool", told.tool_revision, tool, told),
     ]
     return "; ".join(filter(None, pairs))
 
 
-def _is_plain(head: Head) -> bool:
-    return head.calibration_id is None
-
-
-def _idle(told: ToldCorrection, thermal: Head) -> str:
-    """Why nothing is corrected, whatever the revisions in use."""
-    if told.shadow:
-        return "is in shadow mode, nothing is corrected: start it with shadow false"
-    if told.state is CorrectionState.MISMATCH:
-        return f"puts nothing out, {told.mismatch}: see where the robot stands, call ~/acknowledge"
-    if told.state is CorrectionState.OTHER_COMMANDER:
-        return f"puts nothing out, {told.commanders}: end them"
-    if not told.enabled:
-        return "is OFF: call ~/enable"
-    if told.state is CorrectionState.WITHOUT_MODEL:
-        return "has heard of no model and no tool: wire its inputs kinematic_model and tool"
-    if told.stale and not _is_plain(thermal):
-        return f"corrects without the model, {told.stale}: accept a newer one"
-    return ""
-
-
-def _other(what: str, topic: str, used: int, head: Head, told: ToldCorrection) -> str:
-    """Words where another revision is in use than in force; 0 is as good as any plain one."""
-    if used == head.revision or (used == 0 and _is_plain(head)):
+def _other_revision(what: str, topic: str, used: int, head: Head, told: ToldCorrection) -> str:
+    """Words where another revision is in use than in force; 0 is as good as any nominal one."""
+    if used == head.revision or (used == 0 and head.calibration_id is None):
         return ""
     words = f"{NODE} corrects with {what} revision {used}, in force is revision {head.revision}"
     if topic == "tool" and told.waiting_tool_revision == head.revision:

@@ -48,21 +48,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.correction import solution
 from robocal_ros.correction.limiter import step_out
-from robocal_ros.correction.solution import (
-    RATE_STEP_S,
-    STEP_AHEAD_S,
-    work_size,
-)
+from robocal_ros.correction.solution import RATE_STEP_S, STEP_AHEAD_S, work_size
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 
-# ---- rates --------------------------------------------------------------------------------------
-
-
 Array = NDArray[np.float64]
-
-
-# ---- joint correction between a reference model and the actual one, each with its tool ----------
 
 
 LARGEST_SHIFT = 1.0
@@ -222,12 +212,6 @@ def path_rates(
     before, after = (corrected(at) - at for at in ends)
     rate = (after - before) / (2.0 * h)
     return velocity + rate, acceleration + (after - 2.0 * here + before) / h**2
-
-
-# ---- one target of a stream, from taught joints to what goes out: compiled in one piece ---------
-
-
-# ---- correction of the arm's drift and of the tool's change, each within its own bounds ---------
 
 
 EXACT = 1e-13  # rad, m: to rounding

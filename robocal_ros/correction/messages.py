@@ -49,9 +49,6 @@ def all_finite(*rows: Any) -> bool:
     return all(all(map(math.isfinite, row)) for row in rows)
 
 
-# ---- commands and readings ----------------------------------------------------------------------
-
-
 class JointMessage:
     """A serialized ``JointState`` that came in, its command, and what goes out for it.
 

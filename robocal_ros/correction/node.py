@@ -233,8 +233,6 @@ class JointCorrectionNode(HouseNode):
             self._proxy.destroy()
         super().destroy_node()
 
-    # ---- what decides about the correction ------------------------------------------------------
-
     def _on_model(self, message: Any) -> None:
         build = self._session.counted
         self._session.offer_model(build(lambda: offered_model(message, KinematicModel.ACCEPTED)))
@@ -280,8 +278,6 @@ class JointCorrectionNode(HouseNode):
         self.get_logger().info(f"{what}: {words}")
         self._tell()
         return response
-
-    # ---- what is corrected ----------------------------------------------------------------------
 
     def _listen(
         self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None], profile: Any
@@ -374,8 +370,6 @@ class JointCorrectionNode(HouseNode):
             same = command is came
             self._outputs[topic].publish(message.unchanged() if same else message.changed(command))
 
-    # ---- goals of the action --------------------------------------------------------------------
-
     def _correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
         """A goal's trajectory, corrected, and its path; as it came in shadow mode."""
         message = PathMessage(trajectory)
@@ -402,8 +396,6 @@ class JointCorrectionNode(HouseNode):
     def _goal_lost(self, why: str) -> None:
         """The robot may still follow it, and is stopped by where it is."""
         self._stop_by_readings(why, time.monotonic())
-
-    # ---- stops, and what goes out without a message ---------------------------------------------
 
     def _stop(self, why: str) -> None:
         """Bring what this node moves to rest: by what was put out, else by where the robot is."""
@@ -499,8 +491,6 @@ class JointCorrectionNode(HouseNode):
             self._outputs[self._stream].publish(tail_message(command, kind, self.now_ns()))
         return command is not None
 
-    # ---- the controller -------------------------------------------------------------------------
-
     def _on_controller(self, message: Any) -> None:
         """Where the controller is, and how fast its clock runs."""
         now = time.monotonic()
@@ -529,8 +519,6 @@ class JointCorrectionNode(HouseNode):
         before, self._scaling = self._scaling, 1.0 if scaling is None else scaling
         if self._scaling != before:
             self._session.controller((), np.empty(0), self._scaling, now_s)
-
-    # ---- who else commands ----------------------------------------------------------------------
 
     def _on_lease(self, message: Any) -> None:
         self._leases.hear(message, time.monotonic())
@@ -565,8 +553,6 @@ class JointCorrectionNode(HouseNode):
             self.get_logger().info(f"over: {before.reason.value}")
         if (found is None) is not (before is None):
             self._tell()
-
-    # ---- what is reported -----------------------------------------------------------------------
 
     def _tell_offset(self, cause: int, now_s: float) -> None:
         self._commanded = True

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -76,8 +76,6 @@ class RobotState:
         self._reference, self._reference_s = np.full(arm.n, np.nan), np.full(arm.n, -np.inf)
         self._reference_rate = np.zeros(arm.n)
         self.scaling = 1.0
-
-    # ---- joints by name -------------------------------------------------------------------------
 
     def index(self, names: tuple[str, ...]) -> Index:
         """Numbers (k,) of the arm's joints; raises `RefusedError` for a name that is no such."""
@@ -158,8 +156,6 @@ class RobotState:
         self.require_positions(names, index, state.position[column][None])
         return index, column
 
-    # ---- where it is ----------------------------------------------------------------------------
-
     def read(self, index: Index, position: Array, now_s: float, age_s: float) -> None:
         """Take readings (k,) that were ``age_s`` old by their stamp when they came."""
         self.measured[index] = position
@@ -218,14 +214,11 @@ class RobotState:
                 detail = f"the stamp of {self.names[i]} is over {AHEAD_S:g} s ahead of the clock"
             raise RefusedError(Reason.STALE_JOINTS, detail)
 
-    def fresh(self, index: Index, now_s: float) -> bool:
-        """Whether all these joints were read lately."""
-        return bool(np.all(now_s - self._read_s[index] <= self._age_limit_s))
-
     def stands(self, index: Index, now_s: float) -> bool:
         """Whether these joints were read, and moved by less than ``near`` for the response time."""
         track = self._track
-        if not track or track[0][0] > now_s - RESPONSE_S + TRACK_S or not self.fresh(index, now_s):
+        fresh = np.all(now_s - self._read_s[index] <= self._age_limit_s)
+        if not track or track[0][0] > now_s - RESPONSE_S + TRACK_S or not fresh:
             return False
         here = self.measured[index]
         moved = [self.unwrapped(index, q[index], here) - here for _, q in track]
@@ -266,17 +259,13 @@ class SentPath:
     rejected: bool = False
     _scaling: float = 1.0
     _lost_s: float = 0.0  # by a clock that runs slower
-    _since_s: float = field(default=-np.inf)
+    _since_s: float = -np.inf
     _stopped_s: float = np.inf
 
     def begin(self, now_s: float) -> None:
         """It goes out now: one that begins at once begins now, not when it was corrected."""
         if self.at_once:
             self.begin_s = now_s
-
-    def accept(self) -> None:
-        """The controller took it: there is no way back."""
-        self.replaced = None
 
     def end(self, now_s: float) -> None:
         """It ended early: the controller stays where it is on it."""
@@ -400,8 +389,6 @@ class Output:
         """(n,) what went out for it."""
         return self.limiter.memory[OUT]
 
-    # ---- the offset -----------------------------------------------------------------------------
-
     def correction(self, now_s: float) -> tuple[StagedCorrection | None, Array]:
         """The correction in what is put out now, and what the limiter adds to it (n,)."""
         if self.path is not None:
@@ -415,8 +402,6 @@ class Output:
         if stage is None or not np.isfinite(bare).all():
             return bare
         return stage.uncorrect_one(bare)
-
-    # ---- where a command may begin --------------------------------------------------------------
 
     def place(self, index: Index, q: Array, now_s: float) -> tuple[Array, bool]:
         """Where the controller is (k,), and whether that is known better than by readings.
@@ -534,8 +519,6 @@ class Output:
         self.limiter.state[OFFSET_RATE] = 0.0
         self._track.clear()
         self.taught[:], self.out[:] = np.nan, np.nan
-
-    # ---- what goes out --------------------------------------------------------------------------
 
     def take_up(self, now_s: float) -> None:
         """The offset goes on from the path that was put out last."""

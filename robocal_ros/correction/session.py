@@ -110,8 +110,6 @@ class CorrectionSession:
         self._last_refusal = ""
         self._overtaken = 0
 
-    # ---- what the operator and the estimators decide --------------------------------------------
-
     def enable(self, on: bool) -> None:
         """Correct from now on, or no more: the offset changes with the next commands.
 
@@ -197,8 +195,6 @@ class CorrectionSession:
 
     def _want(self) -> None:
         self._desired.want(self._gate.actual, self._enabled)
-
-    # ---- commands -------------------------------------------------------------------------------
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream of joint targets; itself where nothing is added.
@@ -310,8 +306,6 @@ class CorrectionSession:
         for reason, detail in self._held.items():
             raise RefusedError(reason, detail)
 
-    # ---- readings -------------------------------------------------------------------------------
-
     def reading(self, state: JointCommand, now_s: float, age_s: float = 0.0) -> JointCommand:
         """Un-correct joint readings with what is being put out at ``now_s``.
 
@@ -389,8 +383,6 @@ class CorrectionSession:
         while path is not None:  # the one that it may go on with, too
             path.scale(self._state.scaling, now_s)
             path = path.replaced
-
-    # ---- what is said of it ---------------------------------------------------------------------
 
     def offset(self, now_s: float) -> Offset:
         """What is added to the taught joints now, and what of it the limiter withholds."""

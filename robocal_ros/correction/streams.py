@@ -97,8 +97,6 @@ class TargetStream:
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
         self._lasts_s, self._slowed_s = 0.0, 0.0
 
-    # ---- time -----------------------------------------------------------------------------------
-
     def runs(self, now_s: float) -> bool:
         """Whether it is under way."""
         if self.phase is StreamPhase.ENDING:
@@ -151,8 +149,6 @@ class TargetStream:
         """Time that the next output may use: a robot that stands makes no longer step."""
         elapsed = max(now_s - self._output.out_s, 0.0)
         return min(elapsed, self._step_period_s()) if self._holds(elapsed) else elapsed
-
-    # ---- targets --------------------------------------------------------------------------------
 
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
@@ -372,8 +368,6 @@ class TargetStream:
         names = [self._arm.joint_names[i] for i in index]
         hold_speeds(names, velocity[None], np.ones(1), self._fastest[index])
         return velocity
-
-    # ---- without a message ----------------------------------------------------------------------
 
     def end(self, why: RefusedError, now_s: float) -> None:
         """End it: the robot is slowed down from where and as fast as it was sent lately.

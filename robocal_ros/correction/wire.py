@@ -26,8 +26,6 @@ STAMPS = struct.Struct("<iI")
 NS = 1_000_000_000
 LEAST_POINT = 4 * FIELDS + 8  # bytes of a point without numbers
 
-# ---- text and numbers ---------------------------------------------------------------------------
-
 
 def _string(data: bytes, at: int) -> tuple[str, int]:
     """Text and where the next number begins."""
@@ -67,9 +65,6 @@ def joint_names(data: bytes) -> tuple[str, ...]:
         return _names(data, _string(data, FRAME)[1])[0]
     except (struct.error, UnicodeDecodeError):
         return ()
-
-
-# ---- joint states -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -201,9 +196,6 @@ def _layout(data: bytes) -> _Layout | None:
         fields=tuple(struct.Struct(f"<{count}d") if count else None for count in counts),
         size=len(data),
     )
-
-
-# ---- trajectories -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

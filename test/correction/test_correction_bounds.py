@@ -64,11 +64,7 @@ def through_the_wrist() -> np.ndarray:
     return q
 
 
-PATHS = {
-    "free": path_through(HOME),
-    "limit": near_limits(),
-    "wrist": through_the_wrist(),
-}
+PATHS = {"free": path_through(HOME), "limit": near_limits(), "wrist": through_the_wrist()}
 ARMS = {
     "small": drifted(1.0),
     "large": drifted(15.0, seed=3),

@@ -4,14 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from correction_robot import (
-    DT,
-    HOME,
-    NAMES,
-    NOMINAL,
-    Robot,
-    refused,
-)
+from correction_robot import DT, HOME, NAMES, NOMINAL, Robot, refused
 
 from robocal_ros.correction.interface import (
     JointCommand,

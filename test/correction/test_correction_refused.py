@@ -4,16 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from correction_robot import (
-    HOME,
-    NAMES,
-    NOMINAL,
-    Robot,
-    offer,
-    refused,
-    still,
-    swing,
-)
+from correction_robot import HOME, NAMES, NOMINAL, Robot, offer, refused, still, swing
 
 from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCommand
 from robocal_ros.ground.samples import CORRECTED, TAUGHT

@@ -5,17 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from correction_robot import (
-    HOME,
-    NAMES,
-    NOMINAL,
-    REST,
-    ROUNDING,
-    Robot,
-    bent_tool,
-    refused,
-    still,
-)
+from correction_robot import HOME, NAMES, NOMINAL, REST, ROUNDING, Robot, bent_tool, refused, still
 
 from robocal_ros.correction.interface import Reason, TrajectoryCommand, offered_tool
 
