@@ -5,7 +5,7 @@ import numpy as np
 from bench.closed_loop import setting
 from robocal_ros.correction.interface import OfferedModel, OfferedTool, ToldCorrection
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.maintenance.memory import Drift
+from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.session import ThermalSession

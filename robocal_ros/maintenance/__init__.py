@@ -9,7 +9,8 @@ memory           settings, what outlives a restart, the accuracy of the cell
 services, node   parameters, services and messages; the node and its clients
 """
 
-from robocal_ros.maintenance.memory import AcceptBounds, CycleResult, MaintenanceConfig, Times
+from robocal_ros.maintenance.accuracy import AcceptBounds, MaintenanceConfig, Times
+from robocal_ros.maintenance.memory import CycleResult
 from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState, Status
 
 __all__ = [

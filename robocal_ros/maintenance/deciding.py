@@ -27,7 +27,7 @@ from robocal_ros.ground.proposals import (
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.maintenance.memory import MaintenanceConfig
+from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.maintenance.robot_interface import CellInterface, Script
 from robocal_ros.session.events import (
     ACCEPT,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.maintenance.memory import MaintenanceConfig
+from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.motion.cell import MotionCell, ToolBody, along, departure, joint_way, raised_way
 from robocal_ros.motion.plan import JointPlan, joined, start_near, stop, stop_time
 from robocal_ros.motion.robot_watch import (

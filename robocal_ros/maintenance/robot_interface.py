@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, ConflictError, LimitError
-from robocal_ros.maintenance.memory import MaintenanceConfig
+from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.maintenance.mover import HOME, STATION, FaultError, Mover, Route, Ways
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap

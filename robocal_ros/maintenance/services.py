@@ -26,7 +26,7 @@ from robocal_ros.maintenance import (
     Status,
     Times,
 )
-from robocal_ros.maintenance.memory import Drift
+from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.motion.driver import CONTROLLER, MOTION, driving_config, require_limits
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import MM, joint_poses, joints_of

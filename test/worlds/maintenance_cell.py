@@ -18,7 +18,7 @@ from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, MaintenanceState, Times
 from robocal_ros.maintenance import robot_interface as ask
-from robocal_ros.maintenance.memory import Drift
+from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.mover import STATION, Ways
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.motion.cell import DrivingConfig, Housing

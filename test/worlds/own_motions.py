@@ -16,7 +16,7 @@ from std_msgs.msg import String
 
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance.memory import MaintenanceConfig
+from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.maintenance.mover import FaultError, Mover, Route, Ways
 from robocal_ros.motion.cell import joint_way, load_motion
 from robocal_ros.motion.driver import (
