@@ -119,6 +119,7 @@ class Graph:
         self._nodes: list[Any] = []
         self._clients: dict[str, Any] = {}
         self._executables: list[Executable] = []
+        self.at_close: list[Callable[[], None]] = []  # ends threads that use the probe
 
     def add(
         self, node_class: type, parameters: dict[str, Any] | None = None, **options: Any
@@ -240,6 +241,8 @@ class Graph:
 
     def close(self) -> None:
         """End everything."""
+        for ended in self.at_close:
+            ended()
         for executable in self._executables:
             executable.close()
         for node in self._nodes:

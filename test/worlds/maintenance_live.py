@@ -1,7 +1,6 @@
 """A whole cell over DDS: robot, beams, thermal_node, tcf_node, maintenance_node; the probe is PLC
 and sphere sensor. Everything is simulated."""
 
-import contextlib
 import threading
 import time
 from pathlib import Path
@@ -88,7 +87,10 @@ class LiveCell:
         graph.probe.create_subscription(JointState, "joint_states", self._joints, endpoints.STREAM)
         self.sphere = graph.probe.create_publisher(PointStamped, "sphere_center", 10)
         self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
-        threading.Thread(target=self._beats, daemon=True).start()
+        self._ended = threading.Event()
+        self._plc = threading.Thread(target=self._beats, daemon=True)
+        self._plc.start()
+        graph.at_close.append(self._stop_beats)
         graph.probe.create_timer(SENSE_S, self._sense)
         csv, laser = folder / "beams.csv", folder / "laser.yaml"
         simulated = {"laser_csv": str(csv), "seed": 7, "q_start_deg": yaml_list(HOME_DEG)} | faults
@@ -139,12 +141,16 @@ class LiveCell:
 
     def _beats(self) -> None:
         """As a PLC does it: whatever else goes on here."""
-        while self.graph.context.ok():
+        while not self._ended.wait(self.beat_s):
             if self.beating:
-                with contextlib.suppress(Exception):  # the test ends
-                    beat = self.statuses[-1].beat if self.statuses else 0
-                    self.gap.publish(GapOpen(open=self.is_open, echo=beat))
-            time.sleep(self.beat_s)
+                newest = self.statuses[-1:]  # which the test may clear meanwhile
+                beat = newest[0].beat if newest else 0
+                self.gap.publish(GapOpen(open=self.is_open, echo=beat))
+
+    def _stop_beats(self) -> None:
+        """Who publishes with a node that is being destroyed ends the process."""
+        self._ended.set()
+        self._plc.join()
 
     def _sense(self) -> None:
         recent = self.joints[-round(RESTS_S * 125) :]
