@@ -36,6 +36,7 @@ NO_CALL = SimpleNamespace(id="")  # of a test without parameters
 DEADLINE_S = 30.0  # of what takes a second, on a machine that is busy otherwise
 ENDS_WITHIN_S = 10.0
 DISCOVERY_S = 0.25
+GONE_WITHIN_S = 1.0
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -253,6 +254,11 @@ class Graph:
             # what the traceback of a failed test keeps would command the next one's robot
             if isinstance(waitable, (ActionClient, ActionServer)):
                 waitable.destroy()
+        # Fast DDS may crash where a participant ends just as it learns that another one has; one
+        # that was killed stays known for long.
+        until_s = time.monotonic() + GONE_WITHIN_S
+        while len(self.probe.get_node_names()) > 1 and time.monotonic() < until_s:
+            time.sleep(0.01)
         self.probe.destroy_node()
         self.context.try_shutdown()
 
