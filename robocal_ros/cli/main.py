@@ -73,7 +73,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "replay any number of bags, in parallel, and write one report: is it good, in mm?",
     ),
     "history": CliCommand(
-        "cli.robot:history", "list the calibrations of a robot; accept, reject or roll back"
+        "cli.history:history", "list the calibrations of a robot; accept, reject or roll back"
     ),
     "thermal": CliGroup(
         "place the sensor, identify a thermal drift, learn what drift to expect, screen, plan"

@@ -1,0 +1,439 @@
+"""``robocal history``: calibrations listed and shown, decisions taken, damage acknowledged."""
+
+import argparse
+import getpass
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robocal_ros.cli.command import (
+    CliResult,
+    Document,
+    count,
+    text,
+)
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
+from robocal_ros.ground.proposals import (
+    BEFORE_ANY,
+    HEALTHY_TOOL,
+    MANDREL,
+    THERMAL,
+    TOOL,
+    Decision,
+    Entry,
+    hand_eye_kind,
+)
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_file import acknowledge, damaged_files, known_serials, state_folder
+from robocal_ros.session.events import measured_with
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+_STYLES = {"in_force": "bold green", "pending": "bold yellow", "refused": "red"}
+
+
+def show_list(console: "Console", document: Document) -> None:
+    """Print the calibrations as a table, and what is in force."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
+    for name in ("id", "revision", "kind", "state", "verdict", "rms mm", "data (UTC)", "cycle"):
+        table.add_column(name, justify="right" if name in ("id", "revision", "rms mm") else "left")
+    table.add_column("last decision")
+    for entry in document["calibrations"]:
+        rms = entry["candidate_rms_mm"]
+        table.add_row(
+            str(entry["id"]),
+            str(entry["revision"] or ""),
+            Text(entry["kind"]),
+            Text(entry["state"], style=_STYLES.get(entry["state"], "")),
+            entry["code"],
+            "" if rms is None else f"{rms:.3f}",
+            _time(entry["stamp_ns"]),
+            Text(entry["cycle_id"]),
+            Text(_words(entry["decisions"][-1]) if entry["decisions"] else ""),
+        )
+    console.print(table)
+    for head in document["in_force"]:
+        console.print(Text(_in_force(head)))
+    if not document["in_force"]:
+        console.print("In force: the nominal model; nothing was accepted yet")
+
+
+def show_entry(console: "Console", document: Document) -> None:
+    """Print one calibration: the record, its inputs, its decisions."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    entry = document["calibration"]
+    table = Table(box=None, show_header=False)
+    table.add_row("robot", Text(document["serial"]))
+    for name, value in entry.items():
+        if name == "decisions" or value is None:
+            continue
+        shown = _time(value) if name.endswith("_ns") else str(value)
+        table.add_row(name.removesuffix("_ns").replace("_", " "), Text(shown))
+    for name, kind in document["inputs"].items():
+        size = " x ".join(str(n) for n in kind["shape"])
+        table.add_row(f"input {name}", f"{kind['dtype']} {size}")
+    for decision in entry["decisions"]:
+        table.add_row("decision", Text(_words(decision)))
+    console.print(table)
+    console.print("The full document, the model and its figures: --json")
+
+
+def show_corrections(console: "Console", document: Document) -> None:
+    """Print what the commands were corrected with, and since when."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
+    for name in ("since (UTC)", "correction", "model", "tool", "reference", "from", "its hash"):
+        table.add_column(name, justify="right" if name in ("model", "tool") else "left")
+    table.add_column("version")
+    for record in document["corrections"]:
+        asked = ("shadow" if record["shadow"] else "on") if record["enabled"] else "off"
+        table.add_row(
+            _time(record["wall_ns"]),
+            Text(asked, style="bold green" if asked == "on" else ""),
+            str(record["model_revision"] or "none"),
+            str(record["tool_revision"] or "taught"),
+            record["reference"],
+            Text(record["reference_source"]),
+            record["reference_hash"][:8],
+            Text(record["software"]),
+        )
+    console.print(table)
+    if not document["corrections"]:
+        console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
+
+
+def show_acknowledged(console: "Console", document: Document) -> None:
+    """Print which damaged histories somebody knows of now."""
+    from rich.text import Text
+
+    for path in document["acknowledged"]:
+        console.print(Text(f"Acknowledged by {document['by']}: {path}"), soft_wrap=True)
+    if not document["acknowledged"]:
+        console.print("There is nothing to acknowledge")
+
+
+def show_decision(console: "Console", document: Document) -> None:
+    """Print what was done."""
+    from rich.text import Text
+
+    _show_damage(console, document)
+    console.print(Text(document["verdict"]["reason"].capitalize()), soft_wrap=True)
+
+
+def _show_damage(console: "Console", document: Document) -> None:
+    if document["damaged"]:
+        console.print(
+            f"The history was damaged and is kept as {document['damaged']}; 'robocal history "
+            "acknowledge' ends the warnings",
+            style="bold red",
+            soft_wrap=True,
+        )
+
+
+def _in_force(head: Document) -> str:
+    number = head["calibration_id"]
+    name = "the nominal model" if number is None else f"calibration {number}"
+    return f"In force: {name}, {head['kind']} revision {head['revision']}"
+
+
+def _words(decision: Document) -> str:
+    number = decision["calibration_id"]
+    target = ""
+    if decision["action"] == "rollback":
+        target = " to nominal" if number is None else f" to {number}"
+    by = f" by {decision['by']}" if decision["by"] else ""
+    why = f": {decision['reason']}" if decision["reason"] else ""
+    return f"{_time(decision['wall_ns'])} {decision['action']}{target}{by}{why}"
+
+
+def _time(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+_PREVIOUS = "previous"
+_NOMINAL = "nominal"
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL)
+
+
+def add_history_options(action: argparse.ArgumentParser) -> None:
+    """Declare which history is meant."""
+    action.add_argument(
+        "--robot-serial",
+        type=text,
+        metavar="S",
+        help="robot serial; may be left out where only one robot has a history",
+    )
+    action.add_argument(
+        "--state",
+        type=Path,
+        metavar="DIR",
+        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
+    )
+
+
+def add_rollback_target(action: argparse.ArgumentParser) -> None:
+    """Declare what a rollback returns to."""
+    action.add_argument(
+        "--to",
+        type=_target,
+        default=None,
+        metavar="ID",
+        help="an accepted calibration, 'nominal', or 'previous' (default): the one in force "
+        "before the present one",
+    )
+    action.add_argument(
+        "--kind",
+        type=_kind,
+        metavar="KIND",
+        default=THERMAL,
+        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
+    )
+
+
+def _kind(value: str) -> str:
+    """A kind of calibration; each sensor has its own."""
+    start = hand_eye_kind("")
+    if value not in _KINDS and (not value.startswith(start) or value == start):
+        known = ", ".join((*_KINDS, hand_eye_kind("SENSOR")))
+        raise argparse.ArgumentTypeError(f"'{value}' is none of {known}")
+    return value
+
+
+def _target(value: str) -> int | None:
+    if value == _PREVIOUS:
+        return None
+    if value == _NOMINAL:
+        return 0
+    try:
+        return count(value)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(
+            f"{quoted(value)} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
+        ) from error
+
+
+def add_history(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``history``."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="action")
+
+    def add(name: str, words: str) -> argparse.ArgumentParser:
+        action = actions.add_parser(name, help=words, description=words)
+        add_history_options(action)
+        return action
+
+    for name, words in (
+        ("list", "the latest calibrations, newest first"),
+        ("corrections", "what joint_correction_node corrected with, newest change first"),
+    ):
+        listing = add(name, words)
+        listing.add_argument("--limit", type=count, default=50, metavar="N", help="default 50")
+    knowing = add("acknowledge", "say that you know of a damaged history that was set aside")
+    knowing.add_argument("--by", type=text, help="who knows, default the user's name")
+    showing = add("show", "all that is kept of one calibration")
+    showing.add_argument("id", type=int, help="number in the list")
+    for name, words in (
+        ("accept", "bring a pending calibration into force"),
+        ("reject", "rule out a calibration that was never accepted"),
+        ("rollback", "return to an earlier calibration, as a new revision"),
+    ):
+        action = add(name, words)
+        if name != "rollback":
+            action.add_argument("id", type=int, help="number in the list")
+        action.add_argument("--by", type=text, help="who decides, default the user's name")
+        action.add_argument("--reason", type=text, default="", help="why, kept with the decision")
+        if name != "reject":
+            action.add_argument(
+                "--expect-revision",
+                type=int,
+                metavar="N",
+                help="refuse when another revision is in force",
+            )
+        if name == "rollback":
+            add_rollback_target(action)
+
+
+def run_history(args: argparse.Namespace) -> CliResult:
+    """Do ``history``. Raises `RobocalError` for what a user can mend."""
+    folder = state_folder() if args.state is None else args.state.absolute()
+    serial = args.robot_serial
+    if serial is None:
+        serial = _only(known_serials(folder), folder)
+    with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
+        document, render = _ACTIONS[args.action](history, args)
+    damaged = damaged_files(history.path)
+    place = {
+        "serial": serial,
+        "file": str(history.path),
+        "damaged": str(damaged[-1]) if damaged else None,
+    }
+    complete = place | document
+    return CliResult(complete, lambda console: render(console, complete))
+
+
+def _only(serials: list[str], folder: Path) -> str:
+    if len(serials) == 1:
+        return serials[0]
+    if not serials:
+        raise InputError(
+            "no calibration history here; name its folder with --state or ROBOCAL_STATE",
+            file=str(folder),
+        )
+    raise InputError(
+        f"several robots have a history: {', '.join(serials)}; choose one with --robot-serial",
+        file=str(folder),
+    )
+
+
+Answer = tuple[Document, Callable[..., None]]
+
+
+def _list(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    document = {
+        "in_force": [
+            {"kind": h.kind, "revision": h.revision, "calibration_id": h.calibration_id}
+            for h in history.heads()
+        ],
+        "calibrations": [_entry(entry) for entry in history.list(args.limit)],
+    }
+    return document, show_list
+
+
+def _show_history(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    entry = history.get(args.id)
+    document = {
+        "calibration": _entry(entry),
+        "document": history.document(entry.id),
+        "model": history.model(entry.id),
+        "inputs": {
+            name: {"dtype": str(array.dtype), "shape": list(array.shape)}
+            for name, array in history.inputs(entry.id).items()
+        },
+    }
+    return document, show_entry
+
+
+def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    document = {
+        "corrections": [
+            asdict(record) | {"taught_tool": list(record.taught_tool)}
+            for record in history.corrections(args.limit)
+        ]
+    }
+    return document, show_corrections
+
+
+def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    files = acknowledge(history.path, _by(args), time.time_ns())
+    return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_acknowledged
+
+
+def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    head = history.accept(
+        args.id,
+        by=_by(args),
+        reason=args.reason,
+        expected_head=args.expect_revision,
+        wall_ns=time.time_ns(),
+        with_heads=measured_with(history, history.get(args.id)),
+    )
+    said = f"calibration {args.id} is in force as {head.kind} revision {head.revision}"
+    return _decided(args, head.kind, args.id, head.revision, said), show_decision
+
+
+def _reject(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    history.reject(args.id, by=_by(args), reason=args.reason, wall_ns=time.time_ns())
+    kind = history.get(args.id).kind
+    revision = history.get(args.id).decisions[-1].head_after
+    said = f"calibration {args.id} is rejected; {kind} revision {revision} stays in force"
+    return _decided(args, kind, args.id, revision, said), show_decision
+
+
+def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    head = history.rollback(
+        args.to,
+        kind=args.kind,
+        by=_by(args),
+        reason=args.reason,
+        expected_head=args.expect_revision,
+        wall_ns=time.time_ns(),
+    )
+    number = head.calibration_id
+    start = BEFORE_ANY.get(args.kind, "nothing")
+    name = start if number is None else f"calibration {number}"
+    said = f"{name} is in force again, as {head.kind} revision {head.revision}"
+    return _decided(args, head.kind, number, head.revision, said), show_decision
+
+
+_ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]] = {
+    "list": _list,
+    "acknowledge": _acknowledge,
+    "show": _show_history,
+    "corrections": _corrections,
+    "accept": _accept,
+    "reject": _reject,
+    "rollback": _rollback,
+}
+
+
+def _decided(
+    args: argparse.Namespace, kind: str, calibration_id: int | None, revision: int, said: str
+) -> Document:
+    return {
+        "action": args.action,
+        "kind": kind,
+        "calibration_id": calibration_id,
+        "revision": revision,
+        "by": _by(args),
+        "reason": args.reason,
+        "verdict": {"accept": True, "code": "ACCEPT", "reason": said},
+    }
+
+
+def _entry(entry: Entry) -> Document:
+    document = {
+        "id": entry.id,
+        "revision": entry.revision,
+        "kind": entry.kind,
+        "state": entry.state.value,
+        "code": entry.code.name,
+        "reason": entry.reason,
+        "candidate_rms_mm": entry.candidate_rms_mm,
+        "model_hash": entry.model_hash,
+        "based_on": entry.based_on,
+        "cycle_id": entry.cycle_id,
+        "stamp_ns": entry.stamp_ns,
+        "created_ns": entry.created_ns,
+        "software": entry.software,
+        "method": entry.method,
+    }
+    return document | {"decisions": [_decision(decision) for decision in entry.decisions]}
+
+
+def _decision(decision: Decision) -> Document:
+    return asdict(decision) | {"action": decision.action.value}
+
+
+def _by(args: argparse.Namespace) -> str:
+    if args.by is not None:
+        return str(args.by)
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a user without a name, as in containers
+        return f"uid {os.getuid()}"
