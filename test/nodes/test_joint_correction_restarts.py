@@ -130,7 +130,8 @@ class Cell:
         self.robot, self._heard = out, now
 
     def goes_on(self) -> None:
-        """Commands come again; after a mismatch the planner asks for it."""
+        """Commands come again, once model and tool do; after a mismatch the planner asks for it."""
+        self.graph.spin_until(self._knows, "the model and the tool", 30.0)
         count = len(self.sent)
         for _ in range(10):
             self.graph.spin_for(0.5)
@@ -140,6 +141,14 @@ class Cell:
                 assert self.graph.call(Trigger, f"{NODE}/acknowledge").success
         logs = "".join(f"\n--- {name}:\n{e.output}" for name, e in self.nodes.items())
         pytest.fail(f"no commands come any more: {self.status[-1]}{logs}")
+
+    def _knows(self) -> bool:
+        """Whether it knows the calibrations, with which it tells where the robot may stand."""
+        if not self.status:
+            return False
+        told = self.status[-1]
+        model = max(told.model_revision, told.waiting_model_revision)
+        return bool(model == 1 and max(told.tool_revision, told.waiting_tool_revision) == 1)
 
     def enable(self) -> None:
         """Ask for the correction and wait until all of it is made.
