@@ -16,8 +16,7 @@ from bench.long_shift import JOINTS, ROBOT, LongShift, write_shift
 from bench.tables import Goal, Table
 from robocal_ros.bags.bags import BagReader, bag_info
 from robocal_ros.bags.replay import one_by_one
-from robocal_ros.ground.samples import JointBlock, joint_sample
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import JointBlock, StandstillRule, joint_sample
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.observations import ObservationDesk
 

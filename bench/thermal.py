@@ -23,13 +23,13 @@ from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.accuracy import EarlierShift, LearnedProcess, learn_drift, learn_process
 from robocal_ros.thermal.identification import (
     drift_prior,
     identify_cycle,
     judge_cycle,
     subset_drift,
 )
-from robocal_ros.thermal.learning import EarlierShift, LearnedProcess, learn_drift, learn_process
 from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.screening import DriftHistory, screen, share_within
 

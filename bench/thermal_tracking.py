@@ -18,8 +18,7 @@ from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.thermal_shift import DriftingCell, DriftPlan, DriftRecord, record
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.identification import identify_cycle
-from robocal_ros.thermal.learning import (
+from robocal_ros.thermal.accuracy import (
     EarlierShift,
     LearnedProcess,
     learn_drift,
@@ -27,6 +26,7 @@ from robocal_ros.thermal.learning import (
     learn_process,
     visit_noise,
 )
+from robocal_ros.thermal.identification import identify_cycle
 from robocal_ros.thermal.tracking import Innovation
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from robocal_ros.hand_eye.camera_fit import fit_pairs
 from robocal_ros.hand_eye.camera_model import PosePairs
 from robocal_ros.identification import identify
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.inverse import inverse
+from robocal_ros.kinematics.arm import inverse
 
 POSES = 30
 

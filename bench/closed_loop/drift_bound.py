@@ -15,9 +15,8 @@ from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.thermal_shift import PERIOD_S, DriftPlan
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.accuracy import AccuracyForecast, Work
+from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work
 from robocal_ros.thermal.drift_following import default_process
-from robocal_ros.thermal.learning import LearnedProcess
 from robocal_ros.thermal.tracking import DriftTracker
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from robocal_ros.cell_sim.cell import poses
 from robocal_ros.cell_sim.robot import TrueRobot
 from robocal_ros.cell_sim.thermal_shift import PLANS, DriftingCell, DriftPlan, record
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.learning import EarlierShift, LearnedProcess, learn_gains
+from robocal_ros.thermal.accuracy import EarlierShift, LearnedProcess, learn_gains
 
 
 def seen(

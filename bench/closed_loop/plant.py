@@ -23,7 +23,7 @@ from robocal_ros.motion.cell import joint_way
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.learning import LearnedProcess
+from robocal_ros.thermal.accuracy import LearnedProcess
 from robocal_ros.tool.session import REFERENCE
 
 Array = NDArray[np.float64]

@@ -31,9 +31,8 @@ from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.thermal.accuracy import Accuracy
+from robocal_ros.thermal.accuracy import Accuracy, LearnedProcess, process_document
 from robocal_ros.thermal.drift_following import EXPECTED
-from robocal_ros.thermal.learning import LearnedProcess, process_document
 from robocal_ros.thermal.session import ThermalSession
 from robocal_ros.tool.driving import ToolDriver
 from robocal_ros.tool.edges import EDGES, EdgeSample

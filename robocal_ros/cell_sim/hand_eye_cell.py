@@ -27,7 +27,7 @@ from robocal_ros.cell_sim.sensors import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.inverse import inverse
+from robocal_ros.kinematics.arm import inverse
 
 Array = NDArray[np.float64]
 

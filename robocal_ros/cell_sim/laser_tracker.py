@@ -16,7 +16,7 @@ from robocal_ros.ground import frames
 from robocal_ros.hand_eye.shots import profile_of
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.inverse import inverse
+from robocal_ros.kinematics.arm import inverse
 
 Array = NDArray[np.float64]
 

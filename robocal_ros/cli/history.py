@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.command import (
+from robocal_ros.cli.main import (
     CliResult,
     Document,
     count,
@@ -18,7 +18,9 @@ from robocal_ros.cli.command import (
 )
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
-from robocal_ros.ground.proposals import (
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_file import acknowledge, damaged_files, known_serials, state_folder
+from robocal_ros.history.history_records import (
     BEFORE_ANY,
     HEALTHY_TOOL,
     MANDREL,
@@ -28,8 +30,6 @@ from robocal_ros.ground.proposals import (
     Entry,
     hand_eye_kind,
 )
-from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_file import acknowledge, damaged_files, known_serials, state_folder
 from robocal_ros.session.events import measured_with
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robocal_ros import __version__
-from robocal_ros.cli.command import (
+from robocal_ros.cli.main import (
     DONE,
     NO_ANSWER,
     PARTS,
@@ -31,10 +31,13 @@ from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge
-from robocal_ros.identification.iso9283 import CYCLES, Repeated, read_positions, repeated
 from robocal_ros.identification.judged import (
+    CYCLES,
+    Repeated,
     explain_mismatch,
     identification_document,
+    read_positions,
+    repeated,
     require_match,
 )
 from robocal_ros.kinematics import SerialArm

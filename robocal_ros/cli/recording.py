@@ -23,7 +23,7 @@ from robocal_ros.bags.replay import (
     read_events,
     topic_kind,
 )
-from robocal_ros.cli.command import describe_robot
+from robocal_ros.cli.main import describe_robot
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
 from robocal_ros.hand_eye.shots import SHOTS

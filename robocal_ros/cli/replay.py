@@ -16,7 +16,8 @@ import numpy as np
 from robocal_ros import __version__
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
-from robocal_ros.cli.command import (
+from robocal_ros.cli.identify import show_identification
+from robocal_ros.cli.main import (
     BAD_REQUEST,
     DONE,
     NO_ANSWER,
@@ -29,18 +30,17 @@ from robocal_ros.cli.command import (
     tell,
     warn,
 )
-from robocal_ros.cli.identify import show_identification
 from robocal_ros.cli.recording import UNASKED, BagOverview, find_robot, open_recording
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.ground.proposals import Head
-from robocal_ros.ground.streams import JointStream
+from robocal_ros.ground.samples import JointStream
 from robocal_ros.hand_eye.session import (
     hand_eye_session_as_recorded,
     is_hand_eye_session,
     take_hand_eye_message,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN

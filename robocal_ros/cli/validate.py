@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from robocal_ros import __version__
-from robocal_ros.cli.command import (
+from robocal_ros.cli.main import (
     DONE,
     NO_ANSWER,
     ROBOT_HELP,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
 from robocal_ros.cell_sim.faults import SIZES
-from robocal_ros.cli.command import Document, refusal
+from robocal_ros.cli.main import Document, refusal
 from robocal_ros.cli.recording import (
     HAND_EYE,
     TOOL,
@@ -37,10 +37,10 @@ from robocal_ros.cli.recording import (
 from robocal_ros.cli.replay import ReplayRequest, replay_bag, seconds
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError
-from robocal_ros.ground.proposals import REFERENCE, THERMAL, Action, Entry
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.hand_eye.session import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import REFERENCE, THERMAL, Action, Entry
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.report.figures import (

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.history.history_records import Head
 
 if TYPE_CHECKING:  # who hears a status needs no compiled code
     from robocal_ros.correction.bounds import Policy, Survey

@@ -7,7 +7,7 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.command import CliResult, Document, positive, text, three_numbers
+from robocal_ros.cli.main import CliResult, Document, positive, text, three_numbers
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted

@@ -7,7 +7,7 @@ from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.cli.command import ROBOT_HELP, CliResult, Document, describe_robot, positive, warn
+from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, positive, warn
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.hand_eye.board import (

@@ -11,13 +11,12 @@ import numpy as np
 
 from robocal_ros.bags.bags import DATA_SET, BagReader, read_data_set
 from robocal_ros.bags.replay import topic_kind
-from robocal_ros.cli.command import ROBOT_HELP, Document, input_topic, positive
+from robocal_ros.cli.main import ROBOT_HELP, Document, input_topic, positive
 from robocal_ros.cli.recording import BagOverview, open_recording
-from robocal_ros.estimation.edge import EdgeRule
-from robocal_ros.estimation.polyline import CornerRule
+from robocal_ros.estimation.edge import CornerRule, EdgeRule
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import StandstillRule
 from robocal_ros.hand_eye.data import FEATURES, data_set_of, flange_poses
 from robocal_ros.hand_eye.files import PoseTable, read_pose_table, read_profiles
 from robocal_ros.hand_eye.result import HandEyeSettings

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError
 from robocal_ros.ground.frames import Document
-from robocal_ros.ground.proposals import Head
 from robocal_ros.hand_eye.board import find_corners
 from robocal_ros.hand_eye.camera_model import Mount
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE, Shot, profile_of
 from robocal_ros.hand_eye.targets import BoardTarget, target_of
+from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.events import Command

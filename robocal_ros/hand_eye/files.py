@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.cells import Cells, read_cells, texts, write_cells
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
@@ -29,10 +28,12 @@ from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import (
     POSITION,
     QUATERNION,
+    Cells,
     TableLayout,
     check_plain,
     flange_unit_fault,
     joint_texts,
+    read_cells,
     read_layout,
     read_pose_columns,
     read_rotations,
@@ -40,6 +41,8 @@ from robocal_ros.kinematics.tables import (
     read_stamps,
     require_different,
     stamp_texts,
+    texts,
+    write_cells,
 )
 
 Array = NDArray[np.float64]

@@ -14,9 +14,7 @@ from sensor_msgs.msg import Image, JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
-from robocal_ros.ground.proposals import Head, hand_eye_kind
-from robocal_ros.ground.samples import JOINTS
-from robocal_ros.ground.streams import Silence
+from robocal_ros.ground.samples import JOINTS, Silence
 from robocal_ros.hand_eye.data import FEATURES, MOUNTS, TOPIC_OF
 from robocal_ros.hand_eye.result import METHODS
 from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
@@ -28,6 +26,7 @@ from robocal_ros.hand_eye.session import (
 )
 from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Head, hand_eye_kind
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run

@@ -24,7 +24,6 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.files import made_folder_beside
-from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.hand_eye.data import (
     IN_HAND,
@@ -50,6 +49,7 @@ from robocal_ros.hand_eye.targets import KIND_OF, read_target, target_document
 from robocal_ros.hand_eye.targets import KINDS as TARGET_FILE_KINDS
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
+from robocal_ros.history.history_records import Head
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import StaticTf, pose_message, transform_message
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text

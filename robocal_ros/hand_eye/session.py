@@ -18,9 +18,14 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Document
-from robocal_ros.ground.proposals import THERMAL, Head, Proposal, hand_eye_kind
-from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
-from robocal_ros.ground.streams import CLOCK_JUMP_NS, NotStillError, StandstillRule
+from robocal_ros.ground.samples import (
+    CLOCK_JUMP_NS,
+    JOINTS,
+    JointSample,
+    NotStillError,
+    StandstillRule,
+    joint_sample,
+)
 from robocal_ros.hand_eye.data import (
     FEATURES,
     MOST_CAPTURES,
@@ -48,6 +53,7 @@ from robocal_ros.hand_eye.result import (
 )
 from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Profile, Shot, ShotLog, shot_of, target_poses
 from robocal_ros.hand_eye.targets import target_of
+from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events

@@ -8,13 +8,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError, RobocalError
-from robocal_ros.ground.proposals import CalibrationState
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.data import DataSet
 from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.targets import BoardTarget, SphereTarget, target_of
+from robocal_ros.history.history_records import CalibrationState
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
 from robocal_ros.session.events import History

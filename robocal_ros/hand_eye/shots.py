@@ -17,13 +17,15 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.samples import (
     JOINTS,
+    JointStream,
+    NotStillError,
+    StandstillRule,
     cloud_points,
     image_array,
     joint_sample,
     pose_sample,
     stamp_ns,
 )
-from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.session import events
 from robocal_ros.session.base import GAP_NS, Ignored
 from robocal_ros.session.events import Command

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.polyline import CornerFit, CornerRule, fit_corners
+from robocal_ros.estimation.edge import CornerFit, CornerRule, fit_corners
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     InputError,

@@ -9,9 +9,9 @@ from typing import ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.arc import ArcRule, fit_arc
 from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.estimation.estimation import solve
+from robocal_ros.estimation.sphere import ArcRule, fit_arc
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     InputError,

@@ -6,21 +6,519 @@ under the write lock, so that of two at once one wins and the other gets a `Conf
 are revisions of other kinds that a calibration needs beside it.
 """
 
+import logging
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
-from robocal_ros.ground.errors import InputError, StaleError, WrongRobotError
-from robocal_ros.ground.proposals import THERMAL, Action, Candidate, Decision, Head, Proposal
-from robocal_ros.history.history_reader import HistoryReader
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    RobocalError,
+    StaleError,
+    WrongRobotError,
+)
+from robocal_ros.ground.files import SoleUser
+from robocal_ros.history.history_file import (
+    DamagedError,
+    HistoryFile,
+    history_path,
+    open_file,
+    state_folder,
+    storage_errors,
+)
 from robocal_ros.history.history_records import (
+    THERMAL,
+    Action,
+    CalibrationState,
+    Candidate,
     CorrectionRecord,
+    Decision,
+    Entry,
+    Head,
+    read_arrays,
+    read_candidate,
+    read_candidates,
+    read_corrections,
+    read_decisions,
+    read_json,
+    require_measured_with,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+from robocal_ros.history.history_records import (
+    Proposal,
     insert_correction,
     insert_decision,
     insert_proposal,
     packed,
-    read_candidate,
 )
+
+# ---- the rules of accept, reject and rollback, as a fold over the decisions log -----------------
+#
+# The log alone says what is in force: there is no second place that could disagree with it.
+
+
+NOMINAL = 0
+"""As a rollback's target: the nominal model."""
+
+
+class VerdictError(RobocalError):
+    """A calibration whose own verdict refuses it; ``code`` is that verdict."""
+
+    def __init__(self, message: str, code: Code) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass
+class _Standing:
+    """What the log says of one calibration."""
+
+    revision: int = 0  # as which it was accepted
+    parent: int | None = None  # what was in force before it; None = nominal
+    rejected: bool = False
+    left: CalibrationState | None = None  # how it went out of force
+    decisions: tuple[Decision, ...] = ()
+
+
+class Ledger:
+    """The decisions log, folded: what is in force, and where each calibration stands."""
+
+    def __init__(self) -> None:
+        self.last_seq = 0
+        self._heads: dict[str, tuple[int, int | None]] = {}
+        self._standings: dict[int, _Standing] = {}
+
+    def head(self, kind: str) -> tuple[int, int | None]:
+        """Revision in force and its calibration (None = nominal)."""
+        return self._heads.get(kind, (0, None))
+
+    def kinds(self) -> list[str]:
+        """Kinds that have ever had a revision."""
+        return sorted(self._heads)
+
+    def standing(self, calibration_id: int) -> _Standing:
+        """Tell what the log says of a calibration; the default when it says nothing."""
+        return self._standings.get(calibration_id, _Standing())
+
+    def state(self, calibration_id: int, candidate: Candidate) -> CalibrationState:
+        """Where a calibration stands."""
+        standing = self.standing(calibration_id)
+        revision, in_force = self.head(candidate.kind)
+        if calibration_id == in_force:
+            return CalibrationState.IN_FORCE
+        if standing.left is not None:
+            return standing.left
+        if standing.rejected:
+            return CalibrationState.REJECTED
+        if candidate.code is not Code.ACCEPT:
+            return CalibrationState.REFUSED
+        return (
+            CalibrationState.PENDING if candidate.based_on == revision else CalibrationState.STALE
+        )
+
+    def extend(self, decisions: Iterable[Decision]) -> None:
+        """Add the decisions that follow. Raises `DamagedError`, see `apply`."""
+        for decision in decisions:
+            self.apply(decision)
+
+    def apply(self, decision: Decision) -> None:
+        """Add the next decision.
+
+        Raises
+        ------
+        DamagedError
+            It does not follow from the decisions before it.
+        """
+        revision, in_force = self.head(decision.kind)
+        step = 0 if decision.action is Action.REJECT else 1
+        chained = decision.head_before == revision and decision.head_after == revision + step
+        if not chained or not self._possible(decision, in_force):
+            raise DamagedError(f"decision {decision.seq} contradicts those before it")
+        if decision.calibration_id is not None:
+            standing = self._standings.setdefault(decision.calibration_id, _Standing())
+            standing.decisions += (decision,)
+            if decision.action is Action.REJECT:
+                standing.rejected = True
+            elif decision.action is Action.ACCEPT:
+                standing.revision, standing.parent = decision.head_after, in_force
+        if decision.action is not Action.REJECT:
+            if in_force is not None:
+                out = self._standings[in_force]
+                accepted = decision.action is Action.ACCEPT
+                out.left = CalibrationState.SUPERSEDED if accepted else CalibrationState.ROLLED_BACK
+                out.decisions += (decision,)
+            self._heads[decision.kind] = (decision.head_after, decision.calibration_id)
+        self.last_seq = decision.seq
+
+    def _possible(self, decision: Decision, in_force: int | None) -> bool:
+        target = decision.calibration_id
+        if decision.action is Action.ROLLBACK:
+            was_accepted = target is None or self.standing(target).revision > 0
+            return in_force != target and was_accepted
+        if target is None:
+            return False
+        standing = self.standing(target)
+        return not standing.rejected and standing.revision == 0
+
+    def check_open(self, calibration_id: int) -> None:
+        """Refuse a calibration that was decided before.
+
+        Raises
+        ------
+        ConflictError
+        """
+        standing = self.standing(calibration_id)
+        if standing.revision:
+            raise ConflictError(
+                f"calibration {calibration_id} was accepted already, as revision "
+                f"{standing.revision}; to return to it use rollback"
+            )
+        if standing.rejected:
+            raise ConflictError(
+                f"calibration {calibration_id} was rejected by "
+                f"{standing.decisions[-1].by or 'an unnamed person'}; measure again"
+            )
+
+    def check_head(self, kind: str, expected: int | None) -> None:
+        """Refuse when another revision is in force than the caller believes.
+
+        Raises
+        ------
+        ConflictError
+        """
+        revision, _ = self.head(kind)
+        if expected is not None and expected != revision:
+            raise ConflictError(
+                f"{kind} revision {revision} is in force, not {expected}: another change came "
+                "first; look at the list and decide again"
+            )
+
+    def check_accept(
+        self,
+        calibration_id: int,
+        candidate: Candidate,
+        expected: int | None,
+        with_heads: Mapping[str, int],
+    ) -> None:
+        """Refuse what must not come into force.
+
+        Raises
+        ------
+        ConflictError, VerdictError, StaleError
+        """
+        self.check_open(calibration_id)
+        if candidate.code is not Code.ACCEPT:
+            raise VerdictError(
+                f"calibration {calibration_id} was judged {candidate.code.name}: "
+                f"{candidate.reason}; it cannot be accepted",
+                candidate.code,
+            )
+        self.check_head(candidate.kind, expected)
+        revision, _ = self.head(candidate.kind)
+        if candidate.based_on != revision:
+            raise StaleError(
+                f"calibration {calibration_id} was solved against {candidate.kind} revision "
+                f"{candidate.based_on}, but {revision} is in force; measure again"
+            )
+        what = f"{candidate.kind} {calibration_id}"
+        require_measured_with(what, with_heads, lambda kind: self.head(kind)[0])
+
+    def rollback_target(self, kind: str, to: int | None) -> int | None:
+        """Calibration that a rollback returns to (None = nominal).
+
+        ``to`` None goes to what was in force when the present one was accepted, so that each
+        further rollback goes further back and never forward again.
+
+        Raises
+        ------
+        ConflictError
+        """
+        _, in_force = self.head(kind)
+        if to is None:
+            if in_force is None:
+                raise ConflictError(f"the nominal {kind} model is in force: nothing to roll back")
+            return self.standing(in_force).parent
+        target = None if to == NOMINAL else to
+        if target == in_force:
+            name = "the nominal model" if target is None else f"calibration {target}"
+            raise ConflictError(f"{name} is in force already")
+        if target is not None and not self.standing(target).revision:
+            raise ConflictError(
+                f"calibration {target} was never accepted: a rollback returns to what was in "
+                "force before"
+            )
+        return target
+
+
+# ---- opening and reading it ---------------------------------------------------------------------
+
+
+_log = logging.getLogger(__name__)
+
+# As `Ledger.state`, but without reading those that were refused or decided.
+_PENDING = (
+    "WHERE kind = ? AND based_on = ? AND code = ? AND NOT EXISTS (SELECT 1 FROM decisions "
+    "WHERE calibration_id = calibrations.id AND action <> 'rollback') ORDER BY id DESC LIMIT ?"
+)
+
+BUSY_TIMEOUT_S = 2.0
+"""Longest wait for another process's change, itself a matter of milliseconds."""
+
+
+class HistoryReader:
+    """What a history holds. Use `CalibrationHistory.open`, as a context manager.
+
+    Every method raises `StorageError` when the file cannot be read. Not for several threads at
+    once.
+
+    Attributes
+    ----------
+    serial : the robot.
+    path : the file.
+    damaged : where a damaged predecessor was set aside at this opening, or None.
+    created : whether this opening made a new, empty history.
+    """
+
+    def __init__(
+        self,
+        serial: str,
+        file: HistoryFile,
+        ledger: Ledger,
+        model_hash: str | None,
+        sole: SoleUser | None,
+    ) -> None:
+        self.serial = serial
+        self.path = file.path
+        self.damaged = file.damaged
+        self.created = file.created
+        self._file, self._sole = file, sole
+        self._ledger = ledger
+        self._model_hash = model_hash
+        self._own_commits = 0
+
+    @classmethod
+    def open(
+        cls,
+        serial: str,
+        *,
+        model_hash: str | None = None,
+        state_dir: Path | None = None,
+        create: bool = True,
+        busy_timeout_s: float = BUSY_TIMEOUT_S,
+        sole_user: str = "",
+        owner: bool = True,
+    ) -> Self:
+        """Open the history of a robot.
+
+        Parameters
+        ----------
+        serial : robot serial; any text.
+        model_hash : hash of the nominal model in use; what was made for another one is refused.
+        state_dir : folder of the histories, default `state_folder()`.
+        create : False refuses a robot that has no history.
+        busy_timeout_s : longest wait for other processes.
+        sole_user : the part that only one process may play for this robot; empty: none.
+        owner : sets a damaged file aside and begins anew; others are refused.
+
+        Raises
+        ------
+        InputError
+            Bad serial, or no history and ``create`` is False.
+        WrongRobotError
+            The file belongs to another serial.
+        StorageError
+            The file cannot be opened, was made by a newer version, or is damaged and ``owner`` is
+            False.
+        ConflictError
+            Another process plays the part of ``sole_user``.
+        """
+        path = history_path(serial, state_dir or state_folder())
+        if not create and not path.exists():
+            raise InputError(f"robot {serial!r} has no calibration history here", file=str(path))
+        ledger = Ledger()
+
+        def verify(connection: sqlite3.Connection) -> None:
+            nonlocal ledger
+            ledger = Ledger()
+            ledger.extend(read_decisions(connection, 0))
+            for kind in ledger.kinds():
+                _, in_force = ledger.head(kind)
+                if in_force is not None:
+                    read_json(connection, in_force, "model")
+
+        sole = SoleUser(path, sole_user, serial, busy_timeout_s) if sole_user else None
+        try:
+            file = open_file(path, serial, timeout_s=busy_timeout_s, verify=verify, owner=owner)
+        except Exception:
+            if sole is not None:
+                sole.close()
+            raise
+        if file.damaged is not None:
+            _log.warning(
+                "%s was damaged: it is kept as %s, the history of robot %s starts anew with the "
+                "nominal model; restore a backup to go on with the former one",
+                *(path, file.damaged.name, serial),
+            )
+        return cls(serial, file, ledger, model_hash, sole)
+
+    def wait_at_most(self, seconds: float) -> None:
+        """From now on wait for other processes no longer than so."""
+        with storage_errors(self.path):
+            self._file.connection.execute(f"PRAGMA busy_timeout = {round(seconds * 1e3)}")
+
+    def close(self) -> None:
+        """Close the file; idempotent."""
+        self._file.close()
+        if self._sole is not None:
+            self._sole.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def head(self, kind: str = THERMAL) -> Head:
+        """Tell what is in force.
+
+        Raises
+        ------
+        WrongRobotError
+            It was made for another nominal model than the one in use: it must not be applied.
+        """
+        with self._reading() as connection:
+            revision, in_force = self._ledger.head(kind)
+            if in_force is not None:
+                candidate = read_candidate(connection, in_force)
+                self._require_hash(candidate.model_hash, f"calibration {in_force}, in force,")
+            return self._head(kind, revision, in_force)
+
+    def heads(self) -> tuple[Head, ...]:
+        """Tell what is in force of each kind that ever had a revision, whatever its model hash."""
+        with self._reading():
+            kinds = self._ledger.kinds()
+            return tuple(self._head(kind, *self._ledger.head(kind)) for kind in kinds)
+
+    def list(self, limit: int = 50) -> tuple[Entry, ...]:
+        """Latest calibrations, newest first."""
+        with self._reading() as connection:
+            rows = read_candidates(connection, "ORDER BY id DESC LIMIT ?", max(limit, 0))
+            return tuple(self._entry(*row) for row in rows)
+
+    def get(self, calibration_id: int) -> Entry:
+        """One calibration.
+
+        Raises
+        ------
+        InputError
+            Unknown id.
+        """
+        with self._reading() as connection:
+            return self._entry(calibration_id, read_candidate(connection, calibration_id))
+
+    def pending(self, kind: str = THERMAL, limit: int = -1) -> tuple[Entry, ...]:
+        """Calibrations that can be accepted now, newest first; ``limit``: so many at the most."""
+        with self._reading() as connection:
+            revision, _ = self._ledger.head(kind)
+            rows = read_candidates(connection, _PENDING, kind, revision, Code.ACCEPT, limit)
+            return tuple(self._entry(*row) for row in rows)
+
+    def decisions(self, after_seq: int = 0, newest: int = -1) -> tuple[Decision, ...]:
+        """Decisions of every kind after a sequence number, oldest first.
+
+        ``newest``: the latest so many at the most, at a cost that does not grow with the history.
+        """
+        with self._reading() as connection:
+            return read_decisions(connection, after_seq, newest)
+
+    def corrections(self, limit: int = 50) -> tuple[CorrectionRecord, ...]:
+        """What the robot's commands were corrected with, newest first."""
+        with self._reading() as connection:
+            return tuple(read_corrections(connection, limit))
+
+    def document(self, calibration_id: int) -> dict[str, Any]:
+        """JSON document of the identification. Raises `InputError` for an unknown id."""
+        with self._reading() as connection:
+            return read_json(connection, calibration_id, "document")
+
+    def model(self, calibration_id: int) -> dict[str, Any]:
+        """Model in full precision. Raises `InputError` for an unknown id."""
+        with self._reading() as connection:
+            return read_json(connection, calibration_id, "model")
+
+    def inputs(self, calibration_id: int) -> "dict[str, NDArray[Any]]":
+        """Arrays it was solved from, bit for bit. Raises `InputError` for an unknown id."""
+        with self._reading() as connection:
+            return read_arrays(connection, calibration_id)
+
+    def data_version(self) -> int:
+        """Cheap number that differs after each change of the file, by this process or another.
+
+        Meant to be polled. Raises `StorageError` when the file was deleted or replaced.
+        """
+        self._file.require_in_place()
+        with storage_errors(self.path):
+            row = self._file.connection.execute("PRAGMA data_version").fetchone()
+        return int(row[0]) + self._own_commits
+
+    def _entry(self, calibration_id: int, candidate: Candidate) -> Entry:
+        standing = self._ledger.standing(calibration_id)
+        return Entry(
+            **vars(candidate),
+            id=calibration_id,
+            state=self._ledger.state(calibration_id, candidate),
+            revision=standing.revision,
+            decisions=standing.decisions,
+        )
+
+    def _head(self, kind: str, revision: int, calibration_id: int | None) -> Head:
+        model = None
+        if calibration_id is not None:
+            model = read_json(self._file.connection, calibration_id, "model")
+        return Head(kind, revision, calibration_id, model)
+
+    def _require_hash(self, found: str, what: str) -> None:
+        if self._model_hash is not None and found != self._model_hash:
+            raise WrongRobotError(
+                f"{what} was made for the nominal model {found}, but {self._model_hash} is in "
+                "use: load that robot file, or roll back to nominal and measure again"
+            )
+
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection]:
+        """One consistent view of the present state."""
+        with self._transaction("BEGIN") as connection:
+            yield connection
+
+    @contextmanager
+    def _transaction(self, begin: str) -> Iterator[sqlite3.Connection]:
+        connection = self._file.connection
+        with storage_errors(self.path):
+            connection.execute(begin)
+            try:
+                self._ledger.extend(read_decisions(connection, self._ledger.last_seq))
+                yield connection
+                connection.execute("COMMIT")
+            finally:
+                if connection.in_transaction:
+                    connection.execute("ROLLBACK")
+
+
+# ---- changing it --------------------------------------------------------------------------------
 
 
 class CalibrationHistory(HistoryReader):

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from robocal_ros.correction.interface import ToldCorrection, uncorrected
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.proposals import Head
+from robocal_ros.history.history_records import Head
 from robocal_ros.maintenance.memory import MM, NS, Array, Memory, ToolRecord
 from robocal_ros.motion.cell import DrivingConfig
 from robocal_ros.thermal.accuracy import (

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ground.proposals import THERMAL, TOOL
+from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
 from robocal_ros.maintenance.memory import CycleResult, Memory, ToolRecord

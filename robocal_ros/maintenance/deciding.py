@@ -14,7 +14,7 @@ from robocal_ros.ground.errors import (
     StaleError,
     StorageError,
 )
-from robocal_ros.ground.proposals import (
+from robocal_ros.history.history_records import (
     REFERENCE,
     THERMAL,
     TOOL,

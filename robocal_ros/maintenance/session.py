@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.correction.interface import ToldCorrection
 from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
-from robocal_ros.ground.proposals import THERMAL, TOOL
+from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import Drift, MaintenanceConfig, NodeReports, accuracy_of
 from robocal_ros.maintenance.cycle import CycleRun, ThermalCycle, ThermalPart

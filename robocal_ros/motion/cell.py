@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.inverse import follow, inverse, require_within_limits
+from robocal_ros.kinematics.arm import follow, inverse, require_within_limits
 from robocal_ros.motion.plan import (
     JointPlan,
     MotionLimits,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError, LimitError
-from robocal_ros.ground.streams import Silence
+from robocal_ros.ground.samples import Silence
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import DrivingConfig, MotionCell
 from robocal_ros.motion.plan import JointPlan, MotionLimits, start_near, stop

@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.proposals import Entry
+from robocal_ros.history.history_records import Entry
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import COLUMNS
 from robocal_ros.ros import endpoints

@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import nearest
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import StandstillRule
 
 QOS_OVERRIDES = "qos_overrides."  # of topics, which are declared with their endpoints
 # Parameters that several nodes have, and what a launch file gives to all of its nodes: below /** of

@@ -16,10 +16,10 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, InputError, RobocalError, WrongRobotError
 from robocal_ros.ground.files import StateFile
-from robocal_ros.ground.proposals import Head
 from robocal_ros.ground.samples import JOINTS, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge, damage_notice, history_path, state_folder
+from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_file_hash
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode

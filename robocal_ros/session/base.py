@@ -8,9 +8,8 @@ from typing import Any
 
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
-from robocal_ros.ground.proposals import THERMAL, Decision, Head
-from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample
-from robocal_ros.ground.streams import JointStream
+from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample, JointStream
+from robocal_ros.history.history_records import THERMAL, Decision, Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.events import (

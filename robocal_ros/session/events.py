@@ -12,8 +12,16 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, RobocalError, WrongRobotError
-from robocal_ros.ground.proposals import BEFORE_ANY, THERMAL, TOOL, Decision, Entry, Head, Proposal
 from robocal_ros.ground.samples import JOINTS, JUMPS
+from robocal_ros.history.history_records import (
+    BEFORE_ANY,
+    THERMAL,
+    TOOL,
+    Decision,
+    Entry,
+    Head,
+    Proposal,
+)
 from robocal_ros.kinematics import SerialArm
 
 CONFIGURE = "configure"

@@ -1,22 +1,413 @@
-"""How far the tool may be off by now, and when that is too much: from the tracker, at any time."""
+"""What drift to expect of a robot, learned from its cycles; how far the tool may be off by now."""
 
 import math
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.history.history_records import REFERENCE, THERMAL, CalibrationState, Entry
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.thermal.reference import ColdSpots
-from robocal_ros.thermal.tracking import DriftTracker
+from robocal_ros.kinematics.robots import Fields, read_made, write_made
+from robocal_ros.session.events import History
+from robocal_ros.thermal.identification import drift_prior, identify_cycle, learned_prior
+from robocal_ros.thermal.reference import ColdSpots, reference_of
+from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, HeatGains
 
 Array = NDArray[np.float64]
+Document = dict[str, Any]
 
+
+FEWEST_CYCLES = 10
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedDrift:
+    """Expected drift.
+
+    Attributes
+    ----------
+    covariance : (k, k) of the free parameters' drift since the cold visit, SI.
+    cycles : how many cycles it was learned from.
+    """
+
+    covariance: Array
+    cycles: int
+
+
+def learn_drift(
+    histories: Sequence[tuple[ColdSpots, Sequence[Measurements]]], *, sigma_m: float
+) -> LearnedDrift:
+    """Learn from cold visits and the cycles that followed each, all of one robot.
+
+    Each cycle is identified with the default prior; ``process.learned_prior`` weighs what the
+    cycles show against it. What no cycle can show keeps its default.
+
+    Raises
+    ------
+    InputError
+        When a cycle does not belong to its cold visit.
+    TooFewSamplesError
+        With fewer than ten cycles.
+    """
+    total = sum(len(cycles) for _, cycles in histories)
+    if total < FEWEST_CYCLES:
+        raise TooFewSamplesError(
+            f"{total} cycles show too little of what drift to expect: at least {FEWEST_CYCLES}"
+        )
+    default = drift_prior(histories[0][0].cell.arm)
+    found = [
+        identify_cycle(spots, cycle, prior_covariance=default, sigma_m=sigma_m)
+        for spots, cycles in histories
+        for cycle in cycles
+    ]
+    drifts = np.array([one.drift for one in found])
+    covariances = np.array([one.covariance for one in found])
+    return LearnedDrift(learned_prior(default, drifts, covariances), total)
+
+
+# Widths are chosen where earlier cycles are most likely, each shift judged by what the others
+# teach; of what is to be tracked nothing is used.
+SCALES = tuple(2.0**-i for i in range(6))
+APPROACH_S = (1800.0, 2400.0, 3600.0)
+WORK_TIME_S = 7200.0  # within which work, and so the steady state, is taken to change
+LAGS_S = (1800.0, 3600.0, 7200.0)
+THINNED = 5  # cycles of one shift resemble each other: every fifth tells how large drifts are,
+SUCCESSIVE = 2  # and every second how they go on,
+JUDGING_POSES = 7  # by so many of its poses, or a few more
+LEFT_OVER = (1e-2, 1e-3, 1e-4, 1e-5)  # share of the default prior's variance that gains leave
+MEDIAN_SQUARE = 2.3659739  # of three standard normal numbers
+OUTLYING = 5.0  # standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class EarlierShift:
+    """A cold visit and the t cycles that followed it.
+
+    ``time_s`` (t,): of each cycle, since the cold visit. ``temperature`` (t, n): motors at each
+    cycle above those at the cold visit, K; None where they were not read.
+    """
+
+    spots: ColdSpots
+    cycles: Sequence[Measurements]
+    time_s: Array
+    temperature: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedProcess:
+    """What a tracker needs.
+
+    Attributes
+    ----------
+    process, sigma_m : of the drift, and of one coordinate of one visit.
+    gains : of the motors' temperatures; None: track without them.
+    """
+
+    process: DriftProcess
+    sigma_m: float
+    gains: HeatGains | None = None
+
+    def tracker(self, spots: ColdSpots, time_s: float = 0.0) -> DriftTracker:
+        """Start a tracker at a cold visit."""
+        return DriftTracker(spots, self.process, self.sigma_m, time_s, self.gains)
+
+
+def visit_noise(shifts: Sequence[EarlierShift]) -> float:
+    """Standard deviation, m, of one coordinate of one visit.
+
+    From second differences over three cycles in a row, in which a drift all but cancels (Gasser,
+    Sroka and Jennen-Steinmetz 1986), without points far beyond the median: outliers.
+
+    Raises
+    ------
+    TooFewSamplesError
+        With fewer than ten cycles that visit the same poses as the cold visit.
+    """
+    found = [np.empty(0)]
+    for shift in shifts:
+        whole = [
+            (time, shift.spots.drift(cycle)[np.argsort(shift.spots.match(cycle))])
+            for time, cycle in zip(shift.time_s.tolist(), shift.cycles, strict=True)
+            if len(cycle) == len(shift.spots.visits)
+        ]
+        if len(whole) < FEWEST_CYCLES:
+            continue
+        y = np.array([drift for _, drift in whole])
+        time = np.array([at for at, _ in whole])
+        share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None, None]
+        miss = y[1:-1] - (1.0 - share) * y[:-2] - share * y[2:]
+        miss /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+        found.append(np.sum(miss**2, axis=2).ravel())
+    squares = np.concatenate(found)
+    if not len(squares):
+        raise TooFewSamplesError(
+            f"no shift has {FEWEST_CYCLES} cycles that visit all its cold poses: the noise of a "
+            "visit does not show"
+        )
+    likely = squares <= OUTLYING**2 * np.median(squares) / MEDIAN_SQUARE
+    return float(np.sqrt(np.mean(squares[likely]) / 3.0))
+
+
+def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
+    """Learn to track without temperatures.
+
+    The covariance is ``learn_drift``'s; its size, and the time of approach, are those with which
+    each shift is most likely under what the others teach (one shift alone judges itself).
+
+    Raises
+    ------
+    InputError
+        When a cycle does not belong to its cold visit.
+    TooFewSamplesError
+        With fewer than ten cycles.
+    """
+    sigma_m = visit_noise(shifts)
+
+    def covariance(of: Sequence[EarlierShift]) -> Array:
+        every = max(1, min(THINNED, sum(len(s.cycles) for s in of) // FEWEST_CYCLES))
+        histories = [(shift.spots, shift.cycles[::every]) for shift in of]
+        return learn_drift(histories, sigma_m=sigma_m).covariance
+
+    pairs = [
+        (covariance([s for s in shifts if s is not judged] or [judged]), _fewer(judged))
+        for judged in shifts
+    ]
+
+    def likely(scale: float, approach_s: float) -> float:
+        total = 0.0
+        for learned, judged in pairs:
+            process = DriftProcess(scale * learned, approach_s, WORK_TIME_S)
+            total += _follow(LearnedProcess(process, sigma_m), judged, SUCCESSIVE)[1]
+        return total
+
+    approach_s = max(APPROACH_S, key=lambda x: likely(SCALES[2], x))
+    scale = _first_peak(lambda x: likely(x, approach_s), SCALES)
+    process = DriftProcess(scale * covariance(shifts), approach_s, WORK_TIME_S)
+    return LearnedProcess(process, sigma_m)
+
+
+def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
+    """Learn to track with temperatures: gains, and the process of what they leave.
+
+    The gains pass from shift to shift with their covariance, as the tracker updates them. Their
+    expected size (lengths, angles) and the process are those that make the shifts most likely.
+
+    Raises
+    ------
+    InputError
+        When a shift has no temperatures, or a cycle does not belong to its cold visit.
+    TooFewSamplesError
+        With fewer than ten cycles.
+    """
+    if any(shift.temperature is None for shift in shifts):
+        raise InputError("a shift without motor temperatures teaches no gains: leave it out")
+    sigma_m, arm = visit_noise(shifts), shifts[0].spots.cell.arm
+
+    def start(left: float, lag_s: float, length: float, angle: float) -> LearnedProcess:
+        gains = HeatGains.expected(arm, lag_s, length, angle)
+        process = DriftProcess(left * drift_prior(arm))
+        return LearnedProcess(process, sigma_m, gains)
+
+    def likely(*settings: float) -> float:
+        return _pass(start(*settings), shifts, THINNED)[1]
+
+    left, lag_s = LEFT_OVER[1], LAGS_S[1]
+    angle = _first_peak(lambda x: likely(left, lag_s, 1.0, x), SCALES)
+    length = _first_peak(lambda x: likely(left, lag_s, x, angle), SCALES)
+    lag_s = max(LAGS_S, key=lambda x: likely(left, x, length, angle))
+    left = _first_peak(lambda x: likely(x, lag_s, length, angle), LEFT_OVER)
+    return _pass(start(left, lag_s, length, angle), shifts, 1)[0]
+
+
+def _fewer(shift: EarlierShift) -> EarlierShift:
+    """The shift by a part of its poses: quicker, and no less telling of time."""
+    spots = shift.spots
+    every = max(1, len(spots.visits) // JUDGING_POSES)
+    kept = np.arange(0, len(spots.visits), every)
+    few = replace(
+        spots, q=spots.q[kept], target=spots.target[kept], error=spots.error[kept],
+        visits=spots.visits[kept],
+    )  # fmt: skip
+    cycles = [cycle.take(np.isin(spots.match(cycle), kept)) for cycle in shift.cycles]
+    return replace(shift, spots=few, cycles=cycles)
+
+
+def _pass(
+    learned: LearnedProcess, shifts: Sequence[EarlierShift], every: int
+) -> tuple[LearnedProcess, float]:
+    """The gains after shift upon shift, and the log-likelihood of all."""
+    total = 0.0
+    for shift in shifts:
+        tracker, log_likelihood = _follow(learned, shift, every)
+        learned, total = replace(learned, gains=tracker.gains), total + log_likelihood
+    return learned, total
+
+
+def _follow(learned: LearnedProcess, shift: EarlierShift, every: int) -> tuple[DriftTracker, float]:
+    """Track a shift by some of its cycles; and how likely those are, as a logarithm."""
+    tracker, total = learned.tracker(shift.spots), 0.0
+    for i, (cycle, time_s) in enumerate(zip(shift.cycles, shift.time_s.tolist(), strict=True)):
+        if learned.gains is not None and shift.temperature is not None:
+            tracker.read_temperatures(shift.temperature[i], time_s)
+        if i % every == 0:
+            total += tracker.take(cycle, time_s).log_likelihood
+    return tracker, total
+
+
+def _first_peak(likely: Callable[[float], float], candidates: Sequence[float]) -> float:
+    """The candidate after which it gets no more likely."""
+    best, peak = candidates[0], likely(candidates[0])
+    for candidate in candidates[1:]:
+        value = likely(candidate)
+        if value <= peak:
+            break
+        best, peak = candidate, value
+    return best
+
+
+def process_document(learned: LearnedProcess) -> dict[str, Any]:
+    """A learned (or default) process; SI."""
+    process, gains = learned.process, learned.gains
+    return {
+        "covariance": process.covariance.tolist(),
+        "approach_s": process.approach_s,
+        "steady_s": process.steady_s,
+        "sigma_m": learned.sigma_m,
+        "gains": None
+        if gains is None
+        else {
+            "mean": gains.mean.tolist(),
+            "covariance": gains.covariance.tolist(),
+            "lag_s": gains.lag_s,
+        },
+    }
+
+
+def process_of(document: Mapping[str, Any]) -> LearnedProcess:
+    """Read it back."""
+    gains = document["gains"]
+    return LearnedProcess(
+        DriftProcess(
+            np.array(document["covariance"]),
+            approach_s=float(document["approach_s"]),
+            steady_s=float(document["steady_s"]),
+        ),
+        float(document["sigma_m"]),
+        None
+        if gains is None
+        else HeatGains(
+            np.array(gains["mean"]), np.array(gains["covariance"]), float(gains["lag_s"])
+        ),
+    )
+
+
+LEARN_FROM = 2000
+MOST_SHIFTS = 5  # the newest; learning takes half a second each
+FEWEST_WITH_TEMPERATURES = 2  # shifts, so that what one motor does is not what all of them do
+WRONG = (CalibrationState.REJECTED, CalibrationState.ROLLED_BACK)  # somebody did not believe it
+
+
+def expected_drift(nominal: SerialArm, history: History) -> tuple[LearnedProcess | None, str]:
+    """What every cold reference in the history with its cycles teaches, and the same in words.
+
+    With the motors' temperatures where all cycles have them. None: too little.
+    """
+    shifts = earlier_shifts(nominal, history)
+    warm = [shift for shift in shifts if shift.temperature is not None]
+    if len(warm) >= FEWEST_WITH_TEMPERATURES:
+        with suppress(RobocalError, np.linalg.LinAlgError):  # then without temperatures
+            return learn_gains(warm), f"learned with temperatures from {len(warm)} shifts"
+    try:
+        return learn_process(shifts), f"learned from {len(shifts)} shifts"
+    except (RobocalError, np.linalg.LinAlgError) as error:
+        return None, f"default, because {error}"
+
+
+def earlier_shifts(nominal: SerialArm, history: History) -> list[EarlierShift]:
+    """Every cold reference of the history with its cycles, those apart that nobody believed."""
+    entries = history.list(LEARN_FROM)
+    cycles: dict[int, list[Entry]] = defaultdict(list)
+    for entry in entries:
+        sound = entry.state not in WRONG and entry.code is not Code.SENSOR_OR_ROBOT_MOVED
+        if entry.kind == THERMAL and sound:
+            cycles[int(history.model(entry.id).get("reference_stamp_ns", 0))].append(entry)
+    shifts: list[EarlierShift] = []
+    for entry in entries:
+        if entry.kind != REFERENCE or len(shifts) == MOST_SHIFTS:
+            continue
+        reference = reference_of(history.model(entry.id), nominal)
+        cold_ns = reference.data.middle_ns
+        arrays = [history.inputs(e.id) for e in cycles[cold_ns]]
+        arrays = [a for a in arrays if "q" in a and "stamp_ns" in a]
+        data = [Measurements.of_arrays(a) for a in arrays]
+        order = np.argsort([d.middle_ns for d in data], kind="stable").tolist()
+        times = [1e-9 * (data[i].middle_ns - cold_ns) for i in order]
+        if not order or times[0] <= 0.0 or np.any(np.diff(times) <= 0.0):
+            continue  # the clock jumped within it
+        cold = reference.temperature
+        known = cold is not None and all("motor_temperature" in a for a in arrays)
+        rise = [arrays[i]["motor_temperature"] - cold for i in order] if known else None
+        shifts.append(
+            EarlierShift(
+                reference.spots,
+                [data[i] for i in order],
+                np.array(times),
+                None if rise is None else np.array(rise),
+            )
+        )
+    return shifts[::-1]
+
+
+KEYS = ("robot", "model_hash", "parameters", "covariance", "cycles")
+SYMMETRY = 1e-9  # of the largest element
+
+
+def write_prior(path: Path, document: Document) -> None:
+    """Write the parts of a learned prior's document that an estimator needs."""
+    write_made(path, document, KEYS, "thermal learn-prior")
+
+
+def read_prior(path: Path, arm: SerialArm) -> Array:
+    """Covariance (k, k), SI, of the expected drift of ``arm``'s free parameters.
+
+    Raises
+    ------
+    InputError
+        Naming file and key, when it is not as docs/thermal.md says.
+    WrongRobotError
+        When it was learned for another nominal model.
+    """
+    file, top = str(path), read_made(path, arm, KEYS, "prior file", "learn it")
+    if top.values.get("parameters") != list(arm.parameters.names):
+        raise InputError(
+            f"parameters must be {', '.join(arm.parameters.names)}, in this order", file=file
+        )
+    rows = top.values.get("covariance")
+    count = len(arm.parameters)
+    if not isinstance(rows, list) or len(rows) != count:
+        raise InputError(f"covariance must be {count} rows", file=file)
+    table = Fields({f"row {i + 1}": row for i, row in enumerate(rows)}, file, "covariance")
+    covariance = np.array([table.numbers(f"row {i + 1}", count) for i in range(count)])
+    if np.abs(covariance - covariance.T).max() > SYMMETRY * np.abs(covariance).max():
+        raise InputError("covariance is not symmetric", file=file)
+    if np.linalg.eigvalsh(covariance)[0] <= 0.0:
+        raise InputError("covariance is not positive: some combination has no spread", file=file)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+# ---- how far the tool may be off by now ---------------------------------------------------------
 
 HORIZON_S = 24.0 * 3600.0
 DUE_WITHIN_S = 1.0  # to which the time that is left is found

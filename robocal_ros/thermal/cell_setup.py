@@ -31,9 +31,8 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification.cell import CellModel
 from robocal_ros.identification.judged import require_match
-from robocal_ros.identification.solve import identify, linear_start, random_postures
+from robocal_ros.identification.solve import CellModel, identify, linear_start, random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_made, write_made
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots

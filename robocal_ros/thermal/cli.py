@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cli.command import (
+from robocal_ros.cli.identify import show_identification
+from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
     Document,
@@ -21,14 +22,14 @@ from robocal_ros.cli.command import (
     text,
     warn,
 )
-from robocal_ros.cli.identify import show_identification
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import write_text
-from robocal_ros.identification.cell import CellModel
+from robocal_ros.identification.solve import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import read_measurements
 from robocal_ros.report.figures import draw_rounds
+from robocal_ros.thermal.accuracy import learn_drift, read_prior, write_prior
 from robocal_ros.thermal.cell_setup import (
     PlacedSensor,
     SensorField,
@@ -49,7 +50,6 @@ from robocal_ros.thermal.identification import (
     identify_subset,
     judge_cycle,
 )
-from robocal_ros.thermal.learning import learn_drift, read_prior, write_prior
 from robocal_ros.thermal.reference import (
     ONLY_CYCLE,
     ColdSpots,

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground.errors import Code, ConflictError, InputError
-from robocal_ros.ground.proposals import REFERENCE, THERMAL, Entry
-from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements, StandstillRule
+from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry
 from robocal_ros.identification import Method
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.base import HistoryFollower
 from robocal_ros.session.events import History
-from robocal_ros.thermal.accuracy import AccuracyForecast, Work
+from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work, process_of
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
-from robocal_ros.thermal.learning import LearnedProcess, process_of
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
 from robocal_ros.thermal.tracking import DriftProcess, DriftState, Heat, TrackedCycle, track_cycle
 

@@ -23,7 +23,6 @@ from robocal_ros import __version__
 from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, LimitError, RobocalError
-from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import (
     DEFAULT_TARGET,
     JOINTS,
@@ -36,6 +35,7 @@ from robocal_ros.ground.samples import (
     joint_sample,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash

@@ -21,11 +21,13 @@ from robocal_ros.ground.samples import (
     REFERENCE_SPHERE,
     JointBlock,
     JointSample,
+    JointStream,
     Measurements,
+    NotStillError,
     PointSample,
+    StandstillRule,
     TemperatureSample,
 )
-from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.session import events
 from robocal_ros.session.base import Ignored
 from robocal_ros.session.events import Command

@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, summarise
 from robocal_ros.ground.errors import Code, ConflictError, InputError, TooFewSamplesError
-from robocal_ros.ground.proposals import REFERENCE, THERMAL, Proposal
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.history.history_records import REFERENCE, THERMAL, Proposal
 from robocal_ros.identification import Method, identify_and_hold_out
 from robocal_ros.identification.judged import identification_document, identified_model_document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session.events import Command, History, Outcome
+from robocal_ros.thermal.accuracy import expected_drift, process_document
 from robocal_ros.thermal.cell_setup import (
     SensorMethod,
     calibrate_sensor,
@@ -35,7 +36,6 @@ from robocal_ros.thermal.identification import (
     identify_subset,
     judge_cycle,
 )
-from robocal_ros.thermal.learning import expected_drift, process_document
 from robocal_ros.thermal.observations import Beside
 from robocal_ros.thermal.reference import (
     COMMISSIONED,

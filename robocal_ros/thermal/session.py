@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StorageError
-from robocal_ros.ground.proposals import REFERENCE, THERMAL, Entry, Head
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -24,13 +23,14 @@ from robocal_ros.ground.samples import (
     JointSample,
     Measurements,
     PointSample,
+    StandstillRule,
     TemperatureSample,
     joint_sample,
     point_sample,
     pose_sample,
     temperature_sample,
 )
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry, Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.events import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cli.command import (
+from robocal_ros.cli.main import (
     ROBOT_HELP,
     SIGMA_MM,
     CliResult,

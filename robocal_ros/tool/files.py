@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
-from robocal_ros.ground.cells import Cells, read_cells
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
@@ -18,8 +17,10 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields
 from robocal_ros.kinematics.tables import (
     ORIENTATIONS,
+    Cells,
     check_plain,
     orientation_columns,
+    read_cells,
     read_joint_columns,
     read_rotations,
     read_stamps,

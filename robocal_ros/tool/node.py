@@ -13,8 +13,7 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
-from robocal_ros.ground.samples import JOINTS
-from robocal_ros.ground.streams import Silence
+from robocal_ros.ground.samples import JOINTS, Silence
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash

@@ -17,9 +17,9 @@ from std_srvs.srv import SetBool, Trigger
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.frames import Document
-from robocal_ros.ground.proposals import TOOL
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.driver import (
     CONTROLLER,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
-from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head, Proposal
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
+from robocal_ros.history.history_records import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head, Proposal
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events

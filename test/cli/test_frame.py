@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 
 from robocal_ros import __version__
 from robocal_ros.cli import main as frame
-from robocal_ros.cli.command import CliResult, exit_status, failure
+from robocal_ros.cli.main import CliResult, exit_status, failure
 from robocal_ros.ground.errors import (
     Code,
     ConflictError,
@@ -222,7 +222,7 @@ SLOW = """
 import sys, time
 from types import SimpleNamespace
 from robocal_ros.cli import main as frame
-from robocal_ros.cli.command import CliResult
+from robocal_ros.cli.main import CliResult
 def run(args):
     if args.wait:
         print("ready", file=sys.stderr, flush=True)
@@ -274,7 +274,7 @@ class TestSignals:
 def test_piped_tables_stay_whole(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     stream = io.StringIO()
-    from robocal_ros.cli.command import show
+    from robocal_ros.cli.main import show
 
     show(CliResult({}, lambda console: console.print("x" * 150)), stream)
     assert stream.getvalue() == "x" * 150 + "\n"

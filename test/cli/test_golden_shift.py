@@ -16,8 +16,8 @@ from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord, run_shift
 from robocal_ros.bags.bags import BagReader, bag_info
 from robocal_ros.bags.replay import NOT_BITS
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import TOOL
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.tool.judging import KnownTool
 

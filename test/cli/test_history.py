@@ -14,9 +14,8 @@ from command import conforms, environment, robocal, robocal_json
 from jsonschema import ValidationError
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import CalibrationState, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import CorrectionRecord
+from robocal_ros.history.history_records import CalibrationState, CorrectionRecord, Proposal
 
 SERIAL = "KR/7"
 STAMP_NS = 1_700_000_000_123_456_789

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from robocal_ros.correction.interface import CorrectionState, ToldCorrection, uncorrected
-from robocal_ros.ground.proposals import THERMAL, TOOL, Head
+from robocal_ros.history.history_records import THERMAL, TOOL, Head
 
 NOMINAL, TAUGHT = Head(THERMAL, 0, None, None), Head(TOOL, 0, None, None)
 MODEL, BENT = Head(THERMAL, 4, 17, {}), Head(TOOL, 2, 18, {})

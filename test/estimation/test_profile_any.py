@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from profile_shapes import COLUMNS, arc_profile, polyline_profile, stairs
 
-from robocal_ros.estimation.arc import ArcRule, fit_arc
-from robocal_ros.estimation.edge import EdgeRule, fit_edge
-from robocal_ros.estimation.polyline import CornerRule, fit_corners
+from robocal_ros.estimation.edge import CornerRule, EdgeRule, fit_corners, fit_edge
+from robocal_ros.estimation.sphere import ArcRule, fit_arc
 from robocal_ros.ground.errors import RobocalError
 
 FITS = {

@@ -12,7 +12,7 @@ from profile_shapes import (
     stairs,
 )
 
-from robocal_ros.estimation.arc import ArcFit, ArcRule, fit_arc
+from robocal_ros.estimation.sphere import ArcFit, ArcRule, fit_arc
 from robocal_ros.ground.errors import InputError, ResidualError, TooFewSamplesError
 
 R = 0.02

@@ -11,7 +11,7 @@ from profile_shapes import (
     stairs,
 )
 
-from robocal_ros.estimation.polyline import CornerRule, fit_corners
+from robocal_ros.estimation.edge import CornerRule, fit_corners
 from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
 
 STEPS = 4

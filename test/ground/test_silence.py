@@ -1,6 +1,6 @@
 """How long something was not heard."""
 
-from robocal_ros.ground.streams import Silence
+from robocal_ros.ground.samples import Silence
 
 
 def test_a_clock_that_stands_is_silent():

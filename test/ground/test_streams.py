@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.samples import JointSample
-from robocal_ros.ground.streams import JointStream, NotStillError, StandstillRule
+from robocal_ros.ground.samples import JointSample, JointStream, NotStillError, StandstillRule
 
 MS = 1_000_000
 RULE = StandstillRule(before_s=0.2, after_s=0.1, tolerance_rad=0.01, gap_s=0.15)

@@ -15,10 +15,10 @@ from hand_eye_laser import SHOTS, WARM, begun, driver_of
 
 from robocal_ros.bags.bags import read_data_set, write_data_set
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.hand_eye.data import data_set_of
 from robocal_ros.hand_eye.session import configuration, hand_eye_session_as_recorded
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, bring_into_force, digest

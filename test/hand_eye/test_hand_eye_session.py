@@ -21,9 +21,9 @@ from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import THERMAL, hand_eye_kind
 from robocal_ros.hand_eye.result import HandEyeSettings
 from robocal_ros.hand_eye.session import HandEyeConfig
+from robocal_ros.history.history_records import THERMAL, hand_eye_kind
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
 from robocal_ros.session.events import bring_into_force, digest

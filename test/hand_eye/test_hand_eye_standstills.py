@@ -16,7 +16,7 @@ from hand_eye_driver import (
 )
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import StandstillRule
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.shots import StandingShot, Standstills, captured_marks, first_of_each
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -10,8 +10,8 @@ from histories import BY, reopened
 from history_workers import proposal
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
-from robocal_ros.ground.proposals import Action, CalibrationState, Head
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Action, CalibrationState, Head
 
 
 class TestProposals:

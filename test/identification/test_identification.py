@@ -9,8 +9,7 @@ from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.identification import CellModel, identify, identify_and_judge
-from robocal_ros.identification.cell import CellProblem, make_layout
-from robocal_ros.identification.solve import linear_start
+from robocal_ros.identification.solve import CellProblem, linear_start, make_layout
 
 # the sliding arm's limits depend on what was bought
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")

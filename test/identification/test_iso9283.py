@@ -5,7 +5,7 @@ import pytest
 
 from robocal_ros.ground.errors import TooFewSamplesError
 from robocal_ros.ground.frames import exp_rotation
-from robocal_ros.identification.iso9283 import repeated
+from robocal_ros.identification.judged import repeated
 
 # Barycentre 0; distances 1, 1, 2, 2 mm: mean 1.5, S = sqrt(4 * 0.5**2 / 3).
 CROSS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0]]) * 1e-3

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from bench import ur10_campaigns
 from robocal_ros.bags.bags import bag_info, read_bag
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.samples import Measurements, joint_sample, pose_sample
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import Measurements, StandstillRule, joint_sample, pose_sample
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.tables import beyond_limits, read_measurements
 from robocal_ros.thermal.observations import ObservationDesk

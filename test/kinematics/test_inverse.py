@@ -10,7 +10,7 @@ from motion_cell import POSTURES
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
-from robocal_ros.kinematics.inverse import SMALLEST_SINGULAR_VALUE, follow, inverse
+from robocal_ros.kinematics.arm import SMALLEST_SINGULAR_VALUE, follow, inverse
 from robocal_ros.kinematics.robots import load_robot
 
 P_FLANGE = np.array([0.02, -0.03, 0.2])

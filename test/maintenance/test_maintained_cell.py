@@ -14,8 +14,8 @@ from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 from robocal_ros.cell_sim import cell as simulated
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
-from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command

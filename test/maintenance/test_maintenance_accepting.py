@@ -34,9 +34,15 @@ from maintenance_tools import (
 from tool_driver import TAUGHT
 
 from robocal_ros.ground.errors import Code, StaleError
-from robocal_ros.ground.proposals import THERMAL, TOOL, Action, Decision, Head
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import insert_decision
+from robocal_ros.history.history_records import (
+    THERMAL,
+    TOOL,
+    Action,
+    Decision,
+    Head,
+    insert_decision,
+)
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.motion.robot_watch import STALL_S

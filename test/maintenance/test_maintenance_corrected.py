@@ -16,7 +16,7 @@ from maintenance_cell import (
 )
 
 from robocal_ros.correction.interface import CorrectionState, ToldCorrection
-from robocal_ros.ground.proposals import TOOL
+from robocal_ros.history.history_records import TOOL
 from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.thermal.accuracy import AccuracyLevel
 

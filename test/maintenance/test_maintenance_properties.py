@@ -38,8 +38,8 @@ from maintenance_cell import (
 from tool_driver import TAUGHT
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ground.proposals import Action
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Action
 from robocal_ros.maintenance import AcceptBounds, MaintenanceState
 from robocal_ros.maintenance.robot_interface import DEAF_S, DriverAnswer
 from robocal_ros.motion.plan import SHORTEST_STOP_S

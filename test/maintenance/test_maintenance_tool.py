@@ -19,7 +19,7 @@ from maintenance_cell import (
 from maintenance_tools import decide, level, measured_in_full, modes, until_measuring
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import THERMAL, TOOL
+from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.session.events import ACCEPT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError

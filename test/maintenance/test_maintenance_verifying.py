@@ -27,8 +27,8 @@ from maintenance_tools import (
 )
 
 from robocal_ros.ground.errors import Code, StorageError
-from robocal_ros.ground.proposals import TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import TOOL
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.session.events import ACCEPT, REJECT
 from robocal_ros.thermal.accuracy import AccuracyLevel

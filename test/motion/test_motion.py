@@ -23,7 +23,7 @@ from motion_cell import (
 from robocal_ros.cell_sim.beams import beams_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
-from robocal_ros.kinematics.inverse import inverse
+from robocal_ros.kinematics.arm import inverse
 from robocal_ros.motion.plan import MotionLimits, Ride
 from robocal_ros.tool.driving import approach, measuring, start_pose, turn_s
 from robocal_ros.tool.laser_frame import LaserFrame

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from motion_cell import POSTURES, circle_step, make_motion_cell, shifted, tip_in_laser, upright
 
 from robocal_ros.ground.errors import InputError, LimitError
-from robocal_ros.kinematics.inverse import inverse
+from robocal_ros.kinematics.arm import inverse
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody, departure, joint_way
 from robocal_ros.motion.plan import SHORTEST_STOP_S, MotionLimits, stop, stop_time
 from robocal_ros.tool.driving import measuring, start_pose

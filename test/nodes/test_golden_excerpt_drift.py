@@ -32,8 +32,8 @@ from robocal_ros.bags.bag_writer import BagWriter
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import THERMAL, Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL, Proposal
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS

@@ -21,8 +21,8 @@ from tool_driver import noisy_cell
 
 from robocal_ros.correction.bounds import CorrectionConfig, correction_between
 from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.ground.proposals import THERMAL, TOOL
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import endpoints

@@ -21,8 +21,8 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import MaintenanceState

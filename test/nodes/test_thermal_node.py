@@ -26,11 +26,11 @@ from robocal_ros import __version__
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.bags.replay import input_topics, read_events, replay
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import CalibrationState, Head, Proposal
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge
+from robocal_ros.history.history_records import CalibrationState, Head, Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode

@@ -15,18 +15,19 @@ from tool_driver import config_of, noisy_cell
 
 from robocal_ros.bags.replay import read_events, replay
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
     MEASURED_POINT,
     JointBlock,
     JointSample,
+    JointStream,
     PointSample,
+    StandstillRule,
 )
-from robocal_ros.ground.streams import JointStream, StandstillRule
 from robocal_ros.hand_eye import session as hand_eye_session
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached

@@ -13,7 +13,6 @@ from shift import Shift, built, postures, warmed
 
 from robocal_ros.bags.replay import NOT_BITS, feed, input_topics, read_events, replay
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.ground.proposals import Proposal
 from robocal_ros.ground.samples import (
     JOINTS,
     MEASURED_POINT,
@@ -22,6 +21,7 @@ from robocal_ros.ground.samples import (
     JointSample,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Proposal
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import (

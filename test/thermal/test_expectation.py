@@ -11,9 +11,9 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.accuracy import earlier_shifts, expected_drift
 from robocal_ros.thermal.drift_following import FollowerState, ThermalConfig
 from robocal_ros.thermal.identification import drift_prior
-from robocal_ros.thermal.learning import earlier_shifts, expected_drift
 from robocal_ros.thermal.observations import MotorTemperatures
 from robocal_ros.thermal.session import ThermalSession
 

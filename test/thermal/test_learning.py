@@ -5,8 +5,8 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
 from robocal_ros.cell_sim import thermal_shift
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.accuracy import learn_drift
 from robocal_ros.thermal.identification import drift_prior, identify_cycle
-from robocal_ros.thermal.learning import learn_drift
 from robocal_ros.thermal.reference import ColdSpots
 
 

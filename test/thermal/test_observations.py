@@ -9,9 +9,11 @@ from robocal_ros.ground.samples import (
     MEASURED_POINT,
     MEASURED_POSE,
     JointSample,
+    JointStream,
     PointSample,
+    Reading,
+    StandstillRule,
 )
-from robocal_ros.ground.streams import JointStream, Reading, StandstillRule
 from robocal_ros.session.base import MOST_REASONS
 from robocal_ros.thermal.observations import MOST_WAITING, ObservationDesk, as_measurements
 

@@ -9,8 +9,8 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.accuracy import EarlierShift, learn_gains, learn_process, visit_noise
 from robocal_ros.thermal.identification import drift_prior
-from robocal_ros.thermal.learning import EarlierShift, learn_gains, learn_process, visit_noise
 from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.tracking import DriftProcess
 

@@ -13,8 +13,13 @@ from hypothesis import strategies as st
 from shift import Shift, built, of_kind, postures, warmed
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.samples import JOINTS, MEASURED_POINT, JointSample, PointSample
-from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.ground.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    JointSample,
+    PointSample,
+    StandstillRule,
+)
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events

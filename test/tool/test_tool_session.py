@@ -9,8 +9,8 @@ from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.ground.proposals import THERMAL
 from robocal_ros.ground.samples import JointSample
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session.events import (
     ACCEPT,

@@ -9,8 +9,8 @@ from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
 from robocal_ros.cell_sim.faults import Fault, Faults, size_of
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.proposals import TOOL, CalibrationState
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import TOOL, CalibrationState
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.run import rows_of
 from robocal_ros.tool.session import ToolSession

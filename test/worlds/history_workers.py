@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ground.proposals import Proposal
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import Proposal
 
 SERIAL = "KR-7"
 _BEGUN = b"begun"

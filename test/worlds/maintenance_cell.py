@@ -14,7 +14,7 @@ from tool_driver import config_of as tool_config
 
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
+from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, MaintenanceState, Times
 from robocal_ros.maintenance import robot_interface as ask

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from shift import BALL, NOISE_M, T_SENSOR_BASE
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.kinematics.inverse import inverse
+from robocal_ros.kinematics.arm import inverse
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody, joint_way
 from robocal_ros.motion.driver import trajectory_message
