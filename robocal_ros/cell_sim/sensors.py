@@ -272,20 +272,6 @@ class ProfileSensor:
             there = (share[:, None] * ghost)[:, ::2]
             taken = lit & np.isfinite(share) & (rng.random(self.columns) < self.ghosts)
             xz[taken] = there[taken]
-        return self._disturbed(xz, rng)
-
-    def _faces(self, normal: Array, toward: Array) -> Mask:
-        return np.asarray(np.sum(normal * toward, axis=1) > np.cos(self.flattest_rad))
-
-    def _shown(self, scene: Scene, spot: Array, normal: Array, camera: Array) -> Mask:
-        """Whether the camera has a free view of spots (n, 3)."""
-        way = camera - spot
-        length = np.linalg.norm(way, axis=1)
-        way /= length[:, None]
-        blocked = scene.meet(spot, way)[0] < length
-        return np.asarray(self._faces(normal, way) & ~blocked)
-
-    def _disturbed(self, xz: Array, rng: np.random.Generator) -> Array:
         n = self.columns
         xz[:, 1] += self.noise_m * rng.standard_normal(n)
         speckled = rng.random(n) < self.spikes
@@ -299,6 +285,17 @@ class ProfileSensor:
             out = ~((xz[:, 1] >= self.near_m) & (xz[:, 1] <= self.far_m))
         xz[lost | out] = np.nan
         return xz
+
+    def _faces(self, normal: Array, toward: Array) -> Mask:
+        return np.asarray(np.sum(normal * toward, axis=1) > np.cos(self.flattest_rad))
+
+    def _shown(self, scene: Scene, spot: Array, normal: Array, camera: Array) -> Mask:
+        """Whether the camera has a free view of spots (n, 3)."""
+        way = camera - spot
+        length = np.linalg.norm(way, axis=1)
+        way /= length[:, None]
+        blocked = scene.meet(spot, way)[0] < length
+        return np.asarray(self._faces(normal, way) & ~blocked)
 
 
 STEM_EXPANSION_PER_K = 12e-6  # steel

@@ -113,7 +113,12 @@ class ThermalPart:
                 return None, f"{MEASUREMENT}, {left} poses"
         if not cell.fits(self._times.solve_s):
             return None, "end of the thermal cycle"
-        unmeasured, measured = ", ".join(map(str, sorted(thermal.unmeasured))), self._places()
+        places: list[Array] = []  # the thermal node takes near poses for one
+        for pose in sorted(thermal.visited - thermal.unmeasured):
+            q = cell.config.poses[pose - 1]
+            if all(np.max(np.abs(q - other)) >= SAME_VISIT_RAD for other in places):
+                places.append(q)
+        unmeasured, measured = ", ".join(map(str, sorted(thermal.unmeasured))), len(places)
         answer = yield from self._end()
         if answer.code not in FOUND:
             return answer, MEASUREMENT
@@ -123,15 +128,6 @@ class ThermalPart:
             has = f"of which the thermal node has {answer.visited}"
             lacking.append(f"{MEASUREMENT} at {measured} poses, {has}")
         return answer, "; ".join(lacking)
-
-    def _places(self) -> int:
-        """At how many places this cycle measured; the thermal node takes near ones for one."""
-        found: list[Array] = []
-        for pose in sorted(self._thermal.visited - self._thermal.unmeasured):
-            q = self._cell.config.poses[pose - 1]
-            if all(np.max(np.abs(q - other)) >= SAME_VISIT_RAD for other in found):
-                found.append(q)
-        return len(found)
 
     def _visit(self, todo: list[int]) -> Script[int]:
         """How many poses did not fit."""

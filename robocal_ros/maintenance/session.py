@@ -79,7 +79,16 @@ class Conductor:
             if self._script is not None:
                 next(self._script)
         except StopIteration:
-            self._script_ended(run)
+            robot = self._cell.robot
+            if away := robot.beside_home():
+                code = Code.TOO_FEW_SAMPLES if robot.unheard else Code.LIMIT_EXCEEDED
+                self.fault(code, f"robot is not at home: {away}")
+            elif self._cell.tool.doubted:
+                self.fault(Code.CONFLICT, "the tool node may still be armed")
+            elif self.broken is not None:
+                self._end(*self.broken)
+            else:
+                self._end(run.result.code, run.result.message)
         except FaultError as error:
             self.fault(error.code, str(error))
         except RobocalError as error:  # refused in the middle of it: home, and end with its code
@@ -139,18 +148,6 @@ class Conductor:
         if self._cell.tool.engaged:
             yield from self._cell.disarmed()
         yield from run.script()
-
-    def _script_ended(self, run: CycleRun) -> None:
-        robot = self._cell.robot
-        if away := robot.beside_home():
-            code = Code.TOO_FEW_SAMPLES if robot.unheard else Code.LIMIT_EXCEEDED
-            self.fault(code, f"robot is not at home: {away}")
-        elif self._cell.tool.doubted:
-            self.fault(Code.CONFLICT, "the tool node may still be armed")
-        elif self.broken is not None:
-            self._end(*self.broken)
-        else:
-            self._end(run.result.code, run.result.message)
 
     def _end(self, code: Code, message: str) -> None:
         self._close_script()

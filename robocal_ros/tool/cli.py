@@ -92,7 +92,13 @@ def add_beams(parser: argparse.ArgumentParser) -> None:
 
 def run_beams(args: argparse.Namespace) -> CliResult:
     """Do ``beams``. Raises `RobocalError` for what a user can mend."""
-    _require_together(args)
+    # Refuse a file without its robot or station, and options that only the file needs.
+    for option in ("robot", "station", "sigma_mm"):
+        given, name = getattr(args, option) is not None, f"--{option.replace('_', '-')}"
+        if args.output is not None and not given and option != "sigma_mm":
+            raise InputError(f"--output needs {name}: a laser file says whose it is")
+        if args.output is None and given:
+            raise InputError(f"{name} only matters for a laser file: give --output too")
     radius_m = None if args.radius_mm is None else args.radius_mm * 1e-3
     sigma_m = 1e-3 * (SIGMA_MM if args.sigma_mm is None else args.sigma_mm)
     laser = calibrate_laser(read_beam_points(args.data), sigma_m, radius_m)
@@ -108,16 +114,6 @@ def run_beams(args: argparse.Namespace) -> CliResult:
         write_laser(args.output, LaserFile(laser, args.station, arm.name, arm.model_hash))
         document["output"] = str(args.output)
     return CliResult(document, partial(_show_beams, document=document))
-
-
-def _require_together(args: argparse.Namespace) -> None:
-    """Refuse a file without its robot or station, and options that only the file needs."""
-    for option in ("robot", "station", "sigma_mm"):
-        given, name = getattr(args, option) is not None, f"--{option.replace('_', '-')}"
-        if args.output is not None and not given and option != "sigma_mm":
-            raise InputError(f"--output needs {name}: a laser file says whose it is")
-        if args.output is None and given:
-            raise InputError(f"{name} only matters for a laser file: give --output too")
 
 
 def _show_beams(console: "Console", document: Document) -> None:
@@ -302,20 +298,6 @@ def run_crossed(args: argparse.Namespace) -> CliResult:
             "give --joints, --robot and --laser for a whole run, or --radius-mm and --period-s "
             "for one circle"
         )
-    document = _circle(args, rule)
-    return CliResult(document, partial(_show_crossed, document=document))
-
-
-def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
-    taught = {"xyz_mm": "taught_mm", "rpy_deg": "taught_rpy_deg"}
-    return [
-        f"--{taught.get(name, name).replace('_', '-')}"
-        for name in names
-        if getattr(args, name) is not None
-    ]
-
-
-def _circle(args: argparse.Namespace, rule: "InputRule") -> Document:
     start_deg = args.start_deg or 0.0
     beam_angle_deg = 90.0 if args.beam_angle_deg is None else args.beam_angle_deg
     if not (isfinite(start_deg) and isfinite(args.latency_s or 0.0)):
@@ -330,7 +312,17 @@ def _circle(args: argparse.Namespace, rule: "InputRule") -> Document:
         beam_angle_rad=radians(beam_angle_deg),
     )
     edges = debounced(read_edges(args.events, rule.sigma_s), rule.debounce_s)
-    return circle_document(fit_circle(motion, edges, args.method, latency_s=args.latency_s))
+    document = circle_document(fit_circle(motion, edges, args.method, latency_s=args.latency_s))
+    return CliResult(document, partial(_show_crossed, document=document))
+
+
+def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
+    taught = {"xyz_mm": "taught_mm", "rpy_deg": "taught_rpy_deg"}
+    return [
+        f"--{taught.get(name, name).replace('_', '-')}"
+        for name in names
+        if getattr(args, name) is not None
+    ]
 
 
 def _show_crossed(console: "Console", document: Document) -> None:

@@ -349,7 +349,18 @@ class ToolDriver:
 
     def _tick(self, now_s: float) -> None:
         if self._session.run is None:
-            self._without_run(now_s)
+            # Let the last motion end, or an arming that nobody used.
+            if self.phase is not DrivePhase.IDLE:
+                self.armed, self.told = False, "the run has ended"
+                self._supervise(now_s)
+                if self.robot.at_end(now_s):
+                    self._settle("the run has ended")
+            elif self._driven != NO_RUN:
+                self._settle("the run has ended")
+            elif self.armed and self.robot.silent_s > SILENT_ARMED_S:
+                self._settle("joint states are silent")
+            elif self.armed and now_s - self._armed_at_s > self._config.armed_s:
+                self._settle(f"no run within {self._config.armed_s:g} s")
             return
         if self.phase is not DrivePhase.IDLE:
             self._supervise(now_s)
@@ -360,20 +371,6 @@ class ToolDriver:
             self.phase = DrivePhase.IDLE
         if self.phase is DrivePhase.IDLE and self.armed and self._number() != self._driven:
             self._begin(now_s)
-
-    def _without_run(self, now_s: float) -> None:
-        """Let the last motion end, or an arming that nobody used."""
-        if self.phase is not DrivePhase.IDLE:
-            self.armed, self.told = False, "the run has ended"
-            self._supervise(now_s)
-            if self.robot.at_end(now_s):
-                self._settle("the run has ended")
-        elif self._driven != NO_RUN:
-            self._settle("the run has ended")
-        elif self.armed and self.robot.silent_s > SILENT_ARMED_S:
-            self._settle("joint states are silent")
-        elif self.armed and now_s - self._armed_at_s > self._config.armed_s:
-            self._settle(f"no run within {self._config.armed_s:g} s")
 
     def _settle(self, reason: str) -> None:
         self.phase, self.armed, self.told = DrivePhase.IDLE, False, reason

@@ -370,21 +370,18 @@ class TcfNode(SessionNode[ToolSession]):
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{name} was done but not published: {error}")
         if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None and not self._last:
-            self._end_run(outcome)
-
-    def _end_run(self, outcome: Outcome) -> None:
-        self._last = outcome
-        if self._motion is not None:
-            self._motion.run_ended(outcome)
-        try:
-            if outcome.calibration_id and self._history is not None:
-                model = self._history.model(outcome.calibration_id)
-                self._outputs.candidate(model, outcome.command.stamp_ns or 0)
-            self._outputs.quality(outcome)
-        except RobocalError as error:  # the caller is answered all the same
-            self.get_logger().error(f"the run has ended but was not published: {error}")
-        if not self._run_end.done():
-            self._run_end.set_result(outcome)
+            self._last = outcome
+            if self._motion is not None:
+                self._motion.run_ended(outcome)
+            try:
+                if outcome.calibration_id and self._history is not None:
+                    model = self._history.model(outcome.calibration_id)
+                    self._outputs.candidate(model, outcome.command.stamp_ns or 0)
+                self._outputs.quality(outcome)
+            except RobocalError as error:  # the caller is answered all the same
+                self.get_logger().error(f"the run has ended but was not published: {error}")
+            if not self._run_end.done():
+                self._run_end.set_result(outcome)
 
     def _show_step(self, words: str = "") -> None:
         session = self._session

@@ -138,9 +138,12 @@ class MeasuringPlan:
             raise InputError(f"step {name} follows from the steps before it: measure them first")
         tool = self.T_flange_tool if seen is None or not self.needs_tool(number) else seen
         plunge = name.startswith("plunge")
-        T = self._pose(
-            tool, -0.5 * self.motion.plunge_depth_m if plunge else self.motion.above_tip_m
-        )
+        above_tip_m = -0.5 * self.motion.plunge_depth_m if plunge else self.motion.above_tip_m
+        # Flange pose with the tool upright and a point of its axis on the crossing.
+        spin = frames.exp_rotation([0.0, 0.0, self.spin_rad])
+        down = self.laser.T_base_laser[:3, :3] @ spin @ np.diag([1.0, -1.0, -1.0])
+        near, point = frames.transform(down, np.zeros(3)), tool[:3, 3] - above_tip_m * tool[:3, 2]
+        T = upright_pose(self.laser, near, tool[:3, 2], point)
         if name == "high":
             # Straight below the first circle: the tool is not set upright yet.
             T[:3, 3] -= self.motion.height_m * self.laser.T_base_laser[:3, 2]
@@ -160,14 +163,6 @@ class MeasuringPlan:
     def needs_tool(self, number: int) -> bool:
         """Whether a step follows from what the ones before it show."""
         return self.mode == "full" and self.names[number - 1] not in ("low", "high")
-
-    def _pose(self, T_flange_tool: Array, above_tip_m: float) -> Array:
-        """Flange pose with the tool upright and a point of its axis on the crossing."""
-        spin = frames.exp_rotation([0.0, 0.0, self.spin_rad])
-        down = self.laser.T_base_laser[:3, :3] @ spin @ np.diag([1.0, -1.0, -1.0])
-        point = T_flange_tool[:3, 3] - above_tip_m * T_flange_tool[:3, 2]
-        near = frames.transform(down, np.zeros(3))
-        return upright_pose(self.laser, near, T_flange_tool[:3, 2], point)
 
 
 # Traits are the radii, the latency and the rate of the joint readings. No bend changes these; what

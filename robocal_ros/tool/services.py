@@ -154,7 +154,12 @@ class TcfServices:
         result.left_plan = outcome is not None and outcome.left_plan
         if outcome is not None and document is not None:
             result.candidate_id = outcome.calibration_id
-            _fill(result, document)
+            change = document.get("change", {})
+            sigma = document["sigma_mm"]
+            result.answer = ANSWERS.get(document.get("answer", ""), MeasureTool.Result.NONE)
+            result.deviation_mm = float(change.get("tip_mm", 0.0))
+            result.deviation_deg = float(change.get("axis_deg", 0.0))
+            result.sigma_mm = float(np.max(sigma))
             if outcome.calibration_id:
                 result.tool = self._runner.frame(outcome)
         if goal.is_cancel_requested:
@@ -203,15 +208,6 @@ def _trigger(response: Any, outcome: Outcome) -> Any:
     response.success = outcome.done
     response.message = trigger_text(outcome.calibration_id, outcome.status, outcome.message)
     return response
-
-
-def _fill(result: Any, document: Any) -> None:
-    change = document.get("change", {})
-    sigma = document["sigma_mm"]
-    result.answer = ANSWERS.get(document.get("answer", ""), MeasureTool.Result.NONE)
-    result.deviation_mm = float(change.get("tip_mm", 0.0))
-    result.deviation_deg = float(change.get("axis_deg", 0.0))
-    result.sigma_mm = float(np.max(sigma))
 
 
 Array = NDArray[np.float64]
