@@ -354,15 +354,6 @@ class CellSamples:
             ]
         return sorted(samples, key=lambda sample: sample.stamp_ns)
 
-    def _spheres(self, shot: SphereShot) -> list[PointSample]:
-        at, frame = self.ns(shot.time_s), self._frame
-        floor = PointSample(at, frame, "floor", shot.floor, REFERENCE_SPHERE)
-        if not len(shot.points):
-            return [PointSample(at, frame, "ball", shot.centre, MEASURED_POINT), floor]
-        fit = fit_sphere(shot.points.astype(np.float32).astype(np.float64), self._rule)
-        sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
-        return [PointSample(at, frame, "ball", fit.centre, SPHERE_CLOUD, sigma_m), floor]
-
 
 def station_name(name: str, faults: Faults) -> str:
     """The station that the edges claim to come from."""

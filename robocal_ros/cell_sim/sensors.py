@@ -284,7 +284,7 @@ class ProfileSensor:
         with np.errstate(invalid="ignore"):
             out = ~((xz[:, 1] >= self.near_m) & (xz[:, 1] <= self.far_m))
         xz[lost | out] = np.nan
-        return xz
+        return np.asarray(xz)
 
     def _faces(self, normal: Array, toward: Array) -> Mask:
         return np.asarray(np.sum(normal * toward, axis=1) > np.cos(self.flattest_rad))
