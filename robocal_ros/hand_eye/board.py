@@ -96,10 +96,7 @@ class SeenBoards:
 def decode_image(data: bytes, name: str) -> Image:
     """Grey image (h, w) from the bytes of a file of any usual format.
 
-    Raises
-    ------
-    InputError
-        When it is no image.
+    Raises `InputError` when it is no image.
     """
     import cv2
 
@@ -141,14 +138,9 @@ def see_boards(
 ) -> SeenBoards:
     """Find the board in named images, and the intrinsics from the same images if none are given.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When no image, or too few for the intrinsics, shows the board.
-    InputError
-        When images have another size than the intrinsics say.
-    RankDeficientError
-        When the images do not show the intrinsics.
+    Raises `TooFewSamplesError` when no image, or too few for the intrinsics, shows the board;
+    `InputError` when images have another size than the intrinsics say; `RankDeficientError` when
+    the images do not show the intrinsics.
     """
     rejected: dict[str, str] = {}
     size = intrinsics.size if intrinsics else _usual_size(images)
@@ -179,12 +171,8 @@ def boards_of_corners(
 ) -> SeenBoards:  # fmt: skip
     """The same from corners (m, n, 2), px.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        As `see_boards`.
-    InputError
-        When no camera sees a board as the corners lie.
+    Raises `TooFewSamplesError` or `RankDeficientError` as `see_boards`; `InputError` when no camera
+    sees a board as the corners lie.
     """
     out = dict(rejected or {})
     _require(len(names), intrinsics, out)
@@ -347,10 +335,7 @@ NOT_NEEDED = ("camera_name", "rectification_matrix", "projection_matrix")
 def read_images(folder: Path, table: PoseTable) -> tuple[list[tuple[str, Image]], dict[str, str]]:
     """Named grey images of the shots that a table names, and why any of them cannot be read.
 
-    Raises
-    ------
-    InputError
-        When a file is missing.
+    Raises `InputError` when a file is missing.
     """
     images, rejected = [], {}
     for path, name in zip(table.files_in(folder), table.names, strict=True):
@@ -364,10 +349,7 @@ def read_images(folder: Path, table: PoseTable) -> tuple[list[tuple[str, Image]]
 def read_intrinsics(path: Path) -> Intrinsics:
     """Read intrinsics, which are taken as exact.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when it is not as docs/hand_eye_camera.md says.
+    Raises `InputError`, naming file and key, when it is not as docs/hand_eye_camera.md says.
     """
     top = read_fields(path, "file of intrinsics")
     needed = ("image_width", "image_height", "camera_matrix", "distortion_model",

@@ -58,14 +58,8 @@ def require_pairs(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
 
     ``rejected``: samples that were left out already, with the reason.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than three.
-    InputError
-        When positions have another unit.
-    RankDeficientError
-        When the flange was turned about one axis only, or not at all.
+    Raises `TooFewSamplesError`: fewer than three; `InputError` when positions have another unit;
+    `RankDeficientError` when the flange was turned about one axis only, or not at all.
     """
     if len(pairs) < FEWEST_PAIRS:
         raise TooFewSamplesError(
@@ -415,14 +409,9 @@ def calibrate_camera(
     rejected : samples that were left out before, with the reason.
     more : further entries of the document.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the poses do not show the camera's place.
-    InputError
-        When the pairs hold a mistake that can be named: units, inverted, shifted.
-    ResidualError
-        When nothing fits them.
+    Raises `TooFewSamplesError` or `RankDeficientError` when the poses do not show the camera's
+    place; `InputError` when the pairs hold a mistake that can be named: units, inverted, shifted;
+    `ResidualError` when nothing fits them.
     """
     how = settings or CameraSettings()
     pairs, again = _first_of_each_pose(pairs)
@@ -455,10 +444,8 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> Placement:
 
     The mistake is named if it is known.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError, InputError, ResidualError
-        As `calibrate_camera`.
+    Raises `TooFewSamplesError`, `RankDeficientError`, `InputError`, `ResidualError` as
+    `calibrate_camera`.
     """
     require_pairs(pairs, rejected)
     sound = robust_start(pairs)

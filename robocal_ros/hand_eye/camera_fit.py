@@ -398,10 +398,8 @@ def fit_pairs(
     ``start``: where the search begins; default ``sound``. ``sound``: a placement near the truth,
     from which the noise is guessed; default `robust_start`.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        As `robocal_ros.estimation.estimation.solve`.
+    Raises `TooFewSamplesError` or `RankDeficientError` as
+    `robocal_ros.estimation.estimation.solve`.
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
     sound = robust_start(pairs) if sound is None else sound

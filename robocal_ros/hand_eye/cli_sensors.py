@@ -57,12 +57,8 @@ if TYPE_CHECKING:
 def calibrate(args: argparse.Namespace) -> "HandEyeResult":
     """Read what the options name and place the camera.
 
-    Raises
-    ------
-    InputError
-        When files or options are wrong.
-    TooFewSamplesError, RankDeficientError, ResidualError
-        As `robocal_ros.hand_eye.camera.calibrate_camera`.
+    Raises `InputError` when files or options are wrong; `TooFewSamplesError`, `RankDeficientError`,
+    `ResidualError` as `robocal_ros.hand_eye.camera.calibrate_camera`.
     """
     settings = _settings(args)
     if args.measured is not None:
@@ -272,10 +268,7 @@ def run_camera(args: argparse.Namespace) -> CliResult:
 def _board(value: str) -> tuple[int, int]:
     """Type of inner corners along both sides, such as 9x6.
 
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
+    Raises `argparse.ArgumentTypeError` for anything else.
     """
     sides = value.lower().split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):

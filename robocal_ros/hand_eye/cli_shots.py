@@ -161,10 +161,7 @@ def robot_sigma_of(args: argparse.Namespace) -> tuple[float | None, float | None
 def settings_of(args: argparse.Namespace) -> HandEyeSettings:
     """What is known of the robot, and what is good enough.
 
-    Raises
-    ------
-    InputError
-        For an orientation's noise alone.
+    Raises `InputError` for an orientation's noise alone.
     """
     if args.robot_sigma_mm is None and args.robot_sigma_deg is not None:
         raise InputError("--robot-sigma-deg goes with --robot-sigma-mm: give both, or the latter")
@@ -190,10 +187,8 @@ def given_shots(
 ) -> ReadShots:
     """Read the shots that are given, or those like them in the file of ``judges``.
 
-    Raises
-    ------
-    RobocalError
-        When too little or too much is given; further as `read_shots` and `read_bag_shots`.
+    Raises `RobocalError` when too little or too much is given; further as `read_shots` and
+    `read_bag_shots`.
     """
     if args.bag is None:
         if args.poses is None or args.profiles is None:
@@ -216,13 +211,7 @@ def read_shots(poses: Path, profiles: Path, arm: SerialArm | None) -> ReadShots:
 
 
 def require_unused(judges: PoseTable, used: PoseTable) -> None:
-    """Refuse judges that helped to solve.
-
-    Raises
-    ------
-    InputError
-        Naming the row.
-    """
+    """Refuse judges that helped to solve. Raises `InputError`, naming the row."""
     for index, file in enumerate(judges.files):
         if file in used.files:
             judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
@@ -231,11 +220,8 @@ def require_unused(judges: PoseTable, used: PoseTable) -> None:
 def given_target(kind: str, target: Path | None, radius_mm: float | None) -> LaserTarget | None:
     """What is known of a target: from its file, or a sphere's radius; None for an unknown line.
 
-    Raises
-    ------
-    InputError
-        When too little or too much is given, or the file is of another kind; further as
-        `read_target`.
+    Raises `InputError` when too little or too much is given, or the file is of another kind;
+    further as `read_target`.
     """
     if radius_mm is not None:
         if kind != "sphere":
@@ -278,14 +264,9 @@ def read_bag_shots(path: Path, arm: SerialArm, topics: Mapping[str, str]) -> Bag
 
     ``topics``: input to topic, where given.
 
-    Raises
-    ------
-    InputError
-        When the bag cannot be read, or lacks what is needed.
-    WrongRobotError
-        A data file was made with another robot.
-    TooFewSamplesError
-        When no profile was taken at standstill.
+    Raises `InputError` when the bag cannot be read, or lacks what is needed; `WrongRobotError`
+    when a data file was made with another robot; `TooFewSamplesError` when no profile was taken at
+    standstill.
     """
     with BagReader(path) as reader:
         if DATA_SET not in reader.info.topics:

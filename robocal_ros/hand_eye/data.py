@@ -153,10 +153,7 @@ class DataSet:
     def require_mark(self, mark: str) -> None:
         """Refuse a mark that the target does not have; only a step has any.
 
-        Raises
-        ------
-        InputError
-            Naming those that there are.
+        Raises `InputError`, naming those that there are.
         """
         known = tuple(self.target.get("corners", ("",)))
         if mark not in known:
@@ -164,13 +161,7 @@ class DataSet:
             raise InputError(f"mark '{mark}' is none of the target's: {words}")
 
     def put(self, sample: HandEyeSample) -> str:
-        """Add a sample; says what it is.
-
-        Raises
-        ------
-        InputError
-            When it cannot be one of this set.
-        """
+        """Add a sample; says what it is. Raises `InputError` when it cannot be one of this set."""
         count = len(sample.values)
         seen = f"{count} points" if self.topic == PROFILE else "the target's pose"
         if self.topic == IMAGE:
@@ -200,10 +191,7 @@ class DataSet:
     def chosen(self, handles: Sequence[int]) -> list[HandEyeSample]:
         """The samples of these handles, all without any, in the order of their handles.
 
-        Raises
-        ------
-        InputError
-            When one has no sample.
+        Raises `InputError` when one has no sample.
         """
         unknown = sorted(set(handles) - set(self.samples))
         if unknown:
@@ -253,12 +241,8 @@ def data_set_begun(document: Mapping[str, Any]) -> DataSet:
 def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
     """Read what `DataSet.document` gave, also after JSON; ``arm``: whose joints they are.
 
-    Raises
-    ------
-    InputError
-        When it is no such document.
-    TooFewSamplesError, LimitError
-        When a profile shows too little, or there are more samples or points than are kept.
+    Raises `InputError` when it is no such document; `TooFewSamplesError` or `LimitError` when a
+    profile shows too little, or there are more samples or points than are kept.
     """
     try:
         found = data_set_begun(document)
@@ -316,10 +300,7 @@ def _sample_of(
 def seen_corners(target: Mapping[str, Any], shot: Shot) -> Array:
     """Width and height of an image, then the corners of the board in it: (1 + n, 2), px.
 
-    Raises
-    ------
-    InputError
-        When the image does not show the board.
+    Raises `InputError` when the image does not show the board.
     """
     board = board_of(target).board
     image = shot.read()
@@ -335,10 +316,7 @@ def seen_corners(target: Mapping[str, Any], shot: Shot) -> Array:
 def board_of(target: Mapping[str, Any]) -> BoardTarget:
     """The board that a document of a target describes.
 
-    Raises
-    ------
-    InputError
-        When it describes none.
+    Raises `InputError` when it describes none.
     """
     found = target_of(target)
     if not isinstance(found, BoardTarget):

@@ -89,23 +89,11 @@ class PoseTable:
         return len(self.names)
 
     def fail(self, index: int, message: str) -> NoReturn:
-        """Refuse the file of a shot.
-
-        Raises
-        ------
-        InputError
-            Always.
-        """
+        """Refuse the file of a shot. Always raises `InputError`."""
         raise InputError(message, file=self.path, row=self.rows[index], column=self.column)
 
     def files_in(self, folder: Path) -> list[Path]:
-        """Paths (m,) of the files.
-
-        Raises
-        ------
-        InputError
-            At the first that does not exist.
-        """
+        """Paths (m,) of the files. Raises `InputError` at the first that does not exist."""
         if not folder.is_dir():
             raise InputError("no such folder", file=str(folder))
         paths = [folder / file for file in self.files]
@@ -123,10 +111,7 @@ def read_pose_table(
     Without flange poses they are those of ``arm`` at its joint readings. Joint readings beside
     poses are kept where ``arm`` is known.
 
-    Raises
-    ------
-    InputError
-        With file, row and column, when the table is not as its contract says.
+    Raises `InputError`, with file, row and column, when the table is not as its contract says.
     """
     found: list[TableLayout] = []
     words = ("sample", "stamp_s", "mark", *((file_column,) if file_column else FILE_COLUMNS))
@@ -191,13 +176,8 @@ def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | 
 def read_profile(path: Path, name: str) -> Profile:
     """Read a profile; rows without a return (an empty cell, or nan) are left out.
 
-    Raises
-    ------
-    InputError
-        With file, row and column, when it is no table of ``x_mm`` and ``z_mm``, or is in another
-        unit.
-    TooFewSamplesError
-        When nearly nothing was seen.
+    Raises `InputError`, with file, row and column, when it is no table of ``x_mm`` and ``z_mm``, or
+    is in another unit; `TooFewSamplesError` when nearly nothing was seen.
     """
     lines = [line for line in read_bytes(path, "profile").splitlines() if line.strip()]
     if len(lines) < 2:
@@ -213,10 +193,7 @@ def read_profile(path: Path, name: str) -> Profile:
 def read_profiles(folder: Path, table: PoseTable) -> list[Profile | TooFewSamplesError]:
     """Profiles (m,) of the shots; for one that shows next to nothing the reason.
 
-    Raises
-    ------
-    InputError
-        When a file is missing (all are looked for first), or is no profile.
+    Raises `InputError` when a file is missing (all are looked for first), or is no profile.
     """
     profiles: list[Profile | TooFewSamplesError] = []
     for path, name in zip(table.files_in(folder), table.names, strict=True):
@@ -230,10 +207,7 @@ def read_profiles(folder: Path, table: PoseTable) -> list[Profile | TooFewSample
 def write_profile(path: Path, points: Array) -> None:
     """Write a profile (n, 2), m; what is not-a-number becomes an empty cell.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     seen = np.all(np.isfinite(points), axis=1)
     columns = {}
@@ -256,10 +230,7 @@ def write_pose_table(
 ) -> None:
     """Write a table of shots in millimetres and quaternions, ``joints`` (q (m, n)) beside them.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     columns: dict[str, list[str]] = {}
     if names is not None:
@@ -284,10 +255,7 @@ def write_shots(
 
     ``more`` as in `write_pose_table`.
 
-    Raises
-    ------
-    InputError
-        When one of them cannot be written.
+    Raises `InputError` when one of them cannot be written.
     """
     files = [f"{name}.csv" for name in profiles]
     for file, points in zip(files, profiles.values(), strict=True):
@@ -307,10 +275,8 @@ class TrackerPoints:
 def read_tracker_points(path: Path, arm: SerialArm) -> TrackerPoints:
     """Read the tracker's table; the joints of points that are not on an arc may be empty.
 
-    Raises
-    ------
-    InputError
-        With file, row and column, when the table is not as docs/hand_eye_tracker.md says.
+    Raises `InputError`, with file, row and column, when the table is not as
+    docs/hand_eye_tracker.md says.
     """
     found: list[TableLayout] = []
     table = read_cells(path, lambda header, file: found.append(_layout(header, arm, file)))
@@ -358,10 +324,7 @@ def _joints(table: Cells, layout: TableLayout, on_arc: NDArray[np.bool_]) -> Arr
 def write_tracker_points(path: Path, data: TrackerData) -> None:
     """Write the tracker's table in millimetres and degrees.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     parts = [(arc.name, arc.points) for arc in data.arcs]
     parts += [(SPHERE, data.sphere), *zip(FACES, data.faces, strict=True)]
@@ -384,10 +347,7 @@ class SensorMount:
 def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
     """Read a sensor's place; ``accepted``: refuse a result whose verdict does not accept it.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when the place is missing, given twice or no pose.
+    Raises `InputError`, naming file and key, when the place is missing, given twice or no pose.
     """
     top = read_fields(path, "mount file")
     if "document" in top.values:  # as the history shows it
@@ -417,10 +377,7 @@ def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
 def read_flange_mount(path: Path) -> Array:
     """T_flange_sensor (4, 4), m.
 
-    Raises
-    ------
-    InputError
-        As `read_mount`, and for a sensor that does not sit on the flange.
+    Raises `InputError` as `read_mount`, and for a sensor that does not sit on the flange.
     """
     mount = read_mount(path)
     if mount.parent != "flange":
@@ -438,10 +395,7 @@ def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) ->
     ``xacro``: properties, so that another calibration changes two lines only; ``yaml``: the fields
     of a geometry_msgs/TransformStamped; ``static-transform``: the command that publishes it.
 
-    Raises
-    ------
-    InputError
-        When a frame's name is empty or needs quoting.
+    Raises `InputError` when a frame's name is empty or needs quoting.
     """
     for name in (parent, child):
         if not name or quoteattr(name) != f'"{name}"' or any(c in name for c in " :#{}\n"):

@@ -145,12 +145,8 @@ def fit_mount(
     ----------
     noise : of reported poses; None to estimate it.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer equations than unknowns.
-    RankDeficientError
-        When poses leave a direction open; its words say which motion is missing.
+    Raises `TooFewSamplesError`: fewer equations than unknowns; `RankDeficientError` when poses
+    leave a direction open; its words say which motion is missing.
     """
     rejected: dict[str, str] = {}
     state = start
@@ -255,10 +251,7 @@ def require_seen(fit: MountFit) -> None:
 
     Turns count at the distance at which the targets were seen.
 
-    Raises
-    ------
-    RankDeficientError
-        Naming it, with the missing motion.
+    Raises `RankDeficientError`, naming it, with the missing motion.
     """
     T = np.concatenate([view.sightings.T_base_flange for view in fit.views])
     sigma_m, sigma_rad = min(fit.noise.sigma_m, CALM_M), min(fit.noise.sigma_rad, CALM_M)
@@ -396,10 +389,7 @@ def require_radius(fit: MountFit) -> None:
 
     It is seen where profiles at several heights of the sphere disagree.
 
-    Raises
-    ------
-    ResidualError
-        Naming the radius that fits.
+    Raises `ResidualError`, naming the radius that fits.
     """
     problem = MountProblem(fit.views, fit.noise, fit.state)
     linear = problem.linear(fit.state)

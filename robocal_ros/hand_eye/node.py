@@ -104,10 +104,8 @@ SETTINGS = (
 def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
     """Settings of the session, in SI.
 
-    Raises
-    ------
-    InputError
-        When the sensor's frame has no name of its own, or the error of a turn is given alone.
+    Raises `InputError` when the sensor's frame has no name of its own, or the error of a turn is
+    given alone.
     """
     names = settings["base_frame"], settings["flange_frame"], settings["sensor_frame"]
     if not all(names) or len(set(names)) < len(names):

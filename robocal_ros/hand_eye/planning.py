@@ -430,10 +430,7 @@ class PlannedLine:
 class PlannedStairs:
     """A staircase; ``marks`` of the planned poses: None where all lay the light on the first.
 
-    Raises
-    ------
-    InputError
-        For a mark that the target does not have.
+    Raises `InputError` for a mark that the target does not have.
     """
 
     target: StepTarget

@@ -134,10 +134,7 @@ def point_jacobian(points: Array) -> Array:
 def point_covariance(result: HandEyeResult, points: Array) -> Array:
     """Covariance (n, 3, 3), m^2, sensor axes, of sensor points (n, 3) once they are in the flange.
 
-    Raises
-    ------
-    ValueError
-        When the method tells no covariance.
+    Raises `ValueError` when the method tells no covariance.
     """
     if result.covariance is None:
         raise ValueError("a method without a covariance")

@@ -383,10 +383,7 @@ def start_arguments(
 
     The configured file counts for the target that it describes, and for no other.
 
-    Raises
-    ------
-    InputError
-        When the target's file is missing, or describes another target.
+    Raises `InputError` when the target's file is missing, or describes another target.
     """
     kind = kind or settings["target"]
     configured = settings["target_file"]

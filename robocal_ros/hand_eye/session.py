@@ -103,10 +103,7 @@ class HandEyeConfig:
     def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
         """Read what `document` gave, also after JSON.
 
-        Raises
-        ------
-        InputError
-            When it has other settings than this version knows.
+        Raises `InputError` when it has other settings than this version knows.
         """
         try:
             values = dict(document)
@@ -141,10 +138,7 @@ class HandEyeInForce(HistoryFollower):
 def require_known(data: DataSet, method: str) -> None:
     """Refuse a target, a method or a mount that no estimator answers for.
 
-    Raises
-    ------
-    InputError
-        Naming those that there are.
+    Raises `InputError`, naming those that there are.
     """
     for what, value, known in (
         ("target", data.kind, tuple(TOPIC_OF)),
@@ -170,10 +164,7 @@ def solved(
 
     The estimators are loaded when they are first used: a node's start does not need them.
 
-    Raises
-    ------
-    RobocalError
-        When the samples cannot answer.
+    Raises `RobocalError` when the samples cannot answer.
     """
     require_known(data, method)
     if not samples:
@@ -256,13 +247,7 @@ class HandEyeSession(SessionBase):
         self.data: DataSet | None = None
 
     def add(self, sample: JointSample | Shot) -> None:
-        """Take a sample.
-
-        Raises
-        ------
-        InputError
-            When it cannot be used; the message says why.
-        """
+        """Take a sample. Raises `InputError` when it cannot be used; the message says why."""
         if isinstance(sample, Shot):
             if sample.stamp_ns <= 0:
                 raise InputError(f"{sample.topic} has no time stamp")
@@ -514,10 +499,7 @@ class HandEyeSession(SessionBase):
     def document(self) -> dict[str, Any]:
         """The open data set for a file, with the models that its flange poses come from.
 
-        Raises
-        ------
-        ConflictError
-            When nothing was captured.
+        Raises `ConflictError` when nothing was captured.
         """
         if self.data is None or not self.data.samples:
             raise ConflictError("nothing was captured yet: there is nothing to save")
@@ -569,12 +551,8 @@ def hand_eye_session_as_recorded(
 ) -> HandEyeSession:
     """Make a session with the recorded settings; an empty history gets what was in force.
 
-    Raises
-    ------
-    WrongRobotError
-        The recording was made with another nominal model.
-    InputError
-        The configuration cannot be read.
+    Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
+    configuration cannot be read.
     """
     arguments = recorded_arguments(nominal, configured, ("model", OWN))
     config = HandEyeConfig.of_document(arguments["config"])

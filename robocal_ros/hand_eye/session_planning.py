@@ -34,10 +34,7 @@ TO_GO_BY = (CalibrationState.PENDING, CalibrationState.STALE)
 def require_count(joints: int, flange: int) -> None:
     """Refuse poses that were given in both ways or in none, and too many.
 
-    Raises
-    ------
-    InputError, LimitError
-        Naming the numbers.
+    Raises `InputError` or `LimitError`, naming the numbers.
     """
     if bool(joints) == bool(flange):
         raise InputError(
@@ -51,10 +48,7 @@ def require_count(joints: int, flange: int) -> None:
 def poses_of_joints(arm: SerialArm, samples: Sequence[JointSample]) -> Array:
     """Flange poses (m, 4, 4) at joint positions.
 
-    Raises
-    ------
-    InputError
-        When a joint is missing, or a value is in another unit.
+    Raises `InputError` when a joint is missing, or a value is in another unit.
     """
     q = np.array([sample.position[sample.order(arm.joint_names)] for sample in samples])
     _require(joint_unit_fault(arm, q))
@@ -64,10 +58,7 @@ def poses_of_joints(arm: SerialArm, samples: Sequence[JointSample]) -> Array:
 def poses_of_flange(position: Array, quat_xyzw: Array) -> Array:
     """Flange poses (m, 4, 4) of positions (m, 3), m, and quaternions (m, 4).
 
-    Raises
-    ------
-    InputError
-        When one is no pose, or is in another unit.
+    Raises `InputError` when one is no pose, or is in another unit.
     """
     pairs = zip(position, quat_xyzw, strict=True)
     poses = [pose_of(*pair, f"flange pose {i}") for i, pair in enumerate(pairs, 1)]
@@ -83,10 +74,7 @@ def _require(fault: tuple[int, str] | None) -> None:
 def pose_of(position: ArrayLike, quat_xyzw: ArrayLike, name: str) -> Array:
     """A pose (4, 4) of a position (3,), m, and a quaternion (4,).
 
-    Raises
-    ------
-    InputError
-        When it is none; ``name`` says which.
+    Raises `InputError` when it is none; ``name`` says which.
     """
     quat, place = np.asarray(quat_xyzw, np.float64), np.asarray(position, np.float64)
     norm = float(np.linalg.norm(quat))
@@ -98,10 +86,7 @@ def pose_of(position: ArrayLike, quat_xyzw: ArrayLike, name: str) -> Array:
 def require_near(place: ArrayLike, name: str) -> Array:
     """A place (3,), m.
 
-    Raises
-    ------
-    InputError
-        When it is none within reach of an arm; ``name`` says which.
+    Raises `InputError` when it is none within reach of an arm; ``name`` says which.
     """
     point = np.asarray(place, np.float64)
     if not np.all(np.isfinite(point)):
@@ -121,10 +106,7 @@ def rough_mount(
     What the request has given; else what is in force; else the open data set's last candidate,
     unless it was refused; else what is configured.
 
-    Raises
-    ------
-    InputError
-        When nothing says it.
+    Raises `InputError` when nothing says it.
     """
     if given is not None:
         return given, "the request"
@@ -188,10 +170,8 @@ def judged_plan(
     ``marks``: of a step target the mark (m) of each pose; without any its first one. ``centre``:
     of a sphere (3,), base; None: where most of the poses see it.
 
-    Raises
-    ------
-    InputError
-        For a target whose plans cannot be judged, and for marks that it does not have.
+    Raises `InputError` for a target whose plans cannot be judged, and for marks that it does not
+    have.
     """
     from robocal_ros.hand_eye.planning import check_plan, planned_target
 

@@ -59,12 +59,8 @@ class Profile:
 def profile_of(points: ArrayLike, name: str) -> Profile:
     """Check and wrap points (n, 2), m; columns without a return (not-a-number) are left out.
 
-    Raises
-    ------
-    InputError
-        When the points are not (n, 2), or their extent is that of another unit.
-    TooFewSamplesError
-        When nearly nothing was seen.
+    Raises `InputError` when the points are not (n, 2), or their extent is that of another unit;
+    `TooFewSamplesError` when nearly nothing was seen.
     """
     rows = np.asarray(points, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != 2:
@@ -110,13 +106,9 @@ class Shot:
         That is position, m, and quaternion x, y, z, w of the target in the sensor frame. Of an
         image its grey pixels (h, w), 8 bits.
 
-        Raises
-        ------
-        InputError
-            When the message is no cloud or image that is read, points are not in the plane y = 0,
-            a value of a pose is not finite or its quaternion is not of unit length.
-        TooFewSamplesError
-            When nearly nothing was seen.
+        Raises `InputError` when the message is no cloud or image that is read, points are not in
+        the plane y = 0, a value of a pose is not finite or its quaternion is not of unit length;
+        `TooFewSamplesError` when nearly nothing was seen.
         """
         return self._values
 
@@ -168,11 +160,8 @@ class ShotLog:
     def add(self, shot: Shot, frame: str, joints_ns: int) -> None:
         """Take a shot; ``joints_ns``: newest stamp of the joints, 0 before any.
 
-        Raises
-        ------
-        InputError
-            When it is of another frame, or stamped on another clock than the joints, or there are
-        no joints yet whose clock it could be held against.
+        Raises `InputError` when it is of another frame, or stamped on another clock than the
+        joints, or there are no joints yet.
         """
         if shot.frame != frame:
             raise InputError(
@@ -198,13 +187,7 @@ class ShotLog:
         return iter(sorted(found, key=lambda shot: shot.stamp_ns))
 
     def at(self, topic: str, at_ns: int) -> Shot:
-        """The shot of a stamp.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-        """
+        """The shot of a stamp. Raises `InputError` when there is none."""
         shot = next(self.since(topic, at_ns), None)
         if shot is None or shot.stamp_ns != at_ns:
             raise InputError(f"no {topic} of {at_ns} ns was received")

@@ -77,17 +77,11 @@ def solve_task(
 ) -> HandEyeResult:
     """Calibrate with one target.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer usable profiles than the unknowns need; with the commonest reason.
-    RankDeficientError
-        The poses leave a direction open; it is named, with the missing motion.
-    ResidualError
-        Nothing fits: shifted lists, inverted or left-handed poses, a wrong unit, a wrong radius
-        are named where they explain it.
-    InputError
-        A mark that the target does not have.
+    Raises `TooFewSamplesError` when fewer profiles are usable than the unknowns need, with the
+    commonest reason; `RankDeficientError` when the poses leave a direction open, with the missing
+    motion; `ResidualError` when nothing fits: shifted lists, inverted or left-handed poses, a wrong
+    unit, a wrong radius are named where they explain it; `InputError` for a mark that the target
+    does not have.
     """
     read = features(task, data)
     fit = fit_mount((read.view,), looked(task, data, read), settings.noise())
@@ -239,12 +233,8 @@ def _inconsistent(fit: MountFit) -> Verdict | None:
 def features(task: Task, data: HandEyeData) -> Read:
     """Features of the profiles.
 
-    Raises
-    ------
-    ResidualError
-        When poses must tell which feature is which, and do not: with the mistake that explains it.
-    RobocalError
-        When too little is seen.
+    Raises `ResidualError` when poses must tell which feature is which, and do not: with the mistake
+    that explains it; `RobocalError` when too little is seen.
     """
     try:
         return task.read(data)
@@ -259,12 +249,8 @@ def features(task: Task, data: HandEyeData) -> Read:
 def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
     """A state near the solution.
 
-    Raises
-    ------
-    ResidualError
-        When the data do not fit: with the mistake that explains it, where one does.
-    RobocalError
-        When too little is seen, or the poses leave a direction open.
+    Raises `ResidualError` when the data do not fit: with the mistake that explains it, where one
+    does; `RobocalError` when too little is seen, or the poses leave a direction open.
     """
     try:
         near = look(task, read.view)
@@ -292,10 +278,7 @@ def _shown(view: TargetView, data: HandEyeData) -> bool:
 def look(task: Task, view: TargetView) -> MountState:
     """The state nearest to the sightings to which a start leads, before the noise is known.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When none leads anywhere.
+    Raises `TooFewSamplesError` or `RankDeficientError` when none leads anywhere.
     """
     states: list[MountState] = []
     failure: RobocalError | None = None
@@ -376,10 +359,7 @@ def held_out(task: Task, data: HandEyeData, T_flange_sensor: Array, place: Array
 
     ``place``: of the target, as `HandEyeResult` holds it.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When no shot shows the target.
+    Raises `TooFewSamplesError` when no shot shows the target.
     """
     read = task.read(data, T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
@@ -415,12 +395,8 @@ def verify(
 ) -> Verification:
     """Hold a mount, find the target with it, and see how far each sighting is off.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When too few shots show the target.
-    RankDeficientError
-        When they do not tell where it is.
+    Raises `TooFewSamplesError` when too few shots show the target; `RankDeficientError` when they
+    do not tell where it is.
     """
     read = task.read(data)
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
@@ -489,14 +465,10 @@ def solve_joint(
     their target's kind. ``checks``: by kind, other shots of targets, which have not moved; they
     judge the result.
 
-    Raises
-    ------
-    InputError
-        Fewer than two targets, or two of one kind.
-    ResidualError
-        One target's samples contradict each other; the mistake is named as in `solve_task`.
-    TooFewSamplesError, RankDeficientError
-        When no target gives a first pose, the first one's reason; as `solve_task` otherwise.
+    Raises `InputError`: fewer than two targets, or two of one kind; `ResidualError`: one target's
+    samples contradict each other; the mistake is named as in `solve_task`; `TooFewSamplesError` or
+    `RankDeficientError` when no target gives a first pose, the first one's reason; as `solve_task`
+    otherwise.
     """
     tasks = [task for task, _ in parts]
     kinds = [task.kind for task in tasks]

@@ -198,13 +198,7 @@ def _corners(profile: Profile, rule: CornerRule) -> CornerFit:
 
 
 def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
-    """Refuse marks that the target does not have.
-
-    Raises
-    ------
-    InputError
-        Naming the first of them.
-    """
+    """Refuse marks that the target does not have. Raises `InputError`, naming the first of them."""
     strange = next((mark for mark in marks if mark not in target.corners), None)
     if strange is not None:
         raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
@@ -224,12 +218,8 @@ def closed_corners(value: Array, p_flange: Array) -> Array:
     The nine unknowns of p = x r1 + z r3 + t, projected to a rotation and refined on it, are the
     rotation of the corners' cross-covariance (Kabsch 1976): the least squares of their distances.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than three corners.
-    RankDeficientError
-        When all corners lie on one line of the laser plane.
+    Raises `TooFewSamplesError`: fewer than three corners; `RankDeficientError` when all corners lie
+    on one line of the laser plane.
     """
     if len(value) < 3:
         raise TooFewSamplesError(f"{len(value)} corners fit the target, at least 3 are needed")

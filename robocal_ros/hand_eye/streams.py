@@ -69,12 +69,8 @@ def stream_of(stamp_ns: NDArray[np.int64], T: Array, names: tuple[str, ...], ori
 
     Poses that came late are put in order, repeated stamps count once.
 
-    Raises
-    ------
-    InputError
-        When stamps go back by more than a second.
-    TooFewSamplesError
-        Fewer than 20 poses.
+    Raises `InputError` when stamps go back by more than a second; `TooFewSamplesError`: fewer than
+    20 poses.
     """
     back = -np.diff(stamp_ns)
     if len(back) and back.max() > CLOCK_JUMP_NS:
@@ -95,10 +91,7 @@ def stream_of(stamp_ns: NDArray[np.int64], T: Array, names: tuple[str, ...], ori
 def coarse_offset(robot: PoseStream, camera: PoseStream) -> float:
     """What to add to the camera's stamps, s, so that both streams turn at the same times.
 
-    Raises
-    ------
-    InputError
-        When the angular speeds nowhere correlate.
+    Raises `InputError` when the angular speeds nowhere correlate.
     """
     a, b = _turns(robot), _turns(camera)
     here, there = np.ones(len(a)), np.ones(len(b))
@@ -145,10 +138,7 @@ def pairs_at(
 ) -> tuple[PosePairs, tuple[str, ...]]:
     """Camera poses with the robot's at their times; names of those that have none.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When the streams hardly overlap.
+    Raises `TooFewSamplesError` when the streams hardly overlap.
     """
     time = camera.time_s + offset_s
     there = robot.covers(time)
@@ -198,10 +188,8 @@ def pair_streams(
 ) -> StreamPairs:  # fmt: skip
     """Find the offset, and pair the streams by it.
 
-    Raises
-    ------
-    InputError, TooFewSamplesError, RankDeficientError
-        As `coarse_offset`, `pairs_at`, `robocal_ros.hand_eye.camera.calibrate_camera`.
+    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError` as `coarse_offset`, `pairs_at`,
+    `robocal_ros.hand_eye.camera.calibrate_camera`.
     """
     offset = coarse_offset(robot, camera)
     pairs, left_out = pairs_at(robot, camera, offset, mount)
@@ -234,10 +222,8 @@ def calibrate_streams(
 
     ``check``: a stream of the robot at times of the camera's that judge the result.
 
-    Raises
-    ------
-    InputError, TooFewSamplesError, RankDeficientError, ResidualError
-        As `pair_streams` and `calibrate_camera`; a check of times that were used to solve.
+    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError`, `ResidualError` as
+    `pair_streams` and `calibrate_camera`, and for a check of times that were used to solve.
     """
     how = settings or CameraSettings()
     found = pair_streams(robot, camera, mount, how.noise)

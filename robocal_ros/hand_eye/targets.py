@@ -171,10 +171,7 @@ TYPE_OF = {kind: type_ for type_, kind in KIND_OF.items()}
 def target_document(kind: str, target: Target | None) -> Document:
     """A target with its ``kind``; None where nothing is known of it beforehand.
 
-    Raises
-    ------
-    InputError
-        When the target is of another kind.
+    Raises `InputError` when the target is of another kind.
     """
     if target is None:
         return {"kind": kind}
@@ -186,10 +183,7 @@ def target_document(kind: str, target: Target | None) -> Document:
 def target_of(document: Mapping[str, Any]) -> Target | None:
     """Read what `target_document` gave, also after JSON.
 
-    Raises
-    ------
-    InputError
-        When it is no such document.
+    Raises `InputError` when it is no such document.
     """
     values = {name: _array(value) for name, value in document.items() if name != "kind"}
     if not values:
@@ -237,10 +231,7 @@ def _array(value: Any) -> Any:
 def read_target(path: Path) -> Target:
     """Read a target file.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when it is not as its contract says.
+    Raises `InputError`, naming file and key, when it is not as its contract says.
     """
     top = read_fields(path, "target file")
     kind = top.choice("kind", KINDS)
@@ -383,10 +374,7 @@ def _check_near(fields: Fields, key: str, point_mm: Array) -> None:
 def write_target(path: Path, target: LaserTarget) -> None:
     """Write a target file, corners in full; the file appears whole or not at all.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     document: Document = {"kind": KIND_OF[type(target)]}
     if isinstance(target, SphereTarget):
@@ -411,10 +399,7 @@ def write_target(path: Path, target: LaserTarget) -> None:
 def read_tracker_target(path: Path) -> TrackerTarget:
     """Read the target file of a calibration by laser tracker.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when it is not as docs/hand_eye_tracker.md says.
+    Raises `InputError`, naming file and key, when it is not as docs/hand_eye_tracker.md says.
     """
     top = read_fields(path, "target file")
     top.only("kind", "sphere_radius_mm", "reflector_radius_mm", "height_mm", "height_sigma_mm")
@@ -432,13 +417,7 @@ def read_tracker_target(path: Path) -> TrackerTarget:
 
 
 def write_tracker_target(path: Path, target: TrackerTarget) -> None:
-    """Write a target file.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
+    """Write a target file. Raises `InputError` when it cannot be written."""
     document: Document = {
         "kind": "tracker",
         "sphere_radius_mm": target.sphere_radius_m * 1e3,

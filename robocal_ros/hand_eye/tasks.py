@@ -140,10 +140,7 @@ class Task(ABC):
 def usable(rows: Collection[object], rejected: Mapping[str, str], fewest: int, what: str) -> None:
     """Refuse when fewer than ``fewest`` shots gave a feature.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With the commonest reason.
+    Raises `TooFewSamplesError`, with the commonest reason.
     """
     if len(rows) >= fewest:
         return

@@ -463,10 +463,8 @@ def solve_tracker(
 ) -> HandEyeResult:
     """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted.
 
-    Raises
-    ------
-    InputError, TooFewSamplesError, RankDeficientError, ResidualError
-        Saying what the measurements lack.
+    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError`, `ResidualError`, saying what
+    the measurements lack.
     """
     classic = solve_classic(data, target, noise)
     problem, estimate = solve_best(data, target, noise, classic)
@@ -558,12 +556,8 @@ def solve_best(
 ) -> tuple[TrackerProblem, Estimate[TrackerUnknowns]]:
     """All measurements at once, from the closed form on; the noise of the profiles is theirs.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        As `estimation.estimation.solve`.
-    ResidualError
-        When the place of the sphere does not settle.
+    Raises `TooFewSamplesError` or `RankDeficientError` as `estimation.estimation.solve`;
+    `ResidualError` when the place of the sphere does not settle.
     """
     fits = [fit_lines(scan, name) for scan, name in zip(classic.parts, FACES, strict=False)]
     scatter_m = float(np.sqrt(np.mean([scatter**2 for _, scatter in fits])))

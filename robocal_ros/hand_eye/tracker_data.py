@@ -69,12 +69,8 @@ class Arc:
     def joint(self, arm: SerialArm) -> int:
         """The one joint that moves.
 
-        Raises
-        ------
-        InputError
-            When none or several move.
-        TooFewSamplesError
-            When there are too few points.
+        Raises `InputError` when none or several move; `TooFewSamplesError` when there are too few
+        points.
         """
         if len(self.points) < FEWEST_ARC_POINTS:
             raise TooFewSamplesError(
@@ -112,10 +108,7 @@ class TrackerData:
     def require_enough(self) -> None:
         """Refuse a calibration that lacks measurements.
 
-        Raises
-        ------
-        TooFewSamplesError
-            Naming what is missing.
+        Raises `TooFewSamplesError`, naming what is missing.
         """
         if len(self.sphere) < 1:
             raise TooFewSamplesError("the tracker measured no centre of the sphere")
@@ -190,13 +183,8 @@ def two_axis_frame(first: Array, second: Array) -> Array:
 def fit_axis(arc: Arc, joint: int, slides: bool, sigma_m: float) -> Axis:
     """Axis of the one joint that moved, from the path alone; wild points are left out.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When the path is too short.
-    ResidualError
-        When they scatter ten times more than the tracker does, more than a fifth are wild, or no
-        circle fits them.
+    Raises `TooFewSamplesError` when the path is too short; `ResidualError` when they scatter ten
+    times more than the tracker does, more than a fifth are wild, or no circle fits them.
     """
     used = np.ones(len(arc.points), dtype=np.bool_)
     fewest = max(FEWEST_ARC_POINTS, (1.0 - MOST_REJECTED) * len(used))
@@ -294,12 +282,8 @@ def _require_long(
 def fit_axes(data: TrackerData, sigma_m: float) -> tuple[Axis, Axis]:
     """Axes of both arcs.
 
-    Raises
-    ------
-    InputError, TooFewSamplesError, ResidualError
-        As `Arc.joint` and `fit_axis`.
-    RankDeficientError
-        When both arcs are of one joint, or of two that slide.
+    Raises `InputError`, `TooFewSamplesError`, `ResidualError` as `Arc.joint` and `fit_axis`;
+    `RankDeficientError` when both arcs are of one joint, or of two that slide.
     """
     first, second = (
         fit_axis(arc, joint, bool(data.arm.prismatic[joint]), sigma_m)
@@ -333,12 +317,9 @@ def nominal_axis(data: TrackerData, arc: Arc, joint: int) -> tuple[Array, Array]
 def flange_pose(data: TrackerData, axes: tuple[Axis, Axis], target: TrackerTarget) -> Array:
     """T_tracker_flange (4, 4) at the first profile, in closed form.
 
-    Raises
-    ------
-    RankDeficientError
-        When the axes are parallel, or the reflector's height is needed and not known.
-    ResidualError
-        When the axes stand to each other otherwise than the nominal geometry says.
+    Raises `RankDeficientError` when the axes are parallel, or the reflector's height is needed and
+    not known; `ResidualError` when the axes stand to each other otherwise than the nominal geometry
+    says.
     """
     nominal = [
         nominal_axis(data, arc, axis.joint) for arc, axis in zip(data.arcs, axes, strict=True)
@@ -477,12 +458,8 @@ def tracked_cube(
 ) -> Cube:
     """The target from reflector centres on two faces (k, 3) and on the sphere's centre (k, 3).
 
-    Raises
-    ------
-    RankDeficientError
-        When the points of a face lie on a line, or the faces are parallel.
-    ResidualError
-        When the points of a face miss a plane, or those of the sphere's centre differ.
+    Raises `RankDeficientError` when the points of a face lie on a line, or the faces are parallel;
+    `ResidualError` when the points of a face miss a plane, or those of the sphere's centre differ.
     """
     first, second = (_tracked_face(*face, sigma_m) for face in zip(FACES, faces, strict=True))
     normals, offsets = outward(first, second)

@@ -110,10 +110,7 @@ class Scan:
     def direction(self) -> Array:
         """Unit vector (3,), flange, along which the flange moved from the first profile on.
 
-        Raises
-        ------
-        ResidualError
-            When it hardly moved, or turned.
+        Raises `ResidualError` when it hardly moved, or turned.
         """
         way = self.motion[:, :3, 3]
         ends = way[np.argmax(np.linalg.norm(way, axis=1))]
@@ -133,10 +130,7 @@ def find_planes(scan: Scan, T_flange_sensor: Array) -> list[Index]:
 
     A plane stays one when the scan's direction is not known well: it is only sheared.
 
-    Raises
-    ------
-    ResidualError
-        When there are fewer than two.
+    Raises `ResidualError` when there are fewer than two.
     """
     cloud = scan.built(T_flange_sensor)
     rng = np.random.default_rng(0)
@@ -275,10 +269,7 @@ class Caps:
 def fit_lines(scan: Scan, name: str) -> tuple[Lines, float]:
     """The face ``name`` in each profile, for a noise of 1 m, and the scatter of its points, m.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When fewer than four profiles show it.
+    Raises `TooFewSamplesError` when fewer than four profiles show it.
     """
     m = len(scan.motion)
     x, z = scan.points.T
@@ -319,10 +310,7 @@ def fit_lines(scan: Scan, name: str) -> tuple[Lines, float]:
 def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
     """The sphere in each profile, about its centres (m, 3), sensor frames, m.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When hardly anything of it is seen.
+    Raises `TooFewSamplesError` when hardly anything of it is seen.
     """
     m = len(scan.motion)
     # Where the ball is seen at each x: the measured z, being noisy, must not enter the normals.
@@ -402,10 +390,8 @@ class _Match:
 def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise) -> Classic:
     """Both poses in closed form.
 
-    Raises
-    ------
-    RobocalError
-        Naming what the data lack; see `fit_axes`, `flange_pose`, `tracked_cube`, `find_planes`.
+    Raises `RobocalError`, naming what the data lack; see `fit_axes`, `flange_pose`, `tracked_cube`,
+    `find_planes`.
     """
     data.require_enough()
     axes = fit_axes(data, noise.tracker_m)
@@ -455,12 +441,8 @@ class _CubeSearch:
     def best(self, scan: Scan) -> _Match:
         """The one trial that fits.
 
-        Raises
-        ------
-        ResidualError
-            When none does; the sphere's own error where that is why.
-        RankDeficientError
-            When two mountings of the sensor do.
+        Raises `ResidualError` when none does; the sphere's own error where that is why;
+        `RankDeficientError` when two mountings of the sensor do.
         """
         matches, failures = self._matches(scan)
         backwards = replace(scan, motion=frames.invert(scan.motion))
@@ -577,10 +559,7 @@ class _CubeSearch:
     def refined(self, parts: tuple[Scan, Scan, Scan], X: Array) -> _Match:
         """The match from all points of the parts.
 
-        Raises
-        ------
-        ResidualError
-            When it does not settle.
+        Raises `ResidualError` when it does not settle.
         """
         turned = self._turned(parts[:2], X, SETTLED)
         match = None if turned is None else self._placed(parts[:2], parts[2], turned)
