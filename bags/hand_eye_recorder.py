@@ -10,13 +10,13 @@ from session_events import EventLog
 from robocal_ros import __version__
 from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
 from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.hand_eye.session import (
     HandEyeConfig,
     HandEyeSession,
     configuration,
     take_hand_eye_message,
 )
-from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events

@@ -22,18 +22,18 @@ from bench.hand_eye_sets import (
 )
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
-from robocal_ros.hand_eye.board import boards_of_corners, see_boards
-from robocal_ros.hand_eye.camera import distances, rms
-from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
-from robocal_ros.hand_eye.camera_model import (
+from robocal_ros.hand_eye.camera import distances, pair_streams, rms
+from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,
     HAND_EYE,
     PosePairs,
+    boards_of_corners,
     closed_form,
     closed_form_of_all,
-    linearised,
+    pairs_at,
+    see_boards,
 )
-from robocal_ros.hand_eye.streams import pair_streams, pairs_at
+from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs, linearised
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,17 @@ from scipy.spatial.transform import Rotation
 
 from bench.ur10_campaigns import data_folder
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.board import Chessboard, Image, decode_image
-from robocal_ros.hand_eye.camera_model import Placement, PosePairs, closed_form
+from robocal_ros.hand_eye.camera_data import (
+    Chessboard,
+    Image,
+    Placement,
+    PosePairs,
+    PoseStream,
+    closed_form,
+    decode_image,
+    stream_of,
+)
 from robocal_ros.hand_eye.files import write_pose_table
-from robocal_ros.hand_eye.streams import PoseStream, stream_of
 
 Array = NDArray[np.float64]
 

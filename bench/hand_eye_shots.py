@@ -28,13 +28,12 @@ from robocal_ros.cell_sim.hand_eye_cell import (
 from robocal_ros.cell_sim.robot import Warmth
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye.data import profile_of
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings
-from robocal_ros.hand_eye.shots import profile_of
 from robocal_ros.hand_eye.solve import solve_task
-from robocal_ros.hand_eye.staircase import StepTask
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "cell_sim": ABOVE | {"report"},
     "cli": ABOVE | {"report", "cell_sim"},
 }
-COMMANDS = {"cli", "cli_sensors", "cli_shots"}  # files of a room
+COMMANDS = {"cli", "cli_sensors"}  # files of a room
 ROS_FILES = {
     "node", "messages", "action", "settings", "services", "report",
     "graph", "driver", "replay_node", "recorder_node",

@@ -8,8 +8,8 @@ import numpy as np
 from robocal_ros.correction.session import load_kernels
 from robocal_ros.ground import frames, mcap_records, serialized_joints
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import fit_pairs
-from robocal_ros.hand_eye.camera_model import PosePairs
 from robocal_ros.identification import identify
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse

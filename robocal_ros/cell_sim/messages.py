@@ -34,7 +34,7 @@ from robocal_ros.cell_sim.trajectory_controller import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD, stamp_ns
-from robocal_ros.hand_eye.shots import PROFILE
+from robocal_ros.hand_eye.data import PROFILE
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import NS, header, transform_message
 from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode

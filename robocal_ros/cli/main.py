@@ -483,7 +483,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
                 "place a line laser on the flange from the shots of two or three targets together",
             ),
             "check-plan": CliCommand(
-                "hand_eye.cli:check_plan",
+                "hand_eye.cli_sensors:check_plan",
                 "tell before the robot moves what planned poses would give, and which others "
                 "would do",
             ),
@@ -493,7 +493,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
                 " or another",
             ),
             "export": CliCommand(
-                "hand_eye.cli:export", "print a sensor's place for URDF, xacro or tf2"
+                "hand_eye.cli_sensors:export", "print a sensor's place for URDF, xacro or tf2"
             ),
         },
     ),

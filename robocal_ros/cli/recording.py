@@ -26,7 +26,7 @@ from robocal_ros.bags.replay import (
 from robocal_ros.cli.main import describe_robot
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
-from robocal_ros.hand_eye.shots import SHOTS
+from robocal_ros.hand_eye.data import SHOTS
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_folders
 from robocal_ros.session.events import Command

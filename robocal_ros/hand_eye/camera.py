@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,25 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
-from robocal_ros.hand_eye.camera_model import (
+from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,
-    PairState,
+    STEP_S,
+    Mount,
     Placement,
     PosePairs,
+    PoseStream,
+    Shared,
     closed_form,
     closed_forms,
+    coarse_offset,
+    pairs_at,
+)
+from robocal_ros.hand_eye.camera_fit import (
+    GivenNoise,
+    PairFit,
+    PairState,
     differences,
+    fit_pairs,
     linearised,
     predicted,
     robust_start,
@@ -75,10 +85,6 @@ def require_pairs(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
                 f"the {what}'s positions reach {largest:.4g} m: are they a thousand times too "
                 + ("small, m where mm are said?" if small else "large, mm where m are said?")
             )
-    _require_turns(pairs)
-
-
-def _require_turns(pairs: PosePairs) -> None:
     R = pairs.T_base_flange[:, :3, :3]
     mean = frames.nearest_rotation(R.mean(axis=0))
     turns = frames.log_rotation(mean.T @ R)
@@ -166,11 +172,14 @@ def mistake(pairs: PosePairs, at: Placement) -> str:
     }
     for lag in range(1, MOST_SHIFTED + 1):
         if len(pairs) - lag > FEWEST_PAIRS + 2:
-            for sign, words in ((lag, "after"), (-lag, "before")):
+            every = np.arange(len(pairs))
+            for words, of, to in (
+                ("after", every[:-lag], every[lag:]), ("before", every[lag:], every[:-lag])
+            ):  # fmt: skip
                 tries[
                     f"each board pose fits the robot pose {lag} row(s) {words} its own: the pairs "
                     "are shifted"
-                ] = _shifted(pairs, sign)
+                ] = replace(pairs.take(of), T_base_flange=robot[to])
     scores = {words: score(tried, robust_start(tried)) for words, tried in tries.items()}
     best = min(scores, key=lambda words: scores[words])
     if scores[best] < CLEARLY_BETTER * now:
@@ -196,13 +205,6 @@ def _right_handed(pairs: PosePairs) -> dict[str, PosePairs]:
         found[f"the robot's {words}"] = replace(pairs, T_base_flange=robot)
         found[f"the board's {words}"] = replace(pairs, T_camera_board=board)
     return found
-
-
-def _shifted(pairs: PosePairs, lag: int) -> PosePairs:
-    """Each board pose with the robot pose ``lag`` rows later."""
-    m = len(pairs)
-    rows = np.arange(max(lag, 0), m + min(lag, 0))
-    return replace(pairs.take(rows - lag), T_base_flange=pairs.T_base_flange[rows])
 
 
 def swapped(pairs: PosePairs, at: Placement, rejected: NDArray[np.bool_]) -> dict[str, str]:
@@ -318,38 +320,6 @@ def verdict(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdic
     return Verdict(Code.ACCEPT, words)
 
 
-def form_error(at: Placement, fit: PairFit) -> tuple[float, float]:
-    """How far a closed form is from the most likely placement, rms where the boards were, m.
-
-    And its error to expect there: the same with the error of that placement.
-    """
-    away = apart(at.X, fit.at.X, fit.pairs.T_camera_board[:, :3, 3])
-    return away, float(np.hypot(away, working_error(fit)))
-
-
-def form_verdict(name: str, size: Array, away_m: float, error_m: float, limit_m: float) -> Verdict:
-    """Whether a closed form may be used; ``size`` (n,) of its residuals, m."""
-    words = f"{name} fits {len(size)} samples within {rms(size) * 1e3:.3f} mm rms"
-    if rms(size) > LARGEST_RMS_M:
-        return Verdict(
-            Code.RESIDUAL_TOO_LARGE,
-            f"{words} (allowed {LARGEST_RMS_M * 1e3:.0f} mm): use method best",
-        )
-    judged = judge_classic(away_m, error_m, HandEyeSettings(limit_m=limit_m))
-    return Verdict(judged.code, f"{words}; {judged.reason}")
-
-
-def held_out_verdict(size: Array) -> Verdict | None:
-    """Refuse where samples (n,) that were not used are too far off, m; else None."""
-    if rms(size) <= LARGEST_RMS_M:
-        return None
-    return Verdict(
-        Code.RESIDUAL_TOO_LARGE,
-        f"samples that were not used to solve are off by {rms(size) * 1e3:.2f} mm rms (allowed "
-        f"{LARGEST_RMS_M * 1e3:.0f} mm)",
-    )
-
-
 def rms(size: Array) -> float:
     """Root of the mean square."""
     return float(np.sqrt(np.mean(size**2)))
@@ -417,8 +387,15 @@ def calibrate_camera(
     pairs, again = _first_of_each_pose(pairs)
     rejected = {**(rejected or {}), **again}
     sound = require_sound(pairs, rejected)
-    fit = fit_pairs(pairs, how.noise, _start(pairs, how.method), sound)
-    _require_no_mistake(fit)
+    start = None
+    if how.method in CLOSED_FORMS and (start := closed_form(how.method, pairs)) is None:
+        raise ResidualError(f"{how.method} does not solve these pairs: use method best")
+    fit = fit_pairs(pairs, how.noise, start, sound)
+    used = ~fit.rejected
+    size_m = np.linalg.norm(fit.differences[used][:, :3], axis=1)
+    wrong = mistake(fit.pairs, fit.at) if rms(size_m) > LARGEST_RMS_M else ""
+    if wrong := wrong or wrong_scale(fit.pairs.take(used), fit.at):
+        raise InputError(wrong)
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
     result, state = (_classic if how.method == "classic" else _best)(fit, how)
     result = replace(
@@ -462,24 +439,6 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> Placement:
     )
 
 
-def _start(pairs: PosePairs, method: str) -> Placement | None:
-    if method not in CLOSED_FORMS:
-        return None
-    start = closed_form(method, pairs)
-    if start is None:
-        raise ResidualError(f"{method} does not solve these pairs: use method best")
-    return start
-
-
-def _forms_document(pairs: PosePairs, forms: Mapping[str, Placement | None]) -> Document:
-    return {
-        "closed_forms_mean_mm": {
-            name: None if at is None else float(distances(pairs, at).mean()) * 1e3
-            for name, at in forms.items()
-        }
-    }
-
-
 def _judged(result: HandEyeResult, check: CheckPairs, state: PairState) -> HandEyeResult:
     """A result with the errors at pairs that were not used; they may refuse it.
 
@@ -492,10 +451,14 @@ def _judged(result: HandEyeResult, check: CheckPairs, state: PairState) -> HandE
     held_out = errors_document(summarise(miss)) | {
         "rejected": list(check.rejected), "rejected_because": dict(check.rejected),
     }  # fmt: skip
-    refused = held_out_verdict(np.linalg.norm(miss, axis=1)) if result.verdict.accept else None
-    return replace(
-        result, verdict=refused or result.verdict, more={**result.more, "held_out": held_out}
-    )
+    judged, off_m = result.verdict, rms(np.linalg.norm(miss, axis=1))
+    if judged.accept and off_m > LARGEST_RMS_M:
+        judged = Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"samples that were not used to solve are off by {off_m * 1e3:.2f} mm rms (allowed "
+            f"{LARGEST_RMS_M * 1e3:.0f} mm)",
+        )
+    return replace(result, verdict=judged, more={**result.more, "held_out": held_out})
 
 
 def _noise_document(fit: PairFit, known: GivenNoise) -> Document:
@@ -528,74 +491,177 @@ def _reasons(fit: PairFit) -> dict[str, str]:
     return reasons
 
 
-def _require_no_mistake(fit: PairFit) -> None:
-    used = ~fit.rejected
-    size = np.linalg.norm(fit.differences[used][:, :3], axis=1)
-    wrong = mistake(fit.pairs, fit.at) if rms(size) > LARGEST_RMS_M else ""
-    wrong = wrong or wrong_scale(fit.pairs.take(used), fit.at)
-    if wrong:
-        raise InputError(wrong)
-
-
 def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
-    pairs, used = fit.pairs, ~fit.rejected
-    miss = fit.differences[used]
-    size = np.linalg.norm(miss[:, :3], axis=1)
-    kept = pairs.take(used)
-    error = working_error(fit)
-    result = HandEyeResult(
-        kind="camera",
+    kept, miss = fit.pairs.take(~fit.rejected), fit.differences[~fit.rejected]
+    size, error_m = np.linalg.norm(miss[:, :3], axis=1), working_error(fit)
+    result = replace(
+        _unjudged(kept, fit.at, miss, how.method, closed_forms(kept), fit.pairs.distance_m),
         method="best",
-        T_flange_sensor=fit.at.X,
         covariance=fit.covariance[:6, :6],
-        samples=kept.names,
-        residual_m=size,
-        residual_rad=np.asarray(np.linalg.norm(miss[:, 3:], axis=1)),
         leave_one_out_m=left_out(fit),
         rejected=_reasons(fit),
-        target=_target_document(pairs, fit.at),
-        working_error_m=error,
-        verdict=unsettled(fit) or verdict(fit, size, error, how.limit_m),
-        more={"start": how.method} | _forms_document(kept, closed_forms(kept)),
-        parent=_parent(pairs),
+        working_error_m=error_m,
+        verdict=unsettled(fit) or verdict(fit, size, error_m, how.limit_m),
     )
     return result, fit.estimate.state
 
 
 def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
-    """The closed form that fits all samples best; the most likely placement judges it."""
-    used = fit.pairs
-    forms = closed_forms(used)
+    """The closed form that fits all samples best; the most likely placement judges it.
+
+    Its error to expect is its distance from that placement, where the boards were, with that one's.
+    """
+    pairs, forms = fit.pairs, closed_forms(fit.pairs)
     found = {name: at for name, at in forms.items() if at is not None}
     if not found:
         raise ResidualError("no closed form solves these pairs: measure at more different poses")
-    name = min(found, key=lambda key: float(distances(used, found[key]).mean()))
+    name = min(found, key=lambda key: float(distances(pairs, found[key]).mean()))
     at = found[name]
-    miss = differences(predicted(used, at), used)
+    miss = differences(predicted(pairs, at), pairs)
     size = np.linalg.norm(miss[:, :3], axis=1)
-    away_m, error_m = form_error(at, fit)
-    result = HandEyeResult(
-        kind="camera",
-        method="classic",
-        T_flange_sensor=at.X,
-        covariance=None,
-        samples=used.names,
-        residual_m=size,
-        residual_rad=np.asarray(np.linalg.norm(miss[:, 3:], axis=1)),
-        leave_one_out_m=left_out_of_form(name, used, at),
-        target=_target_document(used, at),
+    away_m = apart(at.X, fit.at.X, pairs.T_camera_board[:, :3, 3])
+    error_m = float(np.hypot(away_m, working_error(fit)))
+    words = f"{name} fits {len(size)} samples within {rms(size) * 1e3:.3f} mm rms"
+    judged = judge_classic(away_m, error_m, HandEyeSettings(limit_m=how.limit_m))
+    judged = Verdict(judged.code, f"{words}; {judged.reason}")
+    if rms(size) > LARGEST_RMS_M:
+        words += f" (allowed {LARGEST_RMS_M * 1e3:.0f} mm): use method best"
+        judged = Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    result = replace(
+        _unjudged(pairs, at, miss, name, forms, pairs.distance_m),
+        leave_one_out_m=left_out_of_form(name, pairs, at),
         working_error_m=error_m,
-        verdict=unsettled(fit) or form_verdict(name, size, away_m, error_m, how.limit_m),
-        more={"start": name} | _forms_document(used, forms),
-        parent=_parent(used),
+        verdict=unsettled(fit) or judged,
     )
     return result, PairState(at, np.zeros(0))
 
 
-def _parent(pairs: PosePairs) -> Literal["flange", "base"]:
-    return "flange" if pairs.mount == "in-hand" else "base"
+def _unjudged(
+    pairs: PosePairs, at: Placement, miss: Array, start: str,
+    forms: Mapping[str, Placement | None], distance_m: float,
+) -> HandEyeResult:  # fmt: skip
+    """What both methods report of the pairs that they used; ``miss`` (n, 6) of these."""
+    in_hand = pairs.mount == "in-hand"
+    means = {
+        name: None if form is None else float(distances(pairs, form).mean()) * 1e3
+        for name, form in forms.items()
+    }
+    return HandEyeResult(
+        kind="camera",
+        method="classic",
+        T_flange_sensor=at.X,
+        covariance=None,
+        samples=pairs.names,
+        residual_m=np.asarray(np.linalg.norm(miss[:, :3], axis=1)),
+        residual_rad=np.asarray(np.linalg.norm(miss[:, 3:], axis=1)),
+        target={
+            f"T_{'base' if in_hand else 'flange'}_board": transform_document(at.Z),
+            "distance_mm": distance_m * 1e3,
+        },
+        verdict=Verdict(Code.NONE, ""),
+        more={"start": start, "closed_forms_mean_mm": means},
+        parent="flange" if in_hand else "base",
+    )
 
 
-def _target_document(pairs: PosePairs, at: Placement) -> Document:
-    parent = "base" if pairs.mount == "in-hand" else "flange"
-    return {f"T_{parent}_board": transform_document(at.Z), "distance_mm": pairs.distance_m * 1e3}
+_FREE_S = 0.5  # prior sigma of what is left of the offset
+_CLOSE_S = 1e-6
+_ROUNDS = 12
+_ALONE = "no robot pose at its time"
+
+
+def _with_offset(robot: PoseStream, pairs: PosePairs, fit: PairFit, offset_s: float) -> PosePairs:
+    """Pairs with what is left of the offset as an error common to all."""
+    time = pairs.time_s
+    if time is None:
+        raise ValueError("pairs of a stream have times")
+    half = 0.5 * max(robot.period_s, STEP_S)
+    later, sooner = (
+        predicted(replace(pairs, T_base_flange=robot.at(time + offset_s + h)), fit.at)
+        for h in (half, -half)
+    )
+    motion = differences(later, replace(pairs, T_camera_board=sooner)) / (2.0 * half)
+    return replace(pairs, shared=Shared(-motion[:, :, None], np.array([[_FREE_S**2]])))
+
+
+@dataclass(frozen=True, eq=False)
+class StreamPairs:
+    """Paired streams: ``left_out`` names the camera poses without one of the robot."""
+
+    pairs: PosePairs
+    offset_s: float
+    sigma_s: float
+    left_out: tuple[str, ...]
+
+
+def pair_streams(
+    robot: PoseStream, camera: PoseStream, mount: Mount = "in-hand",
+    given: GivenNoise | None = None,
+) -> StreamPairs:  # fmt: skip
+    """Find the offset, and pair the streams by it.
+
+    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError` as `coarse_offset`, `pairs_at`,
+    `robocal_ros.hand_eye.camera.calibrate_camera`.
+    """
+    offset = coarse_offset(robot, camera)
+    pairs, left_out = pairs_at(robot, camera, offset, mount)
+    fit = fit_pairs(pairs, given, sound=require_sound(pairs, {}))
+    for _ in range(_ROUNDS):
+        fit = fit_pairs(_with_offset(robot, pairs, fit, offset), given, fit.at, fit.at)
+        step = float(fit.estimate.state.common[0])
+        offset += step
+        pairs, left_out = pairs_at(robot, camera, offset, mount)
+        if abs(step) < max(_CLOSE_S, 0.01 * _sigma(fit)):
+            break
+    else:
+        raise RankDeficientError(
+            f"the time offset did not settle (last {offset:.4f} s): record a motion that turns "
+            "about all axes, with changes of speed",
+            ("time offset",),
+        )
+    return StreamPairs(_with_offset(robot, pairs, fit, offset), offset, _sigma(fit), left_out)
+
+
+def _sigma(fit: PairFit) -> float:
+    return float(np.sqrt(fit.whole_covariance[12, 12]))
+
+
+def calibrate_streams(
+    robot: PoseStream, camera: PoseStream, mount: Mount = "in-hand",
+    settings: CameraSettings | None = None, check: PoseStream | None = None,
+) -> HandEyeResult:  # fmt: skip
+    """Place a camera from two streams; the result's ``more`` tells the offset.
+
+    ``check``: a stream of the robot at times of the camera's that judge the result.
+
+    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError`, `ResidualError` as
+    `pair_streams` and `calibrate_camera`, and for a check of times that were used to solve.
+    """
+    how = settings or CameraSettings()
+    found = pair_streams(robot, camera, mount, how.noise)
+    judges = None if check is None else _judges(found, check, camera)
+    elsewhere = set() if judges is None else {*judges.pairs.names, *judges.rejected}
+    return calibrate_camera(
+        found.pairs,
+        how,
+        check=judges,
+        rejected={name: _ALONE for name in found.left_out if name not in elsewhere},
+        more={"time_offset_s": found.offset_s, "time_offset_sigma_s": found.sigma_s},
+    )
+
+
+def _judges(found: StreamPairs, check: PoseStream, camera: PoseStream) -> CheckPairs:
+    """Pairs of the check's stretch, and the camera poses there that have none of the robot."""
+    # the common error is the offset, which is in the times already
+    pairs = pairs_at(check, camera, found.offset_s, found.pairs.mount)[0]
+    used, held = set(found.pairs.names), set(pairs.names)
+    twice = [name for name in pairs.names if name in used]
+    if twice:
+        raise InputError(
+            f"{len(twice)} of the camera's poses, first {twice[0]}, lie in the robot's stream and "
+            "in that of the check: other times must judge"
+        )
+    time = camera.time_s + found.offset_s
+    there = (time >= check.time_s[0]) & (time <= check.time_s[-1])
+    alone = set(np.array(camera.names)[there].tolist()) & set(found.left_out) - held
+    return CheckPairs(pairs, {name: _ALONE for name in found.left_out if name in alone})

@@ -1,74 +1,428 @@
-"""Commands of ``robocal hand-eye`` for a line laser, and export and check-plan of any sensor."""
+"""Commands of ``robocal hand-eye`` for a line laser, and the options and files of all."""
 
 import argparse
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
-from math import degrees
+from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.main import CliResult, Document, positive, text, three_numbers
+import numpy as np
+
+from robocal_ros.bags.bags import DATA_SET, BagReader, read_data_set
+from robocal_ros.bags.replay import topic_kind
+from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, input_topic, positive, text
+from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
-from robocal_ros.ground.errors import InputError
+from robocal_ros.estimation.edge import CornerRule, EdgeRule
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.hand_eye.cli_shots import (
-    KINDS,
-    add_feature,
-    add_limits,
-    add_robot,
-    add_shots,
-    add_target,
-    add_target_file,
-    add_target_kind,
-    arm_of,
-    given_shots,
-    given_target,
-    read_shots,
-    require_unused,
-    settings_of,
-    show_held_out,
-    show_mount,
-    show_pose,
-    show_sigma,
-    show_verdict,
-    task_of,
+from robocal_ros.ground.samples import StandstillRule
+from robocal_ros.hand_eye.data import (
+    FEATURES,
+    PROFILE,
+    Profile,
+    StandingShot,
+    Standstills,
+    captured_marks,
+    data_set_of,
+    first_of_each,
+    flange_poses,
 )
-from robocal_ros.hand_eye.files import (
-    exported,
-    read_flange_mount,
-    read_mount,
-    read_pose_table,
-    write_pose_table,
-)
-from robocal_ros.hand_eye.planning import (
-    PlannedStairs,
-    PlanReport,
-    SensorRange,
-    check_plan,
-    planned_target,
-)
+from robocal_ros.hand_eye.files import PoseTable, read_flange_mount, read_pose_table, read_profiles
 from robocal_ros.hand_eye.result import (
     METHODS,
-    PoseNoise,
+    HandEyeSettings,
     by_shot,
     hand_eye_document,
 )
+from robocal_ros.hand_eye.session import HandEyeConfig, is_hand_eye_session
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
+from robocal_ros.hand_eye.targets import (
+    KIND_OF,
+    BoardTarget,
+    LaserTarget,
+    SphereTarget,
+    StepTarget,
+    read_target,
+)
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-FORMATS = ("urdf", "xacro", "yaml", "static-transform")
-PARENTS = {"flange": "tool0", "base": "base"}
-SENSOR = {
-    "near": (190.0, "nearest distance that the sensor sees"),
-    "far": (210.0, "farthest"),
-    "width": (60.0, "of the field, half way"),
-    "noise": (0.037, "of a point along the beam, one sigma"),
-}
-ROBOT_SIGMA_MM = 0.05
+BagShots = tuple[HandEyeData, dict[str, str]]
+
+KINDS = ("sphere", "step", "line")
+LIMIT_MM = 1.0
+MOST_NAMED = 5  # samples left out for one reason
+
+
+def add_shots(parser: argparse.ArgumentParser) -> None:
+    """Offer the tables of a calibration, or a bag."""
+    parser.add_argument(
+        "--poses",
+        type=Path,
+        metavar="CSV",
+        help="flange poses in base, or joints with --robot; column profile names each shot's file",
+    )
+    parser.add_argument(
+        "--profiles",
+        type=Path,
+        metavar="DIR",
+        help="folder of the profiles, tables of x_mm and z_mm",
+    )
+    parser.add_argument(
+        "--bag",
+        type=Path,
+        help="instead of the tables: a recording of joint_states and profile, or a data file of "
+        "hand_eye_node; with --robot",
+    )
+    parser.add_argument(
+        "--topic",
+        type=input_topic,
+        action="append",
+        default=[],
+        metavar="INPUT:=TOPIC",
+        help="topic of an input in the bag: joint_states, profile, session_events",
+    )
+    add_robot(parser, "bags and tables of joints")
+
+
+def add_robot(parser: argparse.ArgumentParser, needed: str = "tables of joints") -> None:
+    """Offer the robot, ``needed`` for these."""
+    parser.add_argument("--robot", metavar="NAME", help=f"{ROBOT_HELP}; for {needed}")
+
+
+def add_target(parser: argparse.ArgumentParser) -> None:
+    """Offer what is known of a target of any kind."""
+    add_target_file(parser)
+    add_radius(parser)
+
+
+def add_target_file(parser: argparse.ArgumentParser, help: str = "what is known of it") -> None:
+    """Offer a target file."""
+    parser.add_argument("--target", type=Path, metavar="YAML", help=help)
+
+
+def add_radius(parser: argparse.ArgumentParser) -> None:
+    """Offer a sphere's radius."""
+    parser.add_argument("--radius-mm", type=positive, metavar="R", help="of a sphere, true")
+
+
+def add_target_kind(parser: argparse.ArgumentParser) -> None:
+    """Ask for the kind of target."""
+    parser.add_argument("--target-kind", required=True, choices=KINDS, help="what the shots show")
+
+
+def add_feature(parser: argparse.ArgumentParser) -> None:
+    """Offer what a line is."""
+    parser.add_argument(
+        "--line-kind",
+        choices=FEATURES,
+        default=FEATURES[0],
+        help="the line: nearer to the sensor than the surfaces beside it (edge, the default), or "
+        "farther (groove)",
+    )
+
+
+def add_limits(parser: argparse.ArgumentParser, sigma_default: str) -> None:
+    """Offer the robot's scatter, and what is good enough."""
+    add_robot_sigma(parser, sigma_default)
+    add_limit(parser, "in the field of view", LIMIT_MM)
+
+
+def add_robot_sigma(parser: argparse.ArgumentParser, default: str) -> None:
+    """Offer the robot's scatter."""
+    for unit, of in (("mm", "position"), ("deg", "orientation")):
+        parser.add_argument(
+            f"--robot-sigma-{unit}",
+            type=positive,
+            metavar="S",
+            help=f"noise of a reported pose's {of} in each axis; {default}",
+        )
+
+
+def add_limit(parser: argparse.ArgumentParser, where: str, default_mm: float) -> None:
+    """Offer what is good enough."""
+    parser.add_argument(
+        "--limit-mm",
+        type=positive,
+        default=default_mm,
+        metavar="L",
+        help=f"largest expected error (rms) {where} that is accepted; default {default_mm:g}",
+    )
+
+
+def robot_sigma_of(args: argparse.Namespace) -> tuple[float | None, float | None]:
+    """The robot's scatter, m and rad, where it is given."""
+    place_mm, turn_deg = args.robot_sigma_mm, args.robot_sigma_deg
+    return (
+        None if place_mm is None else place_mm * 1e-3,
+        None if turn_deg is None else radians(turn_deg),
+    )
+
+
+def settings_of(args: argparse.Namespace) -> HandEyeSettings:
+    """What is known of the robot, and what is good enough.
+
+    Raises `InputError` for an orientation's noise alone.
+    """
+    if args.robot_sigma_mm is None and args.robot_sigma_deg is not None:
+        raise InputError("--robot-sigma-deg goes with --robot-sigma-mm: give both, or the latter")
+    return HandEyeSettings(*robot_sigma_of(args), limit_m=args.limit_mm * 1e-3)
+
+
+def arm_of(args: argparse.Namespace) -> SerialArm | None:
+    """The robot that is named, if any. Raises as `load_robot`."""
+    return None if args.robot is None else load_robot(args.robot)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadShots:
+    """Shots, the table that holds them (None: a bag), and its profiles that are none, with why."""
+
+    data: HandEyeData
+    table: PoseTable | None = None
+    rejected: Mapping[str, str] = field(default_factory=dict)
+
+
+def given_shots(
+    args: argparse.Namespace, arm: SerialArm | None, judges: Path | None = None
+) -> ReadShots:
+    """Read the shots that are given, or those like them in the file of ``judges``.
+
+    Raises `RobocalError` when too little or too much is given; further as `read_shots` and
+    `read_bag_shots`.
+    """
+    if args.bag is None:
+        if args.poses is None or args.profiles is None:
+            raise InputError("give the shots: --poses with --profiles, or --bag")
+        return read_shots(judges or args.poses, args.profiles, arm)
+
+    if args.poses is not None or args.profiles is not None:
+        raise InputError("the shots are given twice: --bag, and --poses or --profiles; keep one")
+    if arm is None:
+        raise InputError("a bag holds joints, not poses: name its robot with --robot")
+    data, rejected = read_bag_shots(judges or args.bag, arm, dict(args.topic))
+    return ReadShots(data, None, rejected)
+
+
+def read_shots(poses: Path, profiles: Path, arm: SerialArm | None) -> ReadShots:
+    """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
+    table = read_pose_table(poses, arm)
+    seen = read_profiles(profiles, table)
+    return ReadShots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
+
+
+def require_unused(judges: PoseTable, used: PoseTable) -> None:
+    """Refuse judges that helped to solve. Raises `InputError`, naming the row."""
+    for index, file in enumerate(judges.files):
+        if file in used.files:
+            judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
+
+
+def given_target(kind: str, target: Path | None, radius_mm: float | None) -> LaserTarget | None:
+    """What is known of a target: from its file, or a sphere's radius; None for an unknown line.
+
+    Raises `InputError` when too little or too much is given, or the file is of another kind;
+    further as `read_target`.
+    """
+    if radius_mm is not None:
+        if kind != "sphere":
+            raise InputError(f"--radius-mm is a sphere's: a {kind} has none")
+        if target is not None:
+            raise InputError("the sphere is given twice: --radius-mm and --target; keep one")
+        return SphereTarget(radius_mm * 1e-3)
+    if target is not None:
+        return read_target_of(kind, target)
+    if kind == "line":
+        return None
+    missing = {"sphere": "give the sphere: --radius-mm or --target", "step": "give --target"}
+    raise InputError(missing[kind])
+
+
+def read_target_of(kind: str, path: Path) -> LaserTarget:
+    """Read a target file of this kind. Raises as `given_target`."""
+    target = read_target(path)
+    found = KIND_OF[type(target)]
+    if isinstance(target, BoardTarget) or found != kind:
+        raise InputError(f"describes a {found}, not a {kind}", file=str(path))
+    return target
+
+
+def task_of(target: LaserTarget | None, feature: str | None, classic: bool = False) -> Task:
+    """The estimator's view of a target, of a line by its ``feature``.
+
+    ``classic``: corners and edges in the published form.
+    """
+    if isinstance(target, SphereTarget):
+        return SphereTask(target)
+    if isinstance(target, StepTarget):
+        return StepTask(target, CornerRule(classic=classic))
+    rule = EdgeRule(kind="groove" if feature == "groove" else "edge", classic=classic)
+    return LineTask(target, rule)
+
+
+def read_bag_shots(path: Path, arm: SerialArm, topics: Mapping[str, str]) -> BagShots:
+    """Shots of a bag, and the profiles that are none with the reason.
+
+    ``topics``: input to topic, where given.
+
+    Raises `InputError` when the bag cannot be read, or lacks what is needed; `WrongRobotError`
+    when a data file was made with another robot; `TooFewSamplesError` when no profile was taken at
+    standstill.
+    """
+    with BagReader(path) as reader:
+        if DATA_SET not in reader.info.topics:
+            given = dict(topics)
+            seen = [topic for topic in reader.info.topics if topic_kind(topic) == PROFILE]
+            if len(seen) == 1:
+                given.setdefault(PROFILE, seen[0])
+            return _recorded(open_recording(reader, given), arm)
+    return _saved(path, arm), {}
+
+
+def _saved(path: Path, arm: SerialArm) -> HandEyeData:
+    data = data_set_of(read_data_set(path, arm), arm)
+    if data.topic != PROFILE:
+        raise InputError(f"holds shots of a {data.kind}, not profiles", file=str(path))
+    samples = data.chosen([])
+    names = tuple(str(sample.handle) for sample in samples)
+    marks = tuple(sample.mark for sample in samples)
+    q = np.array([sample.q for sample in samples])
+    return HandEyeData(
+        names,
+        flange_poses(q, [sample.thermal for sample in samples], arm),
+        [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
+        marks if any(marks) else None,
+    )
+
+
+def _recorded(recording: BagOverview, arm: SerialArm) -> BagShots:
+    path = recording.reader.info.path
+    if PROFILE not in recording.inputs.values():
+        raise InputError(
+            f"profiles are not found among {', '.join(recording.reader.info.topics)}: choose with "
+            f"--topic {PROFILE}:=TOPIC",
+            file=path,
+        )
+    rule, configured = StandstillRule(), recording.configured
+    if configured is not None and is_hand_eye_session(configured):
+        rule = HandEyeConfig.of_document(configured.arguments["config"]).standstill
+    standstills = Standstills(arm.joint_names, rule)
+    for recorded in recording.samples():
+        standstills.take(recording.inputs[recorded.topic], recorded.message)
+    standstills.close()
+    kept, left_out = _chosen(recording, standstills.found, rule)
+    rejected = dict(sorted((standstills.rejected | left_out).items()))
+    if not kept:
+        why = next(iter(rejected.values()), "there is none")
+        raise TooFewSamplesError(f"{path}: no profile is of use, of {len(rejected)}: {why}")
+    marks = tuple(one.mark for one in kept)
+    return HandEyeData(
+        tuple(one.name for one in kept),
+        np.array([arm.fk(one.q) for one in kept]),
+        [Profile(one.shot.read(), one.name) for one in kept],
+        marks if any(marks) else None,
+    ), rejected
+
+
+def _chosen(
+    recording: BagOverview, found: list[StandingShot], rule: StandstillRule
+) -> tuple[list[StandingShot], dict[str, str]]:
+    """What the recorded session holds; without one, a shot of each standstill."""
+    marks = captured_marks(recording.commands)
+    if marks is None:
+        return first_of_each(found, rule.tolerance_rad)
+    kept = [
+        replace(one, mark=marks[one.shot.stamp_ns]) for one in found if one.shot.stamp_ns in marks
+    ]
+    why = "not captured, or removed, in the recorded session"
+    return kept, {one.name: why for one in found if one.shot.stamp_ns not in marks}
+
+
+def show_mount(console: "Console", document: Document) -> None:
+    """Print where a line laser sits, how well that is known, and which samples were left out."""
+    show_placed(console, document, "Sensor", "in the field of view")
+    residual = document["residual_mm"]
+    console.print(
+        f"Samples from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
+    )
+    show_judged(console, document)
+
+
+def show_placed(console: "Console", document: Document, what: str, where: str) -> None:
+    """Print the decision, where a sensor sits, and how well that is known, ``where`` it looks."""
+    show_verdict(console, document)
+    parent = "flange" if "T_flange_sensor" in document else "base"
+    show_pose(console, f"{what} in the {parent} frame", document[f"T_{parent}_sensor"])
+    if document["sigma"] is not None:
+        show_sigma(console, document["sigma"])
+    error_mm = document["working_error_mm"]
+    if error_mm is not None:
+        console.print(f"Expected error {where}: {error_mm:.3f} mm rms")
+
+
+def show_judged(console: "Console", document: Document) -> None:
+    """Print how far samples are from a result without them, and which were left out."""
+    left_out = document["leave_one_out_mm"]
+    if left_out is not None:
+        console.print(
+            f"Each without itself: mean {left_out['mean']:.3f} mm, largest {left_out['max']:.3f} mm"
+        )
+    if document.get("held_out") is not None:
+        show_held_out(console, document["held_out"])
+    show_rejected(console, document["rejected_because"])
+
+
+def show_verdict(console: "Console", document: Document) -> None:
+    """Print the decision and why."""
+    from rich.text import Text
+
+    verdict = document["verdict"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
+
+
+def show_pose(console: "Console", what: str, pose: Document) -> None:
+    """Print a pose."""
+    xyz = ", ".join(f"{value:.3f}" for value in pose["xyz_mm"])
+    quat = " ".join(f"{value:.6f}" for value in pose["quat_xyzw"])
+    console.print(f"{what}, mm: {xyz}")
+    console.print(f"Orientation, quaternion x y z w: {quat}")
+
+
+def show_held_out(console: "Console", held_out: Document) -> None:
+    """Print the distances of samples that were not used to solve."""
+    console.print(
+        f"Not used to solve, {held_out['n']} samples: mean {held_out['mean_mm']:.3f} mm, rms "
+        f"{held_out['rms_mm']:.3f} mm, largest {held_out['max_mm']:.3f} mm"
+    )
+    show_rejected(console, held_out["rejected_because"])
+
+
+def show_rejected(console: "Console", because: Document) -> None:
+    """Print which samples were left out, and why: those of one reason together."""
+    same: dict[str, list[str]] = {}
+    for name, why in because.items():
+        same.setdefault(why, []).append(name)
+    for why, names in same.items():
+        who = ", ".join(names[:MOST_NAMED]) + (", …" if len(names) > MOST_NAMED else "")
+        count = f"{len(names)} samples, " if len(names) > 1 else ""
+        console.print(f"Not used: {count}{who}: {why}", soft_wrap=True, markup=False)
+
+
+def show_sigma(console: "Console", sigma: Document) -> None:
+    """Print standard deviations of a pose."""
+    xyz = ", ".join(f"{value:.3f}" for value in sigma["xyz_mm"])
+    turns = ", ".join(f"{value:.4f}" for value in sigma["rot_deg"])
+    console.print(f"Standard deviations: {xyz} mm; {turns} deg")
 
 
 def add_target_action(parser: argparse.ArgumentParser) -> None:
@@ -229,146 +583,3 @@ def _show_verify(console: "Console", document: Document) -> None:
     show_verdict(console, document)
     show_pose(console, "Sensor in the flange frame, as given", document["T_flange_sensor"])
     show_held_out(console, document["held_out"])
-
-
-def add_export(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``export``."""
-    parser.add_argument(
-        "--result", required=True, type=Path, metavar="FILE", help="JSON that was printed before"
-    )
-    parser.add_argument("--format", required=True, choices=FORMATS)
-    parser.add_argument(
-        "--parent",
-        type=text,
-        metavar="FRAME",
-        help="default tool0; of a sensor beside the robot base",
-    )
-    parser.add_argument(
-        "--child", type=text, default="laser", metavar="FRAME", help="default laser"
-    )
-
-
-def run_export(args: argparse.Namespace) -> CliResult:
-    """Do ``export``. Raises `RobocalError` for what a user can mend."""
-    mount = read_mount(args.result, accepted=True)
-    T, parent = mount.T_parent_sensor, args.parent or PARENTS[mount.parent]
-    document: Document = {
-        "format": args.format,
-        "parent": parent,
-        "child": args.child,
-        "text": exported(T, parent, args.child, args.format),
-        f"T_{mount.parent}_sensor": transform_document(T),
-    }
-    return CliResult(document, lambda console: console.out(document["text"], highlight=False))
-
-
-def add_check_plan(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``check-plan``."""
-    add_target_kind(parser)
-    parser.add_argument(
-        "--poses",
-        required=True,
-        type=Path,
-        metavar="CSV",
-        help="planned flange poses in base, or joints with --robot",
-    )
-    parser.add_argument(
-        "--mount",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help="T_flange_sensor, roughly: JSON of an earlier result, or YAML with xyz_mm and rpy_deg "
-        "or quat_xyzw",
-    )
-    add_target(parser)
-    parser.add_argument(
-        "--center-mm",
-        type=three_numbers,
-        metavar="X,Y,Z",
-        help="of a sphere, roughly, in base; default: where most of the poses see it",
-    )
-    add_robot(parser)
-    sensor = parser.add_argument_group("the sensor")
-    for name, (value, words) in SENSOR.items():
-        sensor.add_argument(
-            f"--{name}-mm",
-            type=positive,
-            default=value,
-            metavar="L",
-            help=f"{words}; default {value:g}",
-        )
-    add_limits(parser, f"default {ROBOT_SIGMA_MM:g} mm, 0 deg")
-    parser.add_argument("--propose", type=Path, metavar="CSV", help="write the proposed poses")
-
-
-def run_check_plan(args: argparse.Namespace) -> CliResult:
-    """Do ``check-plan``. Raises `RobocalError` for what a user can mend."""
-    settings = settings_of(args)
-    if args.near_mm >= args.far_mm:
-        raise InputError(f"--near-mm {args.near_mm:g} must be below --far-mm {args.far_mm:g}")
-    sensor = SensorRange(
-        near_m=args.near_mm * 1e-3,
-        far_m=args.far_mm * 1e-3,
-        width_m=args.width_mm * 1e-3,
-        noise_m=args.noise_mm * 1e-3,
-    )
-    known = given_target(args.target_kind, args.target, args.radius_mm)
-    table = read_pose_table(args.poses, arm_of(args), None)
-    centre = None if args.center_mm is None else tuple(x * 1e-3 for x in args.center_mm)
-    if centre is not None and args.target_kind != "sphere":
-        raise InputError("--center-mm is a sphere's")
-    target = planned_target(known, sensor, centre, table.mark)
-    X = read_flange_mount(args.mount)
-    noise = settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
-    report = check_plan(target, table.T_base_flange, X, sensor, noise, settings.limit_m)
-    marks = None
-    if table.mark is not None and isinstance(target, PlannedStairs):
-        marks = list(target.lit(report.proposed @ X))  # on which the light is laid
-    if args.propose is not None:
-        names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
-        write_pose_table(args.propose, report.proposed, names=names, mark=marks)
-    document = _document(report, table.names) | {"proposed_marks": marks}
-    return CliResult(document, partial(_show_check_plan, document=document))
-
-
-def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
-    sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
-    return {
-        "rank": report.rank,
-        "unknowns": report.unknowns,
-        "unobservable": list(report.unobservable),
-        "sigma": None
-        if sigma is None
-        else {
-            "xyz_mm": (sigma[:3] * 1e3).tolist(),
-            "rot_deg": [degrees(value) for value in sigma[3:]],
-        },
-        "working_error_mm": None if error_m is None else error_m * 1e3,
-        "unseen": {names[index]: why for index, why in report.unseen.items()},
-        "proposed": [transform_document(T) for T in report.proposed],
-        "proposed_error_mm": None if better_m is None else better_m * 1e3,
-        "verdict": verdict_document(report.verdict),
-    }
-
-
-def _show_check_plan(console: "Console", document: Document) -> None:
-    show_verdict(console, document)
-    console.print(f"Rank: {document['rank']} of {document['unknowns']}")
-    for words in document["unobservable"]:
-        console.print(f"Open: {words}", soft_wrap=True)
-    if document["sigma"] is not None:
-        show_sigma(console, document["sigma"])
-    for name, why in document["unseen"].items():
-        console.print(f"Out of view: {name}: {why}", soft_wrap=True, markup=False)
-    proposed = document["proposed"]
-    if proposed:
-        console.print(
-            f"With {len(proposed)} more poses, expected error "
-            f"{document['proposed_error_mm']:.3f} mm rms:"
-        )
-    for pose, mark in zip(
-        proposed, document["proposed_marks"] or [""] * len(proposed), strict=True
-    ):
-        xyz = ", ".join(f"{value:.1f}" for value in pose["xyz_mm"])
-        quat = " ".join(f"{value:.4f}" for value in pose["quat_xyzw"])
-        console.print(f"  {xyz} mm; x y z w {quat} {mark}".rstrip())

@@ -1,50 +1,85 @@
-"""Commands of ``robocal hand-eye`` for other ways to place a sensor: camera, laser tracker."""
+"""Commands of ``robocal hand-eye`` for a camera and a laser tracker, export and check-plan."""
 
 import argparse
 from dataclasses import replace
 from functools import partial
-from math import radians
+from math import degrees, radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, positive, warn
+from robocal_ros.cli.main import (
+    ROBOT_HELP,
+    CliResult,
+    Document,
+    describe_robot,
+    positive,
+    text,
+    three_numbers,
+    warn,
+)
+from robocal_ros.estimation.assessment import verdict_document
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
-from robocal_ros.hand_eye.board import (
+from robocal_ros.ground.frames import transform_document
+from robocal_ros.hand_eye.camera import (
+    CameraSettings,
+    CheckPairs,
+    calibrate_camera,
+    calibrate_streams,
+)
+from robocal_ros.hand_eye.camera_data import (
     Chessboard,
     Intrinsics,
+    PosePairs,
+    PoseStream,
     SeenBoards,
     board_pairs,
     intrinsics_document,
-    read_images,
     read_intrinsics,
     see_boards,
+    stream_of,
 )
-from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
 from robocal_ros.hand_eye.camera_fit import GivenNoise
-from robocal_ros.hand_eye.camera_model import PosePairs
-from robocal_ros.hand_eye.cli_shots import (
+from robocal_ros.hand_eye.cli import (
     add_limit,
+    add_limits,
     add_robot,
     add_robot_sigma,
+    add_target,
+    add_target_kind,
     arm_of,
+    given_target,
     require_unused,
     robot_sigma_of,
+    settings_of,
     show_judged,
     show_placed,
+    show_sigma,
+    show_verdict,
 )
+from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.files import (
     PoseTable,
+    exported,
+    read_flange_mount,
+    read_images,
+    read_mount,
     read_pose_table,
     read_profiles,
     read_tracker_points,
+    write_pose_table,
 )
-from robocal_ros.hand_eye.result import HandEyeResult, hand_eye_document
-from robocal_ros.hand_eye.shots import Profile
-from robocal_ros.hand_eye.streams import PoseStream, calibrate_streams, stream_of
-from robocal_ros.hand_eye.targets import read_tracker_target
+from robocal_ros.hand_eye.planning import (
+    PlannedStairs,
+    PlanReport,
+    SensorRange,
+    check_plan,
+    planned_target,
+)
+from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise, hand_eye_document
+from robocal_ros.hand_eye.targets import TrackerTarget, read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
-from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
+from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise
 from robocal_ros.kinematics import SerialArm
 
 if TYPE_CHECKING:
@@ -409,3 +444,157 @@ def _show_tracker(console: "Console", document: Document) -> None:
         f"Profiles from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
     )
     show_judged(console, document)
+
+
+FORMATS = ("urdf", "xacro", "yaml", "static-transform")
+PARENTS = {"flange": "tool0", "base": "base"}
+SENSOR = {
+    "near": (190.0, "nearest distance that the sensor sees"),
+    "far": (210.0, "farthest"),
+    "width": (60.0, "of the field, half way"),
+    "noise": (0.037, "of a point along the beam, one sigma"),
+}
+ROBOT_SIGMA_MM = 0.05
+
+
+def add_export(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``export``."""
+    parser.add_argument(
+        "--result", required=True, type=Path, metavar="FILE", help="JSON that was printed before"
+    )
+    parser.add_argument("--format", required=True, choices=FORMATS)
+    parser.add_argument(
+        "--parent",
+        type=text,
+        metavar="FRAME",
+        help="default tool0; of a sensor beside the robot base",
+    )
+    parser.add_argument(
+        "--child", type=text, default="laser", metavar="FRAME", help="default laser"
+    )
+
+
+def run_export(args: argparse.Namespace) -> CliResult:
+    """Do ``export``. Raises `RobocalError` for what a user can mend."""
+    mount = read_mount(args.result, accepted=True)
+    T, parent = mount.T_parent_sensor, args.parent or PARENTS[mount.parent]
+    document: Document = {
+        "format": args.format,
+        "parent": parent,
+        "child": args.child,
+        "text": exported(T, parent, args.child, args.format),
+        f"T_{mount.parent}_sensor": transform_document(T),
+    }
+    return CliResult(document, lambda console: console.out(document["text"], highlight=False))
+
+
+def add_check_plan(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``check-plan``."""
+    add_target_kind(parser)
+    parser.add_argument(
+        "--poses",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="planned flange poses in base, or joints with --robot",
+    )
+    parser.add_argument(
+        "--mount",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help="T_flange_sensor, roughly: JSON of an earlier result, or YAML with xyz_mm and rpy_deg "
+        "or quat_xyzw",
+    )
+    add_target(parser)
+    parser.add_argument(
+        "--center-mm",
+        type=three_numbers,
+        metavar="X,Y,Z",
+        help="of a sphere, roughly, in base; default: where most of the poses see it",
+    )
+    add_robot(parser)
+    sensor = parser.add_argument_group("the sensor")
+    for name, (value, words) in SENSOR.items():
+        sensor.add_argument(
+            f"--{name}-mm",
+            type=positive,
+            default=value,
+            metavar="L",
+            help=f"{words}; default {value:g}",
+        )
+    add_limits(parser, f"default {ROBOT_SIGMA_MM:g} mm, 0 deg")
+    parser.add_argument("--propose", type=Path, metavar="CSV", help="write the proposed poses")
+
+
+def run_check_plan(args: argparse.Namespace) -> CliResult:
+    """Do ``check-plan``. Raises `RobocalError` for what a user can mend."""
+    settings = settings_of(args)
+    if args.near_mm >= args.far_mm:
+        raise InputError(f"--near-mm {args.near_mm:g} must be below --far-mm {args.far_mm:g}")
+    sensor = SensorRange(
+        near_m=args.near_mm * 1e-3,
+        far_m=args.far_mm * 1e-3,
+        width_m=args.width_mm * 1e-3,
+        noise_m=args.noise_mm * 1e-3,
+    )
+    known = given_target(args.target_kind, args.target, args.radius_mm)
+    table = read_pose_table(args.poses, arm_of(args), None)
+    centre = None if args.center_mm is None else tuple(x * 1e-3 for x in args.center_mm)
+    if centre is not None and args.target_kind != "sphere":
+        raise InputError("--center-mm is a sphere's")
+    target = planned_target(known, sensor, centre, table.mark)
+    X = read_flange_mount(args.mount)
+    noise = settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
+    report = check_plan(target, table.T_base_flange, X, sensor, noise, settings.limit_m)
+    marks = None
+    if table.mark is not None and isinstance(target, PlannedStairs):
+        marks = list(target.lit(report.proposed @ X))  # on which the light is laid
+    if args.propose is not None:
+        names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
+        write_pose_table(args.propose, report.proposed, names=names, mark=marks)
+    document = _document(report, table.names) | {"proposed_marks": marks}
+    return CliResult(document, partial(_show_check_plan, document=document))
+
+
+def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
+    sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
+    return {
+        "rank": report.rank,
+        "unknowns": report.unknowns,
+        "unobservable": list(report.unobservable),
+        "sigma": None
+        if sigma is None
+        else {
+            "xyz_mm": (sigma[:3] * 1e3).tolist(),
+            "rot_deg": [degrees(value) for value in sigma[3:]],
+        },
+        "working_error_mm": None if error_m is None else error_m * 1e3,
+        "unseen": {names[index]: why for index, why in report.unseen.items()},
+        "proposed": [transform_document(T) for T in report.proposed],
+        "proposed_error_mm": None if better_m is None else better_m * 1e3,
+        "verdict": verdict_document(report.verdict),
+    }
+
+
+def _show_check_plan(console: "Console", document: Document) -> None:
+    show_verdict(console, document)
+    console.print(f"Rank: {document['rank']} of {document['unknowns']}")
+    for words in document["unobservable"]:
+        console.print(f"Open: {words}", soft_wrap=True)
+    if document["sigma"] is not None:
+        show_sigma(console, document["sigma"])
+    for name, why in document["unseen"].items():
+        console.print(f"Out of view: {name}: {why}", soft_wrap=True, markup=False)
+    proposed = document["proposed"]
+    if proposed:
+        console.print(
+            f"With {len(proposed)} more poses, expected error "
+            f"{document['proposed_error_mm']:.3f} mm rms:"
+        )
+    for pose, mark in zip(
+        proposed, document["proposed_marks"] or [""] * len(proposed), strict=True
+    ):
+        xyz = ", ".join(f"{value:.1f}" for value in pose["xyz_mm"])
+        quat = " ".join(f"{value:.4f}" for value in pose["quat_xyzw"])
+        console.print(f"  {xyz} mm; x y z w {quat} {mark}".rstrip())

@@ -21,7 +21,8 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
-from robocal_ros.hand_eye.shots import Profile, profile_of
+from robocal_ros.hand_eye.camera_data import Image, decode_image
+from robocal_ros.hand_eye.data import Profile, profile_of
 from robocal_ros.hand_eye.tracker_data import FACES, Arc, TrackerData
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, read_pose
@@ -424,3 +425,17 @@ def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) ->
         f"ros2 run tf2_ros static_transform_publisher --x {x} --y {y} --z {z} "
         f"--qx {qx} --qy {qy} --qz {qz} --qw {qw} --frame-id {parent} --child-frame-id {child}"
     )
+
+
+def read_images(folder: Path, table: PoseTable) -> tuple[list[tuple[str, Image]], dict[str, str]]:
+    """Named grey images of the shots that a table names, and why any of them cannot be read.
+
+    Raises `InputError` when a file is missing.
+    """
+    images, rejected = [], {}
+    for path, name in zip(table.files_in(folder), table.names, strict=True):
+        try:
+            images.append((name, decode_image(read_bytes(path, "image"), path.name)))
+        except InputError as error:
+            rejected[name] = str(error)
+    return images, rejected

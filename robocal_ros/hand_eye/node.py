@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image, JointState, PointCloud2
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, Silence
-from robocal_ros.hand_eye.data import FEATURES, MOUNTS, TOPIC_OF
+from robocal_ros.hand_eye.data import FEATURES, IMAGE, MOUNTS, PROFILE, TARGET_POSE, TOPIC_OF
 from robocal_ros.hand_eye.result import METHODS
 from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
 from robocal_ros.hand_eye.session import (
@@ -24,7 +24,6 @@ from robocal_ros.hand_eye.session import (
     configuration,
     take_hand_eye_message,
 )
-from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Head, hand_eye_kind
 from robocal_ros.kinematics.robots import load_robot

@@ -10,11 +10,13 @@ from itertools import product
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code
+from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.hand_eye.data import DataSet, Profile
 from robocal_ros.hand_eye.mount_fit import OPEN_M, joined, open_directions
 from robocal_ros.hand_eye.mount_problem import (
     LineModel,
@@ -27,10 +29,25 @@ from robocal_ros.hand_eye.mount_problem import (
     TargetView,
     same_pose,
 )
-from robocal_ros.hand_eye.result import PoseNoise, at_origin, expected_error_m
-from robocal_ros.hand_eye.staircase import StepTask, require_marks
-from robocal_ros.hand_eye.targets import LaserTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import FEWEST_SPHERES
+from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, at_origin, expected_error_m
+from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
+from robocal_ros.hand_eye.targets import (
+    BoardTarget,
+    LaserTarget,
+    SphereTarget,
+    StepTarget,
+    target_of,
+)
+from robocal_ros.hand_eye.tasks import (
+    FEWEST_SPHERES,
+    HandEyeData,
+    SphereTask,
+    StepTask,
+)
+from robocal_ros.history.history_records import CalibrationState
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
+from robocal_ros.session.events import History
 
 Array = NDArray[np.float64]
 
@@ -439,7 +456,7 @@ class PlannedStairs:
     fewest: int = field(default=4, init=False)
 
     def __post_init__(self) -> None:
-        require_marks(self.target, self.marks or ())
+        self.target.require_marks(self.marks or ())
 
     def place(self, T_base_sensor: Array) -> Array:
         """The taught user frame."""
@@ -523,3 +540,152 @@ def planned_target(
     if target is None:
         return PlannedLine(sensor)
     return PlannedLine(sensor, np.stack([target.point_base, target.direction_base]))
+
+
+ROBOT_SIGMA_M = 5e-5  # of a reported pose in each axis, where it is not given
+MOST_POSES = 200
+FEWEST_SEEN = 3  # samples that tell on which side of the laser plane a sphere lies
+# What was refused or taken back tells nothing.
+TO_GO_BY = (CalibrationState.PENDING, CalibrationState.STALE)
+
+
+def planned_poses(
+    arm: SerialArm, joints: Sequence[JointSample], flange: Sequence[tuple[ArrayLike, ArrayLike]]
+) -> Array:
+    """Flange poses (m, 4, 4) at joint readings, or of positions (3,), m, and quaternions (4,).
+
+    Raises `InputError` when they are given in both ways or in none, a joint is missing, one is no
+    pose, or a value is in another unit; `LimitError` when there are too many.
+    """
+    if bool(joints) == bool(flange):
+        raise InputError(
+            f"{len(joints)} joint states and {len(flange)} flange poses: give the planned poses in "
+            "one of the two ways"
+        )
+    if (count := len(joints) + len(flange)) > MOST_POSES:
+        raise LimitError(f"{count} poses: at most {MOST_POSES} are judged at a time")
+    if joints:
+        q = np.array([sample.position[sample.order(arm.joint_names)] for sample in joints])
+        poses, fault = arm.fk(q), joint_unit_fault(arm, q)
+    else:
+        poses = np.array([pose_of(*pose, f"flange pose {i}") for i, pose in enumerate(flange, 1)])
+        fault = flange_unit_fault(poses[:, :3, 3])
+    if fault is not None:
+        raise InputError(f"planned pose {fault[0] + 1}: {fault[1]}")
+    return poses
+
+
+def pose_of(position: ArrayLike, quat_xyzw: ArrayLike, name: str) -> Array:
+    """A pose (4, 4) of a position (3,), m, and a quaternion (4,).
+
+    Raises `InputError` when it is none; ``name`` says which.
+    """
+    quat, place = np.asarray(quat_xyzw, np.float64), np.asarray(position, np.float64)
+    norm = float(np.linalg.norm(quat))
+    if not (abs(norm - 1.0) <= 1e-3):
+        raise InputError(f"{name} is none: its quaternion has length {norm:.6g}")
+    return frames.transform_from_quat(require_near(place, name), quat / norm)
+
+
+def require_near(place: ArrayLike, name: str) -> Array:
+    """A place (3,), m.
+
+    Raises `InputError` when it is none within reach of an arm; ``name`` says which.
+    """
+    point = np.asarray(place, np.float64)
+    if not np.all(np.isfinite(point)):
+        raise InputError(f"{name} is none: its position is {point}")
+    if (away := float(np.linalg.norm(point))) > FARTHEST_M:
+        raise InputError(
+            f"{name} is {away:.4g} m away: is it a thousand times too far: mm where m are expected?"
+        )
+    return point
+
+
+def rough_mount(
+    session: HandEyeSession, history: History, given: Array | None, configured: Array | None
+) -> tuple[Array, str]:
+    """About where the sensor sits on the flange (4, 4), and who says so.
+
+    What the request has given; else what is in force; else the open data set's last candidate,
+    unless it was refused; else what is configured.
+
+    Raises `InputError` when nothing says it.
+    """
+    if given is not None:
+        return given, "the request"
+    head, number = session.in_force, _candidate(session.data, history)
+    for model, name in (
+        (head.model, f"calibration {head.calibration_id} in force"),
+        (history.model(number) if number else None, f"candidate {number}"),
+    ):
+        if model is not None and model["parent"] == session.config.flange_frame:
+            return np.array(model["T_parent_sensor"]), name
+    if configured is not None:
+        return configured, "rough_xyz_mm and rough_quat_xyzw"
+    raise InputError(
+        "nothing says where the sensor sits: set rough_xyz_mm and rough_quat_xyzw to a few "
+        "millimetres and degrees, or give sensor in the request"
+    )
+
+
+def _candidate(data: DataSet | None, history: History) -> int:
+    """The last calibration of a data set that can be gone by; 0 without."""
+    number = 0 if data is None else data.candidate
+    return number if number and history.get(number).state in TO_GO_BY else 0
+
+
+def sphere_centre(
+    data: DataSet, history: History, arm: SerialArm, T_flange_sensor: Array
+) -> Array | None:
+    """Where the sphere was last found (3,), base; None where neither result nor samples tell."""
+    target = target_of(data.target)
+    if not isinstance(target, SphereTarget):
+        return None
+    if number := _candidate(data, history):
+        return 1e-3 * np.array(history.document(number)["target"]["center_mm"])
+    samples = list(data.samples.values())
+    if len(samples) < FEWEST_SEEN:
+        return None
+    profiles = [Profile(sample.values, str(sample.handle)) for sample in samples]
+    poses = arm.fk(np.array([sample.q for sample in samples]))
+    task = SphereTask(target)
+    shots = HandEyeData(tuple(profile.name for profile in profiles), poses, profiles)
+    try:
+        view = task.read(shots, T_flange_sensor).view
+    except RobocalError:  # they show no sphere: calibrate says so
+        return None
+    return task.placed(view, T_flange_sensor) if len(view.sightings.names) >= FEWEST_SEEN else None
+
+
+def judged_plan(
+    data: DataSet,
+    T_base_flange: Array,
+    marks: Sequence[str],
+    T_flange_sensor: Array,
+    sensor: SensorRange,
+    config: HandEyeConfig,
+    centre: Array | None = None,
+) -> PlanReport:
+    """Judge planned flange poses (m, 4, 4) with a rough T_flange_sensor (4, 4).
+
+    ``marks``: of a step target the mark (m) of each pose; without any its first one. ``centre``:
+    of a sphere (3,), base; None: where most of the poses see it.
+
+    Raises `InputError` for a target whose plans cannot be judged, and for marks that it does not
+    have.
+    """
+    if marks and len(marks) != len(T_base_flange):
+        raise InputError(f"{len(marks)} marks for {len(T_base_flange)} poses: give each its own")
+    for mark in marks:
+        data.require_mark(mark)
+    if centre is not None and data.kind != "sphere":
+        raise InputError(f"center is a sphere's, not a {data.kind}'s: leave it out")
+    target = target_of(data.target)
+    if data.kind == "camera" or isinstance(target, BoardTarget):
+        raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
+    given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
+    noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)
+    middle = None if centre is None else centre.tolist()
+    planned = planned_target(target, sensor, middle, tuple(marks) or None)
+    return check_plan(planned, T_base_flange, T_flange_sensor, sensor, noise, config.limit_m)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -35,16 +35,6 @@ from robocal_ros.hand_eye.data import (
     data_set_begun,
 )
 from robocal_ros.hand_eye.session import HandEyeSession
-from robocal_ros.hand_eye.session_planning import (
-    judged_plan,
-    pose_of,
-    poses_of_flange,
-    poses_of_joints,
-    require_count,
-    require_near,
-    rough_mount,
-    sphere_centre,
-)
 from robocal_ros.hand_eye.targets import KIND_OF, read_target, target_document
 from robocal_ros.hand_eye.targets import KINDS as TARGET_FILE_KINDS
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -56,10 +46,6 @@ from robocal_ros.ros.endpoints import EndpointNode, trigger_text
 from robocal_ros.ros.parameters import given_pose
 from robocal_ros.ros.session_node import SessionEvents, answer, twin
 from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
-
-if TYPE_CHECKING:
-    from robocal_ros.hand_eye.planning import PlanReport
-
 
 Array = NDArray[np.float64]
 AddOutput = Callable[[type, str, QoSProfile], Any]
@@ -303,74 +289,6 @@ def _path(request: Any) -> Path:
         raise InputError(f"{error}: name the whole path", file=request.path) from error
 
 
-class HandEyePlan:
-    """``~/check_plan``.
-
-    Parameters
-    ----------
-    session : the one that runs.
-    """
-
-    def __init__(
-        self,
-        node: EndpointNode,
-        settings: Mapping[str, Any],
-        session: Callable[[], HandEyeSession],
-        history: CalibrationHistory,
-    ) -> None:
-        self._settings, self._session, self._history = settings, session, history
-        node.add_service(CheckHandEyePlan, "~/check_plan", self._check)
-
-    def _check(self, request: Any, response: Any) -> Any:
-        from robocal_ros.hand_eye.planning import SensorRange
-
-        session = self._session()
-        if (data := session.data) is None:
-            raise ConflictError("no data set is open: call start, so that the target is known")
-        poses = _poses(request, session)
-        near, far, width = (1e-3 * x for x in self._settings["sensor_range_mm"])
-        sensor = SensorRange(near, far, width, noise_m=self._settings["sensor_noise_mm"] * 1e-3)
-        given = [pose_of(*_parts(pose), "sensor") for pose in request.sensor]
-        configured = given_pose(self._settings, ROUGH)
-        mount, who = rough_mount(session, self._history, next(iter(given), None), configured)
-        if request.center:
-            centre: Array | None = require_near(_point(request.center[0]), "center")
-        else:
-            centre = sphere_centre(data, self._history, session.current.arm, mount)
-        config = session.config
-        found = judged_plan(data, poses, list(request.marks), mount, sensor, config, centre)
-        return _answered(response, found, who)
-
-
-def _poses(request: Any, session: HandEyeSession) -> Array:
-    require_count(len(request.joints), len(request.flange))
-    if len(request.joints):
-        return poses_of_joints(session.current.arm, [joint_sample(one) for one in request.joints])
-    position, quat = zip(*(_parts(pose) for pose in request.flange), strict=True)
-    return poses_of_flange(np.array(position), np.array(quat))
-
-
-def _parts(pose: Any) -> tuple[list[float], list[float]]:
-    o = pose.orientation
-    return _point(pose.position), [o.x, o.y, o.z, o.w]
-
-
-def _point(point: Any) -> list[float]:
-    return [point.x, point.y, point.z]
-
-
-def _answered(response: Any, found: "PlanReport", who: str) -> Any:
-    response.success, response.status = found.verdict.accept, int(found.verdict.code)
-    response.message = f"{found.verdict.reason} (the sensor's place is that of {who})"
-    response.rank, response.unknowns = found.rank, found.unknowns
-    error_m = found.working_error_m
-    response.expected_error_mm = -1.0 if error_m is None else error_m * 1e3
-    response.unobservable = list(found.unobservable)
-    response.unseen = [f"pose {i + 1}: {why}" for i, why in sorted(found.unseen.items())]
-    response.proposed = [pose_message(T) for T in found.proposed]
-    return response
-
-
 def start_arguments(
     settings: Mapping[str, Any],
     kind: str = "",
@@ -438,7 +356,7 @@ class HandEyeServices:
         add(Trigger, "~/remove_trigger", twin(ask, REMOVE, {"handle": 0}))
         add(CalibrateHandEye, "~/calibrate", self._calibrate)
         add(Trigger, "~/calibrate_trigger", twin(files.calibrate, CALIBRATE, {}))
-        HandEyePlan(node, settings, session, history)
+        add(CheckHandEyePlan, "~/check_plan", self._check_plan)
 
     async def _start(self, request: Any, response: Any) -> Any:
         kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
@@ -510,6 +428,46 @@ class HandEyeServices:
             because = document["rejected_because"]
             response.rejected = [f"{name}: {why}" for name, why in because.items()]
         return answer(response, outcome)
+
+    def _check_plan(self, request: Any, response: Any) -> Any:
+        from robocal_ros.hand_eye import planning  # here: a node's start does not need it
+
+        session, settings = self._session(), self._settings
+        if (data := session.data) is None:
+            raise ConflictError("no data set is open: call start, so that the target is known")
+        arm, joints = session.current.arm, [joint_sample(one) for one in request.joints]
+        poses = planning.planned_poses(arm, joints, [_parts(pose) for pose in request.flange])
+        near, far, width = (1e-3 * x for x in settings["sensor_range_mm"])
+        sensor = planning.SensorRange(near, far, width, noise_m=settings["sensor_noise_mm"] * 1e-3)
+        given = [planning.pose_of(*_parts(pose), "sensor") for pose in request.sensor]
+        mount, who = planning.rough_mount(
+            session, self._history, next(iter(given), None), given_pose(settings, ROUGH)
+        )
+        if request.center:
+            centre: Array | None = planning.require_near(_point(request.center[0]), "center")
+        else:
+            centre = planning.sphere_centre(data, self._history, arm, mount)
+        found = planning.judged_plan(
+            data, poses, list(request.marks), mount, sensor, session.config, centre
+        )
+        response.success, response.status = found.verdict.accept, int(found.verdict.code)
+        response.message = f"{found.verdict.reason} (the sensor's place is that of {who})"
+        response.rank, response.unknowns = found.rank, found.unknowns
+        error_m = found.working_error_m
+        response.expected_error_mm = -1.0 if error_m is None else error_m * 1e3
+        response.unobservable = list(found.unobservable)
+        response.unseen = [f"pose {i + 1}: {why}" for i, why in sorted(found.unseen.items())]
+        response.proposed = [pose_message(T) for T in found.proposed]
+        return response
+
+
+def _parts(pose: Any) -> tuple[list[float], list[float]]:
+    o = pose.orientation
+    return _point(pose.position), [o.x, o.y, o.z, o.w]
+
+
+def _point(point: Any) -> list[float]:
+    return [point.x, point.y, point.z]
 
 
 def _handle(outcome: Outcome) -> int:

@@ -28,9 +28,11 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.hand_eye.data import (
     FEATURES,
+    IMAGE,
     MOST_CAPTURES,
     MOST_HANDLE,
     MOUNTS,
+    SHOTS,
     TO_HAND,
     TOPIC_OF,
     WITHOUT_FILE,
@@ -38,11 +40,16 @@ from robocal_ros.hand_eye.data import (
     DataSet,
     HandEyeSample,
     PoseModels,
+    Profile,
+    Shot,
+    ShotLog,
     board_of,
     data_set_begun,
     data_set_of,
     flange_poses,
     seen_corners,
+    shot_of,
+    target_poses,
 )
 from robocal_ros.hand_eye.result import (
     METHODS,
@@ -51,7 +58,6 @@ from robocal_ros.hand_eye.result import (
     Method,
     hand_eye_document,
 )
-from robocal_ros.hand_eye.shots import IMAGE, SHOTS, Profile, Shot, ShotLog, shot_of, target_poses
 from robocal_ros.hand_eye.targets import target_of
 from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
@@ -173,8 +179,7 @@ def solved(
         return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
     from robocal_ros.estimation.edge import EdgeRule
     from robocal_ros.hand_eye.solve import solve_task
-    from robocal_ros.hand_eye.staircase import StepTask
-    from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
+    from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
 
     names = tuple(str(sample.handle) for sample in samples)
     shots = HandEyeData(
@@ -195,10 +200,14 @@ def _solved_camera(
     data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
 ) -> HandEyeResult:
     """From the corners of a board in images, or from poses of the target."""
-    from robocal_ros.hand_eye.board import board_pairs, boards_of_corners, intrinsics_document
     from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+    from robocal_ros.hand_eye.camera_data import (
+        PosePairs,
+        board_pairs,
+        boards_of_corners,
+        intrinsics_document,
+    )
     from robocal_ros.hand_eye.camera_fit import GivenNoise
-    from robocal_ros.hand_eye.camera_model import PosePairs
 
     names = tuple(str(sample.handle) for sample in samples)
     noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)

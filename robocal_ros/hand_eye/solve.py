@@ -18,6 +18,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Document
+from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.mount_fit import (
     MountFit,
     distances,
@@ -55,7 +56,6 @@ from robocal_ros.hand_eye.result import (
     judge_residuals,
     shots_of,
 )
-from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task
 
 Array = NDArray[np.float64]

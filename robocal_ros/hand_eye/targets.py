@@ -4,7 +4,7 @@ Files are YAML, in millimetres and degrees; the contract is written in docs/hand
 hand_eye_tracker.md and, of a board, hand_eye_node.md.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,14 +14,33 @@ import yaml
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import (
+    InputError,
+)
 from robocal_ros.ground.files import write_text
 from robocal_ros.ground.frames import Document, transform_document
-from robocal_ros.hand_eye.board import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics
-from robocal_ros.hand_eye.tracker_data import TrackerTarget
+from robocal_ros.hand_eye.camera_data import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics
 from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrackerTarget:
+    """Sizes of what is measured.
+
+    The sensor scans the sphere and the tracker measures its centre; the tracked ball (reflector)
+    touches the faces of the cube. ``height_m``: coordinate of the reflector on the flange, from
+    the flange's origin along the axis of the last turning joint of the arcs; needed where the
+    other joint slides.
+    """
+
+    sphere_radius_m: float
+    reflector_radius_m: float
+    height_m: float | None = None
+    height_sigma_m: float = 2e-5
+
+
 CornerKind = Literal["convex", "concave", "both"]
 FirstStep = Literal["lowest", "highest"]
 
@@ -66,6 +85,12 @@ class StepTarget:
     sigma_m: float = MACHINING_M
     user_sigma_m: float = 0.0
     user_sigma_rad: float = 0.0
+
+    def require_marks(self, marks: Iterable[str]) -> None:
+        """Raise `InputError`, naming the first of the marks that the target does not have."""
+        strange = next((mark for mark in marks if mark not in self.corners), None)
+        if strange is not None:
+            raise InputError(f"mark '{strange}' is not one of {', '.join(self.corners)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from robocal_ros.hand_eye.result import (
     judge_classic,
     point_covariance,
 )
+from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.hand_eye.tracker_data import (
     FACES,
     MOVED,
@@ -34,7 +35,6 @@ from robocal_ros.hand_eye.tracker_data import (
     Cube,
     TrackerData,
     TrackerNoise,
-    TrackerTarget,
     nominal_axis,
 )
 from robocal_ros.hand_eye.tracker_scan import (

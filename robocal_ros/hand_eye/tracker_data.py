@@ -18,7 +18,8 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.hand_eye.shots import Profile
+from robocal_ros.hand_eye.data import Profile
+from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
@@ -28,22 +29,6 @@ MOVED = 1e-3  # rad or m: a joint that changes by less stands still
 FEWEST_ARC_POINTS = 6
 FEWEST_FACE_POINTS = 4
 FEWEST_PROFILES = 8
-
-
-@dataclass(frozen=True)
-class TrackerTarget:
-    """Sizes of what is measured.
-
-    The sensor scans the sphere and the tracker measures its centre; the tracked ball (reflector)
-    touches the faces of the cube. ``height_m``: coordinate of the reflector on the flange, from
-    the flange's origin along the axis of the last turning joint of the arcs; needed where the
-    other joint slides.
-    """
-
-    sphere_radius_m: float
-    reflector_radius_m: float
-    height_m: float | None = None
-    height_sigma_m: float = 2e-5
 
 
 @dataclass(frozen=True)

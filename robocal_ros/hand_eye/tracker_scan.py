@@ -23,6 +23,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.hand_eye.mount_problem import tangents
+from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.hand_eye.tracker_data import (
     PARALLEL_FACES,
     Axis,
@@ -30,7 +31,6 @@ from robocal_ros.hand_eye.tracker_data import (
     Plane,
     TrackerData,
     TrackerNoise,
-    TrackerTarget,
     fit_axes,
     fit_plane,
     flange_pose,

@@ -15,7 +15,7 @@ from robocal_ros.cell_sim.laser_tracker import (
 )
 from robocal_ros.cell_sim.sensors import Ball, Scene
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.shots import Profile, profile_of
+from robocal_ros.hand_eye.data import Profile, profile_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 

@@ -12,26 +12,26 @@ from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
-from robocal_ros.hand_eye.camera_fit import (
-    Evidence,
-    GivenNoise,
-    PairNoise,
-    Parts,
-    estimate,
-    fit_pairs,
-)
-from robocal_ros.hand_eye.camera_kernels import weigh
-from robocal_ros.hand_eye.camera_model import (
+from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,
-    PairState,
     Placement,
     PosePairs,
     Shared,
     closed_form,
     closed_form_of_all,
+)
+from robocal_ros.hand_eye.camera_fit import (
+    Evidence,
+    GivenNoise,
+    PairNoise,
+    PairState,
+    Parts,
+    estimate,
+    fit_pairs,
     linearised,
     robust_start,
 )
+from robocal_ros.hand_eye.camera_kernels import weigh
 from robocal_ros.hand_eye.mount_problem import moved
 
 

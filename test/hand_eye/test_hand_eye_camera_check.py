@@ -8,7 +8,7 @@ from camera_pairs import MOUNTS, measured
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
-from robocal_ros.hand_eye.camera_model import closed_form
+from robocal_ros.hand_eye.camera_data import closed_form
 
 
 def test_classic_is_a_closed_form_alone() -> None:

@@ -9,17 +9,17 @@ from scipy.stats import chi2
 
 from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.hand_eye.board import (
+from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera_data import (
     Chessboard,
     Intrinsics,
+    PosePairs,
     boards_of_corners,
     decode_image,
     find_corners,
     see_boards,
 )
-from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
 from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
-from robocal_ros.hand_eye.camera_model import PosePairs
 
 
 def pixels(cell: BoardCell, count: int, seed: int, noise_px: float = 0.2):

@@ -16,8 +16,8 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera, left_out, unsettled
-from robocal_ros.hand_eye.camera_fit import fit_pairs
-from robocal_ros.hand_eye.camera_model import PairState, PosePairs, linearised
+from robocal_ros.hand_eye.camera_data import PosePairs
+from robocal_ros.hand_eye.camera_fit import PairState, fit_pairs, linearised
 
 
 def scaled(T: np.ndarray, factor: float) -> np.ndarray:

@@ -14,8 +14,8 @@ from hand_eye_driver import (
 from hand_eye_laser import SHOTS, STEP, begun, driver_of
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.hand_eye import shots as hand_eye_shots
-from robocal_ros.hand_eye.shots import MOST_BYTES, MOST_KEPT, Shot, ShotLog
+from robocal_ros.hand_eye import data as hand_eye_data
+from robocal_ros.hand_eye.data import MOST_BYTES, MOST_KEPT, Shot, ShotLog
 from robocal_ros.hand_eye.targets import target_document
 from robocal_ros.session import events
 
@@ -104,8 +104,8 @@ def test_a_shot_that_is_stamped_before_the_call_is_told_as_that(history):
 def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkeypatch):
     driver = begun(history)
     read = []
-    points = hand_eye_shots.cloud_points
-    monkeypatch.setattr(hand_eye_shots, "cloud_points", lambda m: read.append(m) or points(m))
+    points = hand_eye_data.cloud_points
+    monkeypatch.setattr(hand_eye_data, "cloud_points", lambda m: read.append(m) or points(m))
     driver.robot.rest(1.0, SHOTS[0][1])
     assert not read
     driver.ask(events.CAPTURE)

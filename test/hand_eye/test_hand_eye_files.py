@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.files import (
     PoseTable,
     exported,
@@ -23,7 +24,6 @@ from robocal_ros.hand_eye.files import (
     write_pose_table,
     write_profile,
 )
-from robocal_ros.hand_eye.shots import Profile
 from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LineTarget,

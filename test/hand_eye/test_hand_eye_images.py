@@ -22,11 +22,10 @@ from scipy.stats import chi2
 from robocal_ros.bags.bags import read_data_set, write_data_set
 from robocal_ros.bags.replay import replay
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.hand_eye import shots as hand_eye_shots
-from robocal_ros.hand_eye.data import data_set_begun, data_set_of
+from robocal_ros.hand_eye import data as hand_eye_data
+from robocal_ros.hand_eye.data import data_set_begun, data_set_of, shot_of
+from robocal_ros.hand_eye.planning import judged_plan
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession, take_hand_eye_message
-from robocal_ros.hand_eye.session_planning import judged_plan
-from robocal_ros.hand_eye.shots import shot_of
 from robocal_ros.hand_eye.targets import read_target, target_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
@@ -215,8 +214,8 @@ def test_colours_are_seen_as_grey(history, tmp_path):
 
 
 def test_images_take_bounded_memory(monkeypatch):
-    monkeypatch.setattr(hand_eye_shots, "MOST_BYTES", 3 * PLAIN.nbytes)
-    log = hand_eye_shots.ShotLog()
+    monkeypatch.setattr(hand_eye_data, "MOST_BYTES", 3 * PLAIN.nbytes)
+    log = hand_eye_data.ShotLog()
     for at_ns in range(1, 9):
         log.add(shot_of("image", namespace(image(at_ns, PLAIN).fields)), FRAME, 1)
     assert [shot.stamp_ns for shot in log.since("image", 0)] == [6, 7, 8]

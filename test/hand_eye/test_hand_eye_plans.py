@@ -17,24 +17,22 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.data import data_set_begun
-from robocal_ros.hand_eye.planning import SensorRange
-from robocal_ros.hand_eye.session import HandEyeConfig
-from robocal_ros.hand_eye.session_planning import (
+from robocal_ros.hand_eye.planning import (
     MOST_POSES,
+    SensorRange,
     judged_plan,
+    planned_poses,
     pose_of,
-    poses_of_flange,
-    poses_of_joints,
-    require_count,
     rough_mount,
     sphere_centre,
 )
+from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.session import events
 
 TRUTH = sphere_set()[0].T_flange_sensor
 GIVEN = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] + 2e-3)
 CONFIGURED = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] - 2e-3)
-QUAT = np.array([[0.0, 0.0, 0.0, 1.0]])
+QUAT = [0.0, 0.0, 0.0, 1.0]
 
 
 def test_the_request_wins_over_what_is_in_force_and_that_over_candidates(history):
@@ -116,14 +114,15 @@ def test_a_plan_takes_the_noise_that_calibrate_takes(history):
 
 def test_other_units_are_named():
     q = np.array([-30.0, -100.0, -110.0, -60.0, 90.0, 20.0])
+    joints = [JointSample(0, ARM.joint_names, x) for x in (np.radians(q), q)]
     with pytest.raises(InputError, match=r"planned pose 2: joint .* is at -110 rad: degrees"):
-        poses_of_joints(ARM, [JointSample(0, ARM.joint_names, x) for x in (np.radians(q), q)])
+        planned_poses(ARM, joints, [])
     with pytest.raises(InputError, match=r"flange pose 1 is 943.* m away: .*thousand.*mm where m"):
-        poses_of_flange(np.array([[800.0, 0.0, 500.0]]), QUAT)
+        planned_poses(ARM, [], [([800.0, 0.0, 500.0], QUAT)])
     with pytest.raises(InputError, match=r"planned pose 1: .*a thousand times too near"):
-        poses_of_flange(np.array([[8e-4, 0.0, 5e-4]]), QUAT)
+        planned_poses(ARM, [], [([8e-4, 0.0, 5e-4], QUAT)])
     with pytest.raises(InputError, match=r"sensor is 90 m away: .*mm where m are expected"):
-        pose_of([0.0, 0.0, 90.0], QUAT[0], "sensor")
+        pose_of([0.0, 0.0, 90.0], QUAT, "sensor")
 
 
 def test_what_is_no_pose_is_refused():
@@ -131,16 +130,18 @@ def test_what_is_no_pose_is_refused():
         with pytest.raises(InputError, match="quaternion has length"):
             pose_of([0.5, 0.0, 0.5], quat, "flange pose 1")
     with pytest.raises(InputError, match="its position is"):
-        pose_of([np.inf, 0.0, 0.5], QUAT[0], "flange pose 1")
+        pose_of([np.inf, 0.0, 0.5], QUAT, "flange pose 1")
 
 
 def test_as_many_poses_as_can_be_judged():
-    for joints, flange in ((0, 0), (1, 1)):
+    joints = JointSample(0, ARM.joint_names, np.zeros(ARM.n))
+    pose = [0.5, 0.0, 0.5], QUAT
+    for both in (([], []), ([joints], [pose])):
         with pytest.raises(InputError, match="in one of the two ways"):
-            require_count(joints, flange)
-    require_count(MOST_POSES, 0)
+            planned_poses(ARM, *both)
+    assert planned_poses(ARM, [joints] * MOST_POSES, []).shape == (MOST_POSES, 4, 4)
     with pytest.raises(LimitError, match=f"at most {MOST_POSES}"):
-        require_count(0, MOST_POSES + 1)
+        planned_poses(ARM, [], [pose] * (MOST_POSES + 1))
 
 
 WIDE = SensorRange(0.17, 0.26, 0.1)

@@ -39,17 +39,16 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
+from robocal_ros.hand_eye.data import profile_of
 from robocal_ros.hand_eye.result import HandEyeSettings, hand_eye_document, point_covariance
-from robocal_ros.hand_eye.shots import profile_of
 from robocal_ros.hand_eye.solve import (
     held_out,
     solve_joint,
     solve_task,
     verify,
 )
-from robocal_ros.hand_eye.staircase import StepTask
 from robocal_ros.hand_eye.targets import SphereTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor

@@ -17,8 +17,8 @@ from hand_eye_driver import (
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import StandstillRule
+from robocal_ros.hand_eye.data import StandingShot, Standstills, captured_marks, first_of_each
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
-from robocal_ros.hand_eye.shots import StandingShot, Standstills, captured_marks, first_of_each
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
 from robocal_ros.session.events import Command

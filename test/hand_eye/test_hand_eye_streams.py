@@ -11,16 +11,9 @@ from scipy.stats import chi2
 from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
-from robocal_ros.hand_eye.camera import CameraSettings
+from robocal_ros.hand_eye.camera import CameraSettings, calibrate_streams, pair_streams
+from robocal_ros.hand_eye.camera_data import PoseStream, coarse_offset, pairs_at, stream_of
 from robocal_ros.hand_eye.camera_fit import GivenNoise, correlation
-from robocal_ros.hand_eye.streams import (
-    PoseStream,
-    calibrate_streams,
-    coarse_offset,
-    pair_streams,
-    pairs_at,
-    stream_of,
-)
 
 MOUNTS = ("in-hand", "to-hand")
 NOISE = BoardNoise(1e-4, 2e-4, (4e-4, 4e-4, 4e-4), (1e-3, 1e-3, 1e-3))

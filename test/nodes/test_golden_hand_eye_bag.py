@@ -13,8 +13,8 @@ from robocal_msgs.msg import SessionEvent
 
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.data import PROFILE
 from robocal_ros.hand_eye.node import HandEyeNode
-from robocal_ros.hand_eye.shots import PROFILE
 from robocal_ros.ros.session_node import EVENTS
 from robocal_ros.session.events import (
     ACCEPT,

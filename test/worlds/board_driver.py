@@ -19,7 +19,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     true_pose,
 )
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.hand_eye.shots import IMAGE
+from robocal_ros.hand_eye.data import IMAGE
 
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
 LENS = TrueLens()

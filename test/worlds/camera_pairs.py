@@ -5,9 +5,8 @@ from scipy.stats import chi2
 
 from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.board import Chessboard
+from robocal_ros.hand_eye.camera_data import Chessboard, PosePairs
 from robocal_ros.hand_eye.camera_fit import GivenNoise
-from robocal_ros.hand_eye.camera_model import PosePairs
 
 MOUNTS = ("in-hand", "to-hand")
 EXACT = BoardNoise(0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

@@ -16,8 +16,8 @@ from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
-from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.hand_eye.targets import SphereTarget, target_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
