@@ -16,7 +16,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from robocal_ros.correction.interface import Reason
-from robocal_ros.correction.wire import joint_names
+from robocal_ros.correction.messages import joint_names
 from robocal_ros.ros.graph import KILLED, clients, own_endpoint, publishers, strangers
 
 LEASE_S = 1.0  # a lease that was not renewed for so long is lost: its holder died, or hangs

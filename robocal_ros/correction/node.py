@@ -31,10 +31,15 @@ from robocal_ros.correction.interface import (
     offered_model,
     offered_tool,
 )
-from robocal_ros.correction.messages import ArrayMessage, JointMessage, PathMessage, tail_message
+from robocal_ros.correction.messages import (
+    ArrayMessage,
+    JointMessage,
+    JointWire,
+    PathMessage,
+    tail_message,
+)
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
-from robocal_ros.correction.robot_state import SentPath
-from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
+from robocal_ros.correction.robot_state import RobotTrack, SentPath
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
@@ -43,7 +48,7 @@ from robocal_ros.correction.settings import (
     joint_limits,
     session_config,
 )
-from robocal_ros.correction.wire import JointWire
+from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, on_its_path
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.driver import StatedController

@@ -14,7 +14,7 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from robocal_ros.correction import joint_correction, limiter, wire
+from robocal_ros.correction import joint_correction, limiter
 from robocal_ros.correction.bounds import CorrectionConfig, CorrectionGate, DesiredOffset
 from robocal_ros.correction.interface import (
     Array,
@@ -41,6 +41,7 @@ from robocal_ros.correction.robot_state import Output, RobotState, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
+from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.kinematics import SerialArm
 
 Answer = TypeVar("Answer")
@@ -510,7 +511,6 @@ def load_kernels(arm: SerialArm) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
     joint_correction.load_kernels(arm)
     limiter.load_kernels(arm.n)
-    wire.load_kernels()
     config, q, ones = CorrectionConfig(), np.zeros(arm.n), np.ones(arm.n)
     desired, speeds = DesiredOffset(arm, config), np.ones((2, arm.n))
     desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)
@@ -518,3 +518,7 @@ def load_kernels(arm: SerialArm) -> None:
     desired.put_out(q, q, (0.004, 0.004), offsets, ones, speeds)
     state = RobotState(arm, config.joint_state_age_s, config.start_near(arm))
     state.require_positions(arm.joint_names, np.arange(arm.n), q[None])
+    doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
+    point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
+    gather_rows(doubles, places[:, 0], np.empty((1, 1)))
+    scatter_rows(np.empty((1, 1)), places[:, 0], doubles)

@@ -1,9 +1,15 @@
-"""Whole trajectories, corrected along their time: one offset function from where the robot is."""
+"""Whole trajectories, corrected along their time, and stops of what moves.
 
+A controller has no order for "stop": one that is sent nothing, or a trajectory without points, goes
+on to where it was sent, and the cancel of a goal is a dead stop from any speed. What stops it
+smoothly is a motion from where it is to rest, some tenths of a second ahead.
+"""
+
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset, require_limits
 from robocal_ros.correction.interface import (
@@ -28,8 +34,12 @@ from robocal_ros.correction.limiter import (
     STILL,
 )
 from robocal_ros.correction.robot_state import (
+    DECELERATION,
+    LAG_S,
+    STANDING_S,
     Output,
     RobotState,
+    RobotTrack,
     SentPath,
     hold_speeds,
     spline,
@@ -37,6 +47,7 @@ from robocal_ros.correction.robot_state import (
 )
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits, stop
 
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
 SPLINE_PEAK = 1.875
@@ -45,7 +56,7 @@ LONGEST_WAIT_S = 60.0  # for which it is worked out how long an offset takes
 TRIES = 12
 LOOKED_AT = 33  # speeds of a spline, from point to point
 STOP_SPACING_S = 0.025  # of the points of a stop
-SHORTEST_STOP_S = 0.1
+SHORTEST_SLOWDOWN_S = 0.1
 OWN = 1.25  # of a path's own accelerations, where they are larger than the limits: a stop's
 
 
@@ -318,8 +329,8 @@ class TrajectoryCorrector:
         """
         limits = self._config.acceleration_limits[path.index]
         here = _motion(path, np.array([begin_s]), rate)[1][0]
-        least = max(float(np.max(np.abs(here) / limits)), SHORTEST_STOP_S)
-        spans = np.maximum(least * np.geomspace(0.25, 4.0, 33), SHORTEST_STOP_S)
+        least = max(float(np.max(np.abs(here) / limits)), SHORTEST_SLOWDOWN_S)
+        spans = np.maximum(least * np.geomspace(0.25, 4.0, 33), SHORTEST_SLOWDOWN_S)
         spans = np.minimum(spans, 2.0 * left)
         c = np.linspace(0.0, 0.5 * spans[-1], 101)
         speed = _motion(path, begin_s + c / rate, rate)[1]
@@ -436,3 +447,147 @@ def _speeds(q: Array, times: Array) -> Array:
     soon = np.searchsorted(times, times[1:-1] + LONGEST_STEP_S).clip(max=len(times) - 1)
     speed[1:-1] = np.maximum(speed[1:-1], speed[soon])
     return speed
+
+
+SEEN = 0.08  # of the fastest speed: a planned loss of so much must show, at least by half
+SLOW = 1e-3  # rad/s (m/s); a robot that was held, and moves faster, does not obey
+GIVE_UP_S = 5.0  # a robot that still moves then is stopped by a person
+PAUSED_S = 0.25  # so often a robot that pauses is sent its stop: what is lost shows when it goes on
+AHEAD_S = 0.06  # where the controller is by then a stop on its path begins to slow down
+SPACING_S = 0.01  # of the points until then
+
+
+class RobotStop:
+    """A stop under way, from `begin` until the robot stands.
+
+    Parameters
+    ----------
+    acceleration, velocity : (n,) largest, rad/s^2, rad/s (prismatic: m/s^2 ...); NaN or infinite
+        where none is known.
+    send : puts a plan out, which goes on for `REACTION_S` from now.
+    reference : joints and unscaled velocities (n,) where the controller is; None: not known.
+
+    Attributes
+    ----------
+    why : of the stop under way; empty when none is.
+    fault : why the robot did not stop; empty when it did.
+    sent : how often the stop was sent.
+    """
+
+    def __init__(
+        self,
+        arm: SerialArm,
+        acceleration: Array,
+        track: RobotTrack,
+        send: Callable[[JointPlan], None],
+        velocity: ArrayLike = np.inf,
+        reference: Callable[[float], tuple[Array, Array] | None] = lambda now_s: None,
+    ) -> None:
+        assumed = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
+        known = np.isfinite(acceleration) & (acceleration > 0.0)
+        self._limits = MotionLimits(stop_deceleration=np.where(known, acceleration, assumed))
+        self._fastest = np.where(np.isnan(velocity), np.inf, velocity)
+        self._arm, self._track, self._send, self._reference = arm, track, send, reference
+        self._began_s = self._first_s = self._sent_s = 0.0
+        self._paused_s = -np.inf  # when the controller's clock was last seen to stand
+        self._times = self._speeds = np.zeros(1)
+        self.why = self.fault = ""
+        self.sent = 0
+
+    def begin(self, why: str, now_s: float, scaling: float = 1.0) -> bool:
+        """Send a stop; False, with the fault, where the robot's place is not known."""
+        if not self.why:
+            self._began_s = self._first_s = now_s
+            self.sent = 0
+        self.why = why
+        if self._again(now_s, scaling):
+            self.fault = ""
+            return True
+        self.why = ""
+        self.fault = f"{why}: no stop can be planned, the joint states are missing or too old"
+        return False
+
+    def forget(self) -> None:
+        """Another motion has been sent."""
+        self.why = ""
+
+    def watch(self, why: str, times: Array, speeds: Array, now_s: float) -> None:
+        """Watch a stop that was sent by others, and send one of its own where it is not obeyed.
+
+        ``times``, ``speeds``: (m,) of its points from now on, of the fastest joint.
+        """
+        here = self._track.here(now_s)
+        measured = 0.0 if here is None else float(np.max(np.abs(here[1])))
+        self._began_s = self._first_s = self._sent_s = now_s
+        self._times = np.append(0.0, times * max(SHORTEST_STOP_S / times[-1], 1.0))
+        self._speeds, self.sent = np.append(measured, speeds), 1
+        self.why, self.fault = why, ""
+
+    def look(self, now_s: float, scaling: float = 1.0, held_s: float = -np.inf) -> bool:
+        """Whether a stop is under way; sent again where the robot does not obey.
+
+        ``scaling``: how fast the controller's clock runs, 0 to 1. While it pauses a robot stands
+        whatever it was sent last: the stop goes out again and again, and is not over before the
+        robot has stood with a clock that runs, or the controller was seen, at ``held_s``, to hold
+        in place of a motion.
+        """
+        if not self.why:
+            return False
+        stands = self._track.stands(now_s)
+        if scaling == 0.0:
+            self._began_s = self._paused_s = now_s
+            if now_s - self._sent_s > STANDING_S and held_s > self._first_s and stands:
+                self.why = ""
+            elif now_s - self._sent_s >= PAUSED_S:
+                self._again(now_s, scaling)
+            return bool(self.why)
+        since_s = now_s - self._sent_s
+        if now_s - max(self._sent_s, self._paused_s) > STANDING_S and stands:
+            self.why = ""
+            return False
+        if now_s - self._began_s > GIVE_UP_S / max(scaling, 0.1):
+            self.fault = f"{self.why}: the robot still moves, stop it by hand"
+            self.why = ""
+            return False
+        here = self._track.here(now_s)
+        planned = float(np.interp((since_s - LAG_S) * scaling, self._times, self._speeds))
+        fastest = max(float(np.max(self._speeds)), SLOW)
+        if here is not None and since_s > LAG_S and planned < (1.0 - SEEN) * fastest:
+            speed = float(np.max(np.abs(here[1])))
+            if speed > 0.5 * (fastest + planned) and not stands:
+                self._again(now_s, scaling)
+        return True
+
+    def _again(self, now_s: float, scaling: float) -> bool:
+        state = self._state(now_s)
+        if state is None:
+            return False
+        q, qd = state
+        qd = np.clip(qd, -self._fastest, self._fastest) if scaling > 0.0 else 0.0 * qd
+        plan = stop(self._arm, self._limits, q, qd)
+        self._times, self._speeds = plan.time_s, np.abs(plan.qd).max(axis=1)
+        self._sent_s = now_s
+        self.sent += 1
+        self._send(plan.going_on(REACTION_S))
+        return True
+
+    def _state(self, now_s: float) -> tuple[Array, Array] | None:
+        """Joints and speeds (n,) to stop from: the controller's, where the robot follows it."""
+        here, told = self._track.here(now_s), self._reference(now_s)
+        if here is None or told is None:
+            return here
+        return told if self._track.behind(told, here) else here
+
+
+def on_its_path(path: SentPath, planned: TrajectoryCommand, now_s: float) -> JointPlan:
+    """A stop ``planned`` on a path, with its way since `AHEAD_S` before now: so far it is now."""
+    at_s = now_s + np.arange(-AHEAD_S, AHEAD_S - 1e-9, SPACING_S)
+    h = 1e-4
+    before, q, after = (np.array([path.place(at + d) for at in at_s]) for d in (-h, 0.0, h))
+    assert planned.velocity is not None
+    return JointPlan(
+        np.concatenate([at_s - at_s[0], AHEAD_S + planned.time_from_start_s]),
+        np.concatenate([q, planned.position]),
+        np.concatenate([(after - before) / (2.0 * h), planned.velocity]),
+        np.zeros((len(at_s) + len(planned.position), q.shape[1])),
+    )

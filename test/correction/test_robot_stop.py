@@ -5,15 +5,14 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.interface import JointCommand
-from robocal_ros.correction.robot_state import SentPath
-from robocal_ros.correction.robot_stop import (
+from robocal_ros.correction.robot_state import (
     LAG_S,
-    PAUSED_S,
-    TRACK_S,
+    STANDING_S,
     VELOCITY_S,
-    RobotStop,
     RobotTrack,
+    SentPath,
 )
+from robocal_ros.correction.trajectories import PAUSED_S, RobotStop
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan
 
@@ -230,7 +229,7 @@ def test_a_stop_that_is_lost_in_a_pause_is_sent_until_the_robot_stands_by_itself
     went_on_s = robot.now_s
     while robot.stop.look(robot.now_s):
         robot.cycle()
-    assert robot.now_s - went_on_s > TRACK_S
+    assert robot.now_s - went_on_s > STANDING_S
     assert not robot.stop.fault
     # Held in the pause it stays. Where each message was lost its motion goes on, is seen to within
     # the time that readings take to tell a speed, and slows down as any stop that was lost once.

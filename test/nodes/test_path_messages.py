@@ -13,8 +13,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.correction.interface import Reason, RefusedError, trajectory_command
-from robocal_ros.correction.messages import PathMessage
-from robocal_ros.correction.wire import read_path
+from robocal_ros.correction.messages import PathMessage, read_path
 
 FIELDS = ("positions", "velocities", "accelerations", "effort")
 

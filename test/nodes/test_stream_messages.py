@@ -13,8 +13,7 @@ from std_msgs.msg import Float64MultiArray, Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.correction.interface import Reason, RefusedError
-from robocal_ros.correction.messages import ArrayMessage, JointMessage, PathMessage
-from robocal_ros.correction.wire import JointWire
+from robocal_ros.correction.messages import ArrayMessage, JointMessage, JointWire, PathMessage
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import CORRECTED
 

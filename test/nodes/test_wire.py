@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from robocal_ros.correction.interface import JointCommand, finite_command
-from robocal_ros.correction.wire import JointWire
+from robocal_ros.correction.messages import JointWire
 
 NAMES = (("a", "b"), ("joint_a1", "joint_a2", "x"), ("only",))
 FRAMES = ("", "base", "base_link", "world_of_robots", "grüße")
