@@ -103,14 +103,9 @@ SETTINGS = (
     STATE_DIR,
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
     Setting(
-        "thermal_tcp_mm",
-        1.0,
-        "Largest correction of the arm's drift at the tool",
-        unit="mm",
-        low=0.0,
-        high=20.0,
+        "thermal_tcp_mm", 1.0, "Largest correction of the arm's drift at the tool", "mm", 0.0, 20.0
     ),
-    Setting("thermal_tcp_deg", 0.1, "and in orientation", unit="deg", low=0.0, high=5.0),
+    Setting("thermal_tcp_deg", 0.1, "and in orientation", "deg", 0.0, 5.0),
     Setting(
         "thermal_joint_deg",
         0.3,
@@ -120,14 +115,9 @@ SETTINGS = (
         high=5.0,
     ),
     Setting(
-        "tool_tcp_mm",
-        10.0,
-        "Largest change of the tool that is made up for",
-        unit="mm",
-        low=0.0,
-        high=100.0,
+        "tool_tcp_mm", 10.0, "Largest change of the tool that is made up for", "mm", 0.0, 100.0
     ),
-    Setting("tool_tcp_deg", 4.0, "and in orientation", unit="deg", low=0.0, high=30.0),
+    Setting("tool_tcp_deg", 4.0, "and in orientation", "deg", 0.0, 30.0),
     Setting(
         "tool_joint_deg",
         5.0,
@@ -145,7 +135,7 @@ SETTINGS = (
         low=0.01,
         high=2.0,
     ),
-    Setting("offset_mm_s", 5.0, "and to a sliding joint", unit="mm/s", low=0.01, high=5.0),
+    Setting("offset_mm_s", 5.0, "and to a sliding joint", "mm/s", 0.01, 5.0),
     Setting(
         "stream_gap_s",
         0.1,
@@ -163,7 +153,7 @@ SETTINGS = (
         low=0.001,
         high=0.5,
     ),
-    Setting("start_mm", 0.05, "and a sliding joint", unit="mm", low=0.001, high=1.0),
+    Setting("start_mm", 0.05, "and a sliding joint", "mm", 0.001, 1.0),
     Setting(
         "joint_state_age_s",
         0.2,

@@ -44,10 +44,10 @@ from robocal_ros.hand_eye.tasks import (
     SphereTask,
     StepTask,
 )
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import CalibrationState
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
-from robocal_ros.session.events import History
 
 Array = NDArray[np.float64]
 
@@ -603,7 +603,10 @@ def require_near(place: ArrayLike, name: str) -> Array:
 
 
 def rough_mount(
-    session: HandEyeSession, history: History, given: Array | None, configured: Array | None
+    session: HandEyeSession,
+    history: CalibrationHistory,
+    given: Array | None,
+    configured: Array | None,
 ) -> tuple[Array, str]:
     """About where the sensor sits on the flange (4, 4), and who says so.
 
@@ -629,14 +632,14 @@ def rough_mount(
     )
 
 
-def _candidate(data: DataSet | None, history: History) -> int:
+def _candidate(data: DataSet | None, history: CalibrationHistory) -> int:
     """The last calibration of a data set that can be gone by; 0 without."""
     number = 0 if data is None else data.candidate
     return number if number and history.get(number).state in TO_GO_BY else 0
 
 
 def sphere_centre(
-    data: DataSet, history: History, arm: SerialArm, T_flange_sensor: Array
+    data: DataSet, history: CalibrationHistory, arm: SerialArm, T_flange_sensor: Array
 ) -> Array | None:
     """Where the sphere was last found (3,), base; None where neither result nor samples tell."""
     target = target_of(data.target)

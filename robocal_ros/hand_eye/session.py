@@ -59,6 +59,7 @@ from robocal_ros.hand_eye.result import (
     hand_eye_document,
 )
 from robocal_ros.hand_eye.targets import target_of
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
@@ -70,7 +71,7 @@ from robocal_ros.session.base import (
     configured_with,
     recorded_arguments,
 )
-from robocal_ros.session.events import Command, History, Outcome, seeded
+from robocal_ros.session.events import Command, Outcome, seeded
 
 Array = NDArray[np.float64]
 Samples = Sequence[HandEyeSample]
@@ -126,7 +127,7 @@ class HandEyeInForce(HistoryFollower):
     head, thermal : heads of this sensor's calibrations and of the thermal models.
     """
 
-    def __init__(self, history: History, nominal: SerialArm, sensor_frame: str) -> None:
+    def __init__(self, history: CalibrationHistory, nominal: SerialArm, sensor_frame: str) -> None:
         self._nominal = nominal
         super().__init__(history, hand_eye_kind(sensor_frame))
 
@@ -240,7 +241,7 @@ class HandEyeSession(SessionBase):
     """
 
     def __init__(
-        self, nominal: SerialArm, history: History, config: HandEyeConfig, software: str
+        self, nominal: SerialArm, history: CalibrationHistory, config: HandEyeConfig, software: str
     ) -> None:
         self.config = config
         self.current = HandEyeInForce(history, nominal, config.sensor_frame)
@@ -556,7 +557,7 @@ def is_hand_eye_session(configured: Command | None) -> bool:
 
 
 def hand_eye_session_as_recorded(
-    nominal: SerialArm, history: History, configured: Command, software: str
+    nominal: SerialArm, history: CalibrationHistory, configured: Command, software: str
 ) -> HandEyeSession:
     """Make a session with the recorded settings; an empty history gets what was in force.
 

@@ -14,6 +14,7 @@ from robocal_ros.ground.errors import (
     StaleError,
     StorageError,
 )
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     REFERENCE,
     THERMAL,
@@ -35,7 +36,6 @@ from robocal_ros.session.events import (
     ROLLBACK,
     WITHHOLD,
     Command,
-    History,
     Outcome,
     decide,
     measured_with,
@@ -60,7 +60,9 @@ DONE = {  # what a repeated decision finds
 class Decider:
     """Accepts, rejects and rolls back in the history that the other nodes follow."""
 
-    def __init__(self, nominal: SerialArm, history: History, config: MaintenanceConfig) -> None:
+    def __init__(
+        self, nominal: SerialArm, history: CalibrationHistory, config: MaintenanceConfig
+    ) -> None:
         self._nominal, self._history, self._config = nominal, history, config
 
     def _waiting(self, kind: str) -> list[Entry]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.correction.interface import ToldCorrection
 from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import Drift, MaintenanceConfig, NodeReports, accuracy_of
@@ -30,7 +31,7 @@ from robocal_ros.maintenance.robot_interface import (
     DriverRequest,
     Script,
 )
-from robocal_ros.session.events import Command, History, Outcome
+from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import Accuracy
 from robocal_ros.tool.session import FULL, QUICK
 
@@ -250,7 +251,7 @@ class MaintenanceSession:
     def __init__(
         self,
         nominal: SerialArm,
-        history: History,
+        history: CalibrationHistory,
         config: MaintenanceConfig,
         keeper: DocumentStore,
         record: Callable[[Command, Outcome], None] = lambda command, outcome: None,

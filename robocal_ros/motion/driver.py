@@ -198,14 +198,14 @@ GOAL_TIME_S = 12  # the nodes wait less for a robot that does not come to rest w
 
 def _of_joints(name: str, default: float, what: str, unit: str) -> Setting:
     words = f"{what}; one for all joints or one for each"
-    return Setting(name, [default], words, unit=unit, low=1e-3, high=1e4)
+    return Setting(name, [default], words, unit, 1e-3, 1e4)
 
 
 MOTION = (
     _of_joints("joint_velocity_deg_s", 57.0, "Largest velocity", "deg/s"),
     _of_joints("joint_acceleration_deg_s2", 286.0, "Largest acceleration", "deg/s^2"),
     _of_joints("stop_deceleration_deg_s2", 573.0, "Deceleration of a stop", "deg/s^2"),
-    Setting("tcp_speed_mm_s", 50.0, "Largest speed of the tip", unit="mm/s", low=1.0, high=250.0),
+    Setting("tcp_speed_mm_s", 50.0, "Largest speed of the tip", "mm/s", 1.0, 250.0),
     Setting(
         "tcp_acceleration_mm_s2",
         1200.0,
@@ -240,12 +240,7 @@ MOTION = (
         high=0.5,
     ),
     Setting(
-        "motion_late_s",
-        0.15,
-        "The robot lags at most so far behind its trajectory",
-        unit="s",
-        low=0.01,
-        high=1.0,
+        "motion_late_s", 0.15, "The robot lags at most so far behind its trajectory", "s", 0.01, 1.0
     ),
 )
 

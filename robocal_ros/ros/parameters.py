@@ -136,7 +136,7 @@ def _typed(value: object, like: Value) -> Value | None:
 
 def length(name: str, default: float, what: str, low: float, high: float) -> Setting:
     """A length in mm."""
-    return Setting(name, default, what, unit="mm", low=low, high=high)
+    return Setting(name, default, what, "mm", low, high)
 
 
 class ParameterTable:
@@ -232,15 +232,7 @@ def count_fault(length: int) -> Callable[[list[float]], str | None]:
 def pose_settings(name: str, place: str, turn: str) -> tuple[Setting, Setting]:
     """``<name>_xyz_mm`` and ``<name>_quat_xyzw`` with their descriptions."""
     return (
-        Setting(
-            f"{name}_xyz_mm",
-            ORIGIN,
-            place,
-            unit="mm",
-            low=-5000.0,
-            high=5000.0,
-            check=count_fault(3),
-        ),
+        Setting(f"{name}_xyz_mm", ORIGIN, place, "mm", -5000.0, 5000.0, check=count_fault(3)),
         Setting(f"{name}_quat_xyzw", UNTURNED, turn, low=-1.0, high=1.0, check=count_fault(4)),
     )
 
@@ -271,7 +263,7 @@ STANDSTILL = (
         low=0.0,
         high=10.0,
     ),
-    Setting("standstill_after_s", 0.1, "and so long after it", unit="s", low=0.0, high=10.0),
+    Setting("standstill_after_s", 0.1, "and so long after it", "s", 0.0, 10.0),
     Setting(
         "standstill_tolerance_deg",
         0.02,

@@ -9,6 +9,7 @@ from typing import Any
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample, JointStream
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, Decision, Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
@@ -16,7 +17,6 @@ from robocal_ros.session.events import (
     BY,
     CONFIGURE,
     Command,
-    History,
     Outcome,
     bring_into_force,
     decide,
@@ -35,7 +35,7 @@ class HistoryFollower:
     when it could.
     """
 
-    def __init__(self, history: History, kind: str) -> None:
+    def __init__(self, history: CalibrationHistory, kind: str) -> None:
         self._history, self._kind = history, kind
         self._version = history.data_version()
         decided = history.decisions(newest=1)
@@ -124,7 +124,7 @@ class SessionBase:
     """
 
     def __init__(
-        self, nominal: SerialArm, history: History, kind: str, current: HistoryFollower
+        self, nominal: SerialArm, history: CalibrationHistory, kind: str, current: HistoryFollower
     ) -> None:
         self.nominal, self._history, self._kind = nominal, history, kind
         self._followed = current

@@ -5,21 +5,19 @@ Decisions about calibrations are commands to the history.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
-
-from numpy.typing import NDArray
+from typing import Any
 
 from robocal_ros.ground.errors import Code, InputError, RobocalError, WrongRobotError
 from robocal_ros.ground.samples import JOINTS, JUMPS
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     BEFORE_ANY,
     THERMAL,
     TOOL,
     Decision,
     Entry,
-    Head,
     Proposal,
 )
 from robocal_ros.kinematics import SerialArm
@@ -172,69 +170,6 @@ def read_command(name: str, stamp_ns: int, arguments: str) -> Command:
         raise InputError(f"session event '{name}' cannot be read: {error}") from error
 
 
-class History(Protocol):
-    """The part of ``history.calibrations.CalibrationHistory`` that sessions use."""
-
-    serial: str
-
-    def propose(self, proposal: Proposal) -> int:
-        """Keep a candidate and return its id."""
-
-    def accept(
-        self,
-        calibration_id: int,
-        *,
-        by: str,
-        reason: str,
-        expected_head: int | None,
-        wall_ns: int,
-        with_heads: Mapping[str, int] | None = ...,
-    ) -> Head:
-        """Bring a candidate into force; ``with_heads``: only beside these revisions, by kind."""
-
-    def reject(self, calibration_id: int, *, by: str, reason: str, wall_ns: int) -> None:
-        """Refuse a candidate for good."""
-
-    def rollback(
-        self,
-        to: int | None,
-        *,
-        by: str,
-        reason: str,
-        expected_head: int | None,
-        wall_ns: int,
-        kind: str = ...,
-    ) -> Head:
-        """Return to an earlier calibration, or to nominal."""
-
-    def head(self, kind: str = ...) -> Head:
-        """What is in force."""
-
-    def pending(self, kind: str = ..., limit: int = ...) -> Sequence[Entry]:
-        """Candidates that wait for a decision, newest first; ``limit``: so many at the most."""
-
-    def decisions(self, after_seq: int = ..., newest: int = ...) -> Sequence[Decision]:
-        """Decisions after a sequence number, oldest first; ``newest``: so many at the most."""
-
-    def list(self, limit: int = ...) -> Sequence[Entry]:
-        """The latest calibrations, newest first."""
-
-    def get(self, calibration_id: int) -> Entry:
-        """A calibration by its id."""
-
-    def model(self, calibration_id: int) -> dict[str, Any]:
-        """A calibration's model in full precision."""
-
-    def document(self, calibration_id: int) -> dict[str, Any]:
-        """A calibration's JSON document."""
-
-    def inputs(self, calibration_id: int) -> dict[str, NDArray[Any]]:
-        """The arrays that a calibration was solved from."""
-
-    def data_version(self) -> Any:
-        """A value that changes when the history does."""
-
-
 BY = "replay"
 
 
@@ -258,7 +193,7 @@ def require_robot(nominal: SerialArm, configured: Command) -> None:
 
 
 def seeded(
-    history: History,
+    history: CalibrationHistory,
     nominal: SerialArm,
     in_force: Mapping[str, Mapping[str, Any] | None],
     software: str,
@@ -276,7 +211,7 @@ def seeded(
 
 
 def bring_into_force(
-    history: History,
+    history: CalibrationHistory,
     kind: str,
     nominal: SerialArm,
     model: Mapping[str, Any] | None,
@@ -310,7 +245,7 @@ ONLY, NEWEST = "only", "newest"  # which pending candidate a command without an 
 
 
 def decide(
-    history: History, command: Command, expected: int, wall_ns: int, kind: str = THERMAL
+    history: CalibrationHistory, command: Command, expected: int, wall_ns: int, kind: str = THERMAL
 ) -> Outcome:
     """Accept, reject or roll back a calibration of a kind whose revision in force is ``expected``.
 
@@ -360,7 +295,7 @@ def decide(
     return Outcome(command, Code.ACCEPT, message, None, chosen, head.revision)
 
 
-def measured_with(history: History, entry: Entry) -> dict[str, int]:
+def measured_with(history: CalibrationHistory, entry: Entry) -> dict[str, int]:
     """Revisions, by kind, beside which alone a calibration may come into force.
 
     A tool's flange poses came from a thermal model: with another one, what the drift did to the
@@ -371,7 +306,7 @@ def measured_with(history: History, entry: Entry) -> dict[str, int]:
     return {THERMAL: int(history.model(entry.id)["thermal_revision"])}
 
 
-def named(history: History, command: Command, kind: str) -> Command:
+def named(history: CalibrationHistory, command: Command, kind: str) -> Command:
     """Put the candidate's id, or why there is none (``refused``), in place of ``choose``."""
     if "choose" not in command.arguments:
         return command

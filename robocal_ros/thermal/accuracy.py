@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, CalibrationState, Entry
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import Fields, read_made, write_made
-from robocal_ros.session.events import History
 from robocal_ros.thermal.identification import drift_prior, identify_cycle, learned_prior
 from robocal_ros.thermal.reference import ColdSpots, reference_of
 from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, HeatGains
@@ -319,7 +319,9 @@ FEWEST_WITH_TEMPERATURES = 2  # shifts, so that what one motor does is not what 
 WRONG = (CalibrationState.REJECTED, CalibrationState.ROLLED_BACK)  # somebody did not believe it
 
 
-def expected_drift(nominal: SerialArm, history: History) -> tuple[LearnedProcess | None, str]:
+def expected_drift(
+    nominal: SerialArm, history: CalibrationHistory
+) -> tuple[LearnedProcess | None, str]:
     """What every cold reference in the history with its cycles teaches, and the same in words.
 
     With the motors' temperatures where all cycles have them. None: too little.
@@ -335,7 +337,7 @@ def expected_drift(nominal: SerialArm, history: History) -> tuple[LearnedProcess
         return None, f"default, because {error}"
 
 
-def earlier_shifts(nominal: SerialArm, history: History) -> list[EarlierShift]:
+def earlier_shifts(nominal: SerialArm, history: CalibrationHistory) -> list[EarlierShift]:
     """Every cold reference of the history with its cycles, those apart that nobody believed."""
     entries = history.list(LEARN_FROM)
     cycles: dict[int, list[Entry]] = defaultdict(list)

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground.errors import Code, ConflictError, InputError
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements, StandstillRule
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry
 from robocal_ros.identification import Method
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.base import HistoryFollower
-from robocal_ros.session.events import History
 from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work, process_of
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
@@ -186,7 +186,7 @@ class InForce(HistoryFollower):
     what is kept of it; or None. ``nominal``: the arm without any calibration.
     """
 
-    def __init__(self, history: History, nominal: SerialArm) -> None:
+    def __init__(self, history: CalibrationHistory, nominal: SerialArm) -> None:
         self.nominal = nominal
         super().__init__(history, THERMAL)
 
@@ -346,7 +346,7 @@ class DriftFollower:
             kept |= state.arrays()
         return kept
 
-    def catch_up(self, history: History, reference_id: int) -> None:
+    def catch_up(self, history: CalibrationHistory, reference_id: int) -> None:
         """Take the kept cycles of this reference again, from the last kept state on."""
         waiting = []
         for entry in self._kept(history, reference_id):
@@ -372,7 +372,7 @@ class DriftFollower:
             if moved:
                 self.state = replace(self.state, moved_s=moved_s)
 
-    def _kept(self, history: History, reference_id: int) -> Iterator[Entry]:
+    def _kept(self, history: CalibrationHistory, reference_id: int) -> Iterator[Entry]:
         """Cycles of this reference, newest first; all of them came after it."""
         cold_ns, limit, seen = self._reference.data.middle_ns, LOOK_BACK, 0
         while len(entries := history.list(limit)) > seen:
@@ -408,7 +408,9 @@ def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
 class Following:
     """The follower of the cold reference in force, made anew where another one comes into force."""
 
-    def __init__(self, history: History, current: InForce, config: ThermalConfig) -> None:
+    def __init__(
+        self, history: CalibrationHistory, current: InForce, config: ThermalConfig
+    ) -> None:
         self._history, self._current, self._config = history, current, config
         self._followed: tuple[int | None, DriftFollower] | None = None
 

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.assessment import Verdict, summarise
 from robocal_ros.ground.errors import Code, ConflictError, InputError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Proposal
 from robocal_ros.identification import Method, identify_and_hold_out
 from robocal_ros.identification.judged import identification_document, identified_model_document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.session.events import Command, History, Outcome
+from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import expected_drift, process_document
 from robocal_ros.thermal.cell_setup import (
     SensorMethod,
@@ -65,7 +66,7 @@ class Proposer:
     def __init__(
         self,
         nominal: SerialArm,
-        history: History,
+        history: CalibrationHistory,
         config: ThermalConfig,
         software: str,
         current: InForce,

@@ -30,6 +30,7 @@ from robocal_ros.ground.samples import (
     pose_sample,
     temperature_sample,
 )
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry, Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
@@ -37,7 +38,6 @@ from robocal_ros.session.events import (
     CONFIGURE,
     NEWEST,
     Command,
-    History,
     Outcome,
     decide,
     joints_awaited_ns,
@@ -90,7 +90,7 @@ class ThermalSession:
     """
 
     def __init__(
-        self, nominal: SerialArm, history: History, config: ThermalConfig, software: str
+        self, nominal: SerialArm, history: CalibrationHistory, config: ThermalConfig, software: str
     ) -> None:
         self.nominal, self.config = nominal, config
         self.desk = ObservationDesk(
@@ -403,7 +403,7 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
 
 
 def session_as_recorded(
-    nominal: SerialArm, history: History, configured: Command, software: str
+    nominal: SerialArm, history: CalibrationHistory, configured: Command, software: str
 ) -> ThermalSession:
     """Make a session with the recorded settings; an empty history gets what was in force.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head, Proposal
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
@@ -22,7 +23,7 @@ from robocal_ros.session.base import (
     configured_with,
     recorded_arguments,
 )
-from robocal_ros.session.events import Command, History, Outcome, seeded
+from robocal_ros.session.events import Command, Outcome, seeded
 from robocal_ros.tool.crossed_model import Held
 from robocal_ros.tool.edges import (
     AHEAD_NS,
@@ -75,7 +76,7 @@ class ToolInForce(HistoryFollower):
         measurements of the healthy tool and of the mandrel.
     """
 
-    def __init__(self, history: History, nominal: SerialArm, config: ToolConfig) -> None:
+    def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
         self._nominal = nominal
         self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
         self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
@@ -157,7 +158,7 @@ class ToolResults:
     def __init__(
         self,
         nominal: SerialArm,
-        history: History,
+        history: CalibrationHistory,
         config: ToolConfig,
         software: str,
         current: ToolInForce,
@@ -404,7 +405,7 @@ class ToolSession(SessionBase):
     """
 
     def __init__(
-        self, nominal: SerialArm, history: History, config: ToolConfig, software: str
+        self, nominal: SerialArm, history: CalibrationHistory, config: ToolConfig, software: str
     ) -> None:
         self.config = config
         self.current = ToolInForce(history, nominal, config)
@@ -601,7 +602,7 @@ def is_tool_session(configured: Command | None) -> bool:
 
 
 def tool_session_as_recorded(
-    nominal: SerialArm, history: History, configured: Command, software: str
+    nominal: SerialArm, history: CalibrationHistory, configured: Command, software: str
 ) -> ToolSession:
     """Make a session with the recorded settings; an empty history gets what was in force.
 
