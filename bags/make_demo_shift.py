@@ -13,6 +13,7 @@ poses; then, every twelve minutes, in eight of them. The bag holds what a cell w
 """
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
+
+from bench.measured_shifts import Shift, ShiftPlan, simulate
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects, TrueRobot
 from robocal_ros.cell_sim.sensors import SphereSensor
-from robocal_ros.cell_sim.thermal_shift import Shift, ShiftPlan, simulate
 from robocal_ros.cell_sim.tool_cell import read_poses, readings
 from robocal_ros.kinematics.robots import load_robot
 
@@ -58,8 +61,8 @@ class DemoCell:
 def build(effects: Effects | None = None, seed: int = SEED) -> DemoCell:
     """Simulate the shift; the same seed gives the same robot and the same noise."""
     body, course = np.random.default_rng(seed).spawn(2)
-    robot = thermal_shift.true_robot(load_robot(ROBOT), body, effects)
-    sensor = thermal_shift.sphere_sensor(effects)
+    robot = kr150.true_robot(load_robot(ROBOT), body, effects)
+    sensor = kr150.sphere_sensor(effects)
     plan = ShiftPlan(
         reference=read_poses(POSES, "cycle", "reference"),
         cycle=read_poses(POSES, "cycle"),
@@ -72,7 +75,7 @@ def build(effects: Effects | None = None, seed: int = SEED) -> DemoCell:
         robot,
         sensor,
         plan,
-        simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course),
+        simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course),
     )
 
 
@@ -145,7 +148,7 @@ def cycle_records(cell: DemoCell) -> list[Record]:
         truth = {
             "simulated": True,
             "cycle": cycle.name,
-            "tool_in_flange_m": thermal_shift.TOOL.tolist(),
+            "tool_in_flange_m": kr150.TOOL.tolist(),
             "q_rad": cell.plan.check.round(9).tolist(),
             "position_m": cycle.check.round(9).tolist(),
         }

@@ -17,6 +17,7 @@ target: ``poses.csv``, ``profiles/``, ``target.yaml``; and ``check.csv`` with fu
 
 import argparse
 import json
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -41,11 +42,9 @@ from hand_eye_program import (
 from hand_eye_recorder import record_session
 from numpy.typing import NDArray
 
-from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import (
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
+
+from bench.hand_eye_cell import (
     ArmRobot,
     HandEyeCell,
     SimulatedShots,
@@ -56,6 +55,10 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     step_shots,
     taught,
 )
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
 from robocal_ros.cell_sim.tool_cell import SmoothPath, readings

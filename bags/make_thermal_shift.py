@@ -11,6 +11,7 @@ without ``measured_point``, the bag holds:
 """
 
 import json
+import sys
 from pathlib import Path
 
 import make_demo_shift as demo
@@ -18,10 +19,12 @@ import numpy as np
 from make_demo_shift import DemoCell, Record, header
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
+
+from bench.measured_shifts import MEASURING, Shift, ShiftPlan, poses, simulate
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.sensors import sphere_cloud
-from robocal_ros.cell_sim.thermal_shift import MEASURING, Shift, ShiftPlan, poses, simulate
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 
@@ -46,8 +49,8 @@ CLOUD_FIELDS = [
 def build() -> DemoCell:
     """Simulate the shift."""
     body, course = np.random.default_rng(SEED).spawn(2)
-    robot = thermal_shift.true_robot(load_robot(demo.ROBOT), body, None)
-    sensor = thermal_shift.sphere_sensor(None)
+    robot = kr150.true_robot(load_robot(demo.ROBOT), body, None)
+    sensor = kr150.sphere_sensor(None)
     measuring = poses("sphere")[list(MEASURING)]
     plan = ShiftPlan(
         reference=np.tile(measuring, (ROUNDS, 1)),
@@ -57,7 +60,7 @@ def build() -> DemoCell:
         duty=DUTY,
         period_s=PERIOD_S,
     )
-    shift = simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course)
+    shift = simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course)
     return DemoCell(robot, sensor, plan, shift)
 
 

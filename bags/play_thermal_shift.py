@@ -21,9 +21,9 @@ from std_msgs.msg import String
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 
 from bench.live.graph import CellController, LiveError
+from bench.measured_shifts import REFERENCE
 from bench.startup import ROOT
 from robocal_ros.bags.bags import BagReader, BagWriter
-from robocal_ros.cell_sim.thermal_shift import REFERENCE
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from bench.hand_eye_sets import (
     ARM_RMS_MM,
     BOARD,
@@ -21,7 +22,6 @@ from bench.hand_eye_sets import (
     turned_tsai,
 )
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.hand_eye.camera import distances, pair_streams, rms
 from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
 from bench.hand_eye_shots import (
     SETTINGS,
     Calibration,
@@ -25,7 +26,6 @@ from bench.hand_eye_worlds import (
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError

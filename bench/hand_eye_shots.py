@@ -5,6 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.hand_eye_cell import (
+    ArmRobot,
+    HandEyeCell,
+    Robot,
+    SimulatedShots,
+    edge_shots,
+    sphere_shots,
+    step_shots,
+)
 from bench.hand_eye_worlds import (
     AIM_M,
     CENTRE,
@@ -16,15 +25,6 @@ from bench.hand_eye_worlds import (
     calibrated,
 )
 from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.hand_eye_cell import (
-    ArmRobot,
-    HandEyeCell,
-    Robot,
-    SimulatedShots,
-    edge_shots,
-    sphere_shots,
-    step_shots,
-)
 from robocal_ros.cell_sim.robot import Warmth
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames

@@ -18,7 +18,7 @@ from bench.hand_eye_bound import (
     least_covariance,
     piercings,
 )
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     HandEyeCell,
     PoseRobot,
     TrueStairs,

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.measured_shifts import MEASURING, MOVE_S, Shift, ShiftPlan, poses, simulate
 from robocal_ros.bags.bag_writer import BagWriter, ros_time
 from robocal_ros.bags.mcap_files import encode
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.sensors import sphere_cloud
-from robocal_ros.cell_sim.thermal_shift import MEASURING, MOVE_S, Shift, ShiftPlan, poses, simulate
 from robocal_ros.cell_sim.tool_cell import readings
 from robocal_ros.kinematics.robots import load_robot
 
@@ -49,13 +49,13 @@ class LongShift:
 def write_shift(path: Path, hours: float) -> LongShift:
     """Simulate a shift of some hours after its cold reference, and write its bag."""
     course, joints, clouds, warmth = np.random.default_rng(SEED).spawn(4)
-    robot = thermal_shift.true_robot(load_robot(ROBOT), course, None)
+    robot = kr150.true_robot(load_robot(ROBOT), course, None)
     measuring = poses("sphere")[list(MEASURING)]
     reference = np.tile(measuring, (ROUNDS, 1))
     phases = ((hours, 1.0),)
     plan = ShiftPlan(reference, measuring, poses("check"), phases, DUTY, PERIOD_S)
-    sensor = thermal_shift.sphere_sensor(None)
-    shift = simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course)
+    sensor = kr150.sphere_sensor(None)
+    shift = simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course)
     end_s = float(shift.path.depart[-1])
     names = list(robot.nominal.joint_names)
     times = np.arange(1.0 / JOINTS_HZ, end_s, 1.0 / JOINTS_HZ)

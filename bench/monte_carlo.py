@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects, Warmth
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
@@ -232,7 +232,7 @@ def _unmodelled(effects: Effects, robots: int = 60) -> Array:
     nominal, rng = load_robot("kr150_r3100"), np.random.default_rng(4)
     cold, sums = Warmth.cold(nominal.n), np.zeros(5)
     for _ in range(robots):
-        robot = thermal_shift.true_robot(nominal, rng, effects)
+        robot = kr150.true_robot(nominal, rng, effects)
 
         def visit(q: Array, noise: float, robot=robot) -> Measurements:  # type: ignore[no-untyped-def]
             exact = robot.point(q, cold, POINTS[0], rng if noise else None)

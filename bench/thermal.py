@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import thermal_real, thermal_setup, thermal_tracking
+from bench.measured_shifts import LENGTHS, MEASURING, DriftingCell, DriftPlan, record
 from bench.tables import Goal, Table
 from bench.thermal_shifts import PARTS, SEEDS, SIGMA_M, Measured, cell_of
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import CloudScene, sphere_cloud
-from robocal_ros.cell_sim.thermal_shift import LENGTHS, MEASURING, DriftingCell, DriftPlan, record
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
@@ -77,7 +77,7 @@ def prepare(seed: int, effects: Effects) -> list[Judged]:
         record(planned, plan, np.random.default_rng([seed, 10 + i]))
         for i, plan in enumerate(cell.plans)
     ]
-    rows = arm.parameter_jacobian(cell.check, thermal_shift.TOOL)[:, :3]
+    rows = arm.parameter_jacobian(cell.check, kr150.TOOL)[:, :3]
     everything = range(len(cell.sphere))
     found = []
     for i, plan in enumerate(cell.plans):
@@ -120,7 +120,7 @@ def _history(
         displacement=np.array([_displacement(spots, cycle) for cycle in teacher.cycles]),
         rows=spots.rows(spots.q, spots.target)[0].reshape(-1, len(arm.parameters)),
         check=truth + noise,
-        check_rows=arm.parameter_jacobian(cell.check, thermal_shift.TOOL)[:, :3].reshape(
+        check_rows=arm.parameter_jacobian(cell.check, kr150.TOOL)[:, :3].reshape(
             truth.shape[1], -1
         ),
     )

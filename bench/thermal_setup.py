@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bench.tables import Goal, Table
 from bench.thermal_shifts import MEASURING, SIGMA_M
 from docs.examples.make_thermal import poses
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects, Warmth
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
@@ -59,7 +59,7 @@ def sensor_table() -> Table:
 def _sensor_errors(q: Array) -> tuple[Array, Array]:
     """Rms error and its bound (3,) of base, turn and sphere; m and rad."""
     arm, rng = load_robot("kr150_r3100"), np.random.default_rng(5)
-    robot = thermal_shift.true_robot(arm, rng, Effects.none())
+    robot = kr150.true_robot(arm, rng, Effects.none())
     flange = robot.flange(q, Warmth.cold(arm.n))
     exact = _centres(np.zeros(9), flange)
     step = 1e-6 * np.eye(9)
@@ -83,18 +83,18 @@ def _sensor_errors(q: Array) -> tuple[Array, Array]:
 def _centres(change: Array, flange: Array) -> Array:
     """Sphere centres (m, 3) in a sensor that is shifted and turned, on a shifted sphere."""
     turn = frames.exp_rotation(change[3:6])
-    T = thermal_shift.T_SENSOR_BASE
-    p = flange @ np.append(thermal_shift.BALL + change[6:], 1.0)
+    T = kr150.T_SENSOR_BASE
+    p = flange @ np.append(kr150.BALL + change[6:], 1.0)
     return np.asarray(p[:, :3] @ (turn @ T[:3, :3]).T + T[:3, 3] + change[:3])
 
 
 def _error(arm: SerialArm, data: Measurements) -> Array:
     found = calibrate_sensor(arm, data)
-    true = thermal_shift.T_SENSOR_BASE
+    true = kr150.T_SENSOR_BASE
     turn = found.T_sensor_base[:3, :3] @ true[:3, :3].T
     angles = Rotation.from_matrix(turn).as_rotvec()
     shift = found.T_sensor_base[:3, 3] - true[:3, 3]
-    return np.concatenate([shift, angles, found.sphere_in_flange - thermal_shift.BALL])
+    return np.concatenate([shift, angles, found.sphere_in_flange - kr150.BALL])
 
 
 @cache
@@ -110,13 +110,13 @@ def _design(count: int) -> tuple[Design, Array]:
     candidates = candidate_poses(cell, SensorField(), count, np.random.default_rng(0))
     both = np.vstack([candidates, poses("sphere")[list(MEASURING)]])
     prior = drift_prior(arm)
-    design = Design.of(cell, both, poses("check"), thermal_shift.TOOL, prior, SIGMA_M, ROUNDS)
+    design = Design.of(cell, both, poses("check"), kr150.TOOL, prior, SIGMA_M, ROUNDS)
     return design, both
 
 
 def _cell() -> CellModel:
-    ball = frames.transform(np.eye(3), thermal_shift.BALL)[None]
-    return CellModel(load_robot("kr150_r3100"), thermal_shift.T_SENSOR_BASE, ("ball",), ball)
+    ball = frames.transform(np.eye(3), kr150.BALL)[None]
+    return CellModel(load_robot("kr150_r3100"), kr150.T_SENSOR_BASE, ("ball",), ball)
 
 
 def poses_table() -> Table:

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim import thermal_shift
+from bench.measured_shifts import MEASURING as MEASURING
+from bench.measured_shifts import DriftingCell, DriftRecord, drifting_cell, poses
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.cell_sim.thermal_shift import MEASURING as MEASURING
-from robocal_ros.cell_sim.thermal_shift import DriftingCell, DriftRecord, drifting_cell, poses
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel
 from robocal_ros.kinematics import SerialArm
@@ -27,9 +27,7 @@ PARTS = 5  # between two cycles
 @cache
 def cell_of(seed: int, effects: Effects) -> DriftingCell:
     """One robot in its cell, its drift as published."""
-    robot = thermal_shift.true_robot(
-        load_robot("kr150_r3100"), np.random.default_rng(seed), effects
-    )
+    robot = kr150.true_robot(load_robot("kr150_r3100"), np.random.default_rng(seed), effects)
     return drifting_cell(robot, poses("sphere"), poses("check"))
 
 

@@ -11,11 +11,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.measured_shifts import DriftingCell, DriftPlan, DriftRecord, record
 from bench.tables import Goal, Table
 from bench.thermal_shifts import MEASURING, PARTS, SEEDS, Measured, cell_of
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.cell_sim.thermal_shift import DriftingCell, DriftPlan, DriftRecord, record
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.accuracy import (
@@ -71,7 +71,7 @@ def trained(seed: int) -> Trained:
     return Trained(
         cell=cell,
         arm=arm,
-        rows=arm.parameter_jacobian(cell.check, thermal_shift.TOOL)[:, :3],
+        rows=arm.parameter_jacobian(cell.check, kr150.TOOL)[:, :3],
         prior=learn_drift(histories, sigma_m=noise).covariance,
         trackers=learned,
     )
@@ -175,7 +175,7 @@ def _limits(robot: Trained) -> list[float]:
     cell, arm, plan = robot.cell, robot.arm, robot.cell.plans[2]
     own = cell.sphere[list(MEASURING)]
     k = len(robot.prior)
-    H = arm.parameter_jacobian(own, thermal_shift.BALL)[:, :3].reshape(-1, k)
+    H = arm.parameter_jacobian(own, kr150.BALL)[:, :3].reshape(-1, k)
     told, noise_m = robot.rows.reshape(-1, k), robot.trackers["tracker"].sigma_m
 
     def gain(variance: float) -> Array:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from bench.closed_loop import setting
 from bench.closed_loop.earlier import seen, taught
+from bench.measured_shifts import PERIOD_S, DriftPlan
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.cell import DUTY, kr150_cell, poses
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
-from robocal_ros.cell_sim.thermal_shift import PERIOD_S, DriftPlan
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.measured_shifts import PLANS, DriftingCell, DriftPlan, record
 from bench.thermal_shifts import Measured
 from robocal_ros.cell_sim.cell import poses
 from robocal_ros.cell_sim.robot import TrueRobot
-from robocal_ros.cell_sim.thermal_shift import PLANS, DriftingCell, DriftPlan, record
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.accuracy import EarlierShift, LearnedProcess, learn_gains
 

@@ -17,14 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.thermal_shift import (
-    MEASURING,
-    DriftRecord,
-    drifting_cell,
-    poses,
-    record,
-    true_robot,
-)
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # for the bench
+
+from bench.measured_shifts import MEASURING, DriftRecord, drifting_cell, poses, record
+from robocal_ros.cell_sim.kr150 import true_robot
 from robocal_ros.kinematics.robots import load_robot
 
 ROBOT, SEED = "kr150_r3100", 1

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.beams import (
     BeamStation,
     BeamWatch,
@@ -41,6 +41,7 @@ from robocal_ros.cell_sim.faults import (
     JointReadings,
     size_of,
 )
+from robocal_ros.cell_sim.kr150 import UNCORRECTED
 from robocal_ros.cell_sim.robot import (
     Draws,
     Effects,
@@ -64,7 +65,6 @@ from robocal_ros.cell_sim.sensors import (
     ball_on_table,
     standstills,
 )
-from robocal_ros.cell_sim.thermal_shift import UNCORRECTED
 from robocal_ros.cell_sim.tool_cell import (
     JITTER_RAD,
     Circle,
@@ -236,17 +236,17 @@ def kr150_cell(
     arm = replace(nominal, T_flange_tool=TAUGHT)
     target = ball_on_table(TARGET, TARGET_RADIUS_M)
     line_laser = ProfileStation(ProfileSensor(), T_FLANGE_LASER, target, TARGET)
-    robot = thermal_shift.true_robot(arm, np.random.default_rng([seed, 0]), effects)
+    robot = kr150.true_robot(arm, np.random.default_rng([seed, 0]), effects)
     return CellPlan(
         robot=_as_published(robot, poses("work")),
         station=BeamStation(beams_of(T_BASE_LASER, BEAM_ANGLE_RAD, BEAM_GAP_M), INPUT, NOISE),
         tool=RoundTool.cylinder(TAUGHT, PIN_RADIUS_M),
         q_start=poses("home")[0],
-        fastest=thermal_shift.FASTEST_RAD_S,
+        fastest=kr150.FASTEST_RAD_S,
         limits=True,
         reading_noise_rad=JITTER_RAD if robot.effects.noise else 0.0,
-        heat=HeatPlan(thermal_shift.WARM_UP, PROGRAMME_RAD_S / DUTY),
-        sphere=SphereStation(thermal_shift.sphere_sensor(effects), FLOOR, points=points),
+        heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
+        sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),
         profile=line_laser if profile else None,
         working=poses("work"),
         seed=seed,
@@ -255,7 +255,7 @@ def kr150_cell(
 
 def worked_for(hours: float) -> Warmth:
     """As warm as the robot is after so long with its programme, from cold."""
-    return thermal_shift.WARM_UP.step(Warmth.cold(len(DUTY)), DUTY, hours * HOUR_S)
+    return kr150.WARM_UP.step(Warmth.cold(len(DUTY)), DUTY, hours * HOUR_S)
 
 
 def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:
@@ -264,7 +264,7 @@ def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:
     p = robot.nominal.T_flange_tool[:3, 3]
     cold, moved = whole.point(working, state, p), []
     for _ in range(round(2.0 * SHIFT_H)):
-        state = thermal_shift.WARM_UP.step(state, DUTY, 1800.0)
+        state = kr150.WARM_UP.step(state, DUTY, 1800.0)
         moved.append(np.abs(whole.point(working, state, p) - cold))
     factor = THRESHOLD_M / float(np.quantile(moved, UNCORRECTED))
     return replace(robot, motor_gain=factor * robot.motor_gain, link_gain=factor * robot.link_gain)

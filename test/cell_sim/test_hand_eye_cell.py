@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     ArmRobot,
     HandEyeCell,
     PoseRobot,
@@ -18,6 +17,7 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     step_shots,
     taught,
 )
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError

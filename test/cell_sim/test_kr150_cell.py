@@ -21,7 +21,7 @@ from kr150_shift import (
     worked,
 )
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.cell import (
     DUTY,
     SPIN_RAD,
@@ -100,8 +100,8 @@ def test_without_readings_all_else_is_the_same():
 def test_work_warms_the_robot_and_a_break_cools_it():
     cell = cell_of()
     worked(cell, 0.08)
-    goal = thermal_shift.WARM_UP.motor_rise * DUTY
-    share = 1.0 - np.exp(-cell.now_s / thermal_shift.WARM_UP.motor_tau_s)
+    goal = kr150.WARM_UP.motor_rise * DUTY
+    share = 1.0 - np.exp(-cell.now_s / kr150.WARM_UP.motor_tau_s)
     assert cell.warmth.motor == pytest.approx(goal * share, rel=0.04)
     warm, end_s = cell.warmth.motor, cell.now_s + 600.0
     assert not cell.moving
@@ -137,7 +137,7 @@ def test_the_drift_has_the_published_size():
     tip = TAUGHT[:3, 3]
     cold = cell.plan.robot.point(WORK, state, tip)
     for _ in range(90):
-        state = thermal_shift.WARM_UP.step(state, DUTY, 300.0)
+        state = kr150.WARM_UP.step(state, DUTY, 300.0)
         moved.append(cell.plan.robot.point(WORK, state, tip) - cold)
     assert 0.40 < share_within(np.array(moved)) < 0.52  # published: 43 to 49 %
 
@@ -189,7 +189,7 @@ def test_each_visit_has_its_own_scatter_in_the_joints():
         q = cell.motion.at(at)[0]
         off.append((cell.flange(at) - cell.plan.robot.flange(q, Warmth.cold(6)))[0, :3, 3])
     J = ARM.jacobian(HOME + 0.01)[:3]
-    wanted = thermal_shift.REPEATABILITY_RAD * np.sqrt(np.sum(J**2, axis=1))
+    wanted = kr150.REPEATABILITY_RAD * np.sqrt(np.sum(J**2, axis=1))
     spread = np.sqrt(np.mean(np.square(off), axis=0))
     assert spread == pytest.approx(wanted, rel=4.0 / np.sqrt(2 * 150))
 

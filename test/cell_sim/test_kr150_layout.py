@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kr150_shift import ABOVE, ARM, CYCLE, HOME, WORK, cell_of, true_laser
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
 from robocal_ros.cell_sim.robot import Warmth, shift, turn
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody
@@ -14,7 +14,7 @@ from robocal_ros.tool.driving import approach, measuring
 from robocal_ros.tool.run import MeasuringPlan
 
 CROSSING = T_BASE_LASER[:3, 3]
-T_BASE_SENSOR = np.linalg.inv(thermal_shift.T_SENSOR_BASE)
+T_BASE_SENSOR = np.linalg.inv(kr150.T_SENSOR_BASE)
 SEEN_FLOOR = T_BASE_SENSOR[:3, :3] @ FLOOR + T_BASE_SENSOR[:3, 3]
 ALONG = np.linspace(0.0, 1.0, 15)[None, :, None]
 ON_THE_WAY = np.linspace(0.0, 1.0, 60)[:, None]
@@ -42,9 +42,7 @@ def joints_of(q: np.ndarray) -> list[np.ndarray]:
 def robot_at(q: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
     """The moving parts as capsules: ends (m, 3) and radius."""
     _, shoulder, elbow, _, wrist, _, flange = joints_of(q)
-    tip, ball = (
-        (ARM.fk(q) @ np.append(p, 1.0))[:, :3] for p in (TAUGHT[:3, 3], thermal_shift.BALL)
-    )
+    tip, ball = ((ARM.fk(q) @ np.append(p, 1.0))[:, :3] for p in (TAUGHT[:3, 3], kr150.BALL))
     return {
         "upper arm": (shoulder, elbow, 0.20),
         "forearm": (elbow, wrist, 0.17),

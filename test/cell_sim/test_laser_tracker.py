@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.laser_tracker import (
+from bench.laser_tracker import (
     FEWEST_LIT,
     PRP_SENSOR,
     PRP_STILL,
@@ -13,6 +12,7 @@ from robocal_ros.cell_sim.laser_tracker import (
     six_axis_cell,
     true_flange,
 )
+from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.sensors import Ball, Scene
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.data import Profile, profile_of

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.hand_eye_cell import view
+from bench.hand_eye_cell import view
 from robocal_ros.cell_sim.sensors import (
     ProfileSensor,
     Scene,

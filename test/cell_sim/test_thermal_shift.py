@@ -5,17 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.measured_shifts import ShiftPlan, drifting_cell, poses, simulate
 from bench.thermal import SEEDS
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.kr150 import UNCORRECTED
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import SphereSensor
-from robocal_ros.cell_sim.thermal_shift import (
-    UNCORRECTED,
-    ShiftPlan,
-    drifting_cell,
-    poses,
-    simulate,
-)
 from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.screening import share_within
@@ -24,11 +19,11 @@ FLANGE = np.array([[1.0, 0, 0, 1.2], [0, 0, -1.0, 0.1], [0, 1.0, 0, 0.8], [0, 0,
 
 
 def sensor(**switched: bool) -> SphereSensor:
-    return thermal_shift.sphere_sensor(replace(Effects.none(), **switched))
+    return kr150.sphere_sensor(replace(Effects.none(), **switched))
 
 
 def exact() -> np.ndarray:
-    return (thermal_shift.T_SENSOR_BASE @ FLANGE @ np.append(thermal_shift.BALL, 1.0))[:3]
+    return (kr150.T_SENSOR_BASE @ FLANGE @ np.append(kr150.BALL, 1.0))[:3]
 
 
 def test_a_perfect_sensor_tells_the_truth():
@@ -46,7 +41,7 @@ def test_noise_is_two_hundredths():
 def test_the_stem_grows_with_the_flange():
     """A stem of 0.219 m warmed by 5 K: 0.219 * 12e-6 * 5 = 0.013 mm along itself."""
     grown = sensor(stem=True).measure(FLANGE, 5.0, 0.0, np.random.default_rng(0)) - exact()
-    stem = exact() - (thermal_shift.T_SENSOR_BASE @ FLANGE)[:3, 3]
+    stem = exact() - (kr150.T_SENSOR_BASE @ FLANGE)[:3, 3]
     np.testing.assert_allclose(grown, stem * 12e-6 * 5.0, atol=1e-12)
     assert np.linalg.norm(grown) == pytest.approx(1.3e-5, rel=0.02)
 
@@ -108,9 +103,9 @@ def plan() -> ShiftPlan:
 
 def shift(plan: ShiftPlan, effects: Effects | None = None, seed: int = 0):
     body, course = np.random.default_rng(seed).spawn(2)
-    robot = thermal_shift.true_robot(load_robot("kr150_r3100"), body, effects)
-    sensor = thermal_shift.sphere_sensor(effects)
-    return robot, simulate(robot, sensor, thermal_shift.WARM_UP, plan, thermal_shift.TOOL, course)
+    robot = kr150.true_robot(load_robot("kr150_r3100"), body, effects)
+    sensor = kr150.sphere_sensor(effects)
+    return robot, simulate(robot, sensor, kr150.WARM_UP, plan, kr150.TOOL, course)
 
 
 def test_a_shift_visits_each_pose_in_each_cycle(plan):
@@ -137,7 +132,7 @@ def test_cycles_come_at_their_period(plan):
 def test_the_truth_is_the_warm_robot_at_the_check_poses(plan):
     robot, found = shift(plan)
     for cycle in found.cycles:
-        expected = robot.point(plan.check, cycle.warmth, thermal_shift.TOOL)
+        expected = robot.point(plan.check, cycle.warmth, kr150.TOOL)
         assert np.array_equal(cycle.check, expected)
     heat = [cycle.warmth.motor[1] for cycle in found.cycles]
     assert heat[0] == 0.0
@@ -159,13 +154,13 @@ def test_without_effects_the_visits_are_the_nominal_ones(plan):
     robot, found = shift(plan, Effects.none())
     for visit in found.visits:
         flange = robot.nominal.fk(visit.reading)
-        expected = thermal_shift.T_SENSOR_BASE @ flange @ np.append(thermal_shift.BALL, 1.0)
+        expected = kr150.T_SENSOR_BASE @ flange @ np.append(kr150.BALL, 1.0)
         np.testing.assert_allclose(visit.position, expected[:3], atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [3, 7])
 def test_a_robot_counts_where_six_lengths_do_as_published(seed):
-    robot = thermal_shift.true_robot(load_robot("kr150_r3100"), np.random.default_rng(seed))
+    robot = kr150.true_robot(load_robot("kr150_r3100"), np.random.default_rng(seed))
     cell = drifting_cell(robot, poses("sphere"), poses("check"))
     assert cell.as_published == (seed in SEEDS)
     # Scaled at every sixth cycle of 90: the others may differ by a cycle's share on either side.

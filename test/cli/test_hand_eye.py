@@ -26,9 +26,7 @@ from hand_eye_tables import (
 )
 from scipy.stats import chi2
 
-from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     DOWN,
     ArmRobot,
     SimulatedShots,
@@ -36,6 +34,8 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     sphere_shots,
     view,
 )
+from robocal_ros.cell_sim.beams import Q_NEAR
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames

@@ -11,7 +11,7 @@ from command import conforms
 from scipy.spatial.transform import Rotation
 
 from bench import hand_eye_sets
-from robocal_ros.cell_sim.hand_eye_cell import TruePose
+from bench.hand_eye_cell import TruePose
 from robocal_ros.cli.main import main
 from robocal_ros.hand_eye.camera import METHODS as CORE_METHODS
 from robocal_ros.hand_eye.camera import distances

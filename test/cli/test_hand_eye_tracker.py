@@ -8,8 +8,8 @@ import pytest
 from command import robocal, robocal_json
 from tracker_files import SCAN, tracker_files
 
+from bench.laser_tracker import TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.cell_sim.beams import Q_NEAR
-from robocal_ros.cell_sim.laser_tracker import TrackerCell, prp_cell, six_axis_cell
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.files import read_tracker_points
 from robocal_ros.hand_eye.targets import read_tracker_target

@@ -15,7 +15,7 @@ from tool_runs import run_tables
 from tool_tables import tool_tables
 from tracker_files import SCAN, tracker_files
 
-from robocal_ros.cell_sim.laser_tracker import prp_cell
+from bench.laser_tracker import prp_cell
 from robocal_ros.cli.main import COMMANDS
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics.robots import load_description

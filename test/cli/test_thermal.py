@@ -8,7 +8,7 @@ import yaml
 from command import robocal, robocal_json
 from drift_tables import ROBOT, SIGMA, fixed_tables, session
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 
 
@@ -42,10 +42,8 @@ def test_a_sensor_is_placed_to_the_arms_static_error(folder, method):
     document = sensor(folder, "--method", method)
     assert document["verdict"]["accept"]
     where = np.array(document["T_sensor_base"]["xyz_mm"]) * 1e-3
-    assert np.linalg.norm(where - thermal_shift.T_SENSOR_BASE[:3, 3]) < 5e-3
-    assert (
-        np.linalg.norm(np.array(document["sphere_in_flange_mm"]) * 1e-3 - thermal_shift.BALL) < 2e-3
-    )
+    assert np.linalg.norm(where - kr150.T_SENSOR_BASE[:3, 3]) < 5e-3
+    assert np.linalg.norm(np.array(document["sphere_in_flange_mm"]) * 1e-3 - kr150.BALL) < 2e-3
     assert (document["covariance"] is None) == (method == "classic")
 
 

@@ -8,7 +8,7 @@ from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured, sound
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TruePose
+from bench.hand_eye_cell import BoardCell, BoardNoise, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera

@@ -7,7 +7,7 @@ import pytest
 from camera_pairs import BOARD, LENS, error, sound
 from scipy.stats import chi2
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens
+from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
 from robocal_ros.hand_eye.camera_data import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, TruePose
+from bench.hand_eye_cell import BoardCell, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,

@@ -16,7 +16,7 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import step_shots
+from bench.hand_eye_cell import step_shots
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import SETTLED, fit_mount

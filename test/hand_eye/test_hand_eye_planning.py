@@ -16,7 +16,7 @@ from hand_eye_sets import (
 )
 from scipy.optimize import minimize
 
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     SimulatedShots,
     TrueStairs,
     edge_shots,

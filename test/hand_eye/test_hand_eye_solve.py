@@ -18,7 +18,7 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     HandEyeCell,
     PoseRobot,
     SimulatedShots,

@@ -8,7 +8,7 @@ from camera_tables import moving_flange
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise
+from bench.hand_eye_cell import BoardCell, BoardNoise
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_streams, pair_streams

@@ -15,8 +15,8 @@ from robocal_msgs.srv import CheckHandEyePlan, Decide, HandEyeFile
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
+from bench.hand_eye_cell import TrueStairs, edge_shots, step_shots
 from robocal_ros.bags.bags import write_data_set
-from robocal_ros.cell_sim.hand_eye_cell import TrueStairs, edge_shots, step_shots
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, postures, visit
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
@@ -46,7 +46,7 @@ def rows_of(work: Work, tracker: DriftTracker) -> np.ndarray:
     """Displacement (p, 3, k) of the tip, by differences of the forward kinematics."""
     arm, step = tracker.spots.cell.arm, 1e-5
     q = random_postures(arm) if work.q is None else work.q
-    tip = np.append(thermal_shift.BALL if work.tip is None else work.tip, 1.0)
+    tip = np.append(kr150.BALL if work.tip is None else work.tip, 1.0)
     moved = [
         [arm.with_mdh(arm.parameters.add(arm.mdh, h)).fk(q) @ tip for h in (change, -change)]
         for change in step * np.eye(len(arm.parameters))

@@ -10,7 +10,7 @@ import pytest
 
 from robocal_ros.bags.bags import bag_info, read_bag
 from robocal_ros.bags.replay import feed, replay
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.ground.errors import Code
@@ -141,7 +141,7 @@ def judge_shift(cell, script, tmp_path, bag: Path) -> list[Judged]:
                 outcome.document["verdict"]["code"],
                 outcome.document["rejected"],
                 predicted * 1e-3,
-                cell.robot.point(corrected, cycle.warmth, thermal_shift.TOOL) - cold,
+                cell.robot.point(corrected, cycle.warmth, kr150.TOOL) - cold,
                 np.array(told["position_m"]) - cold,
             )
         )
@@ -182,7 +182,7 @@ def test_the_predicted_error_is_not_exceeded(judged):
 
 
 def test_a_measurement_that_is_off_by_a_millimetre_is_named(cell, judged):
-    perfect = thermal_shift.sphere_sensor(Effects.none())
+    perfect = kr150.sphere_sensor(Effects.none())
     off = {
         cycle: [
             str(v.time_s)

@@ -3,7 +3,7 @@
 import numpy as np
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.accuracy import learn_drift
 from robocal_ros.thermal.identification import drift_prior, identify_cycle
@@ -17,7 +17,7 @@ def test_a_learned_prior_does_better_than_the_default():
     """
     arm, rng = load_robot("kr150_r3100"), np.random.default_rng(0)
     cell, q, default = cell_of(arm), postures(6), drift_prior(arm)
-    rows = arm.parameter_jacobian(postures(30, 9), thermal_shift.BALL)[:, :3]
+    rows = arm.parameter_jacobian(postures(30, 9), kr150.BALL)[:, :3]
     pattern = np.sqrt(np.diag(default)) * rng.standard_normal(len(default))
 
     def cycle() -> tuple[np.ndarray, ColdSpots, list]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError, TooFewSamplesError
 from robocal_ros.identification.solve import CellModel
@@ -41,7 +41,7 @@ def design_of(arm: SerialArm, candidates: np.ndarray, cell: CellModel | None = N
         cell or cell_of(arm),
         candidates,
         postures(40, 5),
-        thermal_shift.TOOL,
+        kr150.TOOL,
         drift_prior(arm),
         SIGMA,
         1,
@@ -105,7 +105,7 @@ def test_the_predicted_error_is_the_achieved_one(arm, candidates):
     design = design_of(arm, candidates)
     chosen = list(choose(design, 6))
     q, working, squared = candidates[chosen], postures(40, 5), []
-    J = arm.parameter_jacobian(working, thermal_shift.TOOL)[:, :3]
+    J = arm.parameter_jacobian(working, kr150.TOOL)[:, :3]
     for seed in range(300):
         rng = np.random.default_rng(seed)
         drift = np.sqrt(np.diag(prior)) * rng.standard_normal(len(prior))

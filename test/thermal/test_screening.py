@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import entangled, subset_drift
@@ -48,9 +48,9 @@ def warm_up(size: dict[str, float]) -> np.ndarray:
 def history_of(drift: np.ndarray, seed: int = 0, sigma: float = SIGMA) -> DriftHistory:
     """Twenty measuring poses; the check points are told without noise."""
     rng = np.random.default_rng(seed)
-    A = rows(postures(20, seed), thermal_shift.BALL)
+    A = rows(postures(20, seed), kr150.BALL)
     q = np.array([0.0, -1.2, 1.5, 0.0, 0.0, 0.0]) + rng.uniform(-1.2, 1.2, (34, 6))
-    J = rows(q, thermal_shift.TOOL)
+    J = rows(q, kr150.TOOL)
     noise = sigma * rng.standard_normal((len(drift), len(A)))
     return DriftHistory(NAMES, drift @ A.T + noise, A, drift @ J.T, J)
 

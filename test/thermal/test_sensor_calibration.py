@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
@@ -12,7 +12,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.cell_setup import calibrate_sensor, place_sensor
 
 SIGMA = 2e-5
-T_SENSOR_BASE, BALL = thermal_shift.T_SENSOR_BASE, thermal_shift.BALL
+T_SENSOR_BASE, BALL = kr150.T_SENSOR_BASE, kr150.BALL
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 from robocal_ros.bags.bags import bag_info, read_bag
 from robocal_ros.bags.replay import replay
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground.errors import Code
@@ -134,7 +134,7 @@ def test_the_truth_is_met_until_the_knock(script, messages, outcomes):
         if outcome.status is Code.SENSOR_OR_ROBOT_MOVED:
             continue
         corrected = JointCorrection.between(nominal, arm_of(model, nominal)).correct(taught).q
-        after.append(cell.robot.point(corrected, cycle.warmth, thermal_shift.TOOL) - cold)
+        after.append(cell.robot.point(corrected, cycle.warmth, kr150.TOOL) - cold)
         before.append(np.array(told["position_m"]) - cold)
     rms = [np.sqrt(np.mean(np.sum(np.square(e), axis=-1))) for e in (before, after)]
     assert 1e-4 < rms[0] < 9e-4  # tenths of a millimetre, as of a real robot

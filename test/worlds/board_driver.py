@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from hand_eye_driver import ARM, FRAME, Q_NEAR, Recorded
 
-from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     ArmRobot,
     BoardCell,
     BoardNoise,
@@ -18,6 +16,8 @@ from robocal_ros.cell_sim.hand_eye_cell import (
     TruePose,
     true_pose,
 )
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.hand_eye.data import IMAGE
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import chi2
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
+from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.camera_data import Chessboard, PosePairs
 from robocal_ros.hand_eye.camera_fit import GivenNoise

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocal_ros.cell_sim.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
+from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.hand_eye.files import write_pose_table
 
 NOISE = BoardNoise(1e-4, 2e-4, (2e-4, 2e-4, 2e-4), (5e-4, 5e-4, 5e-4))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.solve import CellModel
@@ -20,8 +20,8 @@ def postures(count: int, seed: int = 0) -> np.ndarray:
 
 
 def cell_of(arm: SerialArm) -> CellModel:
-    tool = frames.transform(np.eye(3), thermal_shift.BALL)[None]
-    return CellModel(arm, thermal_shift.T_SENSOR_BASE, ("ball",), tool)
+    tool = frames.transform(np.eye(3), kr150.BALL)[None]
+    return CellModel(arm, kr150.T_SENSOR_BASE, ("ball",), tool)
 
 
 def visit(cell: CellModel, q: np.ndarray, rng: np.random.Generator | None = None) -> Measurements:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.cell_sim import thermal_shift
+from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
@@ -51,8 +51,8 @@ def visits(
         for cycle, arm in cycles.items():
             for pose, taught in poses.items():
                 q = taught + 2e-5 * rng.standard_normal(6)
-                T = thermal_shift.T_SENSOR_BASE @ arm.fk(q)
-                p = T[:3, :3] @ thermal_shift.BALL + T[:3, 3] + SIGMA * rng.standard_normal(3)
+                T = kr150.T_SENSOR_BASE @ arm.fk(q)
+                p = T[:3, :3] @ kr150.BALL + T[:3, 3] + SIGMA * rng.standard_normal(3)
                 writer.writerow(
                     [pose, cycle, f"{cycle}/{pose}"]
                     + [f"{x:.7f}" for x in np.degrees(q)]

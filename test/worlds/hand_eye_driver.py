@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots, sphere_shots
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots, sphere_shots
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames

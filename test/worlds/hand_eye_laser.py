@@ -9,7 +9,7 @@ from hand_eye_driver import (
     sphere_shots_of,
 )
 
-from robocal_ros.cell_sim.hand_eye_cell import TrueStairs, edge_shots, groove_shots, step_shots
+from bench.hand_eye_cell import TrueStairs, edge_shots, groove_shots, step_shots
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.targets import Staircase, StepTarget, target_document

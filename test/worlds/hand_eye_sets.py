@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots, TrueStairs
+from bench.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots, TrueStairs
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.data import profile_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.hand_eye_cell import (
+from bench.hand_eye_cell import (
     HandEyeCell,
     PoseRobot,
     SimulatedShots,

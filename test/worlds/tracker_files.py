@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.cell_sim.laser_tracker import TrackerCell
+from bench.laser_tracker import TrackerCell
 from robocal_ros.hand_eye.files import write_pose_table, write_profile, write_tracker_points
 from robocal_ros.hand_eye.targets import write_tracker_target
 from robocal_ros.hand_eye.tracker_data import TrackerData
