@@ -88,6 +88,8 @@ def main() -> int:
         page = validate(recordings, folder / "report")
     except (LiveError, RobocalError) as error:
         print(f"demo: {error}", file=sys.stderr)
+        if "gap_open is silent" in str(error):
+            print("demo: this computer was too busy, as no PLC may be: again", file=sys.stderr)
         return 1
     show(story, page, time.monotonic() - begin_s, opened=not options.no_open)
     return 0

@@ -21,6 +21,7 @@ pytestmark = pytest.mark.cell
 
 ROOT = Path(__file__).parent.parent.parent
 LONGEST_S = 240.0
+TRIES = 3
 WITHIN_MM = 0.3  # what docs/simulation.md calls recovered
 BENT_MM = 2.0
 NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what it was measured with
@@ -32,16 +33,20 @@ def demo(tmp_path_factory) -> tuple[str, dict, Path]:
 
     A computer that is busy for half a second closes a gap in mid-measurement, as it must: again.
     """
-    printed, story, out = played(tmp_path_factory.mktemp("demo"))
-    if any("gap_open is silent" in gap["message"] for gap in story["gaps"]):
-        printed, story, out = played(tmp_path_factory.mktemp("demo"))
-    return printed, story, out
+    for _ in range(TRIES):
+        out = tmp_path_factory.mktemp("demo")
+        done = played(out)
+        story = (out / "story.json").read_text() if done.returncode == 0 else done.stderr
+        if "gap_open is silent" not in story:
+            break
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout, json.loads(story), out
 
 
-def played(out: Path) -> tuple[str, dict, Path]:
+def played(out: Path) -> subprocess.CompletedProcess[str]:
     command = sys.executable, str(ROOT / "bags" / "demo.py")
     with free_domain() as domain:
-        done = subprocess.run(
+        return subprocess.run(
             [*ENDS_WITH_PARENT, *command, "--out", str(out), "--no-open"],
             env=os.environ | {"ROS_DOMAIN_ID": str(domain), "COLUMNS": "120"},
             capture_output=True,
@@ -49,8 +54,6 @@ def played(out: Path) -> tuple[str, dict, Path]:
             timeout=LONGEST_S,
             check=False,
         )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout, json.loads((out / "story.json").read_text()), out
 
 
 def test_the_shift_goes_as_it_should(demo):

@@ -27,6 +27,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.ros import conversions, endpoints
 
+pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
 PERIOD_S = 0.02  # of the joint states
 RESTS_S = 0.5  # of a stream that begins: its first messages may be lost
 STREAM_TICKS = 2  # a busy machine must not hold the node up for two periods of the stream
@@ -360,7 +361,6 @@ def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> 
     assert all(len(message.points) for message in line.paths)
 
 
-@pytest.mark.cell
 @pytest.mark.parametrize("how", ["streams", "drives"])
 def test_a_deactivation_brings_the_robot_to_rest(graph: Any, how: str) -> None:
     """Of a process: it does nothing else meanwhile."""
