@@ -20,7 +20,7 @@ from robocal_ros.kinematics.robots import (
     robot_file_hash,
 )
 from robocal_ros.ros.base import NO_SERIAL
-from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.parameters import Setting, advanced
 from robocal_ros.ros.session_node import STATE_DIR
 
 Array = NDArray[np.float64]
@@ -136,31 +136,33 @@ SETTINGS = (
         high=2.0,
     ),
     Setting("offset_mm_s", 5.0, "and to a sliding joint", "mm/s", 0.01, 5.0),
-    Setting(
-        "stream_gap_s",
-        0.1,
-        "After a longer pause, and one of two periods, a stream of targets goes on only where the "
-        "robot can be soon",
-        unit="s",
-        low=0.01,
-        high=10.0,
-    ),
-    Setting(
-        "start_deg",
-        0.02,
-        "How far from where a command begins a joint may stand",
-        unit="deg",
-        low=0.001,
-        high=0.5,
-    ),
-    Setting("start_mm", 0.05, "and a sliding joint", "mm", 0.001, 1.0),
-    Setting(
-        "joint_state_age_s",
-        0.2,
-        "Older joint states do not tell where the robot is",
-        unit="s",
-        low=0.01,
-        high=5.0,
+    *advanced(
+        Setting(
+            "stream_gap_s",
+            0.1,
+            "After a longer pause, and one of two periods, a stream of targets goes on only where the "
+            "robot can be soon",
+            unit="s",
+            low=0.01,
+            high=10.0,
+        ),
+        Setting(
+            "start_deg",
+            0.02,
+            "How far from where a command begins a joint may stand",
+            unit="deg",
+            low=0.001,
+            high=0.5,
+        ),
+        Setting("start_mm", 0.05, "How far a sliding joint may stand from there", "mm", 0.001, 1.0),
+        Setting(
+            "joint_state_age_s",
+            0.2,
+            "Older joint states do not tell where the robot is",
+            unit="s",
+            low=0.01,
+            high=5.0,
+        ),
     ),
 )
 

@@ -31,7 +31,14 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.graph import FrameWatch
-from robocal_ros.ros.parameters import STANDSTILL, Setting, length, pose_settings, standstill_rule
+from robocal_ros.ros.parameters import (
+    STANDSTILL,
+    Setting,
+    advanced,
+    length,
+    pose_settings,
+    standstill_rule,
+)
 from robocal_ros.ros.session_node import STATE_DIR, DecisionServices, SessionNode
 from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome, named
 
@@ -61,15 +68,6 @@ SETTINGS = (
     Setting("feature", FEATURES[0], "What a line is in a profile", choices=FEATURES),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
-    *STANDSTILL,
-    Setting(
-        "capture_timeout_s",
-        10.0,
-        "A capture without standstill or without a measurement for so long fails",
-        unit="s",
-        low=0.5,
-        high=600.0,
-    ),
     length(
         "robot_sigma_mm", 0.0, "Error of a reported pose in each axis; 0: from the data", 0.0, 10.0
     ),
@@ -97,6 +95,17 @@ SETTINGS = (
         check=_range_fault,
     ),
     length("sensor_noise_mm", 0.037, "Noise of a point along the beam; for check_plan", 1e-4, 10.0),
+    *advanced(
+        *STANDSTILL,
+        Setting(
+            "capture_timeout_s",
+            10.0,
+            "A capture without standstill or without a measurement for so long fails",
+            unit="s",
+            low=0.5,
+            high=600.0,
+        ),
+    ),
 )
 
 

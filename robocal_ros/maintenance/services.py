@@ -37,7 +37,7 @@ from robocal_ros.ros.endpoints import (
     trigger_text,
 )
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S
-from robocal_ros.ros.parameters import Setting, given_pose, length, pose_settings
+from robocal_ros.ros.parameters import Setting, advanced, given_pose, length, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR, TWIN, SessionEvents
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
@@ -443,17 +443,9 @@ SETTINGS = (
         SHORTEST_STALE_S,
     ),
     GAP_BOOL,
-    _time("rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 10.0, 0.1),
-    _time("reserve_s", 1.0, "Kept free before the end of a gap", 60.0),
     Setting("measurements", 1, "So many measurements make a pose measured", low=1, high=1000),
-    _time("settle_s", 0.3, "A measurement counts so long after the robot stands", 10.0),
-    _time("stay_s", 0.2, "The robot stays so long after the last measurement of a pose", 10.0),
-    _time("measure_s", 3.0, "The longest time at a pose", 600.0),
-    _time("answer_s", 1.0, "Another node answers within", 60.0, 0.1),
-    _time("solve_s", 6.0, "thermal_node ends a cycle within", 600.0, 0.1),
     _time("check_s", 15.0, "A quick check takes at the most", 600.0, 1.0),
     _time("full_s", 30.0, "A full tool measurement takes at the most", 3600.0, 1.0),
-    _time("tool_home_s", 10.0, "Kept free for the way home from the beams", 600.0, 0.1),
     _time(
         "resume_within_s",
         600.0,
@@ -471,7 +463,6 @@ SETTINGS = (
     ),
     _time("tool_due_s", 7200.0, "Age of a tool check at which accuracy_state is DUE", 1e7),
     _time("tool_expires_s", 28800.0, "Age at which it is EXPIRED", 1e7),
-    _time("thermal_silent_s", 5.0, "thermal_node's accuracy may pause for so long", 600.0, 1.0),
     Setting(
         "correction_silent_s",
         5.0,
@@ -499,6 +490,19 @@ SETTINGS = (
         unit="deg",
         low=0.001,
         high=90.0,
+    ),
+    *advanced(
+        _time(
+            "rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 10.0, 0.1
+        ),
+        _time("reserve_s", 1.0, "Kept free before the end of a gap", 60.0),
+        _time("settle_s", 0.3, "A measurement counts so long after the robot stands", 10.0),
+        _time("stay_s", 0.2, "The robot stays so long after the last measurement of a pose", 10.0),
+        _time("measure_s", 3.0, "The longest time at a pose", 600.0),
+        _time("answer_s", 1.0, "Another node answers within", 60.0, 0.1),
+        _time("solve_s", 6.0, "thermal_node ends a cycle within", 600.0, 0.1),
+        _time("tool_home_s", 10.0, "Kept free for the way home from the beams", 600.0, 0.1),
+        _time("thermal_silent_s", 5.0, "thermal_node's accuracy may pause for so long", 600.0, 1.0),
     ),
 )
 

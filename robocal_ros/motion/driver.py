@@ -40,7 +40,7 @@ from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport, RobotWatch, S
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
-from robocal_ros.ros.parameters import Setting, length
+from robocal_ros.ros.parameters import Setting, advanced, length
 
 Array = NDArray[np.float64]
 
@@ -231,16 +231,23 @@ MOTION = (
         low=0.01,
         high=10.0,
     ),
-    Setting(
-        "motion_silence_s",
-        0.1,
-        "Joint states may pause for so long while the robot moves",
-        unit="s",
-        low=0.02,
-        high=0.5,
-    ),
-    Setting(
-        "motion_late_s", 0.15, "The robot lags at most so far behind its trajectory", "s", 0.01, 1.0
+    *advanced(
+        Setting(
+            "motion_silence_s",
+            0.1,
+            "Joint states may pause for so long while the robot moves",
+            unit="s",
+            low=0.02,
+            high=0.5,
+        ),
+        Setting(
+            "motion_late_s",
+            0.15,
+            "The robot lags at most so far behind its trajectory",
+            "s",
+            0.01,
+            1.0,
+        ),
     ),
 )
 

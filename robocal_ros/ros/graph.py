@@ -197,6 +197,7 @@ GAP_BOOL = Setting(
     False,
     "Deprecated, for one release: gap_open is std_msgs/Bool, without an echo; a bridge that "
     "repeats an old value, and a network that delays, then open the gap",
+    advanced=True,
 )
 SHORTEST_STALE_S = 0.25  # longer than a beat
 TYPES = {False: "robocal_msgs/msg/GapOpen", True: "std_msgs/msg/Bool"}

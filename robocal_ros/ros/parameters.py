@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,7 @@ class Setting:
     # says what is wrong with a value of the right type and within the bounds, or None
     check: Callable[[Any], str | None] | None = None
     live: bool = False  # may change at any time; others only while the node is unconfigured
+    advanced: bool = False  # a constant of the method: not in the node's file, but on its page
 
     def accept(self, value: object) -> Value:
         """Return ``value`` as this parameter's type.
@@ -109,7 +110,7 @@ class Setting:
         when = "may change at any time" if self.live else "may change while unconfigured"
         unit = f" [{self.unit}]" if self.unit else ""
         descriptor = ParameterDescriptor(
-            description=self.description + unit,
+            description="advanced: " * self.advanced + self.description + unit,
             additional_constraints="; ".join(part for part in (self.bounds, when) if part),
         )
         if self.low is not None and self.high is not None:
@@ -137,6 +138,11 @@ def _typed(value: object, like: Value) -> Value | None:
 def length(name: str, default: float, what: str, low: float, high: float) -> Setting:
     """A length in mm."""
     return Setting(name, default, what, "mm", low, high)
+
+
+def advanced(*settings: Setting) -> tuple[Setting, ...]:
+    """Constants of a method, which a cell need not think about."""
+    return tuple(replace(setting, advanced=True) for setting in settings)
 
 
 class ParameterTable:
@@ -263,7 +269,7 @@ STANDSTILL = (
         low=0.0,
         high=10.0,
     ),
-    Setting("standstill_after_s", 0.1, "and so long after it", "s", 0.0, 10.0),
+    Setting("standstill_after_s", 0.1, "It stands still so long after the stamp", "s", 0.0, 10.0),
     Setting(
         "standstill_tolerance_deg",
         0.02,

@@ -43,7 +43,14 @@ from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.conversions import MM, joint_poses, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
-from robocal_ros.ros.parameters import ORIGIN, STANDSTILL, Setting, count_fault, standstill_rule
+from robocal_ros.ros.parameters import (
+    ORIGIN,
+    STANDSTILL,
+    Setting,
+    advanced,
+    count_fault,
+    standstill_rule,
+)
 from robocal_ros.ros.session_node import (
     STATE_DIR,
     AddService,
@@ -123,22 +130,6 @@ SETTINGS = (
         high=200.0,
     ),
     Setting(
-        "sphere_tolerance_mm",
-        0.1,
-        "How far the radius of the points of a cloud may be off",
-        unit="mm",
-        low=1e-3,
-        high=5.0,
-    ),
-    Setting(
-        "sphere_noise_mm",
-        0.2,
-        "Largest scatter of a cloud's points about the sphere",
-        unit="mm",
-        low=1e-3,
-        high=5.0,
-    ),
-    Setting(
         "sensor_field_mm",
         [570.0, 430.0, 700.0, 550.0, 850.0],
         "Where the sensor measures: width, height, at what distance; nearest and farthest distance",
@@ -146,24 +137,6 @@ SETTINGS = (
         low=1.0,
         high=20000.0,
         check=_field_fault,
-    ),
-    Setting(
-        "hold_out",
-        0.5,
-        "Share of the poses kept to judge a calibration without a reference",
-        low=0.1,
-        high=0.9,
-    ),
-    Setting("seed", 0, "Which poses are held out", low=0, high=2**31 - 1),
-    *STANDSTILL,
-    Setting(
-        "cycle_timeout_s",
-        660.0,
-        "A cycle ends when nothing was measured for so long; a minute longer than "
-        "maintenance_node's resume_within_s",
-        unit="s",
-        low=1.0,
-        high=7200.0,
     ),
     Setting(
         "tolerance_mm",
@@ -196,21 +169,57 @@ SETTINGS = (
         high=5000.0,
         check=count_fault(3),
     ),
-    Setting(
-        "lateness_s",
-        0.2,
-        "Commands on measurements wait for joint readings so much newer than the call",
-        unit="s",
-        low=0.0,
-        high=5.0,
-    ),
-    Setting(
-        "command_timeout_s",
-        1.0,
-        "They wait at most so long (wall clock), then use what is there",
-        unit="s",
-        low=0.05,
-        high=30.0,
+    *advanced(
+        Setting(
+            "sphere_tolerance_mm",
+            0.1,
+            "How far the radius of the points of a cloud may be off",
+            unit="mm",
+            low=1e-3,
+            high=5.0,
+        ),
+        Setting(
+            "sphere_noise_mm",
+            0.2,
+            "Largest scatter of a cloud's points about the sphere",
+            unit="mm",
+            low=1e-3,
+            high=5.0,
+        ),
+        Setting(
+            "hold_out",
+            0.5,
+            "Share of the poses kept to judge a calibration without a reference",
+            low=0.1,
+            high=0.9,
+        ),
+        Setting("seed", 0, "Which poses are held out", low=0, high=2**31 - 1),
+        *STANDSTILL,
+        Setting(
+            "cycle_timeout_s",
+            660.0,
+            "A cycle ends when nothing was measured for so long; a minute longer than "
+            "maintenance_node's resume_within_s",
+            unit="s",
+            low=1.0,
+            high=7200.0,
+        ),
+        Setting(
+            "lateness_s",
+            0.2,
+            "Commands on measurements wait for joint readings so much newer than the call",
+            unit="s",
+            low=0.0,
+            high=5.0,
+        ),
+        Setting(
+            "command_timeout_s",
+            1.0,
+            "Such commands wait at most so long (wall clock), then use what is there",
+            unit="s",
+            low=0.05,
+            high=30.0,
+        ),
     ),
 )
 

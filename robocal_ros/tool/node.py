@@ -20,7 +20,7 @@ from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
-from robocal_ros.ros.parameters import Setting, given_pose, length, pose_settings
+from robocal_ros.ros.parameters import Setting, advanced, given_pose, length, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR, SessionNode
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
@@ -136,37 +136,45 @@ SETTINGS = (
         low=0.1,
         high=45.0,
     ),
-    length("trait_radius_mm", 0.05, "Change of its radius that is no fault yet; 0: any", 0.0, 5.0),
-    Setting(
-        "trait_latency_ms",
-        5.0,
-        "Change of the edges' delay that is no fault yet; 0: any",
-        unit="ms",
-        low=0.0,
-        high=1000.0,
-    ),
-    Setting(
-        "trait_lost",
-        0.05,
-        "Share of the joint readings that may be lost; 0: any",
-        low=0.0,
-        high=1.0,
-    ),
-    Setting(
-        "step_timeout_s",
-        30.0,
-        "A run ends when a step has no edge for so long",
-        unit="s",
-        low=1.0,
-        high=3600.0,
-    ),
-    Setting(
-        "joint_silence_s",
-        0.5,
-        "A run ends when joint states are silent for so long",
-        unit="s",
-        low=0.02,
-        high=10.0,
+    *advanced(
+        length(
+            "trait_radius_mm",
+            0.05,
+            "Change of the tool's radius that is no fault yet; 0: any",
+            0.0,
+            5.0,
+        ),
+        Setting(
+            "trait_latency_ms",
+            5.0,
+            "Change of the edges' delay that is no fault yet; 0: any",
+            unit="ms",
+            low=0.0,
+            high=1000.0,
+        ),
+        Setting(
+            "trait_lost",
+            0.05,
+            "Share of the joint readings that may be lost; 0: any",
+            low=0.0,
+            high=1.0,
+        ),
+        Setting(
+            "step_timeout_s",
+            30.0,
+            "A run ends when a step has no edge for so long",
+            unit="s",
+            low=1.0,
+            high=3600.0,
+        ),
+        Setting(
+            "joint_silence_s",
+            0.5,
+            "A run ends when joint states are silent for so long",
+            unit="s",
+            low=0.02,
+            high=10.0,
+        ),
     ),
 )
 

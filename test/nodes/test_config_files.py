@@ -22,7 +22,7 @@ from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.driver import MOTION
 from robocal_ros.ros.base import AUTOSTART, SERIAL
-from robocal_ros.ros.parameters import SHARED
+from robocal_ros.ros.parameters import SHARED, Setting
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.node import INPUTS, ThermalNode
 from robocal_ros.tool.judging import ToolLimits
@@ -40,6 +40,14 @@ NODES = (
     MaintenanceNode,
 )
 ALL_NODES = (*NODES, JointCorrectionNode)
+PAGES = {
+    ThermalNode: "thermal_node",
+    TcfNode: "tcf_node",
+    HandEyeNode: "hand_eye_node",
+    MaintenanceNode: "maintenance_node",
+    JointCorrectionNode: "joint_correction",
+    RecorderNode: "bags",
+}
 
 
 def shipped(node: type) -> dict[str, Any]:
@@ -48,13 +56,35 @@ def shipped(node: type) -> dict[str, Any]:
     return content[f"/**/{node.NAME}"]["ros__parameters"]
 
 
+def settings(node: Any) -> tuple[Setting, ...]:
+    return (AUTOSTART, SERIAL, *node.SETTINGS)
+
+
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)
 def test_the_file_shows_every_parameter_with_its_default(node):
-    assert shipped(node) == {s.name: s.default for s in (AUTOSTART, SERIAL, *node.SETTINGS)}
+    assert shipped(node) == {s.name: s.default for s in settings(node) if not s.advanced}
+
+
+@pytest.mark.parametrize("node", PAGES, ids=lambda node: node.NAME)
+def test_the_page_shows_every_advanced_parameter(node):
+    rows = [
+        f"| `{s.name}` | {s.default} {s.unit}".rstrip() + f" | {s.description} |\n"
+        for s in settings(node)
+        if s.advanced
+    ]
+    table = "| parameter | default | meaning |\n| --- | --- | --- |\n" + "".join(rows)
+    page = (CONFIG.parent / "docs" / f"{PAGES[node]}.md").read_text()
+    assert page.endswith(table), f"\n{table}"
+    file = (CONFIG / f"{node.NAME}.yaml").read_text()
+    assert f'docs/{PAGES[node]}.md, "Advanced parameters"' in file
+
+
+def test_only_nodes_with_a_page_have_advanced_parameters():
+    assert {node for node in ALL_NODES if any(s.advanced for s in settings(node))} == set(PAGES)
 
 
 def test_what_several_nodes_have_may_be_given_to_all():
-    tables = [{s.name for s in (AUTOSTART, SERIAL, *node.SETTINGS)} for node in ALL_NODES]
+    tables = [{s.name for s in settings(node)} for node in ALL_NODES]
     counts = Counter(name for table in tables for name in table)
     assert {name for name, count in counts.items() if count > 1} == SHARED
     shared = yaml.safe_load((CONFIG / "cell.yaml").read_text())["/**"]["ros__parameters"]
@@ -63,26 +93,25 @@ def test_what_several_nodes_have_may_be_given_to_all():
 
 def test_each_node_takes_over_what_another_one_gives_as_all_is_set():
     """A tool that may be accepted is corrected with; a cycle that is resumed is still open."""
-    tcf, correction, maintenance, thermal = map(
-        shipped, (TcfNode, JointCorrectionNode, MaintenanceNode, ThermalNode)
-    )
+    tcf, correction, maintenance = map(shipped, (TcfNode, JointCorrectionNode, MaintenanceNode))
     assert tcf["change_limit_mm"] <= correction["tool_tcp_mm"]
     assert tcf["tilt_limit_deg"] <= correction["tool_tcp_deg"] <= correction["tool_joint_deg"]
     assert maintenance["accept_tool_mm"] <= tcf["change_limit_mm"]
     assert maintenance["accept_tool_deg"] <= tcf["tilt_limit_deg"]
     assert maintenance["accept_thermal_mm"] <= correction["thermal_tcp_mm"]
-    assert maintenance["resume_within_s"] + 60.0 <= thermal["cycle_timeout_s"]
+    assert maintenance["resume_within_s"] + 60.0 <= ThermalConfig().cycle_timeout_s
     assert maintenance["correction_silent_s"] > 0.0  # cell.launch.py and the demo have one
 
 
 def test_what_is_judged_without_a_file_is_judged_as_with_it():
-    tcf, correction, thermal = map(shipped, (TcfNode, JointCorrectionNode, ThermalNode))
+    tcf, correction = map(shipped, (TcfNode, JointCorrectionNode))
     limits, tool = ToolLimits(), CorrectionConfig().tool
     assert 1e3 * limits.change_m == pytest.approx(tcf["change_limit_mm"])
     assert np.degrees(limits.tilt_rad) == pytest.approx(tcf["tilt_limit_deg"])
     assert 1e3 * tool.tcp_m == pytest.approx(correction["tool_tcp_mm"])
     assert np.degrees(tool.tcp_rad) == pytest.approx(correction["tool_tcp_deg"])
-    assert ThermalConfig().cycle_timeout_s == thermal["cycle_timeout_s"]
+    (timeout,) = [s for s in ThermalNode.SETTINGS if s.name == "cycle_timeout_s"]
+    assert timeout.default == ThermalConfig().cycle_timeout_s
 
 
 def test_the_page_of_motions_names_them_as_the_parameters_do():

@@ -95,15 +95,17 @@ class Moving(Line):
             self.slowed.append((stamp * 1e-9, message.position[0], message.velocity[0]))
 
     def _plan(self, message: JointTrajectory) -> None:
-        """Go on from here, as fast as it is, by cubics; the last point is the end."""
+        """By cubics from the stamp on; on from where it is to a first point that is ahead."""
         now = time.time()
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        begin = stamp or now
         q, qd = self._now(now)
-        points = [p for p in message.points if p.time_from_start.sec or p.time_from_start.nanosec]
-        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points]
-        speeds = [np.array(p.velocities) if p.velocities else 0.0 * q for p in points]
-        places = [np.array(p.positions) for p in points]
-        self._spline = CubicHermiteSpline([0.0, *times], [q, *places], [qd, *speeds])
-        self._spline_s = now
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
+        speeds = [np.array(p.velocities) if p.velocities else 0.0 * q for p in message.points]
+        places = [np.array(p.positions) for p in message.points]
+        if begin + times[0] > now:
+            times, places, speeds = [now - begin, *times], [q, *places], [qd, *speeds]
+        self._spline, self._spline_s = CubicHermiteSpline(times, places, speeds), begin
 
     def _now(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
         if self._spline is None:
