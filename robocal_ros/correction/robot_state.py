@@ -214,6 +214,13 @@ class RobotState:
                 detail = f"the stamp of {self.names[i]} is over {AHEAD_S:g} s ahead of the clock"
             raise RefusedError(Reason.STALE_JOINTS, detail)
 
+    def require_track(self, now_s: float) -> None:
+        """Refuse while it cannot be told whether the robot stands, as it is read for too short."""
+        read_s = now_s - self._track[0][0] if self._track else 0.0
+        if read_s < RESPONSE_S - TRACK_S:
+            detail = f"read for {read_s:.3f} s, {RESPONSE_S:g} s tell whether the robot stands"
+            raise RefusedError(Reason.STALE_JOINTS, detail)
+
     def stands(self, index: Index, now_s: float) -> bool:
         """Whether these joints were read, and moved by less than ``near`` for the response time."""
         track = self._track
@@ -410,8 +417,8 @@ class Output:
         way; else where the robot stands, joints without limits at the turn nearest to ``q`` (k,):
         what reads them may count no turns, what drives them does.
 
-        Raises `RefusedError` when readings are missing or old, or the robot moves and not by what
-        was put out.
+        Raises `RefusedError` when readings are missing, old or too few, or the robot moves and not
+        by what was put out.
         """
         state = self._state
         known = state.reference(index, now_s)
@@ -429,6 +436,7 @@ class Output:
                 return sent, True
         if stands:
             return state.unwrapped(index, measured, q), False
+        state.require_track(now_s)
         raise self.refuse("the robot moves, and where its controller is is not known")
 
     def note_place(self, now_s: float) -> None:

@@ -41,6 +41,19 @@ def test_nothing_goes_out_before_joint_states_have_arrived() -> None:
     assert np.array_equal(robot.stream(), HOME)
 
 
+def test_readings_that_have_just_begun_are_waited_for() -> None:
+    """Nobody has to acknowledge that a program began to stream as fast as the robot was read."""
+    robot = Robot()
+    robot.session = CorrectionSession(NOMINAL, NOMINAL, "s1", CorrectionConfig(**LIMITS))
+    for _ in range(3):
+        robot.read(HOME)
+        robot.now += DT
+    assert "tell whether the robot stands" in refused(Reason.STALE_JOINTS, robot.stream)
+    assert not robot.session.status().mismatch
+    robot.rest()
+    assert np.array_equal(robot.stream(), HOME)
+
+
 @pytest.mark.parametrize("on", [False, True])
 @pytest.mark.parametrize("joint", range(6))
 def test_the_first_target_is_where_the_robot_stands(on: bool, joint: int) -> None:
