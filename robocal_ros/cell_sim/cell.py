@@ -495,7 +495,9 @@ class SimulatedCell:
         read = []
         while True:
             number = self._readings.due(self.now_s)
-            read.append(self._readings.read(number if readings else number[:0], self.motion))
+            number = number if readings else number[:0]
+            if len(number) or not read:
+                read.append(self._readings.read(number, self.motion))
             if self._ticks >= last:
                 break
             self._pass(min(last, (self._ticks // BEAT + 1) * BEAT))

@@ -400,8 +400,10 @@ class JointReadings:
         self, stream: Stream, number: NDArray[np.int64], width: int, uniform: bool = False
     ) -> Array:
         """Random numbers (k, width) that belong to these readings."""
-        rows = np.empty((len(number), width))
         pages = number // PAGE
+        if len(pages) and pages[0] == pages[-1]:
+            return self._page(stream, int(pages[0]), width, uniform)[number % PAGE]
+        rows = np.empty((len(number), width))
         for page in np.unique(pages).tolist():
             drawn = self._page(stream, page, width, uniform)
             rows[pages == page] = drawn[number[pages == page] % PAGE]

@@ -116,12 +116,15 @@ class SampledPath:
         past = np.searchsorted(self._points_s, time_s, side="right")
         stretch = np.minimum(past, len(self._points_s) - 1)
         t = (time_s - self._knots[stretch])[:, None]
+        if stretch[0] == stretch[-1]:  # times increase, but for what is asked a cycle ahead
+            stretch = stretch[:1]
         c = self._polynomials[:, stretch]
         q = c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * (c[4] + t * c[5]))))
         qd = c[1] + t * (2.0 * c[2] + t * (3.0 * c[3] + t * (4.0 * c[4] + t * 5.0 * c[5])))
         qdd = 2.0 * c[2] + t * (6.0 * c[3] + t * (12.0 * c[4] + t * 20.0 * c[5]))
         over = past == len(self._points_s)
-        q[over], qd[over], qdd[over] = self._last
+        if over.any():
+            q[over], qd[over], qdd[over] = self._last
         return q, qd, qdd, past
 
 
@@ -366,10 +369,10 @@ class TrajectoryController:
             self._new, self._brakes = None, False
         steps = self._steps + np.arange(len(time_s), dtype=np.float64)
         at = np.asarray(self._begin_s + steps * self._step_s)
-        desired, desired_qd, desired_qdd, _ = self._path.sample(at)
-        command, speed, _, past = self._path.sample(at + self.period_s)
-        past_s, ended = np.asarray(at - self._path.start_s), past == self._path.count
-        return Cycles(desired, desired_qd, desired_qdd, command, speed * self.scale, past_s, ended)
+        k = len(at)
+        q, qd, qdd, past = self._path.sample(np.concatenate([at, at + self.period_s]))
+        past_s, ended = np.asarray(at - self._path.start_s), past[k:] == self._path.count
+        return Cycles(q[:k], qd[:k], qdd[:k], q[k:], qd[k:] * self.scale, past_s, ended)
 
     def judge(self, cycles: Cycles, measured: Array) -> int:
         """Compare them with where (k, n) the drives were in each; how many of them pass so.
@@ -493,10 +496,12 @@ class JointMotion:
         self.peak, self.faults, self.fault = np.zeros_like(here), 0, ""
         names = names or tuple(f"joint_{i + 1}" for i in range(len(here)))
         self.controller = TrajectoryController(names, here, CYCLE_S, options or ControllerOptions())
-        # Each row is a cycle: measured, sent and desired joints with their rates.
+        # Each row is a cycle: measured, sent and desired joints with their rates. What the drives
+        # report next follows the last.
         self._width = 1 + round(2.0 * lag_s / CYCLE_S)
         self._sent = np.tile(np.stack([here, np.zeros_like(here)]), (self._width, 1, 1))
-        self._rows = np.empty((2 * KEPT, 7, len(here)))
+        self._rows = np.empty((2 * KEPT + 1, 7, len(here)))
+        self._rows[0, :2] = self._mean(self._sent[:0])[0]
         self._past_s = np.empty(2 * KEPT)
         self._begin = self._count = 0  # number of the first row's cycle, and of the next one
         self._before = self._snapshot()
@@ -515,7 +520,7 @@ class JointMotion:
     @property
     def here(self) -> Array:
         """Joints and velocities (2, n) that the drives report next."""
-        return np.asarray(self._mean(self._sent[:0])[0])
+        return self._rows[self._count - self._begin, :2].copy()
 
     def follow(
         self,
@@ -565,16 +570,13 @@ class JointMotion:
 
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Joints (k, n) and their velocities at times (k,), of which `KEPT` cycles are known."""
-        t = np.asarray(time_s, dtype=np.float64)
-        if len(t):
-            self._run(int(np.floor(np.max(t) / CYCLE_S * (1.0 + 1e-12))) + 1)
-        number = np.floor(t / CYCLE_S * (1.0 + 1e-12)).astype(np.int64)
-        number = np.clip(number, self._begin, self._count - 1)
-        first = int(np.min(number, initial=self._count - 1))
-        known = self._rows[first - self._begin : self._count - self._begin, :2]
-        rows, row = np.concatenate([known, self.here[None]]), number - first
-        s = np.clip(t / CYCLE_S - number, 0.0, 1.0)[:, None]
-        (q0, v0), (q1, v1) = (rows[row + i].transpose(1, 0, 2) for i in (0, 1))
+        t = np.asarray(time_s, dtype=np.float64) / CYCLE_S
+        number = np.floor(t * (1.0 + 1e-12)).astype(np.int64)
+        self._run(int(np.max(number, initial=-1)) + 1)
+        number = np.minimum(np.maximum(number, self._begin), self._count - 1)
+        s = np.minimum(np.maximum(t - number, 0.0), 1.0)[:, None]
+        row, rows = number - self._begin, self._rows
+        q0, v0, q1, v1 = rows[row, 0], rows[row, 1], rows[row + 1, 0], rows[row + 1, 1]
         # Drives interpolate between two cycles as the controller does between two points.
         way, v0, v1 = q1 - q0, v0 * CYCLE_S, v1 * CYCLE_S
         c2, c3 = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
@@ -600,6 +602,7 @@ class JointMotion:
             return
         if self._count > count:
             self._count, self.controller, self._sent = self._before
+            self._rows[self._count - self._begin, :2] = self._mean(self._sent[:0])[0]
         self._run(count)
         self._before = self._snapshot()
 
@@ -638,13 +641,13 @@ class JointMotion:
     def _append(self, cycles: Cycles) -> None:
         count = len(cycles.command)
         row = self._count - self._begin
-        if row + count > len(self._rows):
+        if row + count >= len(self._rows):
             self._rows[:KEPT] = self._rows[row - KEPT : row]
             self._past_s[:KEPT] = self._past_s[row - KEPT : row]
             self._begin, row = self._count - KEPT, KEPT
         rows = slice(row, row + count)
         sent = np.stack([cycles.command, cycles.speed], axis=1)
-        self._rows[rows, :2] = self._mean(sent)[:-1]
+        self._rows[row : row + count + 1, :2] = self._mean(sent)
         for i, part in enumerate(
             (cycles.command, cycles.speed, cycles.desired, cycles.desired_qd, cycles.desired_qdd)
         ):
