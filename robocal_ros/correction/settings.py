@@ -140,8 +140,8 @@ SETTINGS = (
         Setting(
             "stream_gap_s",
             0.1,
-            "After a longer pause, and one of two periods, a stream of targets goes on only where the "
-            "robot can be soon",
+            "After a longer pause, and one of two periods, a stream of targets goes on only where "
+            "the robot can be soon",
             unit="s",
             low=0.01,
             high=10.0,
