@@ -26,7 +26,6 @@ from robocal_ros.history.history_records import (
     MANDREL,
     THERMAL,
     TOOL,
-    Decision,
     Entry,
     hand_eye_kind,
 )
@@ -64,7 +63,9 @@ def show_list(console: "Console", document: Document) -> None:
         )
     console.print(table)
     for head in document["in_force"]:
-        console.print(Text(_in_force(head)))
+        number = head["calibration_id"]
+        name = "the nominal model" if number is None else f"calibration {number}"
+        console.print(Text(f"In force: {name}, {head['kind']} revision {head['revision']}"))
     if not document["in_force"]:
         console.print("In force: the nominal model; nothing was accepted yet")
 
@@ -119,20 +120,16 @@ def show_corrections(console: "Console", document: Document) -> None:
         console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
 
 
-def show_acknowledged(console: "Console", document: Document) -> None:
-    """Print which damaged histories somebody knows of now."""
+def show_done(console: "Console", document: Document) -> None:
+    """Print what was decided, or which damaged histories somebody knows of now."""
     from rich.text import Text
 
-    for path in document["acknowledged"]:
-        console.print(Text(f"Acknowledged by {document['by']}: {path}"), soft_wrap=True)
-    if not document["acknowledged"]:
-        console.print("There is nothing to acknowledge")
-
-
-def show_decision(console: "Console", document: Document) -> None:
-    """Print what was done."""
-    from rich.text import Text
-
+    if "acknowledged" in document:
+        for path in document["acknowledged"]:
+            console.print(Text(f"Acknowledged by {document['by']}: {path}"), soft_wrap=True)
+        if not document["acknowledged"]:
+            console.print("There is nothing to acknowledge")
+        return
     _show_damage(console, document)
     console.print(Text(document["verdict"]["reason"].capitalize()), soft_wrap=True)
 
@@ -145,12 +142,6 @@ def _show_damage(console: "Console", document: Document) -> None:
             style="bold red",
             soft_wrap=True,
         )
-
-
-def _in_force(head: Document) -> str:
-    number = head["calibration_id"]
-    name = "the nominal model" if number is None else f"calibration {number}"
-    return f"In force: {name}, {head['kind']} revision {head['revision']}"
 
 
 def _words(decision: Document) -> str:
@@ -170,41 +161,6 @@ def _time(stamp_ns: int) -> str:
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
 _KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL)
-
-
-def add_history_options(action: argparse.ArgumentParser) -> None:
-    """Declare which history is meant."""
-    action.add_argument(
-        "--robot-serial",
-        type=text,
-        metavar="S",
-        help="robot serial; may be left out where only one robot has a history",
-    )
-    action.add_argument(
-        "--state",
-        type=Path,
-        metavar="DIR",
-        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-    )
-
-
-def add_rollback_target(action: argparse.ArgumentParser) -> None:
-    """Declare what a rollback returns to."""
-    action.add_argument(
-        "--to",
-        type=_target,
-        default=None,
-        metavar="ID",
-        help="an accepted calibration, 'nominal', or 'previous' (default): the one in force "
-        "before the present one",
-    )
-    action.add_argument(
-        "--kind",
-        type=_kind,
-        metavar="KIND",
-        default=THERMAL,
-        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
-    )
 
 
 def _kind(value: str) -> str:
@@ -235,7 +191,18 @@ def add_history(parser: argparse.ArgumentParser) -> None:
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
         action = actions.add_parser(name, help=words, description=words)
-        add_history_options(action)
+        action.add_argument(
+            "--robot-serial",
+            type=text,
+            metavar="S",
+            help="robot serial; may be left out where only one robot has a history",
+        )
+        action.add_argument(
+            "--state",
+            type=Path,
+            metavar="DIR",
+            help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
+        )
         return action
 
     for name, words in (
@@ -265,8 +232,21 @@ def add_history(parser: argparse.ArgumentParser) -> None:
                 metavar="N",
                 help="refuse when another revision is in force",
             )
-        if name == "rollback":
-            add_rollback_target(action)
+    action.add_argument(
+        "--to",
+        type=_target,
+        default=None,
+        metavar="ID",
+        help="an accepted calibration, 'nominal', or 'previous' (default): the one in force "
+        "before the present one",
+    )
+    action.add_argument(
+        "--kind",
+        type=_kind,
+        metavar="KIND",
+        default=THERMAL,
+        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
+    )
 
 
 def run_history(args: argparse.Namespace) -> CliResult:
@@ -274,7 +254,16 @@ def run_history(args: argparse.Namespace) -> CliResult:
     folder = state_folder() if args.state is None else args.state.absolute()
     serial = args.robot_serial
     if serial is None:
-        serial = _only(known_serials(folder), folder)
+        serials = known_serials(folder)
+        if len(serials) != 1:
+            raise InputError(
+                f"several robots have a history: {', '.join(serials)}; choose one with "
+                "--robot-serial"
+                if serials
+                else "no calibration history here; name its folder with --state or ROBOCAL_STATE",
+                file=str(folder),
+            )
+        serial = serials[0]
     with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
         document, render = _ACTIONS[args.action](history, args)
     damaged = damaged_files(history.path)
@@ -285,20 +274,6 @@ def run_history(args: argparse.Namespace) -> CliResult:
     }
     complete = place | document
     return CliResult(complete, lambda console: render(console, complete))
-
-
-def _only(serials: list[str], folder: Path) -> str:
-    if len(serials) == 1:
-        return serials[0]
-    if not serials:
-        raise InputError(
-            "no calibration history here; name its folder with --state or ROBOCAL_STATE",
-            file=str(folder),
-        )
-    raise InputError(
-        f"several robots have a history: {', '.join(serials)}; choose one with --robot-serial",
-        file=str(folder),
-    )
 
 
 Answer = tuple[Document, Callable[..., None]]
@@ -341,7 +316,7 @@ def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Ans
 
 def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     files = acknowledge(history.path, _by(args), time.time_ns())
-    return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_acknowledged
+    return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_done
 
 
 def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
@@ -354,7 +329,7 @@ def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
         with_heads=measured_with(history, history.get(args.id)),
     )
     said = f"calibration {args.id} is in force as {head.kind} revision {head.revision}"
-    return _decided(args, head.kind, args.id, head.revision, said), show_decision
+    return _decided(args, head.kind, args.id, head.revision, said), show_done
 
 
 def _reject(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
@@ -362,7 +337,7 @@ def _reject(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     kind = history.get(args.id).kind
     revision = history.get(args.id).decisions[-1].head_after
     said = f"calibration {args.id} is rejected; {kind} revision {revision} stays in force"
-    return _decided(args, kind, args.id, revision, said), show_decision
+    return _decided(args, kind, args.id, revision, said), show_done
 
 
 def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
@@ -378,7 +353,7 @@ def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer
     start = BEFORE_ANY.get(args.kind, "nothing")
     name = start if number is None else f"calibration {number}"
     said = f"{name} is in force again, as {head.kind} revision {head.revision}"
-    return _decided(args, head.kind, number, head.revision, said), show_decision
+    return _decided(args, head.kind, number, head.revision, said), show_done
 
 
 _ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]] = {
@@ -407,7 +382,7 @@ def _decided(
 
 
 def _entry(entry: Entry) -> Document:
-    document = {
+    return {
         "id": entry.id,
         "revision": entry.revision,
         "kind": entry.kind,
@@ -422,12 +397,8 @@ def _entry(entry: Entry) -> Document:
         "created_ns": entry.created_ns,
         "software": entry.software,
         "method": entry.method,
+        "decisions": [asdict(made) | {"action": made.action.value} for made in entry.decisions],
     }
-    return document | {"decisions": [_decision(decision) for decision in entry.decisions]}
-
-
-def _decision(decision: Decision) -> Document:
-    return asdict(decision) | {"action": decision.action.value}
 
 
 def _by(args: argparse.Namespace) -> str:

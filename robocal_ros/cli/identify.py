@@ -3,10 +3,9 @@
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,10 +29,9 @@ from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge
+from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.judged import (
     CYCLES,
-    Repeated,
     explain_mismatch,
     identification_document,
     read_positions,
@@ -41,7 +39,7 @@ from robocal_ros.identification.judged import (
     require_match,
 )
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import RobotDescription, save_robot
+from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.tables import beyond_limits, read_measurements
 
 if TYPE_CHECKING:
@@ -171,7 +169,19 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", required=True, type=Path, metavar="CSV", help="measurements to solve from"
     )
-    _add_judging(parser)
+    judging = parser.add_mutually_exclusive_group()
+    judging.add_argument(
+        "--check", type=Path, metavar="CSV", help="measurements to judge on, none of them in --data"
+    )
+    judging.add_argument(
+        "--hold-out",
+        type=share,
+        metavar="SHARE",
+        help=f"without --check: share of the poses of --data to judge on, default {_HOLD_OUT}",
+    )
+    parser.add_argument(
+        "--seed", type=seed, metavar="N", help="which poses are held out, default 0"
+    )
     parser.add_argument(
         "--check-refit",
         type=parts,
@@ -200,42 +210,33 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_judging(parser: argparse.ArgumentParser) -> None:
-    judging = parser.add_mutually_exclusive_group()
-    judging.add_argument(
-        "--check",
-        type=Path,
-        metavar="CSV",
-        help="measurements to judge on, none of them in --data",
-    )
-    judging.add_argument(
-        "--hold-out",
-        type=share,
-        metavar="SHARE",
-        help=f"without --check: share of the poses of --data to judge on, default {_HOLD_OUT}",
-    )
-    parser.add_argument(
-        "--seed", type=seed, metavar="N", help="which poses are held out, default 0"
-    )
-
-
 def run_identify(args: argparse.Namespace) -> CliResult:
     """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
 
     warnings: list[str] = []
     robot = describe_robot(args.robot, warnings)
-    answer = identify_files(robot.arm, _request(args))
-    warnings += answer.warnings
-    document = answer.document | {"output": None}
-    if args.output is not None:
-        _save(robot, answer, args.output, document, warnings)
+    judged, document = _identified(robot.arm, args, warnings)
+    verdict = judged.verdict
+    document["output"] = None
+    if args.output is not None and verdict.accept:  # a script may use it at once
+        used = document["data"]
+        comment = (
+            f"Identified by robocal {__version__} from {used['file']}, {used['train']} "
+            f"measurements, method {document['method']};\n"
+            f"nominal model {robot.arm.model_hash} of {robot.path}.\n{headline(document)}."
+        )
+        arm = robot.arm.with_mdh(judged.identification.cell.arm.mdh)
+        save_robot(arm, args.output, like=robot, comment=comment)
+        document["output"] = str(args.output)
+    elif args.output is not None:
+        warnings.append(f"{args.output} is not written: the verdict is {verdict.code.name}")
     document["warnings"] = warnings
     warn(warnings)
     status = DONE
-    if answer.judged.verdict.code is Code.TOO_FEW_SAMPLES:
-        document |= refusal(Code.TOO_FEW_SAMPLES, answer.judged.verdict.reason)
-        tell(Code.TOO_FEW_SAMPLES.name, answer.judged.verdict.reason)
+    if verdict.code is Code.TOO_FEW_SAMPLES:
+        document |= refusal(verdict.code, verdict.reason)
+        tell(verdict.code.name, verdict.reason)
         status = NO_ANSWER
     return CliResult(document, partial(show_identification, document=document), status)
 
@@ -252,184 +253,90 @@ def _require_sense(args: argparse.Namespace) -> None:
         raise InputError("no such folder for --output", file=str(args.output.parent))
 
 
-def _request(args: argparse.Namespace) -> "IdentifyRequest":
-
-    return IdentifyRequest(
-        data_file=args.data,
-        check_file=args.check,
-        check_refit=args.check_refit,
-        hold_out=_HOLD_OUT if args.hold_out is None else args.hold_out,
-        seed=args.seed or 0,
-        fit=args.fit,
-        method=args.method,
-    )
-
-
-def _save(
-    robot: "RobotDescription",
-    answer: "IdentifyAnswer",
-    path: Path,
-    document: dict[str, Any],
-    warnings: list[str],
-) -> None:
-    """Write the identified robot file, if the verdict accepts: a script may use it at once."""
-    verdict = answer.judged.verdict
-    if not verdict.accept:
-        warnings.append(f"{path} is not written: the verdict is {verdict.code.name}")
-        return
-    arm = robot.arm.with_mdh(answer.judged.identification.cell.arm.mdh)
-    used = document["data"]
-    comment = (
-        f"Identified by robocal {__version__} from {used['file']}, {used['train']} measurements, "
-        f"method {document['method']};\nnominal model {robot.arm.model_hash} of {robot.path}.\n"
-        f"{headline(document)}."
-    )
-    save_robot(arm, path, like=robot, comment=comment)
-    document["output"] = str(path)
-
-
 _OTHER_SET_UP = (
     "if the check data come from another set-up (measuring device or targets moved), say so with "
     "--check-refit base,tool"
 )
 
 
-@dataclass(frozen=True)
-class IdentifyRequest:
-    """What to identify from which files.
+def _identified(
+    arm: SerialArm, args: argparse.Namespace, warnings: list[str]
+) -> tuple[JudgedIdentification, Document]:
+    """Identify from tables and judge, else by a share of the poses that is held out."""
 
-    ``check_file`` None: a share ``hold_out`` of the poses of ``data_file`` judges instead.
-    """
+    def read(path: Path) -> Measurements:
+        data = read_measurements(path, arm)
+        warnings.extend(f"{path}: {words}" for words in beyond_limits(data, arm))
+        return data
 
-    data_file: Path
-    check_file: Path | None = None
-    check_refit: tuple[Part, ...] = ()
-    hold_out: float = 0.5
-    seed: int = 0
-    fit: tuple[Part, ...] = ("base", "tool", "geometry")
-    method: Method = "map"
-
-
-@dataclass(frozen=True)
-class IdentifyAnswer:
-    """An identification, its document and what the user should know beside it."""
-
-    judged: JudgedIdentification
-    document: Document
-    warnings: tuple[str, ...] = field(default=())
-
-
-def identify_files(arm: SerialArm, request: IdentifyRequest) -> IdentifyAnswer:
-    """Identify from tables and judge.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be read, or its data cannot belong to this robot or to each other.
-    TooFewSamplesError, RankDeficientError
-        When the data cannot answer.
-    """
-    warnings: list[str] = []
-    data = _read(request.data_file, arm, warnings)
-    if request.check_file is None:
-        held = hold_out(pose_groups(data.q), request.hold_out, request.seed)
+    data, file = read(args.data), None if args.check is None else str(args.check)
+    part, draw = (args.hold_out or _HOLD_OUT, args.seed or 0) if file is None else (None, None)
+    if part is not None:
+        held = hold_out(pose_groups(data.q), part, draw or 0)
         train, check = data.take(~held), data.take(held)
     else:
-        train, check = data, _read(request.check_file, arm, warnings)
-        _require_other_data(train, check, request)
-        _require_known_targets(train, check, request)
-        warnings += _compared(train, check, request)
-    base, tool = "base" in request.fit, "tool" in request.fit
-    require_match(arm, data, base=base, tool=tool, file=str(request.data_file))
+        train, check = data, read(args.check)
+        warnings += _compared(train, check, args)
+    require_match(arm, data, base="base" in args.fit, tool="tool" in args.fit, file=str(args.data))
+    refit = args.check_refit
     try:
         judged = identify_and_judge(
-            arm,
-            train,
-            check,
-            fit=request.fit,
-            method=request.method,
-            check_refit=request.check_refit,
+            arm, train, check, fit=args.fit, method=args.method, check_refit=refit
         )
     except TooFewSamplesError as error:
-        if request.check_file is not None:
+        if file is not None:
             raise
         raise TooFewSamplesError(
-            f"{request.data_file}: {error} ({len(check)} of its {len(data)} measurements are held "
+            f"{args.data}: {error} ({len(check)} of its {len(data)} measurements are held "
             "out to judge)"
         ) from error
-    if request.check_file is not None:
-        _require_check_fits(judged, check, request)
-        if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not request.check_refit:
+    if file is not None:
+        # The mistake in check data that miss the identified model, as for training data.
+        cell = judged.identification.cell
+        if frozenset(refit) >= {"base", "tool"}:
+            require_match(cell.arm, check, base=True, tool=True, file=file)
+        elif not refit and (mistake := explain_mismatch(cell.arm, check, cell.residual)):
+            raise InputError(mistake, file=file)
+        if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not refit:
             warnings.append(_OTHER_SET_UP)
-    document = identification_document(judged) | {"data": _data_document(request, train, check)}
-    return IdentifyAnswer(judged, document, tuple(warnings))
-
-
-def _read(path: Path, arm: SerialArm, warnings: list[str]) -> Measurements:
-    data = read_measurements(path, arm)
-    warnings += [f"{path}: {words}" for words in beyond_limits(data, arm)]
-    return data
-
-
-def _data_document(request: IdentifyRequest, train: Measurements, check: Measurements) -> Document:
-    split = request.check_file is None
-    return {
-        "file": str(request.data_file),
-        "check_file": None if split else str(request.check_file),
-        "fit": list(request.fit),
-        "check_refit": list(request.check_refit),
-        "hold_out": request.hold_out if split else None,
-        "seed": request.seed if split else None,
+    document = identification_document(judged)
+    document["data"] = {
+        "file": str(args.data),
+        "check_file": file,
+        "fit": list(args.fit),
+        "check_refit": list(refit),
+        "hold_out": part,
+        "seed": draw,
         "train": len(train),
         "check": len(check),
     }
+    return judged, document
 
 
-def _require_check_fits(
-    judged: JudgedIdentification, check: Measurements, request: IdentifyRequest
-) -> None:
-    """Name the mistake in check data that miss the identified model, as for training data."""
-    arm, refit, file = judged.identification.cell.arm, request.check_refit, str(request.check_file)
-    if frozenset(refit) >= {"base", "tool"}:
-        require_match(arm, check, base=True, tool=True, file=file)
-    elif not refit and (
-        mistake := explain_mismatch(arm, check, judged.identification.cell.residual)
-    ):
-        raise InputError(mistake, file=file)
-
-
-def _require_other_data(train: Measurements, check: Measurements, request: IdentifyRequest) -> None:
-    known = {row.tobytes(): i for i, row in enumerate(_rows(train))}
-    same = [i for i, row in enumerate(_rows(check)) if row.tobytes() in known]
+def _compared(train: Measurements, check: Measurements, args: argparse.Namespace) -> list[str]:
+    """What the user should know about the two files together; an error where they do not match."""
+    trained, checked = (
+        [row.tobytes() for row in np.ascontiguousarray(np.hstack([data.q, data.position]))]
+        for data in (train, check)
+    )
+    known, file = set(trained), str(args.check)
+    same = [i for i, row in enumerate(checked) if row in known]
     if same:
         raise InputError(
-            f"{len(same)} of {len(check)} measurements are in {request.data_file} too (the first "
+            f"{len(same)} of {len(check)} measurements are in {args.data} too (the first "
             f"is sample {check.sample[same[0]]}): a model is judged on data not used to solve; "
             "take them out of one file, or leave out --check to hold out a part",
-            file=str(request.check_file),
+            file=file,
         )
-
-
-def _rows(data: Measurements) -> Any:
-    return np.ascontiguousarray(np.hstack([data.q, data.position]))
-
-
-def _require_known_targets(
-    train: Measurements, check: Measurements, request: IdentifyRequest
-) -> None:
     unknown = [name for name in check.targets if name not in train.targets]
-    if unknown and "tool" not in request.check_refit:
+    if unknown and "tool" not in args.check_refit:
         raise InputError(
-            f"target {quoted(unknown[0])} is not in {request.data_file} (it has "
+            f"target {quoted(unknown[0])} is not in {args.data} (it has "
             f"{', '.join(train.targets)}): use the same name, or --check-refit tool (or "
             "base,tool) to place it anew from the check data",
-            file=str(request.check_file),
+            file=file,
             column="target",
         )
-
-
-def _compared(train: Measurements, check: Measurements, request: IdentifyRequest) -> list[str]:
-    """What the user should know about the two files together."""
     found = []
     group = pose_groups(np.vstack([train.q, check.q]))
     again = int(np.sum(np.isin(group[len(train) :], group[: len(train)])))
@@ -440,7 +347,7 @@ def _compared(train: Measurements, check: Measurements, request: IdentifyRequest
         )
     if train.rotation is None and check.rotation is not None:
         found.append(
-            f"{request.check_file} has orientations and {request.data_file} has none: the "
+            f"{args.check} has orientations and {args.data} has none: the "
             "model is solved and judged by positions"
         )
     return found
@@ -489,7 +396,16 @@ def run_iso9283(args: argparse.Namespace) -> CliResult:
             found = repeated(position, None if where is None else np.array(where) * 1e-3)
         except TooFewSamplesError as error:
             raise TooFewSamplesError(f"{args.data}, target {quoted(name)}: {error}") from error
-        targets[name] = _document(found)
+        axes = (None,) * 3 if found.offset is None else (found.offset * 1e3).tolist()
+        targets[name] = {
+            "n": found.n,
+            "AP_mm": None if found.AP_m is None else found.AP_m * 1e3,
+            "RP_mm": found.RP_m * 1e3,
+            "mean_distance_mm": found.mean_distance_m * 1e3,
+            "S_mm": found.S_m * 1e3,
+            "barycentre_mm": (found.barycentre * 1e3).tolist(),
+            **dict(zip(("AP_x_mm", "AP_y_mm", "AP_z_mm"), axes, strict=True)),
+        }
         if found.n < CYCLES:
             warnings.append(
                 f"target {quoted(name)}: {found.n} cycles; ISO 9283 asks for {CYCLES}: RP is less "
@@ -498,19 +414,6 @@ def run_iso9283(args: argparse.Namespace) -> CliResult:
     warn(warnings)
     document: Document = {"targets": targets, "warnings": warnings}
     return CliResult(document, partial(_show_iso9283, document=document))
-
-
-def _document(found: "Repeated") -> Document:
-    axes = (None,) * 3 if found.offset is None else (found.offset * 1e3).tolist()
-    return {
-        "n": found.n,
-        "AP_mm": None if found.AP_m is None else found.AP_m * 1e3,
-        "RP_mm": found.RP_m * 1e3,
-        "mean_distance_mm": found.mean_distance_m * 1e3,
-        "S_mm": found.S_m * 1e3,
-        "barycentre_mm": (found.barycentre * 1e3).tolist(),
-        **dict(zip(("AP_x_mm", "AP_y_mm", "AP_z_mm"), axes, strict=True)),
-    }
 
 
 def _commanded(value: str) -> tuple[str, Point]:
@@ -530,13 +433,7 @@ def _commanded(value: str) -> tuple[str, Point]:
 def _by_target(
     given: Sequence[tuple[str, Point]], targets: Sequence[str], file: str
 ) -> Mapping[str, Point]:
-    """Commanded positions by target.
-
-    Raises
-    ------
-    InputError
-        For a target that the table has not, or that is given twice.
-    """
+    """Commanded positions by target, each in the table and given once."""
     found: dict[str, Point] = {}
     for name, point in given:
         if name != EVERY and name not in targets:

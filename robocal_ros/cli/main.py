@@ -112,19 +112,15 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
+# Types of arguments: an `argparse.ArgumentTypeError` for what is none.
+
 PARTS = ("base", "tool", "geometry")
 ROBOT_HELP = "robot file, or name of a shipped robot (ur10, kr150_r3100 …)"
 SIGMA_MM = 0.03
 
 
 def parts(value: str) -> tuple[str, ...]:
-    """Type of a list such as ``base,tool``; in the order of ``PARTS``.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For a part that is unknown or given twice, and for none.
-    """
+    """Type of a list such as ``base,tool``, none twice; in the order of ``PARTS``."""
     names = [name.strip() for name in value.split(",")]
     for name in names:
         if name not in PARTS:
@@ -135,24 +131,12 @@ def parts(value: str) -> tuple[str, ...]:
 
 
 def positive(value: str) -> float:
-    """Type of a finite number above zero.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
+    """Type of a finite number above zero."""
     return _between(value, math.inf, "a number above 0")
 
 
 def share(value: str) -> float:
-    """Type of a share between 0 and 1.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
+    """Type of a share between 0 and 1."""
     return _between(value, 1.0, "a share between 0 and 1")
 
 
@@ -168,41 +152,19 @@ def _between(value: str, most: float, what: str) -> float:
 
 
 def count(value: str) -> int:
-    """Type of an argument that counts something: a whole number from 1.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
-    return _whole(value, 1)
+    """Type of an argument that counts something: a whole number from 1."""
+    return seed(value, least=1)
 
 
-def seed(value: str) -> int:
-    """Type of a seed of a random choice: a whole number from 0.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
-    return _whole(value, 0)
-
-
-def _whole(value: str, least: int) -> int:
+def seed(value: str, least: int = 0) -> int:
+    """Type of a seed of a random choice: a whole number from ``least``."""
     if not (value.isascii() and value.isdigit()) or int(value) < least:
         raise argparse.ArgumentTypeError(f"{quoted(value)} is not a whole number from {least}")
     return int(value)
 
 
 def text(value: str) -> str:
-    """Type of an argument that is kept as text.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        Bytes that are no text in the terminal's encoding.
-    """
+    """Type of an argument that is kept as text: no bytes beside the terminal's encoding."""
     try:
         value.encode()
     except UnicodeEncodeError as error:
@@ -251,13 +213,7 @@ def warn(messages: Iterable[str]) -> None:
 
 
 def three_numbers(value: str) -> tuple[float, ...]:
-    """Type of three finite numbers such as ``1,-2.5,3``.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
+    """Type of three finite numbers such as ``1,-2.5,3``."""
     try:
         numbers = tuple(float(cell) for cell in value.split(","))
     except ValueError:
@@ -531,7 +487,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
     try:
         try:
-            outcome = _execute(arguments)
+            parser = CommandParser(
+                prog="robocal", description="Accuracy of industrial robots, on files and bags."
+            )
+            parser.add_version(f"robocal {__version__}")
+            words = [word for word in arguments if not word.startswith("-")]
+            _declare(parser, "command", COMMANDS, words)
+            args = parser.parse_args(arguments)
+            outcome: CliResult = args.run_command(args)
         except OSError as error:
             if error.filename is None or isinstance(error, BrokenPipeError):
                 raise
@@ -549,37 +512,18 @@ def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
             stream.flush()
         return DONE
     except RobocalError as error:
-        return _fail(error, stream, as_json)
+        if isinstance(error, UsageError):
+            print(error.usage.rstrip(), file=sys.stderr)
+        tell(error.code.name, error)
+        document, status = failure(error), exit_status(error)
     except BrokenPipeError:
         raise
     except Exception as error:
         traceback.print_exc()
-        _write_failure(crash(error), stream, as_json)
-        return CRASHED
-
-
-def _fail(error: RobocalError, stream: TextIO, as_json: bool) -> int:
-    if isinstance(error, UsageError):
-        print(error.usage.rstrip(), file=sys.stderr)
-    tell(error.code.name, error)
-    _write_failure(failure(error), stream, as_json)
-    return BAD_REQUEST if isinstance(error, UsageError) else exit_status(error)
-
-
-def _write_failure(document: Document, stream: TextIO, as_json: bool) -> None:
+        document, status = crash(error), CRASHED
     if as_json:
         write_json(document, stream)
-
-
-def _execute(arguments: Sequence[str]) -> CliResult:
-    parser = CommandParser(
-        prog="robocal", description="Accuracy of industrial robots, on files and bags."
-    )
-    parser.add_version(f"robocal {__version__}")
-    _declare(parser, "command", COMMANDS, [word for word in arguments if not word.startswith("-")])
-    args = parser.parse_args(arguments)
-    answer: CliResult = args.run_command(args)
-    return answer
+    return status
 
 
 def _declare(

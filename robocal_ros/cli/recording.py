@@ -39,23 +39,14 @@ INPUTS = (JOINTS, *MEASURED, TEMPERATURES)
 
 @dataclass(frozen=True)
 class BagOverview:
-    """What a bag says before its samples are read.
-
-    Attributes
-    ----------
-    events : topic of the commands, or None.
-    inputs : topic of the bag to input of the session.
-    configured : the recorded configuration, or None.
-    commands : recorded commands, each with its recorded outcome.
-    start_ns : stamp of the first joint reading.
-    """
+    """What a bag says before its samples are read."""
 
     reader: BagReader
-    events: str | None
-    inputs: Mapping[str, str]
-    configured: Command | None
-    commands: list[tuple[Command, dict[str, Any]]]
-    start_ns: int
+    events: str | None  # topic of the commands
+    inputs: Mapping[str, str]  # topic of the bag to input of the session
+    configured: Command | None  # as recorded
+    commands: list[tuple[Command, dict[str, Any]]]  # recorded ones, each with its outcome
+    start_ns: int  # stamp of the first joint reading
 
     @property
     def warnings(self) -> list[str]:
@@ -114,9 +105,22 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
         When a topic is missing or ambiguous, or an event cannot be read.
     """
     info = reader.info
-    _require_topics(given, info.topics, info.path)
-    event_topic = given.get(EVENTS) or _event_topic(info.topics, info.path)
-    told = [] if event_topic is None else [event_topic]
+    for kind, topic in given.items():
+        if kind not in (*INPUTS, EVENTS):
+            known = ", ".join((*INPUTS, EVENTS))
+            raise InputError(f"--topic {kind}: the inputs are {known}")
+        if topic not in info.topics:
+            raise InputError(f"no topic {topic}; {_has(info.topics)}", file=info.path)
+    told = [topic for topic in info.topics if topic_kind(topic) == EVENTS]
+    if EVENTS in given:
+        told = [given[EVENTS]]
+    elif len(told) > 1:
+        raise InputError(
+            f"session events of more than one node: {', '.join(told)}; choose with "
+            f"--topic {EVENTS}:=TOPIC",
+            file=info.path,
+        )
+    event_topic = told[0] if told else None
     configured = first_configuration(reader.messages(told))
     inputs = {topic: kind for kind, topic in given.items() if kind != EVENTS}
     others = [topic for topic in info.topics if topic not in inputs]
@@ -129,26 +133,6 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
 
 def _has(topics: Mapping[str, Any]) -> str:
     return f"it has {', '.join(topics)}" if topics else "it has no topics"
-
-
-def _require_topics(given: Mapping[str, str], topics: Mapping[str, Any], path: str) -> None:
-    for kind, topic in given.items():
-        if kind not in (*INPUTS, EVENTS):
-            known = ", ".join((*INPUTS, EVENTS))
-            raise InputError(f"--topic {kind}: the inputs are {known}")
-        if topic not in topics:
-            raise InputError(f"no topic {topic}; {_has(topics)}", file=path)
-
-
-def _event_topic(topics: Mapping[str, Any], path: str) -> str | None:
-    found = [topic for topic in topics if topic_kind(topic) == EVENTS]
-    if len(found) > 1:
-        raise InputError(
-            f"session events of more than one node: {', '.join(found)}; choose with "
-            f"--topic {EVENTS}:=TOPIC",
-            file=path,
-        )
-    return found[0] if found else None
 
 
 def begin_ns(reader: BagReader) -> int:
@@ -284,11 +268,14 @@ class ToldStates:
                 self._sizes[fault] = size
         for name, told in self.transforms.items():
             if name in state:
-                _add_changed(told, stamp_ns, _transform(state, name))
+                _add_changed(told, stamp_ns, state, name)
 
 
 class BagTruth:
-    """The truth that a bag tells, of each robot by its namespace; the states are read once."""
+    """The truth that a bag tells, of each robot by its namespace; the states are read once.
+
+    What cannot be read is an `InputError` that names its topic.
+    """
 
     def __init__(self, reader: BagReader) -> None:
         self._reader = reader
@@ -296,13 +283,7 @@ class BagTruth:
 
     @cached_property
     def states(self) -> dict[str, ToldStates]:
-        """Those of each cell, by their topic; without a cell that tells none.
-
-        Raises
-        ------
-        InputError
-            When they cannot be read.
-        """
+        """Those of each cell, by their topic; without a cell that tells none."""
         found = {topic: ToldStates() for topic in self._topics if topic.endswith(STATE)}
         for topic, states in found.items():
             with self.reading(topic):
@@ -330,31 +311,19 @@ class BagTruth:
         return found[0] if found else None
 
     def transforms(self, topic: str, namespace: str) -> Transforms:
-        """Stamps, ns, and transforms (4, 4) from then on, of `TRANSFORMS`; empty: none is told.
-
-        Raises
-        ------
-        InputError
-            When they cannot be read.
-        """
+        """Stamps, ns, and transforms (4, 4) from then on, of `TRANSFORMS`; empty: none is told."""
         name, own = TRANSFORMS[topic], f"{namespace}{topic}"
         told: Transforms = []
         with self.reading(own):
             for stamp_ns, truth in self._told(own):
-                _add_changed(told, stamp_ns, _transform(truth, name))
+                _add_changed(told, stamp_ns, truth, name)
         if told:
             return told
         states = self.state_topic(namespace)
         return [] if states is None else self.states[states].transforms[name]
 
     def check_points(self, namespace: str) -> CheckPoints | None:
-        """The true positions that a bag tells; None where it tells none.
-
-        Raises
-        ------
-        InputError
-            When they cannot be read.
-        """
+        """The true positions that a bag tells; None where it tells none."""
         topic = f"{namespace}{CHECK_POINTS}"
         stamps: list[int] = []
         positions: list[Array] = []
@@ -408,13 +377,9 @@ def _array(truth: dict[str, Any], name: str) -> Array:
     return found
 
 
-def _transform(truth: dict[str, Any], name: str) -> Array:
-    found = _array(truth, name)
-    if found.shape != (4, 4):
-        raise ValueError(f"{name} has the shape {found.shape}, not (4, 4)")
-    return found
-
-
-def _add_changed(told: Transforms, stamp_ns: int, T: Array) -> None:
+def _add_changed(told: Transforms, stamp_ns: int, truth: dict[str, Any], name: str) -> None:
+    T = _array(truth, name)
+    if T.shape != (4, 4):
+        raise ValueError(f"{name} has the shape {T.shape}, not (4, 4)")
     if not told or not np.array_equal(told[-1][1], T):
         told.append((stamp_ns, T))

@@ -2,13 +2,13 @@
 
 import argparse
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -33,14 +33,12 @@ from robocal_ros.cli.main import (
 from robocal_ros.cli.recording import UNASKED, BagOverview, find_robot, open_recording
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.ground.samples import JointStream
 from robocal_ros.hand_eye.session import (
     hand_eye_session_as_recorded,
     is_hand_eye_session,
     take_hand_eye_message,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN
@@ -58,7 +56,6 @@ from robocal_ros.thermal.session import (
     window_commands,
 )
 from robocal_ros.tool.session import (
-    ToolSession,
     is_tool_session,
     take_tool_message,
     tool_session_as_recorded,
@@ -78,43 +75,40 @@ def seconds(stamp_ns: int | None) -> float:
     return (stamp_ns or 0) * 1e-9
 
 
-def gaps_document(stream: JointStream, recording: BagOverview) -> Document:
-    """Pauses of the joint readings, and damaged parts of the bag."""
-    damaged = recording.reader.info.lost
-    return {
-        "count": stream.gap_count,
-        "longest_s": stream.longest_gap_ns * 1e-9,
-        "damaged": [{"from_ns": part.from_ns, "to_ns": part.to_ns} for part in damaged],
-    }
-
-
-def command_document(outcome: Outcome) -> Document:
-    """A command and what came of it."""
-    return {
-        "command": outcome.command.name,
-        "stamp": seconds(outcome.command.stamp_ns),
-        "code": outcome.status.name,
-        "message": outcome.message,
-        "samples": outcome.samples,
-    }
-
-
 def commanded_document(
-    report: ReplayReport, session: SessionBase, recording: BagOverview
+    report: ReplayReport,
+    session: SessionBase | ThermalSession,
+    recording: BagOverview,
+    candidates: Document | None = None,
 ) -> Document:
-    """What the replay of a recorded session tells, whatever it measures."""
+    """What a replay tells, whatever it measures; ``candidates`` stand behind the topics."""
     topic = {kind: name for name, kind in recording.inputs.items()}
     ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
+    stream = session.desk.stream if isinstance(session, ThermalSession) else session.stream
+    damaged = recording.reader.info.lost
     return {
         "robot": session.nominal.name,
         "model_hash": session.nominal.model_hash,
         "start_ns": recording.start_ns,
         "topics": topic,
-        "recorded": True,
+        **({"recorded": True} if candidates is None else candidates),
         "ignored": {name: sum(why.values()) for name, why in ignored.items()},
         "ignored_reasons": ignored,
-        "gaps": gaps_document(session.stream, recording),
-        "commands": [command_document(outcome) for outcome in report.outcomes],
+        "gaps": {
+            "count": stream.gap_count,
+            "longest_s": stream.longest_gap_ns * 1e-9,
+            "damaged": [{"from_ns": part.from_ns, "to_ns": part.to_ns} for part in damaged],
+        },
+        "commands": [
+            {
+                "command": outcome.command.name,
+                "stamp": seconds(outcome.command.stamp_ns),
+                "code": outcome.status.name,
+                "message": outcome.message,
+                "samples": outcome.samples,
+            }
+            for outcome in report.outcomes
+        ],
         "differs": report.differs,
         "warnings": recording.warnings,
     }
@@ -146,62 +140,45 @@ def replay_commanded(
 def replay_tool(
     recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
 ) -> Document:
-    """Replay what a tool node recorded: each run with its answer.
-
-    Raises
-    ------
-    InputError, WrongRobotError
-        The bag lacks what a replay needs.
-    """
+    """Replay what a tool node recorded: each run with its answer. Raises as `replay_commanded`."""
     report, session = replay_commanded(
         recording, arm, history, samples, tool_session_as_recorded, take_tool_message
     )
-    return _tool_document(report, session, recording)
-
-
-def _tool_document(report: ReplayReport, session: ToolSession, recording: BagOverview) -> Document:
     return commanded_document(report, session, recording) | {
-        "runs": [_run(o) for o in report.outcomes if o.document is not None],
+        "runs": [
+            {
+                "stamp": seconds(o.command.stamp_ns),
+                "run": o.command.arguments.get("run", 0),
+                **o.document,
+            }
+            for o in report.outcomes
+            if o.document is not None
+        ],
         "final_tool": transform_document(session.current.tool.T_flange_tool)
         | {"revision": session.in_force.revision},
     }
 
 
-def _run(outcome: Outcome) -> Document:
-    number = outcome.command.arguments.get("run", 0)
-    return {"stamp": seconds(outcome.command.stamp_ns), "run": number, **(outcome.document or {})}
-
-
 def replay_hand_eye(
     recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
 ) -> Document:
-    """Replay what a hand-eye node recorded: each calibration with its figures.
-
-    Raises
-    ------
-    InputError, WrongRobotError
-        The bag lacks what a replay needs.
-    """
+    """Replay what a hand-eye node recorded: each calibration. Raises as `replay_commanded`."""
     report, session = replay_commanded(
         recording, arm, history, samples, hand_eye_session_as_recorded, take_hand_eye_message
     )
+    final, head = None, session.in_force
+    if head.model is not None:
+        frames = {name: head.model[name] for name in ("parent", "child")}
+        T = np.array(head.model["T_parent_sensor"])
+        final = frames | transform_document(T) | {"revision": head.revision}
     return commanded_document(report, session, recording) | {
         "calibrations": [
-            {"stamp": seconds(o.command.stamp_ns), **(o.document or {})}
+            {"stamp": seconds(o.command.stamp_ns), **o.document}
             for o in report.outcomes
             if o.document is not None and o.calibration_id
         ],
-        "final_sensor": _sensor(session.in_force),
+        "final_sensor": final,
     }
-
-
-def _sensor(head: Head) -> Document | None:
-    """What is in force at the end; None: nothing is."""
-    if head.model is None:
-        return None
-    frames = {name: head.model[name] for name in ("parent", "child")}
-    T = np.array(head.model["T_parent_sensor"])
-    return frames | transform_document(T) | {"revision": head.revision}
 
 
 Window = tuple[float, float]
@@ -251,32 +228,37 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
     InputError, WrongRobotError
         The bag cannot be read, or lacks what a replay needs.
     """
-    with BagReader(request.bag) as reader:
+    given = bool(request.auto or request.cold or request.warm)  # in place of recorded commands
+    with ExitStack() as opened:
+        reader = opened.enter_context(BagReader(request.bag))
         recording = open_recording(reader, request.topics)
-        if not _given(request):
+        if not given:
             _require_commands(request, recording)
         arm = request.find_robot(recording.configured)
-        with _history(request, arm) as history:
-            for is_of, replayed, node in _OF_OTHER_NODES:
-                if not is_of(recording.configured):
-                    continue
-                if _given(request):
-                    raise InputError(
-                        f"the bag is of a {node} node: --auto, --cold and --warm are for thermal "
-                        "ones"
-                    )
-                return replayed(recording, arm, history, watch("replaying", recording))
-            kept = _GOES_ON.format(history.path) if history.list(1) else ""
-            session = _session(recording, arm, history)
-            commands = _commands(request, recording, arm, history, watch)
-            samples = watch("replaying", recording)
-            if request.observe is not None:
-                samples = request.observe(session, recording, samples)
-            report = replay(session, samples, commands, recording.inputs, take_message)
-            used = commands is recording.commands
-            document = _document(report, session, recording) | {"recorded": used}
-            document["warnings"] += [kept] if kept else []
-            return document
+        state = request.state or Path(opened.enter_context(TemporaryDirectory(prefix="robocal-")))
+        serial = request.bag.resolve().stem
+        history = opened.enter_context(
+            CalibrationHistory.open(serial, model_hash=arm.model_hash, state_dir=state)
+        )
+        for is_of, replayed, node in _OF_OTHER_NODES:
+            if not is_of(recording.configured):
+                continue
+            if given:
+                raise InputError(
+                    f"the bag is of a {node} node: --auto, --cold and --warm are for thermal ones"
+                )
+            return replayed(recording, arm, history, watch("replaying", recording))
+        kept = _GOES_ON.format(history.path) if history.list(1) else ""
+        session = _session(recording, arm, history)
+        commands = _commands(request, recording, arm, history, watch)
+        samples = watch("replaying", recording)
+        if request.observe is not None:
+            samples = request.observe(session, recording, samples)
+        report = replay(session, samples, commands, recording.inputs, take_message)
+        used = commands is recording.commands
+        document = _document(report, session, recording) | {"recorded": used}
+        document["warnings"] += [kept] if kept else []
+        return document
 
 
 _NO_COMMANDS = "the bag holds no commands (session_events)"
@@ -306,22 +288,6 @@ def _require_commands(request: ReplayRequest, recording: BagOverview) -> None:
     recording.require_inputs()
 
 
-def _given(request: ReplayRequest) -> bool:
-    """Whether the user says what to carry out, in place of the recorded commands."""
-    return bool(request.auto or request.cold or request.warm)
-
-
-@contextmanager
-def _history(request: ReplayRequest, arm: SerialArm) -> Iterator[CalibrationHistory]:
-    serial = request.bag.resolve().stem
-    with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
-        state_dir = request.state or Path(folder)
-        with CalibrationHistory.open(
-            serial, model_hash=arm.model_hash, state_dir=state_dir
-        ) as history:
-            yield history
-
-
 def _session(recording: BagOverview, arm: SerialArm, history: CalibrationHistory) -> ThermalSession:
     if recording.configured is None:
         return ThermalSession(arm, history, ThermalConfig(), __version__)
@@ -337,8 +303,13 @@ def _commands(
 ) -> Commands:
     """The user's windows, else what --auto finds, else what was recorded."""
     if request.cold or request.warm:
-        cold = None if request.cold is None else _stamps(request.cold, recording)
-        return window_commands(cold, [_stamps(window, recording) for window in request.warm])
+
+        def stamps(window: Window) -> tuple[int, int]:
+            start, end = (recording.start_ns + round(t * 1e9) for t in window)
+            return start, end
+
+        cold = None if request.cold is None else stamps(request.cold)
+        return window_commands(cold, [stamps(window) for window in request.warm])
     if not request.auto:
         return recording.commands
     scout = _session(recording, arm, history)
@@ -353,37 +324,28 @@ def _commands(
     return accepting(commands, by="replay") if request.accept else commands
 
 
-def _stamps(window: Window, recording: BagOverview) -> tuple[int, int]:
-    start, end = (recording.start_ns + round(t * 1e9) for t in window)
-    return start, end
-
-
 def _document(report: ReplayReport, session: ThermalSession, recording: BagOverview) -> Document:
     placed = events.CALIBRATE_SENSOR  # what it found is no candidate for the model
     made = [o for o in report.outcomes if o.document is not None and o.command.name != placed]
     place = {outcome.calibration_id: index for index, outcome in enumerate(made)}
-    head = session.in_force
-    topic = {kind: name for name, kind in recording.inputs.items()}
-    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.desk.ignored.items()}
-    return _failure(report, made) | {
-        "robot": session.nominal.name,
-        "model_hash": session.nominal.model_hash,
-        "start_ns": recording.start_ns,
-        "topics": topic,
-        "candidates": [_candidate(outcome) for outcome in made],
-        "accepted": [
-            _accepted(outcome, place)
-            for outcome in report.outcomes
-            if outcome.command.name == events.ACCEPT and outcome.done
+    candidates = {
+        "candidates": [
+            {"stamp": seconds(o.command.stamp_ns), **dict(o.document or {})} for o in made
         ],
-        "final_model": model_document(session.arm) | {"revision": head.revision},
-        "ignored": {name: sum(why.values()) for name, why in ignored.items()},
-        "ignored_reasons": ignored,
-        "gaps": gaps_document(session.desk.stream, recording),
-        "commands": [command_document(outcome) for outcome in report.outcomes],
-        "differs": report.differs,
-        "warnings": recording.warnings,
+        "accepted": [
+            {
+                "stamp": seconds(o.command.stamp_ns),
+                "revision": o.revision,
+                "candidate": place.get(o.calibration_id),
+                "by": str(o.command.arguments.get("by", "")),
+                "reason": str(o.command.arguments.get("reason", "")),
+            }
+            for o in report.outcomes
+            if o.command.name == events.ACCEPT and o.done
+        ],
+        "final_model": model_document(session.arm) | {"revision": session.in_force.revision},
     }
+    return _failure(report, made) | commanded_document(report, session, recording, candidates)
 
 
 def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
@@ -401,21 +363,6 @@ def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
     return refusal(first.status, first.message)
 
 
-def _candidate(outcome: Outcome) -> Document:
-    return {"stamp": seconds(outcome.command.stamp_ns), **dict(outcome.document or {})}
-
-
-def _accepted(outcome: Outcome, place: Mapping[int, int]) -> Document:
-    arguments = outcome.command.arguments
-    return {
-        "stamp": seconds(outcome.command.stamp_ns),
-        "revision": outcome.revision,
-        "candidate": place.get(outcome.calibration_id),
-        "by": str(arguments.get("by", "")),
-        "reason": str(arguments.get("reason", "")),
-    }
-
-
 MOST_REASONS = 5
 _NOTHING_ACCEPTED = (
     "Nothing was accepted: each cycle is judged against the model in force at the start."
@@ -429,10 +376,8 @@ def show_replay(console: "Console", document: Document) -> None:
     """Print a replay; a single candidate in full, several as a table."""
     from rich.text import Text
 
-    if "runs" in document or "calibrations" in document:
-        _show_commands(console, document)
-        return
-    candidates = document["candidates"]
+    thermal = "candidates" in document
+    candidates = document["candidates"] if thermal else []
     if len(candidates) == 1:
         show_identification(console, candidates[0])
     elif candidates:
@@ -440,30 +385,25 @@ def show_replay(console: "Console", document: Document) -> None:
         if not document["recorded"]:
             console.print(_NOTHING_ACCEPTED, soft_wrap=True)
     for entry in document["commands"]:
-        if entry["code"] != "ACCEPT" and not (entry["command"] == "identify" and entry["samples"]):
-            words = f"{entry['command']}: {entry['code']}: {entry['message']}"
-            console.print(Text(words, style="red"), soft_wrap=True)
-        elif entry["command"] != "identify":
-            console.print(Text(f"{entry['command']}: {entry['message']}"), soft_wrap=True)
+        refused, identified = entry["code"] != "ACCEPT", entry["command"] == "identify"
+        if thermal and identified and (not refused or entry["samples"]):
+            continue  # it is a candidate
+        code = f"{entry['code']}: " if refused or not thermal else ""
+        words = f"{entry['command']}: {code}{entry['message']}"
+        console.print(Text(words, style="red" if refused else ""), soft_wrap=True)
+    if not thermal:
+        final = document["final_tool"] if "runs" in document else document["final_sensor"]
+        if final is None:
+            console.print("Nothing is in force at the end.")
+        else:
+            where = ", ".join(f"{x:.3f}" for x in final["xyz_mm"])
+            console.print(f"In force at the end: revision {final['revision']}, ({where}) mm")
     _show_losses(console, document)
-    _show_equality(console, document)
-
-
-def _show_commands(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    for entry in document["commands"]:
-        style = "" if entry["code"] == "ACCEPT" else "red"
-        words = f"{entry['command']}: {entry['code']}: {entry['message']}"
-        console.print(Text(words, style=style), soft_wrap=True)
-    final = document["final_tool"] if "runs" in document else document["final_sensor"]
-    if final is None:
-        console.print("Nothing is in force at the end.")
-    else:
-        where = ", ".join(f"{x:.3f}" for x in final["xyz_mm"])
-        console.print(f"In force at the end: revision {final['revision']}, ({where}) mm")
-    _show_losses(console, document)
-    _show_equality(console, document)
+    if document["recorded"]:
+        if not document["differs"]:
+            console.print("Every recorded result comes out equal, bit for bit.", style="green")
+        for words in document["differs"]:
+            console.print(Text(f"Differs from the recording: {words}", style="red"), soft_wrap=True)
 
 
 def _candidates(candidates: list[Document]) -> "Table":
@@ -504,17 +444,6 @@ def _show_losses(console: "Console", document: Document) -> None:
         console.print(
             f"{gaps['count']} pauses in the joint readings, the longest {gaps['longest_s']:.2f} s"
         )
-
-
-def _show_equality(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    if not document["recorded"]:
-        return
-    if not document["differs"]:
-        console.print("Every recorded result comes out equal, bit for bit.", style="green")
-    for words in document["differs"]:
-        console.print(Text(f"Differs from the recording: {words}", style="red"), soft_wrap=True)
 
 
 _NO_ANSWER = (Code.RANK_DEFICIENT.name, Code.TOO_FEW_SAMPLES.name)
@@ -583,16 +512,12 @@ def run_replay(args: argparse.Namespace) -> CliResult:
     document = replay_bag(request, _watch)
     document["warnings"] = [*warnings, *document["warnings"]]
     warn(document["warnings"])
-    return CliResult(document, partial(show_replay, document=document), _status(document))
-
-
-def _status(document: dict[str, Any]) -> int:
-    """0, or that of the error in the document; people read the error here."""
-    if "error" not in document:
-        return DONE
-    error = document["error"]
-    tell(error["code"], error["message"])
-    return NO_ANSWER if error["code"] in _NO_ANSWER else BAD_REQUEST
+    status = DONE
+    if "error" in document:
+        error = document["error"]
+        tell(error["code"], error["message"])
+        status = NO_ANSWER if error["code"] in _NO_ANSWER else BAD_REQUEST
+    return CliResult(document, partial(show_replay, document=document), status)
 
 
 def _watch(what: str, recording: "BagOverview") -> "Iterator[BagMessage]":

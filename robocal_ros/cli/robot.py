@@ -5,7 +5,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,19 +58,23 @@ def run_fk(args: argparse.Namespace) -> CliResult:
     arm = describe_robot(args.robot, warnings).arm
     q = np.array(_given_joints(args, arm))
     T_base_flange = arm.fk(q)
+    joints = []
+    for name, value, slides, lower, upper in zip(
+        arm.joint_names, q.tolist(), arm.prismatic, arm.lower, arm.upper, strict=True
+    ):
+        unit = "mm" if slides else "deg"
+        shown, within = value / _TO_SI[unit], bool(lower <= value <= upper)
+        joints.append({"name": name, "value": shown, "unit": unit, "within_limits": within})
+        if not within:
+            warnings.append(f"{name} at {shown:g} {unit} is beyond its limits")
     document: Document = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
-        "joints": _joint_documents(arm, q.tolist()),
+        "joints": joints,
         "T_base_flange": transform_document(T_base_flange),
     }
     if not np.array_equal(arm.T_flange_tool, np.eye(4)):
         document["T_base_tool"] = transform_document(T_base_flange @ arm.T_flange_tool)
-    warnings += [
-        f"{joint['name']} at {joint['value']:g} {joint['unit']} is beyond its limits"
-        for joint in document["joints"]
-        if not joint["within_limits"]
-    ]
     document["warnings"] = warnings
     warn(warnings)
     return CliResult(document, partial(_show_fk, document=document))
@@ -117,21 +121,6 @@ def _value(cell: str, unit: str, option: str, arm: "SerialArm", joint: int) -> f
     return value
 
 
-def _joint_documents(arm: "SerialArm", q: list[float]) -> list[dict[str, Any]]:
-    documents = []
-    for joint, value in enumerate(q):
-        unit = "mm" if arm.prismatic[joint] else "deg"
-        documents.append(
-            {
-                "name": arm.joint_names[joint],
-                "value": value / _TO_SI[unit],
-                "unit": unit,
-                "within_limits": bool(arm.lower[joint] <= value <= arm.upper[joint]),
-            }
-        )
-    return documents
-
-
 def _show_fk(console: "Console", document: Document) -> None:
     from rich.table import Table
 
@@ -175,14 +164,28 @@ def add_import_ur(parser: argparse.ArgumentParser) -> None:
 def run_import_ur(args: argparse.Namespace) -> CliResult:
     """Do ``import-ur``. Raises `RobocalError` for what a user can mend."""
     name = args.name or args.output.stem
-    nominal, factory, dh = _arms(args.nominal, args.calibration, name)
+    settings = [
+        parse_settings(read_text(path, "configuration"), str(path))
+        for path in (args.nominal, args.calibration)
+    ]
+    try:
+        nominal = nominal_arm(settings[0], name)
+        factory = factory_arm(settings[0], settings[1], name)
+    except InputError as error:
+        path = args.calibration if "delta_" in str(error) else args.nominal
+        raise InputError(str(error), file=str(path)) from error
+    # as calibrated in the controller's own numbers
+    dh = replace(nominal, mdh=factory_dh(settings[0], settings[1]))
     save_robot(factory, args.output)
     distances = _distances(nominal, factory)
+    keys = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
+    factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
+    rows = zip(factory.joint_names, (factory.mdh * factors).tolist(), strict=True)
     document: Document = {
         "robot": name,
         "model_hash": factory.model_hash,
         "output": str(args.output),
-        "joints": _joint_rows(factory),
+        "joints": [{"name": joint, **dict(zip(keys, row, strict=True))} for joint, row in rows],
         "from_nominal": {
             "mean_mm": float(distances.mean() * 1e3),
             "max_mm": float(distances.max() * 1e3),
@@ -193,35 +196,10 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
     return CliResult(document, partial(_show_import_ur, document=document))
 
 
-def _arms(nominal: Path, calibration: Path, name: str) -> "tuple[SerialArm, SerialArm, SerialArm]":
-    """The arm as designed, as calibrated, and as calibrated in the controller's own numbers."""
-    settings = [
-        parse_settings(read_text(path, "configuration"), str(path))
-        for path in (nominal, calibration)
-    ]
-    try:
-        designed = nominal_arm(settings[0], name)
-        calibrated = factory_arm(settings[0], settings[1], name)
-    except InputError as error:
-        path = calibration if "delta_" in str(error) else nominal
-        raise InputError(str(error), file=str(path)) from error
-    return designed, calibrated, replace(designed, mdh=factory_dh(settings[0], settings[1]))
-
-
 def _distances(a: "SerialArm", b: "SerialArm") -> "Array":
     """Distances (m,), m, between the flanges of two arms over the whole joint space."""
     q = np.random.default_rng(0).uniform(a.lower, a.upper, (_POSES, a.n))
     return np.asarray(np.linalg.norm(a.fk(q)[:, :3, 3] - b.fk(q)[:, :3, 3], axis=1))
-
-
-def _joint_rows(arm: "SerialArm") -> list[dict[str, Any]]:
-    keys = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
-    factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
-    rows = (arm.mdh * factors).tolist()
-    return [
-        {"name": name, **dict(zip(keys, row, strict=True))}
-        for name, row in zip(arm.joint_names, rows, strict=True)
-    ]
 
 
 def _show_import_ur(console: "Console", document: Document) -> None:

@@ -14,7 +14,7 @@ import tempfile
 import threading
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
 from multiprocessing import forkserver
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from robocal_ros import __version__
 from robocal_ros.cli.main import (
@@ -283,12 +283,12 @@ def run_validate(args: argparse.Namespace) -> CliResult:
     jobs = _jobs(args.bags, args.robot)
     results: dict[int, Document] = {}
     figures: dict[str, Sequence[Sequence[Drawn]]] = {}
-    with _progress(len(jobs)) as shown:
+    with _progress(len(jobs)) as one_more:
         for number, result in validated(jobs, workers, args.scheduler):
             results[number] = result.document
             figures[jobs[number].name] = (result.cells, *result.figures)
             _keep_figures(args.report, jobs[number].name, result)
-            shown.advance()
+            one_more()
     bags = [results[number] for number in range(len(jobs))]
     report = _report(bags)
     _write(args.report, report, page(report, figures))
@@ -377,33 +377,18 @@ def _write(folder: Path, report: Document, html: str) -> None:
         write_text(folder / name, text)
 
 
-class _Progress(Protocol):
-    def advance(self) -> None:
-        """One bag more is done."""
-
-
-class _Quiet:
-    def advance(self) -> None:
-        pass
-
-
 @contextmanager
-def _progress(total: int) -> Iterator[_Progress]:
-    """Bags done, on a terminal."""
+def _progress(total: int) -> Iterator[Callable[[], None]]:
+    """Bags done, on a terminal; what is yielded counts one more."""
     if not sys.stderr.isatty():
-        yield _Quiet()
+        yield lambda: None
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
     columns = ("validating", BarColumn(), MofNCompleteColumn(), "bags", TimeElapsedColumn())
     with Progress(*columns, console=progress_console(), transient=True) as progress:
         task = progress.add_task("validating", total=total)
-
-        class Shown:
-            def advance(self) -> None:
-                progress.advance(task)
-
-        yield Shown()
+        yield lambda: progress.advance(task)
 
 
 def _show_validate(console: "Console", document: Document) -> None:
@@ -429,17 +414,14 @@ def _cells(row: dict[str, Any]) -> list[str]:
     if row["kind"] == "hand_eye":
         errors[-1] = row["predicted_rms_mm"]
     share = row.get("share_below_bound")
+    kinds = {
+        "thermal": "{cycles} cycles, {accepted} accepted",
+        "tool": "{runs} tool runs",
+        "hand_eye": "{calibrations} hand-eye",
+    }
     return [
-        _what(row),
+        kinds[row["kind"]].format(**row),
         *("" if error is None else f"{error:.3f}" for error in errors),
         "" if share is None else f"{share:.1%}",
         str(row["refused"]),
     ]
-
-
-def _what(row: dict[str, Any]) -> str:
-    if row["kind"] == "thermal":
-        return f"{row['cycles']} cycles, {row['accepted']} accepted"
-    if row["kind"] == "tool":
-        return f"{row['runs']} tool runs"
-    return f"{row['calibrations']} hand-eye"
