@@ -14,6 +14,13 @@ from robocal_ros.ground.errors import TooFewSamplesError
 Array = NDArray[np.float64]
 S = TypeVar("S")
 
+MOST_ROUNDS = 50
+CLOSE = 1e-12  # relative
+SMALLEST_SHARE = 1e-9  # of the numbers, so that a fit that takes up all of them is no division by 0
+TINY = 1e-200
+ROUNDING = 1e-15
+NO_MEAN = 2.0  # up to so many numbers a squared error over its reported variance (F) has no mean
+
 
 @dataclass(frozen=True)
 class Freedom:
@@ -249,7 +256,8 @@ class Descent(Generic[S]):
         k = run.jacobian.shape[2]
         left = self._left(run.jacobian, keep)  # hardly changes on the way
         for _ in range(MOST_ITERATIONS):
-            scale = self._scale(run.residual, keep, left, huber)
+            scale_of = self._plain_scale if huber is None else self._robust_scale
+            scale = scale_of(run.residual[keep], left)
             loss = Loss(self.problem, self.prior, keep, scale, huber)
             information, gradient = loss.information(run), loss.gradient(run)
             here = loss.at(run.state, run.residual)
@@ -294,12 +302,6 @@ class Descent(Generic[S]):
         shorter = self._moved(run, ahead / (ahead + passed) * step)
         better = loss.at(shorter.state, shorter.residual) < loss.at(trial.state, trial.residual)
         return shorter if better else trial
-
-    def _scale(
-        self, residual: Array, keep: NDArray[np.bool_], left: Freedom | None, huber: Array | None
-    ) -> float:
-        used = residual[keep]
-        return self._plain_scale(used, left) if huber is None else self._robust_scale(used, left)
 
     def _left(
         self, jacobian: Array, keep: NDArray[np.bool_], information: Array | None = None
@@ -352,29 +354,10 @@ class Descent(Generic[S]):
             return 1.0, freedom
         return float(np.sqrt(misfit / freedom)), freedom
 
-    def _stretch(self, squared: Array, keep: NDArray[np.bool_]) -> float:
-        """Factor by which studentised distances (m,) are larger than given sigmas explain.
-
-        From their median, which outliers cannot inflate; 1 unless it is clearly larger.
-        """
-        if self.scale_components:
-            return 1.0
-        share = squared[keep] / self.quantiles(0.5)[keep]
-        stretch = float(np.sqrt(max(float(np.median(share)), 0.0)))
-        return stretch if stretch > CLEAR_STRETCH else 1.0
-
     def quantiles(self, probability: float) -> Array:
         """Quantile (m,) of each sample's chi-square distribution."""
         values = {int(n): chi2_quantile(probability, int(n)) for n in np.unique(self.sizes)}
         return np.array([values[int(n)] for n in self.sizes])
-
-    def _largest(self, probability: float) -> Array:
-        """Quantile (m,) of each sample's squared distance, with noise that may be uncertain."""
-        from scipy.special import fdtri
-
-        if self.freedom == np.inf:
-            return self.quantiles(probability)
-        return np.asarray(self.sizes * fdtri(self.sizes, self.freedom, probability))
 
     def posterior(self, normal: Array, scale: float) -> Array:
         """Covariance (k, k) of the unknowns from the data's normal matrix."""
@@ -385,6 +368,8 @@ class Descent(Generic[S]):
 
     def inliers(self, run: DescentState[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Samples whose residual fits its own predicted covariance (studentised, chi-square)."""
+        from scipy.special import fdtri
+
         m, c, _ = run.jacobian.shape
         J, information = run.jacobian, information_of(run.jacobian, keep)
         scale = self._robust_scale(run.residual[keep], self._left(J, keep, information))
@@ -394,8 +379,16 @@ class Descent(Generic[S]):
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
         squared = np.sum(run.residual * whitened, axis=1)
-        limit = self._largest(1.0 - FALSE_REJECTION / m) * self._stretch(squared, keep) ** 2
-        inlier = squared < limit
+        probability = 1.0 - FALSE_REJECTION / m
+        if self.freedom == np.inf:
+            largest = self.quantiles(probability)
+        else:  # the noise itself is uncertain
+            largest = self.sizes * fdtri(self.sizes, self.freedom, probability)
+        stretch = 1.0  # by which distances are larger than given sigmas explain
+        if not self.scale_components:  # from their median, which outliers cannot inflate
+            share = squared[keep] / self.quantiles(0.5)[keep]
+            stretch = float(np.sqrt(max(float(np.median(share)), 0.0)))
+        inlier = squared < largest * (stretch if stretch > CLEAR_STRETCH else 1.0) ** 2
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep
 
@@ -417,21 +410,3 @@ def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
     scaled = normal * np.outer(scale, scale)
     scaled[np.diag_indices_from(scaled)] += damping
     return np.asarray(np.linalg.solve(scaled, -gradient * scale) * scale)
-
-
-MOST_ROUNDS = 50
-
-
-CLOSE = 1e-12  # relative
-
-
-SMALLEST_SHARE = 1e-9  # of the numbers, so that a fit that takes up all of them is no division by 0
-
-
-TINY = 1e-200
-
-
-ROUNDING = 1e-15
-
-
-NO_MEAN = 2.0  # up to so many numbers a squared error over its reported variance (F) has no mean

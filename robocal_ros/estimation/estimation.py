@@ -64,12 +64,8 @@ def observability(jacobian: Array, normal: Array | None = None) -> Observability
     s = np.concatenate([s, np.zeros(Vt.shape[0] - len(s))])
     rank = int(np.sum(s > RANK_TOLERANCE * max(s[0], np.finfo(float).tiny)))
     condition = float(s[0] / s[rank - 1]) if rank else np.inf
-    return Observability(rank, condition, _sparse(Vt[rank:].T) / scale[:, None])
-
-
-def _sparse(null: Array) -> Array:
-    """Basis (k, r) of the same space in which r unknowns appear in one direction each."""
-    chosen: list[int] = []
+    # the basis of the null space in which as many unknowns appear in one direction each
+    null, chosen = Vt[rank:].T, []
     rest = null.copy()
     for _ in range(null.shape[1]):
         pivot = int(np.argmax(np.einsum("ij,ij->i", rest, rest)))
@@ -77,7 +73,8 @@ def _sparse(null: Array) -> Array:
         row = rest[pivot] / np.linalg.norm(rest[pivot])
         rest = rest - np.outer(rest @ row, row)
     basis = null @ np.linalg.inv(null[chosen]) if chosen else null
-    return np.asarray(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))
+    basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
+    return Observability(rank, condition, basis / scale[:, None])
 
 
 def describe(direction: Array, names: tuple[str, ...], size: Array | None = None) -> str:
@@ -182,13 +179,18 @@ def solve(
     ValueError
         When the residuals at the start are not finite.
     """
-    residual, jacobian = _linearised(problem, start)
+    residual, jacobian = problem.linearise(start)
+    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
+        raise ValueError("the residuals at the start are not finite")
     m, c, k = jacobian.shape
     counts = np.full(m, c, dtype=np.int64) if sizes is None else sizes
     prior = np.zeros((k, k)) if prior_information is None else prior_information
     flat = not np.any(prior)
     if flat:
-        _require_enough(jacobian, int(np.sum(counts)), problem.names)
+        equations = int(np.sum(counts))
+        if equations < k:
+            raise TooFewSamplesError(f"{m} samples give {equations} equations for {k} unknowns")
+        _require_full_rank(observability(jacobian.reshape(-1, k)), problem.names)
     unscaled = 0 if noise_known else problem.scale_components
     descent = Descent(problem, prior, unscaled, counts, freedom)
     run, keep = _settle(descent, DescentState(start, residual, jacobian, 0, False), robust, flat)
@@ -199,7 +201,11 @@ def solve(
     scale, left = descent.final_scale(run, keep, information)
     covariance = descent.posterior(information, scale)
     if not np.all(np.diag(covariance) > 0.0):
-        raise _not_determined(seen, problem.names)
+        raise RankDeficientError(
+            f"the data determine {seen.rank} of {len(problem.names)} unknowns, and the prior not "
+            "the rest: measure at more and different poses",
+            [describe(column, problem.names) for column in seen.null.T],
+        )
     return Estimate(
         state=run.state,
         names=problem.names,
@@ -212,13 +218,6 @@ def solve(
         iterations=run.iterations,
         converged=run.converged,
     )
-
-
-def _linearised(problem: Problem[S], start: S) -> tuple[Array, Array]:
-    residual, jacobian = problem.linearise(start)
-    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
-        raise ValueError("the residuals at the start are not finite")
-    return residual, jacobian
 
 
 def _settle(
@@ -242,21 +241,6 @@ def _settle(
             break
         keep = update
     return run, keep
-
-
-def _require_enough(jacobian: Array, equations: int, names: tuple[str, ...]) -> None:
-    m, _, k = jacobian.shape
-    if equations < k:
-        raise TooFewSamplesError(f"{m} samples give {equations} equations for {k} unknowns")
-    _require_full_rank(observability(jacobian.reshape(-1, k)), names)
-
-
-def _not_determined(seen: Observability, names: tuple[str, ...]) -> RankDeficientError:
-    return RankDeficientError(
-        f"the data determine {seen.rank} of {len(names)} unknowns, and the prior not the rest: "
-        "measure at more and different poses",
-        [describe(column, names) for column in seen.null.T],
-    )
 
 
 def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:

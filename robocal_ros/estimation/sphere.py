@@ -259,7 +259,11 @@ def _fitted(points: Array, rule: ArcRule) -> ArcFit:
     used = on_curve((residual / limit) ** 2) & (points[:, 1] < circle[1])
     ab = np.full(2, (limit / _NEAR) ** 2)
     for attempt in count():
-        _require_points(used, len(points))
+        if np.sum(used) < FEWEST_POINTS:
+            raise TooFewSamplesError(
+                f"{np.sum(used)} of {len(points)} points lie on an arc: at least {FEWEST_POINTS} "
+                "are needed; clean the sphere, or bring it into the laser line"
+            )
         circle, covariance = _improved(circle, points[used], ab)
         J, residual = linearised(circle, points)
         pull = np.einsum("ij,jk,ik->i", J, covariance, J)
@@ -275,14 +279,6 @@ def _fitted(points: Array, rule: ArcRule) -> ArcFit:
     circle, covariance = _improved(circle, points[used], ab)
     noise = float(np.sqrt(np.mean(_parts(circle, points[used]) @ ab)))
     return ArcFit(circle[:2], float(circle[2]), covariance, noise, used)
-
-
-def _require_points(used: Mask, count: int) -> None:
-    if np.sum(used) < FEWEST_POINTS:
-        raise TooFewSamplesError(
-            f"{np.sum(used)} of {count} points lie on an arc: at least {FEWEST_POINTS} are "
-            "needed; clean the sphere, or bring it into the laser line"
-        )
 
 
 def _parts(circle: Array, points: Array) -> Array:
@@ -348,21 +344,17 @@ def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:
             f"mm (allowed {rule.radius_sigma_m * 1e3:.3f} mm); show the sensor more of the sphere"
         )
     if r - R > max(rule.radius_tolerance_m, _SURE * sigma):
-        raise ResidualError(_larger(r, R))
+        raise ResidualError(
+            f"the profile shows an arc of radius {r * 1e3:.3f} mm, but a plane cuts a sphere of "
+            f"radius {R * 1e3:.3f} mm in no larger circle than that: check which sphere is "
+            "mounted, and the sensor's scale"
+        )
     form = _form(fit, points[fit.used])
     if form > max(_FORM_M, np.sqrt(0.5) * fit.noise_m):
         raise ResidualError(
             f"the surface differs from an arc of radius {r * 1e3:.3f} mm by {form * 1e3:.3f} mm, "
             "which is no noise: it is not round; show the sphere to the sensor"
         )
-
-
-def _larger(r: float, R: float) -> str:
-    return (
-        f"the profile shows an arc of radius {r * 1e3:.3f} mm, but a plane cuts a sphere of radius "
-        f"{R * 1e3:.3f} mm in no larger circle than that: check which sphere is mounted, and the "
-        "sensor's scale"
-    )
 
 
 def _form(fit: ArcFit, points: Array) -> float:

@@ -28,14 +28,8 @@ _GHOSTS = 2  # pieces back that a surface may go on
 _HOLE = 0.5  # largest part of a surface that may be missing
 _MEETING, _BREAK = 0.25, -0.9  # worth of a corner, of none, in points of the smaller neighbour
 _REFINEMENTS = 2
-
-
 FEWEST_ON_FLANK = 6
-
-
 _FREE_ROUNDS = 12  # in which a point that was left out may come back
-
-
 _WORST = 0.5  # share of points beside a line that is still one
 
 
@@ -97,8 +91,11 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
         if np.sum(near) < max(FEWEST_ON_FLANK, _WORST * count):
             return None
         middle = cloud[near].mean(axis=0)
-        direction = _main_direction(cloud[near] - middle, direction)
         away = cloud - middle
+        (xx, xz), (_, zz) = (away[near].T @ away[near]).tolist()
+        angle = 0.5 * np.arctan2(2.0 * xz, xx - zz)  # of the largest extent
+        main = np.array([np.cos(angle), np.sin(angle)])
+        direction = main if main @ direction > 0.0 else -main
         residual = away @ np.array([-direction[1], direction[0]])
         along = away @ direction
         spread = float(np.sum(along[near] ** 2)) + SMALLEST_M**2
@@ -145,14 +142,6 @@ def _median(values: Array) -> float:
     """The upper median of values (n,), in a fifth of NumPy's time for the few of a piece."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
-
-
-def _main_direction(away: Array, towards: Array) -> Array:
-    """Direction (2,) of largest extent of points (n, 2) about their mean."""
-    (xx, xz), (_, zz) = (away.T @ away).tolist()
-    angle = 0.5 * np.arctan2(2.0 * xz, xx - zz)
-    main = np.array([np.cos(angle), np.sin(angle)])
-    return main if main @ towards > 0.0 else -main
 
 
 def angle_between(a: Flank, b: Flank) -> float:
@@ -367,17 +356,9 @@ def _corner(a: Flank, b: Flank, slack: float, rule: SurfaceRule) -> Corner | Non
 
 
 FEWEST_POINTS = 20
-
-
 SMOOTHED = 5  # columns of the median
-
-
 MAD = 1.4826  # standard deviation of a normal by its median absolute deviation
-
-
 SMALLEST_M = 1e-8  # keeps noise-free profiles solvable
-
-
 _LAGS = (1, 3)  # neighbours of a sensor that smooths are alike, those further apart are not
 
 
@@ -421,17 +402,9 @@ def local_noise(heights: Array) -> float:
 
 
 _NEAR = 13  # columns
-
-
 _CLOSE = 5.0  # limits within which a point that is off the curve is another surface's that meets it
-
-
 _AGAINST = 2.0  # weight of such a point against that of one on the curve
-
-
 _AGREEING = 0.7  # weight of the neighbours that are on the curve
-
-
 _PIECE = 0.2  # smallest piece, of the largest
 
 

@@ -144,20 +144,17 @@ def made_folder_beside(history: Path, name: str) -> Path:
 SOURCE_ROOT = Path(__file__).resolve().parents[2]
 
 
-def prefixes() -> list[Path]:
-    """Prefixes that may hold ``share/<package>``: of ROS, of this installation, of Python."""
-    named = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    found = [Path(prefix) for prefix in named if prefix]
-    found += [folder for folder in SOURCE_ROOT.parents if (folder / "share").is_dir()]
-    return [*found, Path(sys.prefix)]
-
-
 def share_folders(package: str, inside: str, source: str) -> list[Path]:
     """Existing folders ``share/<package>/<inside>`` of all prefixes, the best first.
 
-    ``source`` is the same folder in the source tree; it comes before the installed ones.
+    Those of ROS, of this installation and of Python. ``source`` is the same folder in the source
+    tree; it comes before the installed ones.
     """
-    installed = (prefix / "share" / package / inside for prefix in prefixes())
+    named = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    prefixes = [Path(prefix) for prefix in named if prefix]
+    prefixes += [folder for folder in SOURCE_ROOT.parents if (folder / "share").is_dir()]
+    prefixes += [Path(sys.prefix)]
+    installed = (prefix / "share" / package / inside for prefix in prefixes)
     candidates = dict.fromkeys([SOURCE_ROOT / source, *installed])
     return [folder for folder in candidates if folder.is_dir()]
 
@@ -180,11 +177,9 @@ class StateFile:
     def __init__(self, history: Path, name: str) -> None:
         folder = history.with_suffix("") / name
         self.path = folder / STATE
-        if not folder.exists():  # from then on a file that is missing was lost
-            self._begin(history, folder)
-
-    def _begin(self, history: Path, folder: Path) -> None:
-        """Make the folder with the file in it, unless another does so first."""
+        if folder.exists():  # from then on a file that is missing was lost
+            return
+        # The folder with the file in it, unless another makes it first.
         draft = made_folder_beside(history, draft_beside(folder).name)
         try:
             write_text(draft / STATE, "{}", durable=True)
@@ -199,7 +194,10 @@ class StateFile:
                 (draft / STATE).unlink(missing_ok=True)
                 draft.rmdir()
         for parent in (folder.parent, history.parent):
-            self._sync(parent)
+            try:
+                sync_folder(parent)
+            except OSError as error:
+                raise StorageError(f"{parent} cannot be brought to the disk: {error}") from error
 
     def load(self) -> Mapping[str, Any] | None:
         """The document; None before the first.
@@ -237,12 +235,6 @@ class StateFile:
         except ValueError as error:
             raise StorageError(f"{self.path}: {error}") from error
 
-    def _sync(self, folder: Path) -> None:
-        try:
-            sync_folder(folder)
-        except OSError as error:
-            raise StorageError(f"{folder} cannot be brought to the disk: {error}") from error
-
 
 # ---- a part of a cell that one process at a time may play for a robot ---------------------------
 
@@ -274,8 +266,17 @@ class SoleUser:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise StorageError(f"{path} cannot be made: {error}") from error
+        deadline = time.monotonic() + timeout_s
         try:
-            self._wait_for(name, serial, history, timeout_s)
+            while not self._held():
+                if time.monotonic() > deadline:
+                    other = os.pread(self._file, 20, 0).decode(errors="replace").strip()
+                    self.close()
+                    raise ConflictError(
+                        f"another {name} (process {other or 'unknown'}) keeps the calibrations of "
+                        f"robot '{serial}' in {history}: end it, or give each robot its own serial"
+                    )
+                time.sleep(_POLL_S)
         except OSError as error:
             self.close()
             raise StorageError(
@@ -283,18 +284,6 @@ class SoleUser:
             ) from error
         os.ftruncate(self._file, 0)
         os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
-
-    def _wait_for(self, name: str, serial: str, history: Path, timeout_s: float) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not self._held():
-            if time.monotonic() > deadline:
-                other = os.pread(self._file, 20, 0).decode(errors="replace").strip()
-                self.close()
-                raise ConflictError(
-                    f"another {name} (process {other or 'unknown'}) keeps the calibrations of "
-                    f"robot '{serial}' in {history}: end it, or give each robot its own serial"
-                )
-            time.sleep(_POLL_S)
 
     def _held(self) -> bool:
         try:

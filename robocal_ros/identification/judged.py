@@ -180,18 +180,28 @@ def identify_and_judge(
     predicted, total = _predicted(result, check, check_refit)
     doubt = still_joints(arm, train) and still_joints(arm, check)
     sound = ~gross(before, after)
-    doubt = doubt or _doubt(result, summarise(before[sound]).rms_m, in_force or arm)
+    current, workspace_m = (
+        summarise(before[sound]),
+        result.workspace_rms(result.estimate.covariance),
+    )
+    doubt = doubt or result.estimate.creeping
+    if not doubt:
+        change_m = result.workspace_change(in_force or arm)
+        doubt = too_narrow(workspace_m, change_m, current.rms_m, SPREAD_POSES)
     verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
-    if "geometry" not in fit:
-        verdict = _of_placement(verdict)
+    if "geometry" not in fit and verdict.code in (
+        Code.WORSE_THAN_CURRENT, Code.NO_SIGNIFICANT_GAIN
+    ):  # fmt: skip  # base and targets alone were fitted: the model cannot have changed
+        why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
+        verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
     return JudgedIdentification(
         identification=result,
         nominal=summarise(plain[sound]),
-        current=summarise(before[sound]),
+        current=current,
         candidate=summarise(after[sound]),
         predicted_rms_m=predicted,
         predicted_total_rms_m=total,
-        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
+        workspace_rms_m=workspace_m,
         held_out_rejected=tuple(check.sample[i] for i in np.flatnonzero(~sound)),
         verdict=verdict,
     )
@@ -236,35 +246,17 @@ def identify_and_hold_out(
     return identify_and_judge(arm, train, check, method=method, in_force=in_force)
 
 
-def _doubt(result: Identification, current_rms_m: float, in_force: SerialArm) -> str:
-    """Say why the poses do not carry over to the workspace; empty when they do."""
-    error = result.workspace_rms(result.estimate.covariance)
-    change = result.workspace_change(in_force)
-    return result.estimate.creeping or too_narrow(error, change, current_rms_m, SPREAD_POSES)
-
-
 def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:
     """Base and targets for a given geometry."""
     return identify(arm, train, fit=fit).cell if fit else linear_start(arm, train)
 
 
-def _of_placement(verdict: Verdict) -> Verdict:
-    """The verdict where base and targets alone were fitted: the model cannot have changed."""
-    if verdict.code not in (Code.WORSE_THAN_CURRENT, Code.NO_SIGNIFICANT_GAIN):
-        return verdict
-    why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
-    return Verdict(Code.NO_SIGNIFICANT_GAIN, why)
-
-
 def _check_error(cell: CellModel, check: Measurements, refit: Collection[Part]) -> Array:
     if refit:
-        cell = identify(cell.arm, check, fit=refit, method="map", start=_start(cell, refit)).cell
+        # What is not refitted is kept; with both refitted nothing of the old set-up counts.
+        start = None if frozenset(refit) >= {"base", "tool"} else cell
+        cell = identify(cell.arm, check, fit=refit, method="map", start=start).cell
     return np.asarray(np.linalg.norm(cell.residual(check), axis=1))
-
-
-def _start(cell: CellModel, refit: Collection[Part]) -> CellModel | None:
-    """Keep what is not refitted; with both refitted nothing of the old set-up counts."""
-    return None if frozenset(refit) >= {"base", "tool"} else cell
 
 
 def _predicted(

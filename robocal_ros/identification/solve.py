@@ -240,7 +240,8 @@ def linear_start(
         T = T_base_flange @ tools[index]
         T_frame_base = _aligned(T[:, :3, 3], data.position)
     elif tool:
-        p = (frames.invert(T_base_flange) @ _homogeneous(data.position)[..., None])[:, :3, 0]
+        homogeneous = np.hstack([data.position, np.ones((len(data), 1))])
+        p = (frames.invert(T_base_flange) @ homogeneous[..., None])[:, :3, 0]
         for t in range(len(targets)):
             tools[t, :3, 3] = p[index == t].mean(axis=0)
     if tool and data.rotation is not None:
@@ -249,10 +250,6 @@ def linear_start(
             mean = (relative @ data.rotation)[index == t].mean(axis=0)
             tools[t, :3, :3] = frames.nearest_rotation(mean)
     return CellModel(arm, T_frame_base, targets, tools)
-
-
-def _homogeneous(points: Array) -> Array:
-    return np.hstack([points, np.ones((len(points), 1))])
 
 
 def _base_and_points(
@@ -488,7 +485,9 @@ def identify(
     try:
         estimate, lever = _solve(arm, data, layout, initial, covariance, robust)
         if by_prior and prior_covariance is None:
-            covariance = _learned_prior(arm, estimate)
+            count, found = len(names), arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
+            variances = fitted_prior(arm, found, estimate.covariance[:count, :count])
+            covariance = np.diag(variances)
             estimate, lever = _solve(arm, data, layout, estimate.state, covariance, robust)
     except RankDeficientError as error:
         still = still_joints(arm, data)
@@ -559,13 +558,6 @@ def random_postures(arm: SerialArm, count: int = 60) -> Array:
     lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
     upper = np.where(np.isfinite(arm.upper), arm.upper, span)
     return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
-
-
-def _learned_prior(arm: SerialArm, estimate: estimation.Estimate[CellModel]) -> Array:
-    """Covariance of a prior whose widths are what this robot's deviations show."""
-    count = len(arm.parameters.names)
-    found = arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
-    return np.diag(fitted_prior(arm, found, estimate.covariance[:count, :count]))
 
 
 def _redundant(

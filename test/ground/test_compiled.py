@@ -54,23 +54,17 @@ def walk(folder: Path, script: str = WALK) -> tuple[float, int]:
     return float(told[0]), int(told[1])
 
 
-def test_a_new_kernel_is_built_from_kept_code(tmp_path):
-    shutil.copytree(PACKAGE, tmp_path / "robocal_ros", ignore=shutil.ignore_patterns("__pycache__"))
-    fresh = walk(tmp_path)
-    assert walk(tmp_path, WALK + AGAIN) == (fresh[0], fresh[1] + 1)
-
-
-def test_an_edit_of_what_a_kernel_is_built_from_compiles_it_again(tmp_path):
-    shutil.copytree(PACKAGE, tmp_path / "robocal_ros", ignore=shutil.ignore_patterns("__pycache__"))
-    assert walk(tmp_path) == (pytest.approx(0.8775825618903728, abs=1e-15), 0)
-    assert walk(tmp_path) == (pytest.approx(0.8775825618903728, abs=1e-15), 1)
-    kernels = tmp_path / "robocal_ros" / "kinematics" / "kernels.py"
+def test_a_new_kernel_is_built_from_kept_code_and_an_edit_compiles_it_again(tree):
+    right = pytest.approx(0.8775825618903728, abs=1e-15)
+    assert walk(tree) == (right, 0)
+    assert walk(tree, WALK + AGAIN) == (right, 1)
+    kernels = tree / "robocal_ros" / "kinematics" / "kernels.py"
     text = kernels.read_text()
     kernels.write_text(text.replace("r = ((angle - ", "r = 0.0 * ((angle - "))
     assert kernels.read_text() != text
-    assert walk(tmp_path) == (1.0, 0)
+    assert walk(tree) == (1.0, 0)
     kernels.write_text(text)
-    assert walk(tmp_path) == (pytest.approx(0.8775825618903728, abs=1e-15), 0)
+    assert walk(tree)[0] == right
 
 
 def modules(path: Path) -> set[Path]:
@@ -156,6 +150,15 @@ def tree(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Code that the first call kept beside its source."""
+    folder = tmp_path_factory.mktemp("kept")
+    shutil.copytree(PACKAGE, folder / "robocal_ros", ignore=shutil.ignore_patterns("__pycache__"))
+    assert call(folder)["hits"] == 0
+    return folder / "robocal_ros" / "kinematics" / "__pycache__"
+
+
 @pytest.fixture
 def read_only(tree: Path) -> list[str]:
     """What runs a command with the tree read-only; skipped where that cannot be had."""
@@ -190,17 +193,11 @@ def test_a_read_only_tree_without_a_home_keeps_its_code_in_a_private_folder(
 
 
 def test_code_that_was_compiled_at_the_installation_is_used_from_a_read_only_tree(
-    tree: Path, read_only: list[str], tmp_path: Path
+    tree: Path, read_only: list[str], tmp_path: Path, kept: Path
 ) -> None:
-    writable = tree.parent / "writable"
-    shutil.copytree(tree, writable)
-    for path in writable.rglob("*"):
-        path.chmod(0o755)
-    assert call(writable)["hits"] == 0
-    made = writable / "robocal_ros" / "kinematics" / "__pycache__"
     beside = tree / "robocal_ros" / "kinematics"
     beside.chmod(0o755)
-    shutil.copytree(made, beside / "__pycache__")
+    shutil.copytree(kept, beside / "__pycache__")
     beside.chmod(0o555)
     for temporary in (str(tmp_path), NOWHERE):  # with and without a place for new code
         found = call(tree, *read_only, arguments=temporary)
@@ -218,15 +215,17 @@ def test_where_nothing_can_be_kept_kernels_work_and_it_is_told_once(
 
 @pytest.mark.parametrize("content", [b"", b"junk"])
 def test_kept_code_that_a_power_cut_left_in_pieces_is_made_again(
-    tree: Path, content: bytes
+    tree: Path, kept: Path, content: bytes
 ) -> None:
-    assert call(tree)["hits"] == 0
     folder = tree / "robocal_ros" / "kinematics" / "__pycache__"
+    shutil.copytree(kept, folder)
     for end in ("nbi", "nbc"):
-        for path in folder.glob(f"newton.copy*.{end}"):
-            path.write_bytes(content)
-        assert call(tree)["right"]
-        assert call(tree)["hits"] == 1
+        (path,) = folder.glob(f"newton.copy*.{end}")
+        path.write_bytes(content)
+        again = call(tree)
+        assert (again["right"], again["hits"]) == (True, 0)
+        assert path.read_bytes() != content
+    assert call(tree)["hits"] == 1
 
 
 def test_a_full_disk_stops_no_kernel(tree: Path, small_disk: Path) -> None:
