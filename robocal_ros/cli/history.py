@@ -235,7 +235,6 @@ def add_history(parser: argparse.ArgumentParser) -> None:
     action.add_argument(
         "--to",
         type=_target,
-        default=None,
         metavar="ID",
         help="an accepted calibration, 'nominal', or 'previous' (default): the one in force "
         "before the present one",
