@@ -492,7 +492,7 @@ class SimulatedCell:
         Without ``readings`` no joints are read: a long stretch of work takes less time.
         """
         last = int(np.floor(to_s / TICK_S * (1.0 + 1e-12)))
-        read = []
+        read: list[tuple[Array, Array, Array]] = []
         while True:
             number = self._readings.due(self.now_s)
             number = number if readings else number[:0]
