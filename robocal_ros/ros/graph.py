@@ -333,6 +333,8 @@ class FrameWatch:
             self._listen_anew()
         elif publishers > self._publishers and self.settled:
             self._listen_anew()
+        elif publishers > self._publishers:  # one that came while it listens is heard as long
+            self._since = time.monotonic()
         self._publishers = publishers
 
     def _take(self, message: Any) -> None:

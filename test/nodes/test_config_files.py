@@ -38,8 +38,8 @@ NODES = (
     RecorderNode,
     CellSimNode,
     MaintenanceNode,
+    JointCorrectionNode,
 )
-ALL_NODES = (*NODES, JointCorrectionNode)
 PAGES = {
     ThermalNode: "thermal_node",
     TcfNode: "tcf_node",
@@ -80,11 +80,11 @@ def test_the_page_shows_every_advanced_parameter(node):
 
 
 def test_only_nodes_with_a_page_have_advanced_parameters():
-    assert {node for node in ALL_NODES if any(s.advanced for s in settings(node))} == set(PAGES)
+    assert {node for node in NODES if any(s.advanced for s in settings(node))} == set(PAGES)
 
 
 def test_what_several_nodes_have_may_be_given_to_all():
-    tables = [{s.name for s in settings(node)} for node in ALL_NODES]
+    tables = [{s.name for s in settings(node)} for node in NODES]
     counts = Counter(name for table in tables for name in table)
     assert {name for name, count in counts.items() if count > 1} == SHARED
     shared = yaml.safe_load((CONFIG / "cell.yaml").read_text())["/**"]["ros__parameters"]

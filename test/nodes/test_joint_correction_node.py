@@ -2,12 +2,10 @@
 
 import time
 from array import array
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from joint_correction_live import (
@@ -31,10 +29,8 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.correction.settings import SETTINGS
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ros import conversions, endpoints
-from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.endpoints import OK, WARN
 from robocal_ros.ros.graph import SourceGuard
 
@@ -328,13 +324,6 @@ def test_a_tool_that_makes_no_sense_is_named(graph: Any, parameters: dict[str, A
     node = graph.add(JointCorrectionNode, parameters)
     assert not node.is_active
     assert "taught_tool" in node._full_health().message
-
-
-def test_the_configuration_file_shows_every_parameter_with_its_default() -> None:
-    path = Path(__file__).parents[2] / "config" / "joint_correction_node.yaml"
-    (content,) = yaml.safe_load(path.read_text()).values()
-    defaults = {s.name: s.default for s in (AUTOSTART, SERIAL, *SETTINGS)}
-    assert content["ros__parameters"] == defaults
 
 
 def test_as_a_process_it_answers_and_streams(graph: Any) -> None:

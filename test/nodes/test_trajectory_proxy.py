@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.correction import action as trajectory_proxy
@@ -167,9 +167,11 @@ def test_what_a_goal_is_corrected_by_is_told(cell: Any) -> None:
     cell.graph.spin_until(lambda: len(offsets) > 3, "offsets")
     assert [o.cause for o in offsets].count(JointOffset.TRAJECTORY) == 1
     assert {o.cause for o in offsets} == {JointOffset.TRAJECTORY, JointOffset.PERIODIC}
-    cell.graph.spin_until(lambda: np.abs(offsets[-1].withheld).max() < 1e-9, "all of it")
     expected = cell.robot.goals[-1].trajectory.points[-1].positions - MOVED
-    assert np.abs(np.array(offsets[-1].offset) - expected).max() < 1e-9
+    cell.graph.spin_until(
+        lambda: np.abs(np.array(offsets[-1].offset) - expected).max() < 1e-9, "that of the end"
+    )
+    assert np.abs(offsets[-1].withheld).max() < 1e-9
 
 
 def test_feedback_is_of_the_taught_world(cell: Any) -> None:
@@ -526,7 +528,10 @@ def test_a_controller_that_is_killed_ends_the_goal(apart: Any) -> None:
     for _ in range(10):  # the node may have to find the new one first, and says so
         sent = cell.send(cell.taught(), HOME)
         cell.graph.spin_until(lambda sent=sent: sent.answer, "the goal ends", 5.0)
-        if "no controller offers" not in sent.answer.result.error_string:
+        said = sent.answer.result.error_string
+        if "call ~/acknowledge" in said:  # the new robot stands elsewhere than the old one
+            cell.graph.call(Trigger, f"{NODE}/acknowledge")
+        elif "no controller offers" not in said:
             break
         cell.graph.spin_for(0.5)
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
