@@ -85,6 +85,10 @@ def endurance(amount: Amount) -> Table:
         lambda: not _pytest(matrix, ROBOCAL_FAULTS="all"))  # fmt: skip
     add("sensor, sphere or robot knocked in a live cell, each told in the next gap", 1,
         lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
+    add("a node that is stopped for 50 to 500 ms in a fast stream: largest step against direct", 1,
+        lambda: not _pytest("test/nodes/soak_stalls.py"))  # fmt: skip
+    add("real measurements through live nodes and their replay, bit for bit", 2,
+        lambda: not _pytest("test/nodes/test_real_replay.py", ROBOCAL_SERIES="B D"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test", "--ignore=test/nodes")

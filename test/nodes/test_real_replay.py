@@ -91,7 +91,7 @@ def with_events(bag: Path, events: list[SessionEvent], path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("series", ["B", "D"])
+@pytest.mark.parametrize("series", os.environ.get("ROBOCAL_SERIES", "D").split())
 def test_live_equals_replay(graph, tmp_path: Path, series: str) -> None:
     arm, data = load_robot("ur10"), ur10_campaigns.load_campaign(series)
     bag = tmp_path / f"{series}.mcap"
