@@ -130,24 +130,21 @@ class BagReader:
                 types[channel.topic] = file.msgtype(number)
         starts = [file.start_ns for file in self._files if file.start_ns is not None]
         ends = [file.end_ns for file in self._files if file.end_ns is not None]
+        losses = [
+            f"{file.path}: a damaged chunk is left out, with all messages recorded from "
+            f"{_utc(lost.from_ns)} to {_utc(lost.to_ns)} ({lost.why})"
+            for file in self._files
+            for lost in file.lost.values()
+        ]
         return BagInfo(
             path=str(self._path),
             topics={topic: TopicInfo(types[topic], counts[topic]) for topic in sorted(counts)},
             start_ns=min(starts, default=None),
             end_ns=max(ends, default=None),
             truncated=any(file.notes for file in self._files),
-            notes=(*self._notes, *self._losses()),
+            notes=(*self._notes, *losses),
             lost=tuple(lost for file in self._files for lost in file.lost.values()),
         )
-
-    def _losses(self) -> Iterator[str]:
-        for file in self._files:
-            for lost in file.lost.values():
-                start, end = (_utc(ns) for ns in (lost.from_ns, lost.to_ns))
-                yield (
-                    f"{file.path}: a damaged chunk is left out, with all messages recorded from "
-                    f"{start} to {end} ({lost.why})"
-                )
 
     def messages(
         self,
@@ -367,36 +364,25 @@ def write_data_set(
 
 
 def _shot(topic: str, header: Document, values: Sequence[Sequence[float]]) -> Document:
+    """Message of an image (rows: its width and height, then each corner), a profile or a pose."""
     if topic == IMAGE:
-        return _corners(values)
-    return {"header": header} | (_cloud(values) if topic == PROFILE else _pose(values))
-
-
-def _corners(values: Sequence[Sequence[float]]) -> Document:
-    """Rows of two: width and height of the image, then each corner."""
-    size = 2 * len(values)
-    layout = [("size and corners", len(values), size), ("x, y", 2, 2)]
-    dim = [{"label": label, "size": n, "stride": stride} for label, n, stride in layout]
-    return {"layout": {"dim": dim, "data_offset": 0}, "data": np.ravel(values)}
-
-
-def _cloud(points: Sequence[Sequence[float]]) -> Document:
-    data = np.insert(np.array(points, dtype="<f8").reshape(-1, 2), 1, 0.0, axis=1)
-    fields = [
-        {"name": name, "offset": 8 * i, "datatype": _DOUBLE, "count": 1}
-        for i, name in enumerate("xyz")
-    ]
-    size = len(data) * _BYTES
-    return {
-        "height": 1, "width": len(data), "fields": fields, "point_step": _BYTES,
-        "row_step": size, "data": data.tobytes(), "is_dense": True,
-    }  # fmt: skip
-
-
-def _pose(values: Sequence[Sequence[float]]) -> Document:
+        layout = [("size and corners", len(values), 2 * len(values)), ("x, y", 2, 2)]
+        dim = [{"label": label, "size": n, "stride": stride} for label, n, stride in layout]
+        return {"layout": {"dim": dim, "data_offset": 0}, "data": np.ravel(values)}
+    if topic == PROFILE:
+        data = np.insert(np.array(values, dtype="<f8").reshape(-1, 2), 1, 0.0, axis=1)
+        fields = [
+            {"name": name, "offset": 8 * i, "datatype": _DOUBLE, "count": 1}
+            for i, name in enumerate("xyz")
+        ]
+        return {
+            "header": header, "height": 1, "width": len(data), "fields": fields,
+            "point_step": _BYTES, "row_step": len(data) * _BYTES, "data": data.tobytes(),
+            "is_dense": True,
+        }  # fmt: skip
     x, y, z, *quat = values[0]
     turn = dict(zip("xyzw", quat, strict=True))
-    return {"pose": {"position": {"x": x, "y": y, "z": z}, "orientation": turn}}
+    return {"header": header, "pose": {"position": {"x": x, "y": y, "z": z}, "orientation": turn}}
 
 
 def read_data_set(path: Path, arm: SerialArm) -> Document:
@@ -411,7 +397,10 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
     """
     with BagReader(path) as reader:
         found = list(reader.messages([DATA_SET, JOINTS, *_TYPE]))
-        _require_whole(reader.info, path)
+        info = reader.info
+    if info.notes or info.lost:  # what is missing cannot be told from the rest
+        told = "; ".join([*info.notes, *(part.why for part in info.lost)])
+        raise InputError(f"is truncated or damaged: copy it again ({told})", file=str(path))
     texts = [m.message.data for m in found if m.topic == DATA_SET]
     if len(texts) != 1:
         raise InputError(f"is no data file of hand_eye_node: no topic {DATA_SET}", file=str(path))
@@ -432,13 +421,6 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the data set cannot be read: {error}", file=str(path)) from error
     return dict(document)
-
-
-def _require_whole(info: BagInfo, path: Path) -> None:
-    """Refuse a file that was cut off or damaged: what is missing cannot be told from the rest."""
-    if info.notes or info.lost:
-        told = "; ".join([*info.notes, *(part.why for part in info.lost)])
-        raise InputError(f"is truncated or damaged: copy it again ({told})", file=str(path))
 
 
 def _values(recorded: BagMessage) -> Array:

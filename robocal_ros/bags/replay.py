@@ -115,8 +115,8 @@ def read_events(
         if command.name == events.CONFIGURE:
             if not found:
                 configured, before = command, _jumps(command)
-            elif _takes_over(command, model):
-                found.append((command, {}))
+            elif "reference" not in command.arguments and command.arguments.get("model") != model:
+                found.append((command, {}))  # another node brought another model into force
             model = command.arguments.get("model")
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
@@ -125,12 +125,6 @@ def read_events(
     return configured, [
         (_counted_from(before, from_ns, command), outcome) for command, outcome in found
     ]
-
-
-def _takes_over(configured: Command, model: Any) -> bool:
-    """Whether another node has brought another thermal model into force than the one before."""
-    own = "reference" in configured.arguments
-    return not own and configured.arguments.get("model") != model
 
 
 def _jumps(command: Command) -> int:

@@ -352,19 +352,15 @@ class ReplayNode(HouseNode):
             self._next = next(self._messages, None)
             sent += 1
         if sent or rate:
-            self._tell_time(now, rate)
+            if rate and self._next is not None:  # on between messages, never beyond the next one
+                self._position_ns = max(self._position_ns, self._due_ns(now, rate))
+            self._clock_out.publish(Clock(clock=time_message(self._position_ns)))
         self._unsettled_since = now if sent else self._unsettled_since
         if self._next is None and self._settled(topics, time.monotonic()):
             self._end(DONE)
 
     def _due_ns(self, now: float, rate: float) -> int:
         return self._from_ns + int((now - self._since) * rate * 1e9)
-
-    def _tell_time(self, now: float, rate: float) -> None:
-        """/clock runs on between messages, and never beyond the next one or back."""
-        if rate and self._next is not None:
-            self._position_ns = max(self._position_ns, self._due_ns(now, rate))
-        self._clock_out.publish(Clock(clock=time_message(self._position_ns)))
 
     def _settled(self, topics: ReplayTopics, now: float) -> bool:
         """Whether everything sent was acknowledged, or given up and reported."""

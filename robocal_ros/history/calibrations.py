@@ -141,7 +141,13 @@ class Ledger:
         revision, in_force = self.head(decision.kind)
         step = 0 if decision.action is Action.REJECT else 1
         chained = decision.head_before == revision and decision.head_after == revision + step
-        if not chained or not self._possible(decision, in_force):
+        target = decision.calibration_id
+        before = None if target is None else self.standing(target)
+        if decision.action is Action.ROLLBACK:
+            possible = target != in_force and (before is None or before.revision > 0)
+        else:
+            possible = before is not None and not before.rejected and before.revision == 0
+        if not chained or not possible:
             raise DamagedError(f"decision {decision.seq} contradicts those before it")
         if decision.calibration_id is not None:
             standing = self._standings.setdefault(decision.calibration_id, _Standing())
@@ -158,16 +164,6 @@ class Ledger:
                 out.decisions += (decision,)
             self._heads[decision.kind] = (decision.head_after, decision.calibration_id)
         self.last_seq = decision.seq
-
-    def _possible(self, decision: Decision, in_force: int | None) -> bool:
-        target = decision.calibration_id
-        if decision.action is Action.ROLLBACK:
-            was_accepted = target is None or self.standing(target).revision > 0
-            return in_force != target and was_accepted
-        if target is None:
-            return False
-        standing = self.standing(target)
-        return not standing.rejected and standing.revision == 0
 
     def check_open(self, calibration_id: int) -> None:
         """Refuse a calibration that was decided before.
@@ -585,7 +581,14 @@ class CalibrationHistory(HistoryReader):
             candidate = read_candidate(connection, calibration_id)
             self._ledger.check_accept(calibration_id, candidate, expected_head, with_heads or {})
             self._require_hash(candidate.model_hash, f"calibration {calibration_id}")
-            self._require_hash_in_force(candidate)
+            _, in_force = self._ledger.head(candidate.kind)
+            if in_force is not None:
+                found = read_candidate(connection, in_force).model_hash
+                if found != candidate.model_hash:
+                    raise WrongRobotError(
+                        f"calibration {in_force}, in force, was made for the nominal model "
+                        f"{found}, this one for {candidate.model_hash}: roll back to nominal first"
+                    )
             return self._decide(Action.ACCEPT, candidate.kind, calibration_id, by, reason, wall_ns)
 
     def reject(self, calibration_id: int, *, by: str, reason: str, wall_ns: int) -> None:
@@ -654,17 +657,6 @@ class CalibrationHistory(HistoryReader):
             Decision(0, kind, action, target, by, reason, wall_ns, before, after),
         )
         return head
-
-    def _require_hash_in_force(self, candidate: Candidate) -> None:
-        _, in_force = self._ledger.head(candidate.kind)
-        if in_force is None:
-            return
-        found = read_candidate(self._file.connection, in_force).model_hash
-        if found != candidate.model_hash:
-            raise WrongRobotError(
-                f"calibration {in_force}, in force, was made for the nominal model {found}, this "
-                f"one for {candidate.model_hash}: roll back to nominal first"
-            )
 
     @contextmanager
     def _changing(self) -> Iterator[sqlite3.Connection]:

@@ -200,6 +200,15 @@ def _acknowledged(history: Path) -> dict[str, Any]:
 
 _FULL_CHECK_BYTES = 2_000_000
 _NOT_READABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_ADVICE = {
+    sqlite3.SQLITE_BUSY: ": another process holds it; nothing was changed, try again",
+    sqlite3.SQLITE_FULL: ": the disk is full; nothing was changed, free some space",
+    sqlite3.SQLITE_READONLY: ": cannot be written; check its owner and permissions",
+    sqlite3.SQLITE_CANTOPEN: ": cannot be opened; check the folder and its permissions",
+    sqlite3.SQLITE_IOERR: ": reading or writing failed; check the disk and its free space",
+    sqlite3.SQLITE_CORRUPT: ": is damaged; start again, then it is set aside",
+    sqlite3.SQLITE_NOTADB: ": is damaged; start again, then it is set aside",
+}
 
 
 @contextmanager
@@ -212,23 +221,10 @@ def storage_errors(path: Path) -> Iterator[None]:
     except sqlite3.IntegrityError:
         raise  # a rule of the schema was broken: a bug, not a storage failure
     except (sqlite3.Error, OSError) as error:
-        raise StorageError(f"{path}: {_advice(error)}") from error
-
-
-def _advice(error: sqlite3.Error | OSError) -> str:
-    base = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    if isinstance(error, OSError) and error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
-        return f"{error}: the disk knows no locks (NFS?), keep histories on a local one"
-    advice = {
-        sqlite3.SQLITE_BUSY: "another process holds it; nothing was changed, try again",
-        sqlite3.SQLITE_FULL: "the disk is full; nothing was changed, free some space",
-        sqlite3.SQLITE_READONLY: "cannot be written; check its owner and permissions",
-        sqlite3.SQLITE_CANTOPEN: "cannot be opened; check the folder and its permissions",
-        sqlite3.SQLITE_IOERR: "reading or writing failed; check the disk and its free space",
-        sqlite3.SQLITE_CORRUPT: "is damaged; start again, then it is set aside",
-        sqlite3.SQLITE_NOTADB: "is damaged; start again, then it is set aside",
-    }.get(base)
-    return f"{error}: {advice}" if advice else str(error)
+        advice = _ADVICE.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, "")
+        if isinstance(error, OSError) and error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
+            advice = ": the disk knows no locks (NFS?), keep histories on a local one"
+        raise StorageError(f"{path}: {error}{advice}") from error
 
 
 @contextmanager
@@ -358,12 +354,9 @@ class HistoryFile:
                 self._check()
                 verify(self.connection)
         except BaseException:
-            self._disconnect()
+            if hasattr(self, "connection"):
+                self.connection.close()
             raise
-
-    def _disconnect(self) -> None:
-        if hasattr(self, "connection"):
-            self.connection.close()
 
     def _refuse_foreign(self) -> None:
         """Look at the file without touching it: closing a writable one would write to it.

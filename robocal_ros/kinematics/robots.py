@@ -238,13 +238,23 @@ def load_description(name: str | Path) -> RobotDescription:
     )
     velocity = np.array([joint.max_velocity for joint in joints])
     given = np.array([joint.max_acceleration for joint in joints])
+    both = np.isinf(arm.lower) & np.isinf(arm.upper)
+    notes = [
+        f"{which} not given, nothing is assumed: {', '.join(np.array(names)[missing])}"
+        for missing, which in (
+            (both, "joint limits"),
+            (np.isinf(arm.lower) & ~both, "a lower limit"),
+            (np.isinf(arm.upper) & ~both, "an upper limit"),
+        )
+        if np.any(missing)
+    ]
     return RobotDescription(
         arm=arm,
         path=path,
         max_velocity=velocity,
         max_acceleration=np.where(np.isnan(given), velocity / FULL_SPEED_IN_S, given),
         acceleration_assumed=np.isnan(given),
-        notes=_open_limits(arm),
+        notes=tuple(notes),
     )
 
 
@@ -315,9 +325,7 @@ def save_robot(
     """
     convention = "mdh" if np.any(arm.mdh[:, 4]) else "dh"
     document: dict[str, Any] = {"robot": arm.name, "convention": convention}
-    document["joints"] = [_joint_document(arm, i, convention) for i in range(arm.n)]
-    if like is not None:
-        _add_speeds(document["joints"], like)
+    document["joints"] = [_joint_document(arm, i, convention, like) for i in range(arm.n)]
     for key, T in (("base", arm.T_base_root), ("tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
             xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
@@ -361,27 +369,15 @@ def _pose(top: Fields, key: str) -> Array:
     return read_pose(top.below(key)) if key in top.values else np.eye(4)
 
 
-def _open_limits(arm: SerialArm) -> tuple[str, ...]:
-    both = np.isinf(arm.lower) & np.isinf(arm.upper)
-    notes = []
-    for missing, which in (
-        (both, "joint limits"),
-        (np.isinf(arm.lower) & ~both, "a lower limit"),
-        (np.isinf(arm.upper) & ~both, "an upper limit"),
-    ):
-        if np.any(missing):
-            names = ", ".join(np.array(arm.joint_names)[missing])
-            notes.append(f"{which} not given, nothing is assumed: {names}")
-    return tuple(notes)
-
-
 def _shown(value: float, factor: float) -> float:
     """The shortest number that reads back as ``value``, where there is one."""
     neat = float(f"{value / factor:.12g}")
     return neat if neat * factor == value else value / factor
 
 
-def _joint_document(arm: SerialArm, joint: int, convention: str) -> dict[str, Any]:
+def _joint_document(
+    arm: SerialArm, joint: int, convention: str, like: RobotDescription | None
+) -> dict[str, Any]:
     prismatic = bool(arm.prismatic[joint])
     document: dict[str, Any] = {"name": arm.joint_names[joint]}
     if prismatic:
@@ -394,17 +390,12 @@ def _joint_document(arm: SerialArm, joint: int, convention: str) -> dict[str, An
     for side, limit in (("lower", arm.lower[joint]), ("upper", arm.upper[joint])):
         if np.isfinite(limit):
             document[f"{side}_{unit}"] = _shown(float(limit), factor)
+    if like is not None and np.isfinite(speed := float(like.max_velocity[joint])):
+        document[f"max_velocity_{unit}_s"] = _shown(speed, factor)
+    if like is not None and not like.acceleration_assumed[joint]:
+        acceleration = float(like.max_acceleration[joint])
+        document[f"max_acceleration_{unit}_s2"] = _shown(acceleration, factor)
     return document
-
-
-def _add_speeds(documents: list[dict[str, Any]], like: RobotDescription) -> None:
-    for joint, document in enumerate(documents):
-        unit, factor = UNITS[bool(like.arm.prismatic[joint])]
-        if np.isfinite(speed := float(like.max_velocity[joint])):
-            document[f"max_velocity_{unit}_s"] = _shown(speed, factor)
-        if not like.acceleration_assumed[joint]:
-            acceleration = float(like.max_acceleration[joint])
-            document[f"max_acceleration_{unit}_s2"] = _shown(acceleration, factor)
 
 
 # ---- files that a command made for one robot: YAML, with the nominal model they belong to -------
@@ -584,12 +575,9 @@ def hayati_from_dh(dh: Array, nominal: Array) -> Array:
         last = i == len(dh) - 1
         if not last and abs(np.sin(nominal[i, ALPHA])) < NEARLY_PARALLEL:
             result[i], turn, shift = _parallel_link(result[i], nominal[i])
-    result[:, THETA] = nominal[:, THETA] + _wrapped(result[:, THETA] - nominal[:, THETA])
+    turned = result[:, THETA] - nominal[:, THETA]
+    result[:, THETA] = nominal[:, THETA] + ((turned + np.pi) % (2.0 * np.pi) - np.pi)
     return result
-
-
-def _wrapped(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def link_transform(row: Array) -> Array:

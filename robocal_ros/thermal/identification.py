@@ -567,7 +567,9 @@ def conclude(
     chosen, cold, spot = spots.cell.arm.parameters, spots.cell.arm, spots.match(data)
     A = spots.rows(data.q, spots.target[spot])[0]
     sound = usable & ~gross(current, after)
-    rows = workspace_rows(spots)
+    # of the first target by the parameters, throughout the joint limits
+    q = random_postures(cold)
+    rows = spots.rows(q, np.zeros(len(q), dtype=np.int64))[0]
     moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
     change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     workspace_rms_m, prior = _rms(rows, found.covariance), found.prior_covariance
@@ -590,9 +592,3 @@ def conclude(
 def _rms(rows: Array, covariance: Array) -> float:
     """Rms length, m, of what a covariance (k, k) does to points with rows (m, 3, k)."""
     return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
-
-
-def workspace_rows(spots: ColdSpots) -> Array:
-    """Displacement (p, 3, k) of the first target by the parameters, throughout the joint limits."""
-    q = random_postures(spots.cell.arm)
-    return spots.rows(q, np.zeros(len(q), dtype=np.int64))[0]

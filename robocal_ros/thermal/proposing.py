@@ -145,10 +145,19 @@ class Proposer:
         RobocalError
             When they cannot answer, or the history refuses.
         """
-        reference = self._current.reference
+        current, reference = self._current, self._current.reference
         if reference is None or follower is None:
-            solution = self._calibration(data, method)
-            return self._keep(command, *solution, method, data, {}, wall_ns)
+            found = identify_and_hold_out(
+                self._nominal,
+                data,
+                share=self._config.hold_out,
+                seed=self._config.seed,
+                method=method,
+                in_force=current.arm if current.head.model is not None else None,
+            )
+            model = identified_model_document(found.identification)
+            document = identification_document(found)
+            return self._keep(command, document, model, found.verdict, method, data, {}, wall_ns)
         with follower.attempt():
             solution = self._drift(follower, reference, data, beside, method)
             kept = follower.kept(beside.temperature)
@@ -205,21 +214,6 @@ class Proposer:
             }
         }
         return document, model, judged.verdict
-
-    def _calibration(
-        self, data: Measurements, method: Method
-    ) -> tuple[Document, Document, Verdict]:
-        current = self._current
-        judged = identify_and_hold_out(
-            self._nominal,
-            data,
-            share=self._config.hold_out,
-            seed=self._config.seed,
-            method=method,
-            in_force=current.arm if current.head.model is not None else None,
-        )
-        model = identified_model_document(judged.identification)
-        return identification_document(judged), model, judged.verdict
 
     def capture(
         self, command: Command, data: Measurements, beside: Beside, wall_ns: int

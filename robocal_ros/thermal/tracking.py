@@ -514,7 +514,18 @@ def track_cycle(
         usable=innovation.kept,
     )
     if moved:
-        judged = replace(judged, verdict=_refusal(tracker, warm, innovation, fixed))
+        deviation, explained = innovation.deviation, innovation.covariance
+        rms_mm, expected_mm = (
+            1e3 * float(np.sqrt(3.0 * np.mean(square)))
+            for square in (deviation**2, np.diag(explained))
+        )
+        causes = step_words(possible_causes(spots, warm, deviation, explained), fixed)
+        refusal = Verdict(
+            Code.SENSOR_OR_ROBOT_MOVED,
+            f"the measured positions are {rms_mm:.2f} mm rms off, where drift and noise explain "
+            f"{expected_mm:.2f} mm; the model stays as it was; {causes}",
+        )
+        judged = replace(judged, verdict=refusal)
     return TrackedCycle(found, judged, innovation)
 
 
@@ -571,18 +582,3 @@ def _left_out(
         spread[i] = np.sqrt(np.trace(S[own, own] - across.T @ gain[:, 1:]))
         drifts[i] = forecast + PH[:, others] @ gain[:, 0]
     return miss, spread, drifts
-
-
-def _refusal(
-    tracker: DriftTracker, warm: Measurements, innovation: Innovation, fixed: FixedSphere | None
-) -> Verdict:
-    rms_mm, expected_mm = (
-        1e3 * float(np.sqrt(3.0 * np.mean(square)))
-        for square in (innovation.deviation**2, np.diag(innovation.covariance))
-    )
-    causes = possible_causes(tracker.spots, warm, innovation.deviation, innovation.covariance)
-    return Verdict(
-        Code.SENSOR_OR_ROBOT_MOVED,
-        f"the measured positions are {rms_mm:.2f} mm rms off, where drift and noise explain "
-        f"{expected_mm:.2f} mm; the model stays as it was; {step_words(causes, fixed)}",
-    )

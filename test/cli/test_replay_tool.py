@@ -43,21 +43,14 @@ def test_the_bag_in_the_repository_gives_the_recorded_verdicts():
     assert document["final_tool"]["revision"] == 1
 
 
-def test_replay_equals_the_recording_bit_for_bit(made):
-    document = robocal_json("replay.tool.json", "replay", made)
+def test_replay_equals_the_recording_and_its_tool_is_exported_from_the_history(made, tmp_path):
+    state = tmp_path / "state"
+    document = robocal_json("replay.tool.json", "replay", made, "--state", state)
     assert document["differs"] == []
     steps = 5 + 2 + 1 + 2 + 5 + 2  # of the six runs; the bumped tool need not plunge
     assert len(document["commands"]) == 6 + steps + 1
     assert "Every recorded result comes out equal" in robocal("replay", made).stdout
-
-
-def test_windows_are_for_thermal_recordings(made):
-    robocal_json("error.json", "replay", made, "--auto", status=2)
-
-
-def test_the_tool_in_force_is_exported_from_the_history(made, tmp_path):
-    state = tmp_path / "state"
-    final = robocal_json("replay.tool.json", "replay", made, "--state", state)["final_tool"]
+    final = document["final_tool"]
     shown = robocal("history", "show", 2, "--state", state, "--json").stdout
     file = tmp_path / "shown.json"
     file.write_text(shown)
@@ -68,3 +61,7 @@ def test_the_tool_in_force_is_exported_from_the_history(made, tmp_path):
                    "--by", "me", "--reason", "the old torch is back")  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "The taught tool is in force again, as tool revision 2" in done.stdout
+
+
+def test_windows_are_for_thermal_recordings():
+    robocal_json("error.json", "replay", BAG, "--auto", status=2)

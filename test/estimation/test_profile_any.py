@@ -9,7 +9,7 @@ from profile_shapes import COLUMNS, arc_profile, polyline_profile, stairs
 
 from robocal_ros.estimation.edge import CornerRule, EdgeRule, fit_corners, fit_edge
 from robocal_ros.estimation.sphere import ArcRule, fit_arc
-from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.errors import RobocalError, TooFewSamplesError
 
 FITS = {
     "arc": lambda points: fit_arc(points, ArcRule(0.02)),
@@ -48,3 +48,9 @@ def test_a_fit_is_finite_or_refused(name):
             with contextlib.suppress(RobocalError):
                 for value in vars(FITS[name](points)).values():
                     assert np.all(np.isfinite(value))
+
+
+@pytest.mark.parametrize(("name", "count"), [("arc", 12), ("corners", 3), ("edge", 5)])
+def test_few_points_are_refused(name, count):
+    with pytest.raises(TooFewSamplesError, match=f"{count} points"):
+        FITS[name](np.full((count, 2), 0.1))

@@ -192,8 +192,3 @@ def test_much_noise_is_refused():
     points, _ = arc_profile(circle(rng, R), rng, noise=3e-4)
     with pytest.raises(ResidualError, match=r"scatter by 0\.[23]"):
         fit_arc(points, ArcRule(R))
-
-
-def test_few_points_are_refused():
-    with pytest.raises(TooFewSamplesError, match="12 points"):
-        fit_arc(np.full((12, 2), 0.1), ArcRule(R))

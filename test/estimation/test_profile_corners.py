@@ -12,7 +12,7 @@ from profile_shapes import (
 )
 
 from robocal_ros.estimation.edge import CornerRule, fit_corners
-from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
+from robocal_ros.ground.errors import ResidualError
 
 STEPS = 4
 COUNT = 2 * STEPS - 1
@@ -154,11 +154,6 @@ def test_a_plane_has_no_corner():
         points, _ = contaminated(polyline_profile(np.array([[-0.05, 0.2], [0.05, 0.21]]), rng), rng)
         with pytest.raises(ResidualError, match="0 corners"):
             fit_corners(points, CornerRule())
-
-
-def test_few_points_are_refused():
-    with pytest.raises(TooFewSamplesError, match="3 points"):
-        fit_corners(np.full((3, 2), 0.1), CornerRule())
 
 
 def test_noise_free_corners_are_exact_and_the_classic_ones_are_a_column_off():

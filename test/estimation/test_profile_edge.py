@@ -12,7 +12,7 @@ from profile_shapes import (
 )
 
 from robocal_ros.estimation.edge import EdgeRule, fit_edge
-from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
+from robocal_ros.ground.errors import ResidualError
 
 COLUMN_M = float(COLUMNS[1] - COLUMNS[0])
 
@@ -122,8 +122,3 @@ def test_the_classic_form_is_refined_below_a_column_but_blunts_the_edge(kind):
     assert abs(np.mean(x_error)) < 3.3 * np.std(x_error) / np.sqrt(len(x_error))
     # A median of five columns cuts a 45 deg edge by one to two columns.
     assert 0.0 < np.mean(z_error) * np.sign(rise) < 2.5 * COLUMN_M
-
-
-def test_few_points_are_refused():
-    with pytest.raises(TooFewSamplesError, match="5 points"):
-        fit_edge(np.full((5, 2), 0.1), EdgeRule())
