@@ -217,17 +217,12 @@ def find_corners(image: Image, board: Chessboard) -> Array | None:
         found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
         if not found:
             return None
-    half = _window(np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2))
+    grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
+    nearest_px = min(np.linalg.norm(np.diff(grid, axis=k), axis=2).min() for k in (0, 1))
+    half = int(np.clip(0.4 * nearest_px, 1, FIRST_WINDOW_PX))  # of a window without a neighbour
     end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
     refined = cv2.cornerSubPix(image, corners, (half, half), (-1, -1), end)
     return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
-
-
-def _window(grid: Array) -> int:
-    """Half a window that holds no neighbouring corner."""
-    across = np.linalg.norm(np.diff(grid, axis=1), axis=2).min()
-    along = np.linalg.norm(np.diff(grid, axis=0), axis=2).min()
-    return int(np.clip(0.4 * min(across, along), 1, FIRST_WINDOW_PX))
 
 
 def see_boards(
@@ -240,7 +235,8 @@ def see_boards(
     the images do not show the intrinsics.
     """
     rejected: dict[str, str] = {}
-    size = intrinsics.size if intrinsics else _usual_size(images)
+    sizes = [(image.shape[1], image.shape[0]) for _, image in images]
+    size = intrinsics.size if intrinsics else max(sizes, key=sizes.count, default=(0, 0))
     names, corners = [], []
     for name, image in images:
         if image.shape[::-1] != size:
@@ -255,11 +251,6 @@ def see_boards(
             names.append(name)
             corners.append(found)
     return boards_of_corners(names, np.array(corners), board, size, intrinsics, rejected)
-
-
-def _usual_size(images: Sequence[tuple[str, Image]]) -> tuple[int, int]:
-    sizes = [(image.shape[1], image.shape[0]) for _, image in images]
-    return max(sizes, key=sizes.count, default=(0, 0))
 
 
 def boards_of_corners(
@@ -532,16 +523,11 @@ def coarse_offset(robot: PoseStream, camera: PoseStream) -> float:
             f"the angular speeds of robot and camera nowhere correlate (at best "
             f"{value[best]:.2f}): are both streams of one run, and did the robot turn?"
         )
-    lag = best - (len(b) - 1) + _peak(value[max(best - 1, 0) : best + 2])
+    lag, near = float(best - (len(b) - 1)), value[max(best - 1, 0) : best + 2]
+    if len(near) == 3 and np.all(near > -1.0):  # where a parabola through them is highest
+        curve = float(near[0] - 2.0 * near[1] + near[2])
+        lag += 0.0 if curve >= 0.0 else float(0.5 * (near[0] - near[2]) / curve)
     return float(robot.time_s[0] - camera.time_s[0] + lag * STEP_S)
-
-
-def _peak(value: Array) -> float:
-    """Where a parabola through the best value and its neighbours is highest, in steps from it."""
-    if len(value) < 3 or np.any(value <= -1.0):
-        return 0.0
-    curve = float(value[0] - 2.0 * value[1] + value[2])
-    return 0.0 if curve >= 0.0 else float(0.5 * (value[0] - value[2]) / curve)
 
 
 def _turns(stream: PoseStream) -> Array:

@@ -585,101 +585,56 @@ def fit_pairs(
 ) -> PairFit:  # fmt: skip
     """Find the most likely placements, reject what does not fit, estimate the unknown noise.
 
-    ``start``: where the search begins; default ``sound``. ``sound``: a placement near the truth,
-    from which the noise is guessed; default `robust_start`.
+    Noise and placements in turn. ``start``: where the search begins; default ``sound``. ``sound``:
+    a placement near the truth, from which the noise is guessed; default `robust_start`.
 
     Raises `TooFewSamplesError` or `RankDeficientError` as
     `robocal_ros.estimation.estimation.solve`.
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
-    sound = robust_start(pairs) if sound is None else sound
-    count = 0 if pairs.shared is None else len(pairs.shared.covariance)
-    near = PairState(sound, np.zeros(count))
-    far = None if start is None else PairState(start, np.zeros(count))
-    return _NoiseSearch(pairs, known).run(near, far)
-
-
-@dataclass(frozen=True, eq=False)
-class _NoiseSearch:
-    """Noise and placements in turn; ``known`` (6,) variances are nan where they are unknown."""
-
-    pairs: PosePairs
-    known: Array
-
-    @cached_property
-    def free(self) -> NDArray[np.bool_]:
-        """(6,) variances to be estimated."""
-        return np.isnan(self.known)
-
-    @property
-    def enough(self) -> bool:
-        """Whether the samples can tell outliers and several variances."""
-        return len(self.pairs) >= _ENOUGH_TO_DOUBT
-
-    def run(self, near: PairState, far: PairState | None) -> PairFit:
-        """The fit, from a state near the truth; placements from ``far`` where it is given."""
-        told = None
-        parts = Parts.of(self.pairs, near.at.X)
-        seen = Evidence.of(self.pairs, parts, near)
-        noise, keep = first_guess(seen.rows[:, :, -1], self.known)
-        state = near if far is None else far
-        if np.any(self.free) and self.enough:
-            keep = keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep)
-            told = self._first_noise(seen, near, keep, noise)
-            noise = told.noise
-            state = near.after(told.best) if far is None else far
-        for _ in range(_ROUNDS):
-            V, root = parts.covariances(noise)
-            found = self._placed(state, root, noise)
-            used, state = ~found.rejected, found.state
-            settled = told is None or told.settled
-            if told is None or (np.array_equal(used, keep) and _together(near.at, state.at)):
-                break
-            parts, near, keep = parts.moved(self.pairs, state.at.X), state, used
-            seen = Evidence.of(self.pairs, parts, state).take(used)
-            told = estimate(seen.with_common(self.pairs.shared, state.common), self.free, noise)
-            settled = told.stayed
-            if settled:
-                break
-            noise = told.noise
-        k = len(found.names)
-        spread = np.zeros((k, k)) if told is None else told.spread
-        return PairFit(self.pairs, noise, V, found, settled, spread)
-
-    def _first_noise(
-        self, seen: Evidence, near: PairState, keep: NDArray[np.bool_], guess: PairNoise
-    ) -> Found:
-        """The likeliest noise by samples to keep (m,), first by some of them."""
-        shared = self.pairs.shared
-        if np.sum(keep) > _MANY:
-            few = seen.take(_thinned(keep)).with_common(shared, near.common)
-            guess = estimate(few, self.free, guess).noise
-        return estimate(seen.take(keep).with_common(shared, near.common), self.free, guess)
-
-    def _placed(self, state: PairState, root: Array, noise: PairNoise) -> Estimate[PairState]:
-        """The most likely placements for one noise."""
-        problem = PairProblem(self.pairs, root, noise.camera_scale)
-        return solve(
+    free, shared = np.isnan(known), pairs.shared
+    common = np.zeros(0 if shared is None else len(shared.covariance))
+    near = PairState(robust_start(pairs) if sound is None else sound, common)
+    state = near if start is None else PairState(start, common)
+    parts = Parts.of(pairs, near.at.X)
+    seen = Evidence.of(pairs, parts, near)
+    noise, keep = first_guess(seen.rows[:, :, -1], known)
+    found_noise, enough = None, len(pairs) >= _ENOUGH_TO_DOUBT
+    if np.any(free) and enough:
+        keep = keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep)
+        if np.sum(keep) > _MANY:  # first by some of them, spread evenly
+            rows, few = np.flatnonzero(keep), np.zeros_like(keep)
+            few[rows[np.linspace(0, len(rows) - 1, _MANY).astype(int)]] = True
+            noise = estimate(seen.take(few).with_common(shared, common), free, noise).noise
+        found_noise = estimate(seen.take(keep).with_common(shared, common), free, noise)
+        noise = found_noise.noise
+        state = near.after(found_noise.best) if start is None else state
+    for _ in range(_ROUNDS):
+        V, root = parts.covariances(noise)
+        problem = PairProblem(pairs, root, noise.camera_scale)
+        found = solve(
             problem,
             state,
             prior_information=problem.prior_information,
-            noise_known=self.enough or not np.any(self.free),
-            robust=self.enough,
+            noise_known=enough or not np.any(free),
+            robust=enough,
         )
-
-
-def _together(a: Placement, b: Placement) -> bool:
-    """Whether weights that follow from one placement do for the other."""
-    away = max(float(np.abs(a.X - b.X).max()), float(np.abs(a.Z - b.Z).max()))
-    return away < _SAME
-
-
-def _thinned(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """About 30 of many samples, spread evenly."""
-    rows = np.flatnonzero(keep)
-    few = np.zeros_like(keep)
-    few[rows[np.linspace(0, len(rows) - 1, _MANY).astype(int)]] = True
-    return few
+        used, state = ~found.rejected, found.state
+        settled = found_noise is None or found_noise.settled
+        away = [np.abs(near.at.X - state.at.X).max(), np.abs(near.at.Z - state.at.Z).max()]
+        # weights that follow from a placement so near do for this one too
+        if found_noise is None or (np.array_equal(used, keep) and max(away) < _SAME):
+            break
+        parts, near, keep = parts.moved(pairs, state.at.X), state, used
+        seen = Evidence.of(pairs, parts, state).take(used)
+        found_noise = estimate(seen.with_common(shared, state.common), free, noise)
+        settled = found_noise.stayed
+        if settled:
+            break
+        noise = found_noise.noise
+    k = len(found.names)
+    spread = np.zeros((k, k)) if found_noise is None else found_noise.spread
+    return PairFit(pairs, noise, V, found, settled, spread)
 
 
 def correlation(residual: Array) -> float:

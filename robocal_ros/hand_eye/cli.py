@@ -102,17 +102,12 @@ def add_robot(parser: argparse.ArgumentParser, needed: str = "tables of joints")
 def add_target(parser: argparse.ArgumentParser) -> None:
     """Offer what is known of a target of any kind."""
     add_target_file(parser)
-    add_radius(parser)
+    parser.add_argument("--radius-mm", type=positive, metavar="R", help="of a sphere, true")
 
 
 def add_target_file(parser: argparse.ArgumentParser, help: str = "what is known of it") -> None:
     """Offer a target file."""
     parser.add_argument("--target", type=Path, metavar="YAML", help=help)
-
-
-def add_radius(parser: argparse.ArgumentParser) -> None:
-    """Offer a sphere's radius."""
-    parser.add_argument("--radius-mm", type=positive, metavar="R", help="of a sphere, true")
 
 
 def add_target_kind(parser: argparse.ArgumentParser) -> None:
@@ -240,20 +235,15 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> Las
             raise InputError("the sphere is given twice: --radius-mm and --target; keep one")
         return SphereTarget(radius_mm * 1e-3)
     if target is not None:
-        return read_target_of(kind, target)
+        known = read_target(target)
+        if isinstance(known, BoardTarget) or KIND_OF[type(known)] != kind:
+            words = f"describes a {KIND_OF[type(known)]}, not a {kind}"
+            raise InputError(words, file=str(target))
+        return known
     if kind == "line":
         return None
     missing = {"sphere": "give the sphere: --radius-mm or --target", "step": "give --target"}
     raise InputError(missing[kind])
-
-
-def read_target_of(kind: str, path: Path) -> LaserTarget:
-    """Read a target file of this kind. Raises as `given_target`."""
-    target = read_target(path)
-    found = KIND_OF[type(target)]
-    if isinstance(target, BoardTarget) or found != kind:
-        raise InputError(f"describes a {found}, not a {kind}", file=str(path))
-    return target
 
 
 def task_of(target: LaserTarget | None, feature: str | None, classic: bool = False) -> Task:

@@ -22,6 +22,7 @@ from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.camera import (
+    METHODS,
     CameraSettings,
     CheckPairs,
     calibrate_camera,
@@ -31,7 +32,6 @@ from robocal_ros.hand_eye.camera_data import (
     Chessboard,
     Intrinsics,
     PosePairs,
-    PoseStream,
     SeenBoards,
     board_pairs,
     intrinsics_document,
@@ -57,7 +57,7 @@ from robocal_ros.hand_eye.cli import (
     show_sigma,
     show_verdict,
 )
-from robocal_ros.hand_eye.data import Profile
+from robocal_ros.hand_eye.data import MOUNTS, Profile
 from robocal_ros.hand_eye.files import (
     PoseTable,
     exported,
@@ -89,35 +89,9 @@ if TYPE_CHECKING:
 # ---- from the tables and images of ``robocal hand-eye camera`` to its result --------------------
 
 
-def calibrate(args: argparse.Namespace) -> "HandEyeResult":
-    """Read what the options name and place the camera.
-
-    Raises `InputError` when files or options are wrong; `TooFewSamplesError`, `RankDeficientError`,
-    `ResidualError` as `robocal_ros.hand_eye.camera.calibrate_camera`.
-    """
-    settings = _settings(args)
-    if args.measured is not None:
-        for option in ("profiles", "board", "square_mm", "intrinsics"):
-            if getattr(args, option) is not None:
-                raise InputError(
-                    f"--{option.replace('_', '-')} belongs to images, --measured to poses: give "
-                    "one of both"
-                )
-        return _from_poses(args, settings)
-    if args.profiles is None or args.board is None or args.square_mm is None:
-        raise InputError(
-            "give --profiles, --board and --square-mm for images, or --measured for board poses"
-        )
-    return _from_images(args, settings)
-
-
-def _settings(args: argparse.Namespace) -> "CameraSettings":
-    return CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
-
-
 def _tables(
     args: argparse.Namespace, file_column: str | None
-) -> "tuple[PoseTable, PoseTable | None]":
+) -> tuple[PoseTable, PoseTable | None]:
     """The robot's poses that solve, and those that judge."""
     arm = arm_of(args)
     used = read_pose_table(args.poses, arm, file_column)
@@ -128,7 +102,7 @@ def _tables(
     return used, judges
 
 
-def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
+def _from_images(args: argparse.Namespace, settings: CameraSettings) -> HandEyeResult:
     columns, rows = args.board
     board = Chessboard(columns, rows, args.square_mm * 1e-3)
     intrinsics = None if args.intrinsics is None else read_intrinsics(args.intrinsics)
@@ -148,9 +122,9 @@ def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandE
 
 
 def _pairs_of_images(
-    table: "PoseTable", args: argparse.Namespace, board: "Chessboard",
-    intrinsics: "Intrinsics | None",
-) -> "tuple[PosePairs, SeenBoards]":  # fmt: skip
+    table: PoseTable, args: argparse.Namespace, board: Chessboard,
+    intrinsics: Intrinsics | None,
+) -> tuple[PosePairs, SeenBoards]:  # fmt: skip
 
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
@@ -158,14 +132,17 @@ def _pairs_of_images(
     return pairs, replace(seen, rejected=unread | seen.rejected)
 
 
-def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
+def _from_poses(args: argparse.Namespace, settings: CameraSettings) -> HandEyeResult:
     robot, check = _tables(args, None)
     camera = read_pose_table(args.measured, None, None)
     tables = [robot, camera] if check is None else [robot, camera, check]
-    stamped = all(table.stamp_ns is not None for table in tables)
-    if stamped and not all(table.named for table in tables):
-        origin_ns = int(min(_stamps(table)[0] for table in tables))
-        streams = [_stream(table, origin_ns) for table in tables]
+    stamps = [table.stamp_ns for table in tables if table.stamp_ns is not None]
+    if len(stamps) == len(tables) and not all(table.named for table in tables):
+        origin_ns = int(min(stamp_ns[0] for stamp_ns in stamps))
+        streams = [
+            stream_of(stamp_ns, table.T_base_flange, table.names, origin_ns, table.path)
+            for stamp_ns, table in zip(stamps, tables, strict=True)
+        ]
         judge = None if check is None else streams[2]
         return calibrate_streams(streams[0], streams[1], args.mount, settings, judge)
     if check is not None and not check.named:
@@ -173,36 +150,17 @@ def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEy
     pairs, alone = _paired(robot, camera, args.mount)
     judges = None
     if check is not None:
-        _require_other_samples(check, robot)
+        for name, row in zip(check.names, check.rows, strict=True):
+            if name in robot.names:
+                words = f"{quoted(name)} is in --poses too: other samples must judge"
+                raise InputError(words, file=check.path, row=row, column="sample")
         held, absent = _paired(check, camera, args.mount)
         judges = CheckPairs(held, {name: absent[name] for name in check.names if name in absent})
         alone = {name: why for name, why in alone.items() if name not in held.names}
     return calibrate_camera(pairs, settings, check=judges, rejected=alone)
 
 
-def _require_other_samples(judges: "PoseTable", used: "PoseTable") -> None:
-    known = set(used.names)
-    for name, row in zip(judges.names, judges.rows, strict=True):
-        if name in known:
-            raise InputError(
-                f"{quoted(name)} is in --poses too: other samples must judge",
-                file=judges.path, row=row, column="sample",
-            )  # fmt: skip
-
-
-def _stamps(table: "PoseTable") -> Any:
-    if table.stamp_ns is None:
-        raise ValueError("a table without stamps is no stream")
-    return table.stamp_ns
-
-
-def _stream(table: "PoseTable", origin_ns: int) -> "PoseStream":
-    return stream_of(_stamps(table), table.T_base_flange, table.names, origin_ns, table.path)
-
-
-def _paired(
-    robot: "PoseTable", camera: "PoseTable", mount: Any
-) -> "tuple[PosePairs, dict[str, str]]":
+def _paired(robot: PoseTable, camera: PoseTable, mount: Any) -> tuple[PosePairs, dict[str, str]]:
     """Pairs of the same sample, or row; and the samples that only one table has."""
     if not robot.named and not camera.named and len(robot) != len(camera):
         raise InputError(
@@ -230,18 +188,6 @@ def _paired(
 # ---- robocal hand-eye camera --------------------------------------------------------------------
 
 
-CAMERA_METHODS = (
-    "best",
-    "classic",
-    "tsai",
-    "park",
-    "horaud",
-    "andreff",
-    "daniilidis",
-    "shah",
-    "li",
-)
-MOUNTS = ("in-hand", "to-hand")
 CAMERA_LIMIT_MM = 2.0
 CAMERA_WHERE = "where the boards were"  # the expected error holds
 
@@ -266,10 +212,6 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
         metavar="YAML",
         help="of the camera, as ROS writes them; default: from the same images",
     )
-    _add_other_options(parser)
-
-
-def _add_other_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--measured",
         type=Path,
@@ -279,8 +221,8 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mount", choices=MOUNTS, default=MOUNTS[0])
     parser.add_argument(
         "--method",
-        choices=CAMERA_METHODS,
-        default=CAMERA_METHODS[0],
+        choices=METHODS,
+        default=METHODS[0],
         help="best; the closed form from which the search starts; or classic, a closed form alone",
     )
     add_robot(parser)
@@ -296,15 +238,27 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
 
 def run_camera(args: argparse.Namespace) -> CliResult:
     """Do ``camera``. Raises `RobocalError` for what a user can mend."""
-    document = hand_eye_document(calibrate(args))
+    settings = CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
+    if args.measured is not None:
+        for option in ("profiles", "board", "square_mm", "intrinsics"):
+            if getattr(args, option) is not None:
+                raise InputError(
+                    f"--{option.replace('_', '-')} belongs to images, --measured to poses: give "
+                    "one of both"
+                )
+        result = _from_poses(args, settings)
+    elif args.profiles is None or args.board is None or args.square_mm is None:
+        raise InputError(
+            "give --profiles, --board and --square-mm for images, or --measured for board poses"
+        )
+    else:
+        result = _from_images(args, settings)
+    document = hand_eye_document(result)
     return CliResult(document, partial(_show_camera, document=document))
 
 
 def _board(value: str) -> tuple[int, int]:
-    """Type of inner corners along both sides, such as 9x6.
-
-    Raises `argparse.ArgumentTypeError` for anything else.
-    """
+    """Type of inner corners along both sides, such as 9x6."""
     sides = value.lower().split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
         raise argparse.ArgumentTypeError(f"'{value}' is not columns and rows such as 9x6")
@@ -312,19 +266,14 @@ def _board(value: str) -> tuple[int, int]:
 
 
 def _show_camera(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
     show_placed(console, document, "Camera", CAMERA_WHERE)
     if document.get("time_offset_s") is not None:
         console.print(
             f"Time offset, to be added to the camera's stamps: {document['time_offset_s']:.4f} s "
             f"± {document['time_offset_sigma_s']:.4f}"
         )
-    _show_residuals(console, document)
-    show_judged(console, document)
-
-
-def _show_residuals(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
     table = Table(title="Mean residual, mm", title_justify="left")
     table.add_column("method")
     table.add_column("mm", justify="right")
@@ -333,12 +282,12 @@ def _show_residuals(console: "Console", document: Document) -> None:
     per_sample = document["residual_mm"]["per_sample"].values()
     table.add_row(document["method"], f"{sum(per_sample) / len(per_sample):.3f}")
     console.print(table)
+    show_judged(console, document)
 
 
 # ---- ``robocal hand-eye tracker``: a profile sensor on a robot, placed by a laser tracker -------
 
 
-TRACKER_METHODS = ("best", "classic")
 TRACKER_LIMIT_MM = 0.5
 TRACKER_WHERE = "at the working distance"  # the expected error holds
 
@@ -372,11 +321,7 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
         metavar="R",
         help="instead of a target file: of the sphere and of the reflector alike",
     )
-    parser.add_argument("--method", choices=TRACKER_METHODS, default=TRACKER_METHODS[0])
-    _add_limits(parser)
-
-
-def _add_limits(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--method", choices=("best", "classic"), default="best")
     noise = parser.add_argument_group("noise, one sigma")
     for option, default in (
         ("tracker-sigma-mm", "0.015"), ("joint-sigma-deg", "0.0029 (5e-5 rad)"),
@@ -395,28 +340,23 @@ def run_tracker(args: argparse.Namespace) -> CliResult:
     else:
         target = read_tracker_target(args.target)
     data, rejected = _read(args, arm)
-    result = solve_tracker(data, target, _noise(args), args.method, args.limit_mm * 1e-3)
+    noise = TrackerNoise()
+    if args.tracker_sigma_mm is not None:
+        noise = replace(noise, tracker_m=args.tracker_sigma_mm * 1e-3)
+    if args.joint_sigma_deg is not None:
+        noise = replace(noise, joint_rad=radians(args.joint_sigma_deg))
+    if args.joint_sigma_mm is not None:
+        noise = replace(noise, joint_m=args.joint_sigma_mm * 1e-3)
+    result = solve_tracker(data, target, noise, args.method, args.limit_mm * 1e-3)
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
     document = hand_eye_document(result)
     return CliResult(document, partial(_show_tracker, document=document))
 
 
-def _noise(args: argparse.Namespace) -> "TrackerNoise":
-    """What is given of it; the rest as `TrackerNoise` has it."""
-    given = {}
-    if args.tracker_sigma_mm is not None:
-        given["tracker_m"] = args.tracker_sigma_mm * 1e-3
-    if args.joint_sigma_deg is not None:
-        given["joint_rad"] = radians(args.joint_sigma_deg)
-    if args.joint_sigma_mm is not None:
-        given["joint_m"] = args.joint_sigma_mm * 1e-3
-    return TrackerNoise(**given)
-
-
-def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", dict[str, str]]:
+def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[str, str]]:
     """All measurements, and the profiles that show next to nothing, with why."""
-    points = read_tracker_points(args.points, arm)
+    arcs, sphere, faces = read_tracker_points(args.points, arm)
     table = read_pose_table(args.poses, arm)
     if table.q is None:
         raise InputError(
@@ -433,8 +373,7 @@ def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", di
     }
     seen = [index for index, name in enumerate(table.names) if name not in rejected]
     profiles = [shot for shot in shots if isinstance(shot, Profile)]
-    data = TrackerData(arm, points.arcs, points.sphere, points.faces, table.q[seen], profiles)
-    return data, rejected
+    return TrackerData(arm, arcs, sphere, faces, table.q[seen], profiles), rejected
 
 
 def _show_tracker(console: "Console", document: Document) -> None:
@@ -557,7 +496,7 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
     return CliResult(document, partial(_show_check_plan, document=document))
 
 
-def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
+def _document(report: PlanReport, names: tuple[str, ...]) -> Document:
     sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
     return {
         "rank": report.rank,

@@ -13,7 +13,6 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import (
@@ -149,11 +148,6 @@ _READERS: Mapping[str, Callable[[Any], NDArray[Any]]] = {
     TARGET_POSE: _pose,
     IMAGE: image_array,
 }
-
-
-def target_poses(values: Array) -> Array:
-    """T_sensor_target (m, 4, 4) of target poses (m, 7)."""
-    return frames.transform_from_quat(values[:, :3], values[:, 3:])
 
 
 class ShotLog:

@@ -23,7 +23,7 @@ from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
 from robocal_ros.hand_eye.camera_data import Image, decode_image
 from robocal_ros.hand_eye.data import Profile, profile_of
-from robocal_ros.hand_eye.tracker_data import FACES, Arc, TrackerData
+from robocal_ros.hand_eye.tracker_data import FACES, Arc
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import (
@@ -264,17 +264,12 @@ def write_shots(
     write_pose_table(path, T_base_flange, files, names=tuple(profiles), **more)
 
 
-@dataclass(frozen=True, eq=False)
-class TrackerPoints:
-    """Points of a laser tracker, m; see `TrackerData`."""
+def read_tracker_points(
+    path: Path, arm: SerialArm
+) -> tuple[tuple[Arc, Arc], Array, tuple[Array, Array]]:
+    """Arcs, points of the sphere and of both faces, m, of `TrackerData`, from the tracker's table.
 
-    arcs: tuple[Arc, Arc]
-    sphere: Array
-    faces: tuple[Array, Array]
-
-
-def read_tracker_points(path: Path, arm: SerialArm) -> TrackerPoints:
-    """Read the tracker's table; the joints of points that are not on an arc may be empty.
+    The joints of points that are not on an arc may be empty.
 
     Raises `InputError`, with file, row and column, when the table is not as
     docs/hand_eye_tracker.md says.
@@ -295,7 +290,7 @@ def read_tracker_points(path: Path, arm: SerialArm) -> TrackerPoints:
     q = _joints(table, layout, np.isin(roles, ARCS))
     first, second = (Arc(role, q[roles == role], points[roles == role]) for role in ARCS)
     faces = (points[roles == FACES[0]], points[roles == FACES[1]])
-    return TrackerPoints((first, second), points[roles == SPHERE], faces)
+    return (first, second), points[roles == SPHERE], faces
 
 
 def _layout(header: list[str], arm: SerialArm, file: str) -> TableLayout:
@@ -320,21 +315,6 @@ def _joints(table: Cells, layout: TableLayout, on_arc: NDArray[np.bool_]) -> Arr
         if len(empty):
             table.fail("the cell is empty; a point of an arc needs all joints", int(empty[0]), name)
     return q * layout.joint_factors
-
-
-def write_tracker_points(path: Path, data: TrackerData) -> None:
-    """Write the tracker's table in millimetres and degrees.
-
-    Raises `InputError` when it cannot be written.
-    """
-    parts = [(arc.name, arc.points) for arc in data.arcs]
-    parts += [(SPHERE, data.sphere), *zip(FACES, data.faces, strict=True)]
-    columns = {"role": [role for role, points in parts for _ in points]}
-    points = np.concatenate([points for _, points in parts])
-    columns |= dict(zip(POSITION["mm"], map(texts, points.T * 1e3), strict=True))
-    joints = joint_texts(np.concatenate([arc.q for arc in data.arcs]), data.arm)
-    rest = [""] * (len(points) - sum(len(arc.q) for arc in data.arcs))
-    write_cells(path, columns | {name: [*cells, *rest] for name, cells in joints.items()})
 
 
 @dataclass(frozen=True, eq=False)

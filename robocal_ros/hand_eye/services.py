@@ -30,7 +30,6 @@ from robocal_ros.hand_eye.data import (
     MOST_POINTS,
     TO_HAND,
     WITHOUT_FILE,
-    Capture,
     DataSet,
     data_set_begun,
 )
@@ -100,7 +99,13 @@ class HandEyeOutputs:
 
     def transform(self, head: Head, stamp_ns: int) -> None:
         """Put what is in force onto tf; nothing in force: late subscribers get no transform."""
-        transforms = [] if head.model is None else [calibration_transform(head.model, stamp_ns)]
+        transforms = []
+        if (model := head.model) is not None:
+            placed = conversions.transform_message(np.array(model["T_parent_sensor"]))
+            header = conversions.header(stamp_ns, model["parent"])
+            transforms = [
+                TransformStamped(header=header, child_frame_id=model["child"], transform=placed)
+            ]
         self.transforms += transforms
         self._tf.publish(transforms)
 
@@ -139,32 +144,22 @@ def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStat
         message.state = HandEyeStatus.CAPTURING if waits else HandEyeStatus.COLLECTING
         message.target, message.method = NUMBER_OF[data.kind], data.method
         message.mount, message.candidate_id = MOUNT_NUMBER_OF[data.mount], data.candidate
-        message.samples = [_sample(one) for _, one in sorted(data.captures.items())]
+        states = {Code.NONE: HandEyeSample.WAITING, Code.ACCEPT: HandEyeSample.CAPTURED}
+        message.samples = [
+            HandEyeSample(
+                handle=one.handle,
+                mark=one.mark,
+                state=states.get(one.code, HandEyeSample.FAILED),
+                reason=one.reason,
+                status=int(one.code),
+                stamp=conversions.time_message(one.stamp_ns),
+            )
+            for _, one in sorted(data.captures.items())
+        ]
     if last is not None:
         message.last_command, message.last_message = last.command.name, last.message
         message.last_status = int(last.status)
     return message
-
-
-def _sample(capture: Capture) -> HandEyeSample:
-    states = {Code.NONE: HandEyeSample.WAITING, Code.ACCEPT: HandEyeSample.CAPTURED}
-    return HandEyeSample(
-        handle=capture.handle,
-        mark=capture.mark,
-        state=states.get(capture.code, HandEyeSample.FAILED),
-        reason=capture.reason,
-        status=int(capture.code),
-        stamp=conversions.time_message(capture.stamp_ns),
-    )
-
-
-def calibration_transform(model: dict[str, Any], stamp_ns: int) -> TransformStamped:
-    """A calibration as a transform."""
-    return TransformStamped(
-        header=conversions.header(stamp_ns, model["parent"]),
-        child_frame_id=model["child"],
-        transform=conversions.transform_message(np.array(model["T_parent_sensor"])),
-    )
 
 
 class HandEyeFiles:
@@ -249,18 +244,16 @@ class HandEyeFiles:
         return response
 
     def _save_twin(self, request: Any, response: Any) -> Any:
+        """Into the folder of the data sets, called after sensor and time (UTC)."""
         try:
-            _, words = self._write(unused(self._folder(), self._stem(), SUFFIX))
+            frame = quote(self._session().config.sensor_frame, safe="")
+            stem = f"{frame}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+            _, words = self._write(unused(self._folder(), stem, SUFFIX))
         except RobocalError as error:
             response.message = trigger_text(0, error.code, str(error))
             return response
         response.success, response.message = True, trigger_text(0, Code.ACCEPT, words)
         return response
-
-    def _stem(self) -> str:
-        """Sensor and time (UTC)."""
-        frame = quote(self._session().config.sensor_frame, safe="")
-        return f"{frame}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
 
     def _write(self, path: Path) -> tuple[int, str]:
         """Write the open data set; how many samples it has, and what to say."""

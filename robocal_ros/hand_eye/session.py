@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,
     ConflictError,
@@ -49,7 +50,6 @@ from robocal_ros.hand_eye.data import (
     flange_poses,
     seen_corners,
     shot_of,
-    target_poses,
 )
 from robocal_ros.hand_eye.result import (
     METHODS,
@@ -214,18 +214,20 @@ def _solved_camera(
     noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)
     settings = CameraSettings(method, noise, config.limit_m)
     if data.topic != IMAGE:
-        poses = target_poses(np.concatenate([sample.values for sample in samples]))
-        return calibrate_camera(PosePairs(T_base_flange, poses, names, data.mount), settings)
+        seen = np.concatenate([sample.values for sample in samples])
+        T_camera_board = frames.transform_from_quat(seen[:, :3], seen[:, 3:])
+        pairs = PosePairs(T_base_flange, T_camera_board, names, data.mount)
+        return calibrate_camera(pairs, settings)
     target = board_of(data.target)
     corners = np.array([sample.values[1:] for sample in samples])
     width, height = samples[0].values[0]
     size = int(width), int(height)
-    seen = boards_of_corners(names, corners, target.board, size, target.intrinsics)
+    boards = boards_of_corners(names, corners, target.board, size, target.intrinsics)
     return calibrate_camera(
-        board_pairs(seen, names, T_base_flange, data.mount),
+        board_pairs(boards, names, T_base_flange, data.mount),
         settings,
-        rejected=seen.rejected,
-        more={"intrinsics": intrinsics_document(seen, target.intrinsics is None)},
+        rejected=boards.rejected,
+        more={"intrinsics": intrinsics_document(boards, target.intrinsics is None)},
     )
 
 

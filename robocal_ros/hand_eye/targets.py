@@ -439,16 +439,3 @@ def read_tracker_target(path: Path) -> TrackerTarget:
         top.fail(f"is {height_mm:g}; the reflector is on the flange: is it in µm?", "height_mm")
     sigma_mm = top.positive("height_sigma_mm", target.height_sigma_m * 1e3)
     return replace(target, height_m=height_mm * 1e-3, height_sigma_m=sigma_mm * 1e-3)
-
-
-def write_tracker_target(path: Path, target: TrackerTarget) -> None:
-    """Write a target file. Raises `InputError` when it cannot be written."""
-    document: Document = {
-        "kind": "tracker",
-        "sphere_radius_mm": target.sphere_radius_m * 1e3,
-        "reflector_radius_mm": target.reflector_radius_m * 1e3,
-    }
-    if target.height_m is not None:
-        document["height_mm"] = target.height_m * 1e3
-        document["height_sigma_mm"] = target.height_sigma_m * 1e3
-    write_text(path, yaml.safe_dump(document, sort_keys=False))

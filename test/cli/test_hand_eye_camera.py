@@ -13,11 +13,10 @@ from scipy.spatial.transform import Rotation
 from bench import hand_eye_sets
 from bench.hand_eye_cell import TruePose
 from robocal_ros.cli.main import main
+from robocal_ros.hand_eye.camera import METHODS, distances
 from robocal_ros.hand_eye.camera import METHODS as CORE_METHODS
-from robocal_ros.hand_eye.camera import distances
 from robocal_ros.hand_eye.camera_data import CLOSED_FORMS
 from robocal_ros.hand_eye.camera_fit import fit_pairs
-from robocal_ros.hand_eye.cli_sensors import CAMERA_METHODS as METHODS
 from robocal_ros.hand_eye.files import write_pose_table
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.tables import joint_texts, write_cells

@@ -67,12 +67,12 @@ def test_both_methods_find_the_sensor(folder):
 def test_the_files_hold_what_was_measured(tmp_path):
     made = cell()
     data = tracker_files(tmp_path, made)
-    points = read_tracker_points(tmp_path / "tracker.csv", data.arm)
-    for one, other in zip(points.arcs, data.arcs, strict=True):
+    arcs, sphere, faces = read_tracker_points(tmp_path / "tracker.csv", data.arm)
+    for one, other in zip(arcs, data.arcs, strict=True):
         assert np.allclose(one.points, other.points, atol=1e-11)
         assert np.allclose(one.q, other.q, atol=1e-11)
-    assert np.allclose(points.sphere, data.sphere, atol=1e-11)
-    assert np.allclose(points.faces[1], data.faces[1], atol=1e-11)
+    assert np.allclose(sphere, data.sphere, atol=1e-11)
+    assert np.allclose(faces[1], data.faces[1], atol=1e-11)
     assert read_tracker_target(tmp_path / "tracker_target.yaml") == made.sizes.target
 
 
