@@ -529,6 +529,7 @@ class PairFit:
     expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
     settled : whether noise and placements agree in the end; where the noise is known they do.
     spread : (12 + s, 12 + s) what the covariance is larger by, because the noise was estimated.
+    differences, jacobian : (m, 6) and (m, 6, 12 + s) of all samples, as `linearised`.
     """
 
     pairs: PosePairs
@@ -537,25 +538,13 @@ class PairFit:
     estimate: Estimate[PairState]
     settled: bool
     spread: Array
+    differences: Array
+    jacobian: Array
 
     @property
     def at(self) -> Placement:
         """Where camera and board are."""
         return self.estimate.state.at
-
-    @cached_property
-    def _linearised(self) -> tuple[Array, Array]:
-        return linearised(self.pairs, self.estimate.state)
-
-    @property
-    def differences(self) -> Array:
-        """Differences (m, 6) of all samples, camera axes, m and rad."""
-        return self._linearised[0]
-
-    @property
-    def jacobian(self) -> Array:
-        """Their Jacobian (m, 6, 12 + s)."""
-        return self._linearised[1]
 
     @property
     def covariance(self) -> Array:
@@ -634,7 +623,7 @@ def fit_pairs(
         noise = found_noise.noise
     k = len(found.names)
     spread = np.zeros((k, k)) if found_noise is None else found_noise.spread
-    return PairFit(pairs, noise, V, found, settled, spread)
+    return PairFit(pairs, noise, V, found, settled, spread, *linearised(pairs, state))
 
 
 def correlation(residual: Array) -> float:

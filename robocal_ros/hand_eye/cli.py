@@ -415,8 +415,8 @@ def show_sigma(console: "Console", sigma: Document) -> None:
     console.print(f"Standard deviations: {xyz} mm; {turns} deg")
 
 
-def add_target_action(parser: argparse.ArgumentParser) -> None:
-    """Offer what all targets have in common."""
+def add_target_action(kind: str, parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``sphere``, ``step`` or ``line``."""
     add_shots(parser)
     parser.add_argument("--method", choices=METHODS, default=METHODS[0])
     add_limits(parser, "default: from the residuals")
@@ -427,12 +427,19 @@ def add_target_action(parser: argparse.ArgumentParser) -> None:
         help="shots of the same target, as --poses or --bag, that judge the result and are not "
         "used to find it",
     )
+    if kind == "sphere":
+        add_target(parser)
+    elif kind == "step":
+        add_target_file(parser, "the stairs and where they were taught")
+    else:
+        add_target_file(parser, "where the line is; default: that is found too")
+        add_feature(parser)
 
 
-def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = None) -> CliResult:
-    """Place the sensor. Raises `RobocalError` for what a user can mend."""
+def run_target(kind: str, args: argparse.Namespace) -> CliResult:
+    """Do ``sphere``, ``step`` or ``line``. Raises `RobocalError` for what a user can mend."""
     arm, settings = arm_of(args), settings_of(args)
-    target = given_target(kind, args.target, radius_mm)
+    target = given_target(kind, args.target, getattr(args, "radius_mm", None))
     task = task_of(target, getattr(args, "line_kind", None), args.method == "classic")
     shots = given_shots(args, arm)
     judges = None if args.check is None else given_shots(args, arm, args.check)
@@ -452,38 +459,8 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
     return CliResult(document, partial(show_mount, document=document))
 
 
-def add_sphere(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``sphere``."""
-    add_target_action(parser)
-    add_target(parser)
-
-
-def run_sphere(args: argparse.Namespace) -> CliResult:
-    """Do ``sphere``. Raises `RobocalError` for what a user can mend."""
-    return run_target("sphere", args, args.radius_mm)
-
-
-def add_step(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``step``."""
-    add_target_action(parser)
-    add_target_file(parser, "the stairs and where they were taught")
-
-
-def run_step(args: argparse.Namespace) -> CliResult:
-    """Do ``step``. Raises `RobocalError` for what a user can mend."""
-    return run_target("step", args)
-
-
-def add_line(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``line``."""
-    add_target_action(parser)
-    add_target_file(parser, "where the line is; default: that is found too")
-    add_feature(parser)
-
-
-def run_line(args: argparse.Namespace) -> CliResult:
-    """Do ``line``. Raises `RobocalError` for what a user can mend."""
-    return run_target("line", args)
+add_sphere, add_step, add_line = (partial(add_target_action, kind) for kind in KINDS)
+run_sphere, run_step, run_line = (partial(run_target, kind) for kind in KINDS)
 
 
 def add_joint(parser: argparse.ArgumentParser) -> None:

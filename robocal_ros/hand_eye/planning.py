@@ -7,7 +7,6 @@ the place where the target is expected, with the noise that sensor and robot are
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -99,26 +98,6 @@ class SensorRange:
         return np.array([self.pivot, *corners])
 
 
-class PlannedTarget(Protocol):
-    """How a target would be seen, and from where it could be."""
-
-    @property
-    def fewest(self) -> int:
-        """Poses without which nothing is solved."""
-
-    def place(self, T_base_sensor: Array) -> Array:
-        """Where it is expected, from sensor poses (m, 4, 4) that look at it."""
-
-    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
-        """Sightings to expect from flange poses (m, 4, 4); those with their pose's index."""
-
-    def unseen(self, view: TargetView) -> dict[int, str]:
-        """Poses from which it is out of view, and why."""
-
-    def candidates(self, T_base_sensor: Array, place: Array) -> Array:
-        """Sensor poses (n, 4, 4) that see it well, turned about those that are planned."""
-
-
 @dataclass(frozen=True, eq=False)
 class PlanReport:
     """What a plan is worth.
@@ -146,7 +125,7 @@ class PlanReport:
 
 
 def check_plan(
-    target: PlannedTarget,
+    target: "PlannedTarget",
     T_base_flange: Array,
     T_flange_sensor: Array,
     sensor: SensorRange,
@@ -229,7 +208,7 @@ def _verdict(
 
 
 def _propose(
-    target: PlannedTarget,
+    target: "PlannedTarget",
     T_base_flange: Array,
     state: MountState,
     information: Array,
@@ -354,7 +333,13 @@ def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict
 
 @dataclass(frozen=True)
 class PlannedSphere:
-    """A sphere; ``centre`` (3,) in base, or None: where most poses see it."""
+    """A sphere; ``centre`` (3,) in base, or None: where most poses see it.
+
+    As each planned target it tells how many poses are the ``fewest`` to solve anything, its
+    ``place`` by sensor poses (m, 4, 4) that look at it, the ``view`` to expect from flange poses
+    (m, 4, 4), from which poses it is ``unseen``, and why, and ``candidates`` (n, 4, 4): sensor
+    poses that see it well, turned about those that are planned.
+    """
 
     radius_m: float
     sensor: SensorRange
@@ -521,6 +506,9 @@ class PlannedStairs:
             middle = place[:3, :3] @ every[number % len(every)].mean(axis=0) + place[:3, 3]
             poses.append(_looking(R[None], at[None], middle)[0])
         return np.array(poses)
+
+
+PlannedTarget = PlannedSphere | PlannedLine | PlannedStairs
 
 
 def planned_target(

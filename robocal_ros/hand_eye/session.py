@@ -102,13 +102,9 @@ class HandEyeConfig:
     robot_sigma_rad: float | None = None
     limit_m: float = 1e-3
 
-    def document(self) -> dict[str, Any]:
-        """Plain values; `of_document` reads them back."""
-        return asdict(self)
-
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
-        """Read what `document` gave, also after JSON.
+        """Read plain values (`asdict`), also after JSON.
 
         Raises `InputError` when it has other settings than this version knows.
         """
@@ -550,7 +546,7 @@ def configuration(session: HandEyeSession, topics: Mapping[str, str]) -> Command
     """
     current = session.current
     in_force = {"model": current.thermal.model, OWN: current.head.model}
-    return configured_with(session, topics, session.config.document(), in_force)
+    return configured_with(session, topics, asdict(session.config), in_force)
 
 
 def is_hand_eye_session(configured: Command | None) -> bool:
