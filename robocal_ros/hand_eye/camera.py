@@ -338,12 +338,10 @@ LARGEST_START_M = 3e-2  # median miss beyond which no search can be trusted
 class CameraSettings:
     """How to calibrate.
 
-    Attributes
-    ----------
-    method : ``best`` is maximum likelihood; the name of a closed form is the same from that start;
-        ``classic`` is the closed form that fits best, alone, without covariance.
-    noise : what is known of it.
-    limit_m : largest expected error where the boards were that is accepted.
+    ``method``: ``best`` is maximum likelihood; the name of a closed form is the same from that
+    start; ``classic`` is the closed form that fits best, alone, without covariance.
+    ``noise``: what is known of it.
+    ``limit_m``: largest expected error where the boards were that is accepted.
     """
 
     method: str = "best"
@@ -373,11 +371,9 @@ def calibrate_camera(
 ) -> HandEyeResult:
     """Place a camera.
 
-    Parameters
-    ----------
-    check : what judges the result and is not used to find it.
-    rejected : samples that were left out before, with the reason.
-    more : further entries of the document.
+    ``check``: what judges the result and is not used to find it.
+    ``rejected``: samples that were left out before, with the reason.
+    ``more``: further entries of the document.
 
     Raises `TooFewSamplesError` or `RankDeficientError` when the poses do not show the camera's
     place; `InputError` when the pairs hold a mistake that can be named: units, inverted, shifted;
@@ -420,9 +416,6 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> Placement:
     """`robust_start`; refuse pairs in which no placement is worth a search.
 
     The mistake is named if it is known.
-
-    Raises `TooFewSamplesError`, `RankDeficientError`, `InputError`, `ResidualError` as
-    `calibrate_camera`.
     """
     require_pairs(pairs, rejected)
     sound = robust_start(pairs)
@@ -598,11 +591,7 @@ def pair_streams(
     robot: PoseStream, camera: PoseStream, mount: Mount = "in-hand",
     given: GivenNoise | None = None,
 ) -> StreamPairs:  # fmt: skip
-    """Find the offset, and pair the streams by it.
-
-    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError` as `coarse_offset`, `pairs_at`,
-    `robocal_ros.hand_eye.camera.calibrate_camera`.
-    """
+    """Find the offset, and pair the streams by it."""
     offset = coarse_offset(robot, camera)
     pairs, left_out = pairs_at(robot, camera, offset, mount)
     fit = fit_pairs(pairs, given, sound=require_sound(pairs, {}))

@@ -27,10 +27,8 @@ Mount = Literal["in-hand", "to-hand"]
 class Shared:
     """Errors common to all board poses, such as those of the intrinsics.
 
-    Attributes
-    ----------
-    sensitivity : (m, 6, s) of each board pose (position and turn along the camera's axes).
-    covariance : (s, s) of the common errors before anything was seen.
+    ``sensitivity`` (m, 6, s) of each board pose (position and turn along the camera's axes).
+    ``covariance`` (s, s) of the common errors before anything was seen.
     """
 
     sensitivity: Array
@@ -46,13 +44,11 @@ class PosePairs:
     ``to-hand``: the camera stands still, the board is on the flange; X = T_base_camera and
     Z = T_flange_board with X T_camera_board = T_base_flange Z.
 
-    Attributes
-    ----------
-    T_base_flange, T_camera_board : (m, 4, 4).
-    names : (m,) of the samples.
-    covariance : (m, 6, 6) of T_camera_board, m and rad: of its position, and of its turn, both
-        along the camera's axes; None where it is not known.
-    time_s : (m,) of the samples of a stream, increasing; None of single shots.
+    ``T_base_flange``, ``T_camera_board`` (m, 4, 4).
+    ``names`` (m,) of the samples.
+    ``covariance`` (m, 6, 6) of T_camera_board, m and rad: of its position, and of its turn, both
+    along the camera's axes; None where it is not known.
+    ``time_s`` (m,) of the samples of a stream, increasing; None of single shots.
     """
 
     T_base_flange: Array
@@ -153,12 +149,10 @@ class Chessboard:
 class Intrinsics:
     """A pinhole camera with OpenCV's distortion.
 
-    Attributes
-    ----------
-    matrix : (3, 3), px. ``distortion`` (k,): k1, k2, p1, p2, k3 …
-    size : width and height of the images, px.
-    covariance : (4 + k, 4 + k) of fx, fy, cx, cy and the distortion; None where they are given
-        and taken as exact.
+    ``matrix`` (3, 3), px. ``distortion`` (k,): k1, k2, p1, p2, k3 …
+    ``size``: width and height of the images, px.
+    ``covariance`` (4 + k, 4 + k) of fx, fy, cx, cy and the distortion; None where they are given
+    and taken as exact.
     """
 
     matrix: Array
@@ -171,13 +165,11 @@ class Intrinsics:
 class SeenBoards:
     """Where the board was in each image that shows it.
 
-    Attributes
-    ----------
-    names : (m,). ``T_camera_board`` (m, 4, 4).
-    covariance : (m, 6, 6) of position and turn along the camera's axes, with exact intrinsics.
-    shared : what errors of the intrinsics do to all poses; None where they are exact.
-    noise_px : standard deviation of a corner's coordinate. ``rms_px`` (m,) misfit of each image.
-    rejected : name of each image left out, with the reason.
+    ``names`` (m,). ``T_camera_board`` (m, 4, 4).
+    ``covariance`` (m, 6, 6) of position and turn along the camera's axes, with exact intrinsics.
+    ``shared``: what errors of the intrinsics do to all poses; None where they are exact.
+    ``noise_px``: standard deviation of a corner's coordinate. ``rms_px`` (m,) misfit of each image.
+    ``rejected``: name of each image left out, with the reason.
     """
 
     names: tuple[str, ...]

@@ -1,6 +1,6 @@
 """Maximum likelihood of a hand-eye calibration, with the noise of both sides."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 
 import numpy as np
@@ -241,15 +241,13 @@ class PairNoise:
     distance by its size alone, its tilt by foreshortening alone. So the camera has a noise of
     distance and one of tilt beside that of its lateral position and of its turn about the axis.
 
-    Attributes
-    ----------
-    position_m : of the board's position, by both sides together; where the pairs have a covariance
-        of the camera's side, by the robot alone.
-    turn_rad : of the flange's orientation, which moves the board by its lever.
-    tilt_rad, roll_rad : of the board's turn in the camera, across its axis and about it.
-    depth_m : what the position along the camera's axis errs by besides.
-    excess : root of what is added to the pairs' own covariance, as a part of it. It takes the place
-        of the camera's other three, which are zero where the pairs have one.
+    ``position_m``: of the board's position, by both sides together; where the pairs have a
+    covariance of the camera's side, by the robot alone.
+    ``turn_rad``: of the flange's orientation, which moves the board by its lever.
+    ``tilt_rad``, ``roll_rad``: of the board's turn in the camera, across its axis and about it.
+    ``depth_m``: what the position along the camera's axis errs by besides.
+    ``excess``: root of what is added to the pairs' own covariance, as a part of it. It takes the
+    place of the camera's other three, which are zero where the pairs have one.
     """
 
     position_m: float
@@ -262,16 +260,7 @@ class PairNoise:
     @property
     def variances(self) -> Array:
         """(6,): the squares."""
-        return np.square(
-            [
-                self.position_m,
-                self.turn_rad,
-                self.tilt_rad,
-                self.roll_rad,
-                self.depth_m,
-                self.excess,
-            ]
-        )
+        return np.square(astuple(self))
 
     @property
     def camera_scale(self) -> float:
@@ -385,12 +374,10 @@ class Evidence:
 class Found:
     """Noise that was estimated.
 
-    Attributes
-    ----------
-    settled : whether the likelihood's top was reached.
-    stayed : whether the noise that the search began with was as good as at the top.
-    spread : (k, k) what the unknowns' covariance is larger by than for noise that is known.
-    best : (k,) step of the unknowns to where they are likeliest.
+    ``settled``: whether the likelihood's top was reached.
+    ``stayed``: whether the noise that the search began with was as good as at the top.
+    ``spread`` (k, k) what the unknowns' covariance is larger by than for noise that is known.
+    ``best`` (k,) step of the unknowns to where they are likeliest.
     """
 
     noise: PairNoise
@@ -491,11 +478,9 @@ _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several varianc
 class GivenNoise:
     """What is known of the noise, standard deviations per axis; None is estimated.
 
-    Attributes
-    ----------
-    camera_m, camera_rad : of board poses without a covariance of their own.
-    camera_scale : factor of the sigmas in the covariance that board poses have: 1 to trust it. What
-        is told of corners alone knows nothing of a lens or a board that are not as assumed.
+    ``camera_m``, ``camera_rad``: of board poses without a covariance of their own.
+    ``camera_scale``: factor of the sigmas in the covariance that board poses have: 1 to trust it.
+    What is told of corners alone knows nothing of a lens or a board that are not as assumed.
     """
 
     robot_m: float | None = None
@@ -523,13 +508,11 @@ class GivenNoise:
 class PairFit:
     """A solved calibration.
 
-    Attributes
-    ----------
-    noise : of both sides, given or estimated.
-    expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
-    settled : whether noise and placements agree in the end; where the noise is known they do.
-    spread : (12 + s, 12 + s) what the covariance is larger by, because the noise was estimated.
-    differences, jacobian : (m, 6) and (m, 6, 12 + s) of all samples, as `linearised`.
+    ``noise``: of both sides, given or estimated.
+    ``expected`` (m, 6, 6) covariance of the samples' differences by the noise alone.
+    ``settled``: whether noise and placements agree in the end; where the noise is known they do.
+    ``spread`` (12 + s, 12 + s) what the covariance is larger by, because the noise was estimated.
+    ``differences``, ``jacobian`` (m, 6) and (m, 6, 12 + s) of all samples, as `linearised`.
     """
 
     pairs: PosePairs
@@ -576,9 +559,6 @@ def fit_pairs(
 
     Noise and placements in turn. ``start``: where the search begins; default ``sound``. ``sound``:
     a placement near the truth, from which the noise is guessed; default `robust_start`.
-
-    Raises `TooFewSamplesError` or `RankDeficientError` as
-    `robocal_ros.estimation.estimation.solve`.
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
     free, shared = np.isnan(known), pairs.shared

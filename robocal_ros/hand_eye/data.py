@@ -50,11 +50,9 @@ AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a sho
 class Profile:
     """Points of one profile.
 
-    Attributes
-    ----------
-    points : (n, 2) x along the laser line and z along the beam, sensor frame, m, in the order of
-        the sensor's columns; its plane is y = 0. Finite: what the sensor did not see is left out.
-    name : of the shot, for reports.
+    ``points`` (n, 2) x along the laser line and z along the beam, sensor frame, m, in the order of
+    the sensor's columns; its plane is y = 0. Finite: what the sensor did not see is left out.
+    ``name``: of the shot, for reports.
     """
 
     points: Array
@@ -215,11 +213,9 @@ class StandingShot:
 class Standstills:
     """Pairs profiles with standstills, as a session does for a capture.
 
-    Attributes
-    ----------
-    found : shots in the order of the recording.
-    rejected : name of each other profile, and why it is none.
-    ignored : joint readings that were not used.
+    ``found``: shots in the order of the recording.
+    ``rejected``: name of each other profile, and why it is none.
+    ``ignored``: joint readings that were not used.
     """
 
     def __init__(self, joint_names: tuple[str, ...], rule: StandstillRule) -> None:
@@ -385,14 +381,12 @@ class PoseModels:
 class HandEyeSample:
     """What was seen at one standstill.
 
-    Attributes
-    ----------
-    handle : its name.
-    mark : of a step target the mark that the laser plane lies through; else empty.
-    stamp_ns : of the shot.
-    q : (n,) mean of the joint readings at standstill, rad (prismatic: m).
-    values : see `Shot.read`; of an image `seen_corners`.
-    thermal : what was in force then, so that a set of a cold robot stays one.
+    ``handle``: its name.
+    ``mark``: of a step target the mark that the laser plane lies through; else empty.
+    ``stamp_ns``: of the shot.
+    ``q`` (n,) mean of the joint readings at standstill, rad (prismatic: m).
+    ``values``: see `Shot.read`; of an image `seen_corners`.
+    ``thermal``: what was in force then, so that a set of a cold robot stays one.
     """
 
     handle: int
@@ -419,12 +413,10 @@ class Capture:
 class DataSet:
     """A target and its captures.
 
-    Attributes
-    ----------
-    target : document of the target, with its ``kind``.
-    method : best or classic; ``mount`` in-hand or to-hand; ``feature`` of a line, in a profile.
-    captures, samples : by handle; a capture that failed or waits has no sample.
-    candidate : the last calibration in the history; 0 without.
+    ``target``: document of the target, with its ``kind``.
+    ``method``: best or classic; ``mount`` in-hand or to-hand; ``feature`` of a line, in a profile.
+    ``captures``, ``samples``: by handle; a capture that failed or waits has no sample.
+    ``candidate``: the last calibration in the history; 0 without.
     """
 
     target: Document

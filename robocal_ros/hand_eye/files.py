@@ -63,16 +63,15 @@ FARTHEST_M = {"flange": 3.0, "base": 20.0}  # of a sensor from its parent
 class PoseTable:
     """Shots: where the flange stood, and the file that each of them gave.
 
-    Attributes
-    ----------
-    names : (m,) of the shots; where the table gives none the file's name, or the row's number.
-    T_base_flange : (m, 4, 4), m.
-    files : (m,) relative to the folder of the shots; none where no such column was asked for.
-    q : (m, n) joint readings, rad (prismatic: m); None without them, or where no arm is known.
-    stamp_ns : (m,); None without a column.
-    mark : (m,) of the target, through which the laser plane was laid; None without a column.
-    path, rows, column : the table's file, the row of each shot there, the column of ``files``.
-    named : whether the table has a column ``sample``.
+    ``names`` (m,) of the shots; where the table gives none the file's name, or the row's number.
+    ``T_base_flange`` (m, 4, 4), m.
+    ``files`` (m,) relative to the folder of the shots; none where no such column was asked for.
+    ``q`` (m, n) joint readings, rad (prismatic: m); None without them, or where no arm is known.
+    ``stamp_ns`` (m,); None without a column.
+    ``mark`` (m,) of the target, through which the laser plane was laid; None without a column.
+    ``path``, ``rows``, ``column``: the table's file, the row of each shot there, the column of
+    ``files``.
+    ``named``: whether the table has a column ``sample``.
     """
 
     names: tuple[str, ...]

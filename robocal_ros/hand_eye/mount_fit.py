@@ -99,13 +99,12 @@ def joined(words: Sequence[str]) -> str:
 class MountFit:
     """The most likely mount.
 
-    Attributes
-    ----------
-    views : of the sightings that were used, in the order of the problem's.
-    state, covariance : (k, k) of the problem's unknowns; scale: how far the misfit widened it.
-    noise : of reported poses, given or found.
-    rejected : names of sightings not used, with the reason.
-    creeping : why this is no solution, in words; empty where it is one.
+    ``views``: of the sightings that were used, in the order of the problem's.
+    ``state``, ``covariance`` (k, k) of the problem's unknowns; ``scale``: how far the misfit
+    widened it.
+    ``noise``: of reported poses, given or found.
+    ``rejected``: names of sightings not used, with the reason.
+    ``creeping``: why this is no solution, in words; empty where it is one.
     """
 
     views: tuple[TargetView, ...]
@@ -141,9 +140,7 @@ def fit_mount(
 ) -> MountFit:
     """Estimate the sensor's pose and what is unknown of its targets.
 
-    Parameters
-    ----------
-    noise : of reported poses; None to estimate it.
+    ``noise``: of reported poses; None to estimate it.
 
     Raises `TooFewSamplesError`: fewer equations than unknowns; `RankDeficientError` when poses
     leave a direction open; its words say which motion is missing.

@@ -28,10 +28,8 @@ OUTSIDE = 0.02  # share of points beyond it on each side: spikes
 class PoseNoise:
     """Standard deviations of what all sightings of one pose have in common.
 
-    Attributes
-    ----------
-    sigma_m, sigma_rad : of a coordinate of the reported pose, and of its turn about an axis.
-    aim_m : of light that is laid on a mark by eye.
+    ``sigma_m``, ``sigma_rad``: of a coordinate of the reported pose, and of its turn about an axis.
+    ``aim_m``: of light that is laid on a mark by eye.
     """
 
     sigma_m: float
@@ -48,13 +46,11 @@ class PoseNoise:
 class HandEyeSettings:
     """What is known of the robot, and what is good enough.
 
-    Attributes
-    ----------
-    robot_sigma_m, robot_sigma_rad : standard deviation of a reported pose along and about each
-        axis; None to estimate both from the profiles. Where the first is given alone, the second
-        is that shift at an arm's length of 1 m.
-    limit_m : largest expected error (rms) of a point in the field that the profiles cover.
-    residual_m : largest distance (rms) of samples from the target.
+    ``robot_sigma_m``, ``robot_sigma_rad``: standard deviation of a reported pose along and about
+    each axis; None to estimate both from the profiles. Where the first is given alone, the second
+    is that shift at an arm's length of 1 m.
+    ``limit_m``: largest expected error (rms) of a point in the field that the profiles cover.
+    ``residual_m``: largest distance (rms) of samples from the target.
     """
 
     robot_sigma_m: float | None = None
@@ -74,22 +70,20 @@ class HandEyeSettings:
 class HandEyeResult:
     """Where a sensor sits.
 
-    Attributes
-    ----------
-    T_flange_sensor : (4, 4), m. For a sensor that does not move (eye-to-hand) ``parent`` is "base"
-        and this is T_base_sensor.
-    covariance : (6, 6) of the `increment` (v, w) to the true pose, m and rad, sensor axes: a turn
-        about ``pivot`` (3,), sensor frame, and its shift; None where the method tells none. About
-        the middle of what was seen it is a Gaussian even where the sensor's origin moves far.
-    samples : names (n,) of the samples used; ``residual_m`` (n,) their distances, and
-        ``residual_rad`` (n,) their angles where the target has any.
-    leave_one_out_m : (n,) distance of each sample from the solution without it; None where too few
-        samples remain to solve without one.
-    rejected : name of each sample not used, with the reason.
-    target : what was found of the target, as a document (``center_mm``, ``line`` …); place: the
-        same as the target's model has it, where there is one.
-    working_error_m : rms error to expect of a point at the working distance; None if not known.
-    more : further entries of the document, such as ``point_residual_mm``.
+    ``T_flange_sensor`` (4, 4), m. For a sensor that does not move (eye-to-hand) ``parent`` is
+    "base" and this is T_base_sensor.
+    ``covariance`` (6, 6) of the `increment` (v, w) to the true pose, m and rad, sensor axes: a turn
+    about ``pivot`` (3,), sensor frame, and its shift; None where the method tells none. About the
+    middle of what was seen it is a Gaussian even where the sensor's origin moves far.
+    ``samples``: names (n,) of the samples used; ``residual_m`` (n,) their distances, and
+    ``residual_rad`` (n,) their angles where the target has any.
+    ``leave_one_out_m`` (n,) distance of each sample from the solution without it; None where too
+    few samples remain to solve without one.
+    ``rejected``: name of each sample not used, with the reason.
+    ``target``: what was found of the target, as a document (``center_mm``, ``line`` …); ``place``:
+    the same as the target's model has it, where there is one.
+    ``working_error_m``: rms error to expect of a point at the working distance; None if not known.
+    ``more``: further entries of the document, such as ``point_residual_mm``.
     """
 
     kind: TargetKind

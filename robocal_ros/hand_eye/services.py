@@ -67,15 +67,11 @@ MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
 class HandEyeOutputs:
     """Publishers of one sensor's results.
 
-    Parameters
-    ----------
-    add : creates a publisher.
-    robot, serial : as messages carry them.
+    ``add``: creates a publisher.
+    ``robot``, ``serial``: as messages carry them.
 
-    Attributes
-    ----------
-    transforms : all that were put onto tf.
-    missing : what cannot be published on this machine; empty when everything can.
+    ``transforms``: all that were put onto tf.
+    ``missing``: what cannot be published on this machine; empty when everything can.
     """
 
     def __init__(self, add: AddOutput, robot: str, serial: str) -> None:
@@ -165,11 +161,9 @@ def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStat
 class HandEyeFiles:
     """``~/load``, ``~/save`` and its Trigger twin; the data set of each calibration is kept.
 
-    Parameters
-    ----------
-    ask : gives a command to the session and awaits its outcome.
-    session : the one that runs; raises while the node is inactive.
-    history : beside its file data sets are kept.
+    ``ask``: gives a command to the session and awaits its outcome.
+    ``session``: the one that runs; raises while the node is inactive.
+    ``history``: beside its file data sets are kept.
     """
 
     def __init__(
@@ -321,11 +315,9 @@ def start_arguments(
 class HandEyeServices:
     """Data set, captures, calibration, with their Trigger twins.
 
-    Parameters
-    ----------
-    ask : gives a command to the session and awaits its outcome.
-    files : asks where data sets begin or are calibrated.
-    session : the one that runs; raises while the node is inactive.
+    ``ask``: gives a command to the session and awaits its outcome.
+    ``files``: asks where data sets begin or are calibrated.
+    ``session``: the one that runs; raises while the node is inactive.
     """
 
     def __init__(

@@ -83,14 +83,13 @@ OWN = "sensor"  # only a hand-eye session's configuration has it
 class HandEyeConfig:
     """Settings of a hand-eye session; plain values, so that a recording carries them.
 
-    Attributes
-    ----------
-    base_frame, flange_frame, sensor_frame : names of the frames.
-    standstill : when the robot counts as standing still about a measurement.
-    capture_timeout_s : a capture without standstill or without a measurement for so long fails.
-    robot_sigma_m, robot_sigma_rad : error of a reported flange pose along and about each axis, one
-        sigma; None: found from the samples, but the second of a line laser as `HandEyeSettings`.
-    limit_m : largest expected error at the working distance that is accepted.
+    ``base_frame``, ``flange_frame``, ``sensor_frame``: names of the frames.
+    ``standstill``: when the robot counts as standing still about a measurement.
+    ``capture_timeout_s``: a capture without standstill or without a measurement for so long fails.
+    ``robot_sigma_m``, ``robot_sigma_rad``: error of a reported flange pose along and about each
+    axis, one sigma; None: found from the samples, but the second of a line laser as
+    `HandEyeSettings`.
+    ``limit_m``: largest expected error at the working distance that is accepted.
     """
 
     base_frame: str = "base"
@@ -118,9 +117,7 @@ class HandEyeConfig:
 class HandEyeInForce(HistoryFollower):
     """What the history has in force for a sensor, as of the last look.
 
-    Attributes
-    ----------
-    head, thermal : heads of this sensor's calibrations and of the thermal models.
+    ``head``, ``thermal``: heads of this sensor's calibrations and of the thermal models.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, sensor_frame: str) -> None:
@@ -233,9 +230,7 @@ class HandEyeSession(SessionBase):
     ``capture`` answers at once; that the robot stood still and what the sensor saw then becomes a
     command of its own, so that a recording holds which shot each sample was made of.
 
-    Attributes
-    ----------
-    data : the open data set; None without.
+    ``data``: the open data set; None without.
     """
 
     def __init__(

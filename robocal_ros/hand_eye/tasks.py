@@ -62,11 +62,9 @@ SEED = 5  # of the fixed set of trials
 class HandEyeData:
     """Shots of one target.
 
-    Attributes
-    ----------
-    names : (m) of the shots; T_base_flange : (m, 4, 4) as the robot reports them.
-    profiles : (m) what the sensor saw, or why that cannot be used.
-    marks : (m) mark of a staircase that each laser plane was laid through, or None.
+    ``names`` (m) of the shots; ``T_base_flange``: (m, 4, 4) as the robot reports them.
+    ``profiles`` (m) what the sensor saw, or why that cannot be used.
+    ``marks`` (m) mark of a staircase that each laser plane was laid through, or None.
     """
 
     names: tuple[str, ...]
@@ -79,10 +77,8 @@ class HandEyeData:
 class Read:
     """Features of a data set.
 
-    Attributes
-    ----------
-    view : of the features; rejected: which shots gave none, and why.
-    points : profile points (n, 2) that each feature rests on, where they are on the target.
+    ``view``: of the features; ``rejected``: which shots gave none, and why.
+    ``points``: profile points (n, 2) that each feature rests on, where they are on the target.
     """
 
     view: TargetView

@@ -238,18 +238,16 @@ LEAST_MM = 0.01  # shown
 class CellCourse:
     """True errors at the working poses over time; not a number where they are not told.
 
-    Attributes
-    ----------
-    topic : on which the truth was told.
-    hours : (t,) since the recording began.
-    without_mm, with_mm : (t,) rms without correction, and of what was commanded; at the same poses,
-        where some were visited.
-    p95_mm : (t,) 95 % of the poses are better, of what was commanded.
-    lambda_without, lambda_with : (t,) share of directions within `TOLERANCE_MM`.
-    bound_mm : (t,) what the line was told: 95 % of the errors are below.
-    tolerance_mm : error that the process allows; None where the line was told nothing.
-    faults : each with ``hours``, ``fault``, ``size`` (SI; 0: it ended) and ``told``, the size in
-        words.
+    ``topic``: on which the truth was told.
+    ``hours`` (t,) since the recording began.
+    ``without_mm``, ``with_mm`` (t,) rms without correction, and of what was commanded; at the same
+    poses, where some were visited.
+    ``p95_mm`` (t,) 95 % of the poses are better, of what was commanded.
+    ``lambda_without``, ``lambda_with`` (t,) share of directions within `TOLERANCE_MM`.
+    ``bound_mm`` (t,) what the line was told: 95 % of the errors are below.
+    ``tolerance_mm``: error that the process allows; None where the line was told nothing.
+    ``faults``: each with ``hours``, ``fault``, ``size`` (SI; 0: it ended) and ``told``, the size in
+    words.
     """
 
     topic: str

@@ -195,13 +195,11 @@ def _csv(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
 class ShiftErrors:
     """True errors of a simulated tool at check poses over a shift, against the cold robot.
 
-    Attributes
-    ----------
-    hours : (c,) time of each cycle since the start of the shift.
-    accepted : of each cycle: whether its model came into force.
-    before, after : (c, m, 3) error at the check poses after each cycle, m, without and with
-        correction.
-    held : (c, m, 3) with the correction that was in force just before the cycle: at its oldest.
+    ``hours`` (c,) time of each cycle since the start of the shift.
+    ``accepted``: of each cycle: whether its model came into force.
+    ``before``, ``after`` (c, m, 3) error at the check poses after each cycle, m, without and with
+    correction.
+    ``held`` (c, m, 3) with the correction that was in force just before the cycle: at its oldest.
     """
 
     hours: Array
