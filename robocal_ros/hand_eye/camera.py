@@ -26,7 +26,6 @@ from robocal_ros.hand_eye.camera_data import (
     PoseStream,
     Shared,
     closed_form,
-    closed_forms,
     coarse_offset,
     pairs_at,
 )
@@ -487,8 +486,9 @@ def _reasons(fit: PairFit) -> dict[str, str]:
 def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
     kept, miss = fit.pairs.take(~fit.rejected), fit.differences[~fit.rejected]
     size, error_m = np.linalg.norm(miss[:, :3], axis=1), working_error(fit)
+    forms = {name: closed_form(name, kept) for name in CLOSED_FORMS}
     result = replace(
-        _unjudged(kept, fit.at, miss, how.method, closed_forms(kept), fit.pairs.distance_m),
+        _unjudged(kept, fit.at, miss, how.method, forms, fit.pairs.distance_m),
         method="best",
         covariance=fit.covariance[:6, :6],
         leave_one_out_m=left_out(fit),
@@ -504,7 +504,8 @@ def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairStat
 
     Its error to expect is its distance from that placement, where the boards were, with that one's.
     """
-    pairs, forms = fit.pairs, closed_forms(fit.pairs)
+    pairs = fit.pairs
+    forms = {name: closed_form(name, pairs) for name in CLOSED_FORMS}
     found = {name: at for name, at in forms.items() if at is not None}
     if not found:
         raise ResidualError("no closed form solves these pairs: measure at more different poses")
@@ -600,7 +601,8 @@ def pair_streams(
         step = float(fit.estimate.state.common[0])
         offset += step
         pairs, left_out = pairs_at(robot, camera, offset, mount)
-        if abs(step) < max(_CLOSE_S, 0.01 * _sigma(fit)):
+        sigma_s = float(np.sqrt(fit.whole_covariance[12, 12]))
+        if abs(step) < max(_CLOSE_S, 0.01 * sigma_s):
             break
     else:
         raise RankDeficientError(
@@ -608,11 +610,7 @@ def pair_streams(
             "about all axes, with changes of speed",
             ("time offset",),
         )
-    return StreamPairs(_with_offset(robot, pairs, fit, offset), offset, _sigma(fit), left_out)
-
-
-def _sigma(fit: PairFit) -> float:
-    return float(np.sqrt(fit.whole_covariance[12, 12]))
+    return StreamPairs(_with_offset(robot, pairs, fit, offset), offset, sigma_s, left_out)
 
 
 def calibrate_streams(

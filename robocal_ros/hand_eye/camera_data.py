@@ -610,11 +610,6 @@ def closed_form_of_all(name: str, pairs: PosePairs) -> Placement | None:
     return found if np.all(np.isfinite(X)) and np.all(np.isfinite(Z)) else None
 
 
-def closed_forms(pairs: PosePairs) -> dict[str, Placement | None]:
-    """Each of OpenCV's."""
-    return {name: closed_form(name, pairs) for name in CLOSED_FORMS}
-
-
 def _call(solve: Callable[..., Any], first: Array, second: Array, method: int) -> Any:
     return solve(
         list(first[:, :3, :3]),

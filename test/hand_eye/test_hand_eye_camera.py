@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from bench.hand_eye_cell import BoardCell, BoardNoise, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
-from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
 from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,
     Placement,
@@ -125,29 +125,29 @@ def test_the_covariance_is_that_of_the_errors(mount: str) -> None:
     assert sound(total, 6 * runs)
 
 
-def test_unknown_noise_of_both_sides_is_found() -> None:
-    truth = BoardNoise(3e-4, 8e-4, (4e-4, 4e-4, 4e-4), (1.2e-3, 1.2e-3, 1.2e-3))
-    _, pairs = measured(400, 5, noise=truth)
-    noise = fit_pairs(pairs).noise
-    # 1200 degrees of freedom each: 2 % of a sigma, more where components compete
-    assert noise.position_m == pytest.approx(5e-4, rel=0.12)
-    assert noise.turn_rad == pytest.approx(8e-4, rel=0.12)
-    assert noise.tilt_rad == pytest.approx(1.2e-3, rel=0.12)
-    assert noise.roll_rad == pytest.approx(1.2e-3, rel=0.2)
-    # there is none: what four sigmas of a variance from 400 numbers leave
-    assert noise.depth_m < 5e-4 * (16.0 * 2.0 / 400) ** 0.25
-
-
-def test_a_camera_that_sees_less_along_its_axis_is_found_out() -> None:
-    truth = BoardNoise(2e-4, 1e-3, (1e-4, 1e-4, 10e-4), (2e-3, 2e-3, 6e-4))
-    _, pairs = measured(400, 6, "to-hand", truth)
-    noise = fit_pairs(pairs).noise
-    # 400 degrees of freedom along the axis: 4 % of a sigma, more where components compete
-    assert noise.position_m == pytest.approx(np.hypot(2e-4, 1e-4), rel=0.25)
-    assert noise.turn_rad == pytest.approx(1e-3, rel=0.12)
-    assert noise.tilt_rad == pytest.approx(2e-3, rel=0.12)
-    assert noise.roll_rad == pytest.approx(6e-4, rel=0.4)  # beside the robot's 1e-3
-    assert noise.depth_m == pytest.approx(np.sqrt(10e-4**2 - 1e-4**2), rel=0.16)
+@pytest.mark.parametrize(
+    ("seed", "mount", "truth", "tolerance"),
+    [
+        # 1200 degrees of freedom each: 2 % of a sigma, more where components compete
+        (5, "in-hand", BoardNoise(3e-4, 8e-4, (4e-4,) * 3, (1.2e-3,) * 3), (0.12, 0.12, 0.2)),
+        # 400 along the axis: 4 %; the roll stands beside the robot's 1e-3
+        (6, "to-hand", BoardNoise(2e-4, 1e-3, (1e-4, 1e-4, 10e-4), (2e-3, 2e-3, 6e-4)),
+         (0.25, 0.12, 0.4)),
+    ],
+    ids=["alike", "less along the camera's axis"],
+)  # fmt: skip
+def test_unknown_noise_of_both_sides_is_found(seed, mount, truth, tolerance) -> None:
+    noise = fit_pairs(measured(400, seed, mount, truth)[1]).noise
+    place, turn, roll = tolerance
+    lateral, _, along = truth.board_m
+    assert noise.position_m == pytest.approx(np.hypot(truth.robot_m, lateral), rel=place)
+    assert noise.turn_rad == pytest.approx(truth.robot_rad, rel=turn)
+    assert noise.tilt_rad == pytest.approx(truth.board_rad[0], rel=0.12)
+    assert noise.roll_rad == pytest.approx(truth.board_rad[2], rel=roll)
+    if along > lateral:
+        assert noise.depth_m == pytest.approx(np.sqrt(along**2 - lateral**2), rel=0.16)
+    else:  # there is none: what four sigmas of a variance from 400 numbers leave
+        assert noise.depth_m < 5e-4 * (16.0 * 2.0 / 400) ** 0.25
 
 
 ANY_AXIS = BoardNoise(2e-4, 3e-4, (2e-4, 2e-4, 2e-4), (6e-4, 6e-4, 6e-4))
@@ -268,3 +268,81 @@ def test_a_start_among_many_outliers_is_sound() -> None:
     T[:16] = T[np.random.default_rng(3).permutation(16)]
     at = robust_start(replace(pairs, T_base_flange=T))
     assert np.abs(error(at.X, cell.camera)[:3]).max() < 5e-3
+
+
+# ---- poses that judge; closed forms alone --------------------------------------------------------
+
+
+def test_classic_is_a_closed_form_alone() -> None:
+    _, pairs = measured(12, 18)
+    found = calibrate_camera(pairs, CameraSettings("classic"))
+    at = closed_form(found.more["start"], pairs)
+    assert at is not None
+    assert np.array_equal(found.T_flange_sensor, at.X)
+    assert found.covariance is None
+    means = found.more["closed_forms_mean_mm"]
+    assert means[found.more["start"]] == min(means.values())
+    with pytest.raises(ValueError, match="not one of"):
+        CameraSettings("guess")
+
+
+def test_check_pairs_judge_and_are_not_used() -> None:
+    _, pairs = measured(30, 19)
+    some, others = pairs.take(np.arange(20)), pairs.take(np.arange(20, 30))
+    found = calibrate_camera(some, check=CheckPairs(others, {"x": "dark"}))
+    assert found.more["held_out"]["n"] == 10
+    alone = calibrate_camera(some)
+    assert np.array_equal(found.T_flange_sensor, alone.T_flange_sensor)
+    assert "held_out" not in alone.more
+    assert found.more["held_out"]["rejected_because"] == {"x": "dark"}
+    expected = np.sqrt(np.sum(np.square([2e-4] * 3)) + np.sum(np.square([1e-4, 1e-4, 4e-4])))
+    assert found.more["held_out"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.5)
+
+
+@pytest.mark.parametrize("method", ["best", "classic"])
+def test_check_pairs_refuse_a_board_that_moved(method: str) -> None:
+    _, pairs = measured(30, 19)
+    some, others = pairs.take(np.arange(20)), pairs.take(np.arange(20, 30))
+    T = others.T_base_flange.copy()
+    T[:, 0, 3] += 0.02  # as far as the board was moved before these were seen
+    found = calibrate_camera(some, CameraSettings(method), check=CheckPairs(others))
+    assert found.verdict.accept
+    moved_on = CheckPairs(replace(others, T_base_flange=T))
+    refused = calibrate_camera(some, CameraSettings(method), check=moved_on)
+    assert refused.verdict.code is Code.RESIDUAL_TOO_LARGE
+    assert "not used to solve are off by" in refused.verdict.reason
+    assert refused.more["held_out"]["rms_mm"] == pytest.approx(20.0, rel=0.1)
+    assert np.array_equal(refused.T_flange_sensor, found.T_flange_sensor)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_classic_is_judged_by_its_distance_from_the_best(mount: str) -> None:
+    _, pairs = measured(12, 18, mount)
+    best = calibrate_camera(pairs)
+    found = calibrate_camera(pairs, CameraSettings("classic"))
+    board = np.concatenate([pairs.T_camera_board[:, :3, 3], np.ones((12, 1))], axis=1)
+    away = board @ (found.T_flange_sensor - best.T_flange_sensor).T
+    away_m = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+    assert found.working_error_m == pytest.approx(np.hypot(away_m, best.working_error_m))
+    assert found.verdict.accept
+    assert f"{away_m * 1e3:.3f} mm from the best estimate" in found.verdict.reason
+    limit_m = 0.5 * (found.working_error_m + best.working_error_m)
+    assert calibrate_camera(pairs, CameraSettings(limit_m=limit_m)).verdict.accept
+    refused = calibrate_camera(pairs, CameraSettings("classic", limit_m=limit_m))
+    assert refused.verdict.code is Code.POSES_NOT_INFORMATIVE
+    assert "use method best" in refused.verdict.reason
+
+
+def test_classic_leaves_each_out_in_turn() -> None:
+    _, pairs = measured(9, 18)
+    found = calibrate_camera(pairs, CameraSettings("classic"))
+    assert found.leave_one_out_m is not None
+    for row in (0, 4, 8):
+        rest = np.arange(9) != row
+        at = closed_form(found.more["start"], pairs.take(rest))
+        assert at is not None
+        boards = pairs.T_boardside_cameraside @ at.X @ pairs.T_camera_board
+        miss = np.linalg.norm((boards[row] - at.Z)[:3, 3])
+        assert found.leave_one_out_m[row] == pytest.approx(miss, rel=1e-6)
+    _, many = measured(51, 18)
+    assert calibrate_camera(many, CameraSettings("classic")).leave_one_out_m is None
