@@ -11,9 +11,13 @@ from bench.closed_loop.judging import gaps_to_recover, harm, per_hour, refused, 
 from bench.closed_loop.plant import (
     AT_WORK,
     BEAT_S,
+    CYCLE,
+    DWELL_S,
+    HOME,
     PASS_S,
     PROGRAMME,
     REST_S,
+    ROUNDS,
     STEP_S,
     GapReport,
     equipped,
@@ -33,10 +37,12 @@ from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.ground.errors import ConflictError
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.motion.cell import joint_way
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.tool.driving import DrivePhase
+from robocal_ros.tool.session import REFERENCE
 
 
 @pytest.fixture
@@ -85,12 +91,29 @@ def test_a_jump_that_is_sent_is_counted(cell):
     assert plant.cell.motion.at([plant.now_s])[0] == pytest.approx(q, abs=1e-12)
 
 
+def reference_measured_late(plant, suite):
+    """The healthy tool as a commissioning measures it, at the time of that; no ball is seen."""
+
+    def unseen(until_s):
+        steps = int(np.ceil((until_s - 1e-9 - plant.now_s) / STEP_S))
+        plant.cell.advance(plant.now_s + steps * STEP_S, readings=False)
+
+    for pose in [*np.tile(CYCLE, (ROUNDS, 1)), HOME]:
+        q = plant.cell.motion.at([plant.now_s])[0][0]
+        plant.send(joint_way(suite.maintenance.ways.cell, q, pose))
+        unseen(plant.cell.motion.end_s)
+        unseen(plant.now_s + DWELL_S)
+    plant.listen(plant.now_s + 0.416)
+    return plant.measure_tool(suite, REFERENCE, "one")
+
+
 @pytest.mark.parametrize("seed", [51, 65, 73])
 def test_a_healthy_tool_is_found_where_noisy_readings_bend_its_path(seed):
     """Joint readings whose noise lets whole steps of the search overshoot for ever."""
     nominal = load_robot("kr150_r3100")
     with equipped(nominal, SimulatedCell(kr150_cell(nominal, seed, points=0))) as (plant, suite):
-        plant.commission()
+        plant.listen(1.0)
+        assert reference_measured_late(plant, suite).done
         assert suite.tool.current.measured_healthy is not None
 
 

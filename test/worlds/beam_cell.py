@@ -1,5 +1,7 @@
 """A UR10 at a beam station, for the tests of tool frames."""
 
+from functools import cache
+
 import numpy as np
 
 from robocal_ros.cell_sim.beams import (
@@ -16,10 +18,16 @@ from robocal_ros.cell_sim.beams import (
     laser_of,
 )
 from robocal_ros.cell_sim.tool_cell import RunPlan, ToolCell
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import RobotNoise
 
 SILENT = RobotNoise(1e-7, 1e-7)
+
+
+@cache
+def ur10() -> SerialArm:
+    return load_robot("ur10")
 
 
 def make_cell(
@@ -33,5 +41,4 @@ def make_cell(
     """A cell whose robot knows its lasers exactly."""
     station = BeamStation(beams_of(T_base_laser, BETA_RAD, GAP_M), source, noise)
     robot = SILENT if exact else RobotNoise(noise.step_m, noise.edge_m)
-    arm = load_robot("ur10")
-    return ToolCell(arm, station, laser_of(station), Q_NEAR, plan or RunPlan(), robot)
+    return ToolCell(ur10(), station, laser_of(station), Q_NEAR, plan or RunPlan(), robot)

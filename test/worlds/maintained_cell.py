@@ -46,7 +46,7 @@ class MaintainedCell(Robot):
         self, history: Any, tool: np.ndarray = TAUGHT, *, from_s: float = 0.0, **changes: Any
     ) -> None:
         super().__init__(history, tool)
-        self.now_s = from_s
+        self.now_s, self.shift_s = from_s, -from_s  # the controller's clock stands between gaps
         self.history = history
         self.arm = self.cell.arm
         self.motion, self.q = AheadMotion(HOME), HOME.copy()
@@ -133,6 +133,7 @@ class MaintainedCell(Robot):
     def production(self, hours: float, kelvin: float) -> None:
         """The robot works, and warms up; the gap is closed meanwhile."""
         self.now_s += hours * 3600.0
+        self.shift_s -= hours * 3600.0
         self.true = warmed(self.arm, kelvin)
         self.run(0.5)
 
