@@ -5,12 +5,11 @@ cycle            the script of a run: thermal measurement, tool, decisions
 robot_interface  what a script does with robot and nodes, and the requests to them
 mover            the ways that the robot may take, one supervised motion at a time
 deciding         accept, reject, roll back; what needs no person
-memory           settings, what outlives a restart, the accuracy of the cell
+accuracy         settings, what outlives a restart, the accuracy of the cell
 services, node   parameters, services and messages; the node and its clients
 """
 
-from robocal_ros.maintenance.accuracy import AcceptBounds, MaintenanceConfig, Times
-from robocal_ros.maintenance.memory import CycleResult
+from robocal_ros.maintenance.accuracy import AcceptBounds, CycleResult, MaintenanceConfig, Times
 from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState, Status
 
 __all__ = [

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.history_records import THERMAL, TOOL
-from robocal_ros.maintenance.accuracy import Drift
+from robocal_ros.maintenance.accuracy import CycleResult, Drift, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
-from robocal_ros.maintenance.memory import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.mover import HOME, FaultError
 from robocal_ros.maintenance.robot_interface import (
     BeginCycle,

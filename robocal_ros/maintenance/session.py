@@ -20,10 +20,17 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitErro
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.maintenance.accuracy import Drift, MaintenanceConfig, NodeReports, accuracy_of
+from robocal_ros.maintenance.accuracy import (
+    CycleResult,
+    DocumentStore,
+    Drift,
+    MaintenanceConfig,
+    Memory,
+    NodeReports,
+    accuracy_of,
+)
 from robocal_ros.maintenance.cycle import CycleRun, ThermalCycle, ThermalPart
 from robocal_ros.maintenance.deciding import Decider
-from robocal_ros.maintenance.memory import CycleResult, DocumentStore, Memory
 from robocal_ros.maintenance.mover import FaultError, Ways
 from robocal_ros.maintenance.robot_interface import (
     CellInterface,

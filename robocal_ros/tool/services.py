@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -60,35 +61,23 @@ ANSWERS = {
 }
 
 
+@dataclass(frozen=True)
 class Runner:
     """What the services need of the node: begin a run, break it off, tell how the last one ended.
 
-    Parameters
-    ----------
-    begin : takes mode, cycle id and caller; the outcome of the call.
-    ended : awaits the outcome of the open run.
-    cancel : breaks the open run off.
-    last : the outcome of the last run; None before any.
-    frame : the measured tool of an outcome.
-    step : the step that is awaited.
-    is_open : whether a run is.
-    deaf : why the node would drive on in a closed gap; empty: it would not.
+    ``begin`` takes mode, cycle id and caller, and gives the outcome of the call; ``ended`` that of
+    the open run; ``last`` that of the last run, None before any; ``frame``: the measured tool of
+    an outcome; ``step``: that is awaited; ``deaf``: why the node would drive on in a closed gap.
     """
 
-    def __init__(
-        self,
-        begin: Callable[[str, str, str], Awaitable[Outcome]],
-        ended: Callable[[], Awaitable[Outcome]],
-        cancel: Callable[[str], Awaitable[Outcome]],
-        last: Callable[[], Outcome | None],
-        frame: Callable[[Outcome], ToolFrame],
-        step: Callable[[], ToolStep],
-        is_open: Callable[[], bool],
-        deaf: Callable[[], str],
-    ) -> None:
-        self.begin, self.ended, self.cancel = begin, ended, cancel
-        self.last, self.frame, self.step, self.is_open = last, frame, step, is_open
-        self.deaf = deaf
+    begin: Callable[[str, str, str], Awaitable[Outcome]]
+    ended: Callable[[], Awaitable[Outcome]]
+    cancel: Callable[[str], Awaitable[Outcome]]
+    last: Callable[[], Outcome | None]
+    frame: Callable[[Outcome], ToolFrame]
+    step: Callable[[], ToolStep]
+    is_open: Callable[[], bool]
+    deaf: Callable[[], str]
 
 
 class TcfServices:
@@ -280,14 +269,6 @@ class ToolMessages:
             state=state,
         )
 
-    def transform(self, known: KnownTool, stamp_ns: int) -> TransformStamped:
-        """A tool as a transform below the flange."""
-        return TransformStamped(
-            header=header(stamp_ns, self._flange),
-            child_frame_id=self._tool,
-            transform=transform_message(known.T_flange_tool),
-        )
-
 
 AddOutput = Callable[[type, str, QoSProfile], Any]
 
@@ -339,8 +320,11 @@ class TcfOutputs:
     def tool(self, known: KnownTool, revision: int, thermal: int, stamp_ns: int) -> None:
         """Say what is in force."""
         state = ToolFrame.ACCEPTED if revision else ToolFrame.NONE
-        self._tool.publish(self._messages.frame(known, revision, thermal, state, stamp_ns))
-        transform = self._messages.transform(known, stamp_ns)
+        message = self._messages.frame(known, revision, thermal, state, stamp_ns)
+        self._tool.publish(message)
+        transform = TransformStamped(
+            header=message.header, child_frame_id=message.child_frame_id, transform=message.tool
+        )
         self._frame.publish(transform)
         self._tf.publish([transform])
 

@@ -21,7 +21,7 @@ from maintenance_tools import automatic, measured_in_full, until_verified
 from robocal_ros.ground.errors import Code, StorageError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import robot_interface as ask
-from robocal_ros.maintenance.memory import VERSION
+from robocal_ros.maintenance.accuracy import VERSION
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 
 SPOILT = {
