@@ -322,10 +322,8 @@ class CellSamples:
     def of(self, came: Happened, faults: Faults) -> list[Sample]:
         """Samples in the order of their stamps; ``faults`` of the cell.
 
-        Raises
-        ------
-        TooFewSamplesError, ResidualError
-            When a cloud holds no sphere as the rule wants it.
+        Raises `TooFewSamplesError` or `ResidualError` when a cloud holds no sphere as the rule
+        wants it.
         """
         samples: list[Sample] = [
             JointSample(self.ns(t), self._names, q)
@@ -454,10 +452,7 @@ class SimulatedCell:
     ) -> None:
         """Follow a trajectory at once, see `JointMotion.follow`; times of the cell.
 
-        Raises
-        ------
-        InputError
-            When the controller rejects it; what runs goes on.
+        Raises `InputError` when the controller rejects it; what runs goes on.
         """
         names = self.plan.arm.joint_names
         self.gate.take(Trajectory.of(names, time_s, q, qd, qdd, start_s=0.0), self.now_s)
@@ -469,10 +464,7 @@ class SimulatedCell:
     def drive(self, step: PlannedStep) -> Circle | Plunge:
         """Let the robot's own program drive a step; its motion, on the cell's clock.
 
-        Raises
-        ------
-        LimitError
-            When it is out of reach, or too fast for the drives.
+        Raises `LimitError` when it is out of reach, or too fast for the drives.
         """
         q_now = self.motion.at([self.now_s])[0][0]
         phase = 2.0 * np.pi * self._draws.of(Stream.RIPPLE, self._motions).random()

@@ -289,10 +289,7 @@ class CommandGate:
     def require_taken(self, trajectory: Trajectory, now_s: float) -> None:
         """Raise where a trajectory is rejected.
 
-        Raises
-        ------
-        InputError
-            With the controller's reason, or with that of a fault.
+        Raises `InputError`, with the controller's reason, or with that of a fault.
         """
         if "commands_rejected" in self._faults:
             raise InputError("rejected: simulated fault commands_rejected")
@@ -301,10 +298,7 @@ class CommandGate:
     def take(self, given: Trajectory | TrajectoryGoal, now_s: float) -> None:
         """Pass one on, lose it, or let it wait.
 
-        Raises
-        ------
-        InputError
-            When it is rejected; what runs goes on.
+        Raises `InputError` when it is rejected; what runs goes on.
         """
         goal = None if isinstance(given, Trajectory) else given
         self.require_taken(given if isinstance(given, Trajectory) else given.trajectory, now_s)

@@ -50,10 +50,7 @@ KINDS: Mapping[int, StepKind] = {ToolStep.CIRCLE: "circle", ToolStep.PLUNGE: "pl
 def planned_step(message: ToolStep) -> PlannedStep:
     """A circle or plunge that is awaited.
 
-    Raises
-    ------
-    InputError
-        When kind, poses or sizes make no motion.
+    Raises `InputError` when kind, poses or sizes make no motion.
     """
     if message.kind not in KINDS:
         raise InputError(f"step {message.name} has the kind {message.kind}: no circle, no plunge")
@@ -88,10 +85,7 @@ def planned_step(message: ToolStep) -> PlannedStep:
 def trajectory_of(message: JointTrajectory, from_ns: int) -> Trajectory:
     """A trajectory whose start, where it has one, is counted from ``from_ns`` on.
 
-    Raises
-    ------
-    InputError
-        When a controller rejects the numbers of its values.
+    Raises `InputError` when a controller rejects the numbers of its values.
     """
     points, count = message.points, len(message.joint_names)
     rows = []

@@ -241,10 +241,7 @@ def laser_pose(settings: Mapping[str, Any]) -> Array:
 def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
     """The cell that the parameters describe.
 
-    Raises
-    ------
-    InputError
-        When ``q_start_deg`` has not a number for each joint.
+    Raises `InputError` when ``q_start_deg`` has not a number for each joint.
     """
     seed = settings["seed"]
     if settings["cell"] == "kr150":

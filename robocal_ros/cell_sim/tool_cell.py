@@ -463,10 +463,7 @@ def program(
 
     Also the motion itself, on the same clock.
 
-    Raises
-    ------
-    LimitError
-        When the robot does not reach it.
+    Raises `LimitError` when the robot does not reach it.
     """
     from scipy.interpolate import CubicSpline
 

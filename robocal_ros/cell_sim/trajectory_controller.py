@@ -277,10 +277,7 @@ class TrajectoryController:
 
         A goal that runs goes on running, and ends as this one ends.
 
-        Raises
-        ------
-        InputError
-            When the controller rejects it; what runs goes on.
+        Raises `InputError` when the controller rejects it; what runs goes on.
         """
         self.require_valid(trajectory, now_s)
         self._new, self._is_holding = trajectory, False
@@ -290,10 +287,7 @@ class TrajectoryController:
 
         ``lost``: a fault; the goal runs, and what ran before goes on in its place.
 
-        Raises
-        ------
-        InputError
-            When the controller rejects it; what runs goes on.
+        Raises `InputError` when the controller rejects it; what runs goes on.
         """
         if not lost:
             self.follow(goal.trajectory, now_s)
@@ -319,10 +313,7 @@ class TrajectoryController:
     def require_valid(self, trajectory: Trajectory, now_s: float) -> None:
         """Look at a trajectory as the controller does before it takes one.
 
-        Raises
-        ------
-        InputError
-            With the reason for which it is rejected.
+        Raises `InputError`, with the reason for which it is rejected.
         """
         names, time, of = trajectory.names, trajectory.time_s, self.options
         if len(names) != len(self.names) and not (names and of.allow_partial_joints_goal):
@@ -534,20 +525,14 @@ class JointMotion:
 
         ``q``, ``qd``, ``qdd`` (k, n).
 
-        Raises
-        ------
-        InputError
-            When the controller rejects it; what runs goes on.
+        Raises `InputError` when the controller rejects it; what runs goes on.
         """
         self.take(now_s, Trajectory.of(self.controller.names, time_s, q, qd, qdd, start_s=0.0))
 
     def take(self, now_s: float, given: Trajectory | TrajectoryGoal) -> None:
         """Follow a trajectory or a goal, see `TrajectoryController`, from the next cycle on.
 
-        Raises
-        ------
-        InputError
-            When the controller rejects it; what runs goes on.
+        Raises `InputError` when the controller rejects it; what runs goes on.
         """
         self.pass_to(now_s)
         if isinstance(given, Trajectory):

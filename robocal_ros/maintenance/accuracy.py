@@ -197,10 +197,7 @@ class Memory:
     def load(cls, keeper: DocumentStore) -> "Memory":
         """Read what is kept; a fault where a cycle was open, or where what was kept is gone.
 
-        Raises
-        ------
-        RobocalError
-            When it cannot be read, or is of another version.
+        Raises `RobocalError` when it cannot be read, or is of another version.
         """
         try:
             document = keeper.load()

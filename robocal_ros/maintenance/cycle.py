@@ -89,10 +89,7 @@ class ThermalPart:
     def script(self, cycle_id: str) -> Script[tuple[DriverAnswer | None, str]]:
         """The answer of the cycle's end, None where it is not reached, and what is left.
 
-        Raises
-        ------
-        SilentError
-            The thermal node did not answer; the robot may be away from home.
+        Raises `SilentError`: the thermal node did not answer; the robot may be away from home.
         """
         cell, thermal = self._cell, self._thermal
         todo = [i for i in range(1, cell.ways.count + 1) if i not in thermal.visited]
@@ -306,10 +303,8 @@ class ToolPart:
     def _measured(self, mode: str, cycle_id: str) -> Script[DriverAnswer | None]:
         """Measure from home and back; None where it did not fit, or no result counts.
 
-        Raises
-        ------
-        FaultError
-            When the robot was stopped because it left its plan, or as `CellInterface` does.
+        Raises `FaultError` when the robot was stopped because it left its plan, or as
+        `CellInterface` does.
         """
         cell, times, outcome = self._cell, self._cell.config.times, self.outcome
         yield  # what was kept just before may have taken its time: the gap is looked at again

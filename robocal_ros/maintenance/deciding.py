@@ -114,11 +114,8 @@ class Decider:
     def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
         """Carry out a decision about one calibration; one that was made before is its answer again.
 
-        Raises
-        ------
-        RobocalError
-            As the history refuses: STALE where it was solved against a revision that is no longer
-            in force.
+        Raises `RobocalError` as the history refuses: STALE where it was solved against a revision
+        that is no longer in force.
         """
         entry = self._history.get(calibration_id)
         command = Command(name, {"id": calibration_id, "by": by, "reason": why})
@@ -149,10 +146,7 @@ class Decider:
     def only_pending(self) -> Entry:
         """The newest candidate, where they are of one kind.
 
-        Raises
-        ------
-        ConflictError
-            When nothing waits, or candidates of both kinds.
+        Raises `ConflictError` when nothing waits, or candidates of both kinds.
         """
         newest = [found for kind in KINDS if (found := self.newest(kind))]
         if len(newest) != 1:
@@ -167,10 +161,8 @@ class Decider:
         in a call. Rollback: take the last acceptance back. Each may come twice: nothing more is
         done.
 
-        Raises
-        ------
-        RobocalError
-            As `decide`, `only_pending`; BAD_INPUT where nothing was accepted lately.
+        Raises `RobocalError` as `decide`, `only_pending`; BAD_INPUT where nothing was accepted
+        lately.
         """
         if name == ROLLBACK:
             yield self._take_back(by, wall_ns)
@@ -302,10 +294,7 @@ WITHIN = "within the configured bounds"
 def patiently(cell: CellInterface, act: Callable[[], Outcome]) -> Script[Outcome]:
     """What ``act`` gives; where the storage refuses, at the next ticks again while time allows.
 
-    Raises
-    ------
-    StorageError
-        The last refusal, where it raised.
+    Raises `StorageError`: the last refusal, where it raised.
     """
     until_s = cell.now_s + HELD_S
     while True:

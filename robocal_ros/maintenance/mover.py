@@ -57,12 +57,8 @@ class Route:
 class Ways:
     """Plans for one robot; planned from where it stands.
 
-    Raises
-    ------
-    InputError
-        When poses have another number of joints, or ``tool_home_s`` is too short.
-    LimitError
-        When a taught way breaks a limit, or cuts into the station's housing.
+    Raises `InputError` when poses have another number of joints, or ``tool_home_s`` is too short;
+    `LimitError` when a taught way breaks a limit, or cuts into the station's housing.
     """
 
     def __init__(self, arm: SerialArm, config: MaintenanceConfig) -> None:
@@ -124,13 +120,7 @@ class Ways:
         return min(routes, key=lambda route: route.plan.duration_s)
 
     def home(self, place: Line, q: Array) -> Route:
-        """The way home, also from the station.
-
-        Raises
-        ------
-        LimitError
-            When there is none.
-        """
+        """The way home, also from the station. Raises `LimitError` when there is none."""
         if place != STATION:
             return self.to(place, q, HOME)
         plan = departure(self.station, q, self._home)
@@ -266,10 +256,7 @@ class Mover:
     def require_at(self, q: Array) -> None:
         """Look after a robot that is to stand at joints (n,).
 
-        Raises
-        ------
-        FaultError
-            When joint states are silent, or it is not there any more.
+        Raises `FaultError` when joint states are silent, or it is not there any more.
         """
         away = np.abs(self.require_heard("while the robot stands away from home") - q)
         self._require_near(away, self._allowed(), "where it came to rest")
@@ -332,10 +319,7 @@ class Mover:
     def require_sane(self, now_s: float) -> None:
         """Look after a motion.
 
-        Raises
-        ------
-        FaultError
-            When joint states are silent, or the robot is not where its plan has it.
+        Raises `FaultError` when joint states are silent, or the robot is not where its plan has it.
         """
         if self._route is None:
             return

@@ -157,13 +157,7 @@ class Asking:
         return number
 
     def waited_for(self, number: int, within_s: float, what: str) -> Script[DriverAnswer]:
-        """Wait for an answer.
-
-        Raises
-        ------
-        SilentError
-            When it does not come in time.
-        """
+        """Wait for an answer. Raises `SilentError` when it does not come in time."""
         until_s = self.now_s + within_s
         while (answer := self._waiting[number]) is None:
             if self.now_s >= until_s:
@@ -395,10 +389,7 @@ class CellInterface(Asking):
     def disarmed(self) -> Script[None]:
         """Wait until it is confirmed.
 
-        Raises
-        ------
-        FaultError
-            When it is not: then the robot must not be moved from here.
+        Raises `FaultError` when it is not: then the robot must not be moved from here.
         """
         self._ask_disarm()
         until_s = self.now_s + self.config.times.answer_s
@@ -414,10 +405,7 @@ class CellInterface(Asking):
     def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[DriverAnswer]:
         """Let the armed driver measure, for a limited time; a longer run is broken off.
 
-        Raises
-        ------
-        SilentError
-            When it did not end in time, and not after it was broken off either.
+        Raises `SilentError` when it did not end in time, and not after it was broken off either.
         """
         number = self._measuring = self.expect(Measure, mode, cycle_id)
         until_s = self.now_s + limit_s
@@ -430,10 +418,8 @@ class CellInterface(Asking):
     def stand(self, span_s: float = SETTLED_S) -> Script[Array]:
         """Wait until the robot rests, and nothing that this node armed moves it; its joints (n,).
 
-        Raises
-        ------
-        FaultError
-            When joint states are silent, it does not come to rest, or is not handed over.
+        Raises `FaultError` when joint states are silent, it does not come to rest, or is not handed
+        over.
         """
         until_s = self.now_s + self.config.times.rest_s
         while (q := self.robot.resting(span_s)) is None or self.tool.armed:
@@ -448,12 +434,9 @@ class CellInterface(Asking):
     def drive(self, route: Route, worst_s: float) -> Script[None]:
         """Send a route and wait until it is over; supervised by the session.
 
-        Raises
-        ------
-        FaultError
-            When the robot does not rest where the route begins, on a taught way.
-        LimitError
-            When the robot is so slow or so late that the step does not fit the gap any more.
+        Raises `FaultError` when the robot does not rest where the route begins, on a taught way;
+        `LimitError` when the robot is so slow or so late that the step does not fit the gap any
+        more.
         """
         self.robot.require_heard("where the way of the robot begins")
         q = self.robot.resting(SETTLED_S)
@@ -490,10 +473,7 @@ class CellInterface(Asking):
     def go_home(self) -> Script[None]:
         """Bring the robot home, from wherever this run may have left it; one that never left stays.
 
-        Raises
-        ------
-        FaultError
-            When there is no way, or it does not fit any more.
+        Raises `FaultError` when there is no way, or it does not fit any more.
         """
         robot = self.robot
         near = not robot.beside_home()

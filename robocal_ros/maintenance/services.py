@@ -316,12 +316,7 @@ LARGEST = 1e9  # mm, s: a figure beyond is a defect, and its square might be inf
 
 
 def require_robot(topic: str, message: Any, robot: str, serial: str) -> None:
-    """Refuse what another robot's node says.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse what another robot's node says. Raises `InputError`."""
     told, mine = (message.robot, message.serial), (robot, serial)
     if told != mine:
         raise InputError(
@@ -333,10 +328,7 @@ def require_robot(topic: str, message: Any, robot: str, serial: str) -> None:
 def drift_of_message(message: Any) -> Drift:
     """Read a ``robocal_msgs/AccuracyState`` of the thermal node.
 
-    Raises
-    ------
-    InputError
-        When its state is unknown, or a figure cannot be.
+    Raises `InputError` when its state is unknown, or a figure cannot be.
     """
     try:
         level = AccuracyLevel(message.state)
@@ -351,13 +343,7 @@ def drift_of_message(message: Any) -> Drift:
 
 
 def correction_of_message(message: Any) -> ToldCorrection:
-    """Read a ``robocal_msgs/CorrectionStatus``.
-
-    Raises
-    ------
-    InputError
-        When its state is unknown.
-    """
+    """Read a ``robocal_msgs/CorrectionStatus``. Raises `InputError` when its state is unknown."""
     try:
         state = CorrectionState(message.state)
     except ValueError as error:
@@ -510,10 +496,7 @@ SETTINGS = (
 def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceConfig:
     """Settings of the session, in SI.
 
-    Raises
-    ------
-    InputError
-        When a value makes no sense, or the laser file cannot be read.
+    Raises `InputError` when a value makes no sense, or the laser file cannot be read.
     """
     driving = driving_config(settings)
     require_limits(arm, driving)

@@ -324,12 +324,9 @@ class MaintenanceSession:
     def run(self, cycle_id: str, gap_s: float, now_s: float, wall_ns: int) -> CycleResult:
         """Begin a cycle; one that runs or has ended gives what it has, and nothing runs twice.
 
-        Raises
-        ------
-        RobocalError
-            When it cannot begin: CONFLICT in a fault, while another one runs, or while the gap is
-            not open; TOO_FEW_SAMPLES while joint states are silent; LIMIT_EXCEEDED, and a fault,
-            where the robot is not at home; STORAGE_FAILED.
+        Raises `RobocalError` when it cannot begin: CONFLICT in a fault, while another one runs, or
+        while the gap is not open; TOO_FEW_SAMPLES while joint states are silent; LIMIT_EXCEEDED,
+        and a fault, where the robot is not at home; STORAGE_FAILED.
         """
         if not 0 < len(cycle_id) <= MOST_ID:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
@@ -376,10 +373,8 @@ class MaintenanceSession:
     def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
         """Accept, reject or roll back a calibration.
 
-        Raises
-        ------
-        RobocalError
-            When it is refused; `StaleError` where another revision is in force by now.
+        Raises `RobocalError` when it is refused; `StaleError` where another revision is in force by
+        now.
         """
         outcome = self._decider.decide(name, calibration_id, by, why, wall_ns)
         self._decided(outcome)
@@ -388,10 +383,7 @@ class MaintenanceSession:
     def decide_only(self, name: str, by: str, wall_ns: int) -> Outcome:
         """The same without an id, see `Decider.decide_only`.
 
-        Raises
-        ------
-        RobocalError
-            When there is nothing to decide about; as `decide`.
+        Raises `RobocalError` when there is nothing to decide about; as `decide`.
         """
         outcomes = []
         for outcome in self._decider.decide_only(name, by, wall_ns):
@@ -403,17 +395,10 @@ class MaintenanceSession:
     def acknowledge(self, by: str) -> str:
         """End a fault, in words; without one nothing happens.
 
-        Raises
-        ------
-        ConflictError
-            While the tool node has not confirmed that it is disarmed, and is not gone, or what
-            it sent may still be driven.
-        TooFewSamplesError
-            While joint states are silent.
-        LimitError
-            While the robot is not at home.
-        StorageError
-            When it cannot be kept; the fault stays.
+        Raises `ConflictError` while the tool node has not confirmed that it is disarmed, and is not
+        gone, or what it sent may still be driven; `TooFewSamplesError` while joint states are
+        silent; `LimitError` while the robot is not at home; `StorageError` when it cannot be kept;
+        the fault stays.
         """
         if not self.memory.fault:
             return "there is no fault"

@@ -107,10 +107,7 @@ def label_edges(
     the beam's middle: a latency up to a quarter of a turn does not confuse it. The first edge may
     be a restore, and there may be several turns.
 
-    Raises
-    ------
-    BeamError
-        When a beam has fewer than four edges, or they do not come in turn.
+    Raises `BeamError` when a beam has fewer than four edges, or they do not come in turn.
     """
     parts = []
     for b, beam in enumerate(BEAMS):
@@ -239,12 +236,8 @@ def fit_circle(
     a misfit is judged (chi-square). The covariance is that of the stamps alone, and wider where
     they do not explain the misfit.
 
-    Raises
-    ------
-    BeamError
-        When edges are missing, doubled or out of order.
-    ResidualError
-        When no circle at constant speed explains the edges.
+    Raises `BeamError` when edges are missing, doubled or out of order; `ResidualError` when no
+    circle at constant speed explains the edges.
     """
     labelled = label_edges(motion, edges, latency_s or 0.0)
     d, rho, latency = closed_form(motion, labelled)
@@ -391,14 +384,8 @@ def driven_circle(
     The circle lies parallel to the beam plane; linear least squares of its centre and radius
     (Kåsa 1976), and of its angle over time.
 
-    Raises
-    ------
-    BeamError
-        When a beam has fewer than four edges.
-    RankDeficientError
-        When the flange went less than half a turn.
-    ResidualError
-        When the flange drove no such circle.
+    Raises `BeamError` when a beam has fewer than four edges; `RankDeficientError` when the flange
+    went less than half a turn; `ResidualError` when the flange drove no such circle.
     """
     for beam in BEAMS:
         edges_of(edges, beam, FEWEST_EDGES["circle"])
@@ -444,12 +431,8 @@ def classic_from_path(
     Its two circles are the first one and, of those with the same orientation of the flange, the
     one farthest from it in height. ``T_flange_tool``: as taught.
 
-    Raises
-    ------
-    BeamError, ResidualError
-        As `driven_circle`; the message names the step.
-    RankDeficientError
-        When there is no second circle at another height, or no plunge.
+    Raises `BeamError` or `ResidualError` as `driven_circle`; the message names the step;
+    `RankDeficientError` when there is no second circle at another height, or no plunge.
     """
     circles = []
     for step in steps:

@@ -155,10 +155,7 @@ def add_frame_options(parser: "argparse._ActionsContainer", tip: str, turn: str)
 def given_frame(args: argparse.Namespace) -> "NDArray[np.float64] | None":
     """T_flange_tool (4, 4) of the options of `add_frame_options`; None without any.
 
-    Raises
-    ------
-    InputError
-        When both are given, or a turn alone; further what `read_tool` raises.
+    Raises `InputError` when both are given, or a turn alone; further what `read_tool` raises.
     """
     R = None if args.rpy_deg is None else frames.rotation_from_rpy(np.radians(args.rpy_deg))
     if args.tool is not None and args.xyz_mm is not None:

@@ -345,20 +345,14 @@ def estimate_tool(
     The flange pose is that of the path at each edge, so that the speed need not be constant and
     the laser's axes need not be the base's.
 
+    Raises `BeamError` when edges are missing, doubled or out of order; `RankDeficientError` when a
+    motion is missing; the message names it; `ResidualError` when no tool explains the edges.
+
     Parameters
     ----------
     T_flange_tool : (4, 4) the taught tool: where the search begins, and the turn about the axis.
     taper : growth of the radius per length above the tip; only matters while the tool is tilted.
     held : what the steps need not determine, with its sigma about the taught tool.
-
-    Raises
-    ------
-    BeamError
-        When edges are missing, doubled or out of order.
-    RankDeficientError
-        When a motion is missing; the message names it.
-    ResidualError
-        When no tool explains the edges.
     """
     noise, held = noise or RobotNoise(), held or Held()
     kinds = {step.kind for step in steps}

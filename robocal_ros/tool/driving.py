@@ -94,10 +94,8 @@ def approach(
     way; there from circle to circle straight. Each part is a straight line of the tip from rest to
     rest, as fast as all limits allow.
 
-    Raises
-    ------
-    LimitError
-        Where the way passes a joint limit, the reach, a singularity, or the housing.
+    Raises `LimitError` where the way passes a joint limit, the reach, a singularity, or the
+    housing.
     """
     q = _joints(cell, q_now)
     here, there = cell.T_base_tip(q), cell.tip_of(start_pose(step, cell.limits))
@@ -121,11 +119,8 @@ def measuring(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPla
     The circle makes one full turn at constant speed, from its ``start_rad``. It begins exactly
     where the robot stands, so circle or plunge lie off the step's own by as much.
 
-    Raises
-    ------
-    LimitError
-        When the robot does not stand where the step begins; where a limit is broken: of depth,
-        speed, acceleration, joints, reach, singularity, or the housing.
+    Raises `LimitError` when the robot does not stand where the step begins; where a limit is
+    broken: of depth, speed, acceleration, joints, reach, singularity, or the housing.
     """
     q = _joints(cell, q_now)
     _require_start(cell, step, q)
@@ -253,10 +248,8 @@ class ToolDriver:
     def arm(self, now_s: float) -> None:
         """Allow motions, until the run ends.
 
-        Raises
-        ------
-        ConflictError
-            While nothing may move, joint states are missing, a run is open, or the robot moves.
+        Raises `ConflictError` while nothing may move, joint states are missing, a run is open, or
+        the robot moves.
         """
         if why := self._closed(now_s):
             raise ConflictError(f"{why}: nothing may move")

@@ -34,10 +34,7 @@ class BeamEdge:
 
     ``time_s`` counts from any origin that all edges and the robot's readings share.
 
-    Raises
-    ------
-    InputError
-        When the time is not finite, or sigma not positive.
+    Raises `InputError` when the time is not finite, or sigma not positive.
     """
 
     beam: Beam
@@ -81,10 +78,7 @@ def debounced(edges: Sequence[BeamEdge], debounce_s: float) -> list[BeamEdge]:
     The contact first touched when the burst began, but a bounce may have hidden an earlier one:
     the stamp's sigma grows by burst length / sqrt(12).
 
-    Raises
-    ------
-    BeamError
-        When a burst leaves the beam as it was (a double edge), or does not settle.
+    Raises `BeamError` when a burst leaves the beam as it was (a double edge), or does not settle.
     """
     kept: list[BeamEdge] = []
     for beam in BEAMS:
@@ -110,10 +104,8 @@ def debounced(edges: Sequence[BeamEdge], debounce_s: float) -> list[BeamEdge]:
 def edges_of(edges: Sequence[BeamEdge], beam: Beam, fewest: int) -> list[BeamEdge]:
     """Edges of one beam in order of time, breaks and restores in turn.
 
-    Raises
-    ------
-    BeamError
-        When there are fewer than ``fewest``, or two of the same kind follow each other.
+    Raises `BeamError` when there are fewer than ``fewest``, or two of the same kind follow each
+    other.
     """
     own = sorted((e for e in edges if e.beam == beam), key=lambda e: e.time_s)
     if not own:
@@ -160,11 +152,8 @@ class EdgeSample:
 def edge_sample(message: Any, names: tuple[str, str]) -> EdgeSample:
     """Build a sample from a ``robocal_msgs/BeamEvent``; ``names`` of the x- and the y-beam.
 
-    Raises
-    ------
-    InputError
-        When the beam is unknown, the edge is neither break nor restore, or the stamp's sigma is
-        negative or not finite.
+    Raises `InputError` when the beam is unknown, the edge is neither break nor restore, or the
+    stamp's sigma is negative or not finite.
     """
     if message.beam not in names:
         raise InputError(f"beam '{message.beam}' is neither '{names[0]}' (x) nor '{names[1]}' (y)")
@@ -194,11 +183,8 @@ class EdgeLog:
     def add(self, sample: EdgeSample, newest_ns: dict[str, int], joints_ns: int) -> None:
         """Take an edge; ``newest_ns``: newest stamp of each beam, brought up to date.
 
-        Raises
-        ------
-        InputError
-            When it is not after the beam's last one, or far ahead of the joint readings: one wrong
-            stamp must not blind a beam.
+        Raises `InputError` when it is not after the beam's last one, or far ahead of the joint
+        readings: one wrong stamp must not blind a beam.
         """
         ahead_ns = sample.stamp_ns - joints_ns
         if joints_ns and ahead_ns > AHEAD_NS:

@@ -52,11 +52,8 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     ``rotation``: R_flange_tool (3, 3) for a document of touches, which tell the tip alone; another
     one takes none.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when one of them is missing, null or no measurement, and when the
-        document's verdict does not accept the tool.
+    Raises `InputError`, naming file and key, when one of them is missing, null or no measurement,
+    and when the document's verdict does not accept the tool.
     """
     top = read_fields(path, "tool file")
     if "document" in top.values:  # as the history shows it
@@ -135,10 +132,7 @@ STATES = {"1": True, "true": True, "0": False, "false": False}
 def read_beam_points(path: Path) -> dict[str, Array]:
     """Flange positions (3,), base, m, by the name of their edge; of one measured often the mean.
 
-    Raises
-    ------
-    InputError
-        With file, row and column, when the table is not as docs/tool.md says.
+    Raises `InputError`, with file, row and column, when the table is not as docs/tool.md says.
     """
     table = read_cells(path, lambda header, file: check_plain(header, file, ("point", *POSITION)))
     positions = _positions(table)
@@ -149,10 +143,7 @@ def read_beam_points(path: Path) -> dict[str, Array]:
 def read_edges(path: Path, sigma_s: float) -> list[BeamEdge]:
     """Edges of one motion, with ``sigma_s`` where the table has none of its own.
 
-    Raises
-    ------
-    InputError
-        As `read_beam_points`; when the table names several steps.
+    Raises `InputError` as `read_beam_points`; when the table names several steps.
     """
     table = _edge_table(path)
     steps = dict.fromkeys(table.words("step"))
@@ -171,10 +162,7 @@ def read_step_edges(
 ) -> tuple[list[BeamEdge], tuple[str, ...]]:
     """Edges of a whole run, their times counted from ``origin_ns``, and the step of each.
 
-    Raises
-    ------
-    InputError
-        As `read_beam_points`; when a name says neither circle nor plunge.
+    Raises `InputError` as `read_beam_points`; when a name says neither circle nor plunge.
     """
     table = _edge_table(path)
     steps = table.words("step")
@@ -220,12 +208,8 @@ def _edges(table: Cells, sigma_s: float, origin_ns: int) -> list[BeamEdge]:
 def read_joint_path(path: Path, arm: SerialArm) -> tuple[JointPath, int]:
     """The flange over time from a table of joint readings, and the origin of its times, ns.
 
-    Raises
-    ------
-    InputError
-        As `read_beam_points`; when stamps do not increase.
-    TooFewSamplesError
-        Fewer than four readings.
+    Raises `InputError` as `read_beam_points`; when stamps do not increase; `TooFewSamplesError`:
+    fewer than four readings.
     """
     found: list[tuple[tuple[str, ...], Array]] = []
     table = read_cells(
@@ -244,10 +228,7 @@ def read_joint_path(path: Path, arm: SerialArm) -> tuple[JointPath, int]:
 def read_flange_poses(path: Path) -> Array:
     """T_base_flange (m, 4, 4).
 
-    Raises
-    ------
-    InputError
-        As `read_beam_points`; without an orientation.
+    Raises `InputError` as `read_beam_points`; without an orientation.
     """
     return _poses(path)[1]
 
@@ -255,10 +236,8 @@ def read_flange_poses(path: Path) -> Array:
 def read_sweeps(path: Path) -> dict[tuple[str, Height], Array]:
     """T_base_flange (m, 4, 4) at the edges of parallel beams, by sweep and beam.
 
-    Raises
-    ------
-    InputError
-        As `read_flange_poses`; when a sweep or a beam has another name than docs/tool.md says.
+    Raises `InputError` as `read_flange_poses`; when a sweep or a beam has another name than
+    docs/tool.md says.
     """
     table, T = _poses(path, ("sweep", "beam"))
     sweeps, beams = table.words("sweep"), table.words("beam")
@@ -308,12 +287,8 @@ def named_steps(
 ) -> list[BeamStep]:
     """Steps in order of time, their edges debounced; ``names`` says the step of each edge.
 
-    Raises
-    ------
-    InputError
-        When a name says neither circle nor plunge, or comes again after another step.
-    BeamError
-        When a beam chatters.
+    Raises `InputError` when a name says neither circle nor plunge, or comes again after another
+    step; `BeamError` when a beam chatters.
     """
     inside: dict[str, list[BeamEdge]] = {}
     before = None

@@ -36,6 +36,9 @@ LARGEST_GAP_M = 2e-3
 class LaserFrame:
     """Two beams in the robot's base.
 
+    Raises `RankDeficientError` when two points of a beam coincide, or the beams are nearly
+    parallel; `InputError` when the beams pass each other at more than 2 mm.
+
     Attributes
     ----------
     points : (4, 3) points A, B on the x-beam and C, D on the y-beam, base, m; beams point from A
@@ -44,13 +47,6 @@ class LaserFrame:
         frame serves both measurements of a change, so that its error cancels.
     reach : (2,) how far from its middle each beam is broken, m: negative where a tool must cover
         more than half of the light. It moves the height of a tip, and nothing else.
-
-    Raises
-    ------
-    RankDeficientError
-        When two points of a beam coincide, or the beams are nearly parallel.
-    InputError
-        When the beams pass each other at more than 2 mm.
     """
 
     points: Array
@@ -138,10 +134,7 @@ def calibrate_laser(
     ``radius_m`` the widths of the shadows give the beams' reach. A constant latency moves a
     point by speed times latency: give the means of sweeps back and forth.
 
-    Raises
-    ------
-    InputError
-        When one is missing; further what `LaserFrame` raises.
+    Raises `InputError` when one is missing; further what `LaserFrame` raises.
     """
     missing = [f"{p}{i}" for p in POINTS for i in range(1, 5) if f"{p}{i}" not in flange]
     if missing:
@@ -191,10 +184,7 @@ class LaserFile:
 def write_laser(path: Path, placed: LaserFile) -> None:
     """Write a laser file in millimetres, all digits kept; the file appears whole or not.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     laser = placed.laser
     document: Document = {
@@ -213,10 +203,8 @@ def write_laser(path: Path, placed: LaserFile) -> None:
 def read_laser(path: Path) -> LaserFile:
     """Read a laser file.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when it is not as docs/tool.md says, or its points are no two beams.
+    Raises `InputError`, naming file and key, when it is not as docs/tool.md says, or its points are
+    no two beams.
     """
     top = read_fields(path, "laser file")
     top.only(*REQUIRED, "serial")
@@ -244,12 +232,8 @@ def read_laser(path: Path) -> LaserFile:
 def read_laser_for(path: Path, arm: SerialArm) -> LaserFile:
     """Read a laser file that was made with ``arm``.
 
-    Raises
-    ------
-    InputError
-        As `read_laser`.
-    WrongRobotError
-        When it was made with another nominal model.
+    Raises `InputError` as `read_laser`; `WrongRobotError` when it was made with another nominal
+    model.
     """
     placed = read_laser(path)
     require_made_for(arm, path, placed.robot, placed.model_hash, "place the beams")
@@ -271,17 +255,15 @@ class FlangePath(Protocol):
 class JointPath:
     """The flange from joint readings, with cubic splines between them.
 
+    Raises `TooFewSamplesError` or `InputError`: fewer than four readings; stamps that do not
+    increase.
+
     Attributes
     ----------
     arm : the model in force, so that the thermal drift is in the poses.
     time_s : (n,) stamps of the readings, in increasing order.
     q : (n, joints) readings, rad (prismatic: m).
     longest_gap_s : longest pause between two readings around an edge.
-
-    Raises
-    ------
-    TooFewSamplesError, InputError
-        Fewer than four readings; stamps that do not increase.
     """
 
     arm: SerialArm
@@ -310,10 +292,7 @@ class JointPath:
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """T_base_flange (m, 4, 4) and twist (m, 6): of its origin, m/s, and turning, rad/s, base.
 
-        Raises
-        ------
-        InputError
-            When readings are missing around one of the times.
+        Raises `InputError` when readings are missing around one of the times.
         """
         after = np.searchsorted(self.time_s, time_s, side="right")
         inside = (after > 0) & (after < len(self.time_s))
@@ -387,10 +366,8 @@ def axis_from_centres(
     second lower. ``centre``: (2,) tool's centre in the beam plane then, laser frame, m. In the
     laser frame the axis is (O1 - O2) - dz z (thesis eq. 4-11, from the tip's side).
 
-    Raises
-    ------
-    RankDeficientError
-        When both circles are at one height, or the axis lies nearly in the beam plane.
+    Raises `RankDeficientError` when both circles are at one height, or the axis lies nearly in the
+    beam plane.
     """
     R_laser_base = laser.T_base_laser[:3, :3].T
     moved = R_laser_base @ (T_base_flange[1][:3, 3] - T_base_flange[0][:3, 3])

@@ -182,10 +182,7 @@ SETTINGS = (
 def taught_tool(settings: Mapping[str, Any], nominal: SerialArm) -> NDArray[np.float64]:
     """T_flange_tool (4, 4) as taught: by the parameters, else by the robot file.
 
-    Raises
-    ------
-    InputError
-        When the quaternion is not of unit length.
+    Raises `InputError` when the quaternion is not of unit length.
     """
     given = given_pose(settings, "taught")
     return nominal.T_flange_tool if given is None else given
@@ -196,10 +193,7 @@ def session_config(
 ) -> ToolConfig:
     """Settings of the session, in SI.
 
-    Raises
-    ------
-    InputError
-        When a length or speed is out of range.
+    Raises `InputError` when a length or speed is out of range.
     """
     return ToolConfig(
         points_m=rows_of(laser.points),

@@ -128,10 +128,7 @@ class MeasuringPlan:
         ``seen`` (4, 4): the tool in the flange frame as the steps so far show it; needed by what
         `needs_tool` names.
 
-        Raises
-        ------
-        InputError
-            When it is missing.
+        Raises `InputError` when it is missing.
         """
         name = self.names[number - 1]
         if self.needs_tool(number) and seen is None:
@@ -245,10 +242,7 @@ class RunTraits:
     def require_readings(self, count: int, span_s: float, limits: TraitLimits) -> None:
         """Refuse ``count`` readings over a time where this run would have had clearly more.
 
-        Raises
-        ------
-        TooFewSamplesError
-            When messages are lost.
+        Raises `TooFewSamplesError` when messages are lost.
         """
         expected = self.rate_hz * span_s
         lost = 1.0 - count / expected if expected > 0.0 else 0.0
@@ -263,14 +257,8 @@ class RunTraits:
     def require_like(self, healthy: "RunTraits", limits: TraitLimits) -> None:
         """Refuse a run that differs from the healthy tool's in what no bend changes.
 
-        Raises
-        ------
-        ClockError
-            When the edges are later or earlier than they were.
-        BeamError
-            When one beam alone sees the tool grown or shrunk.
-        WrongToolError
-            When both do.
+        Raises `ClockError` when the edges are later or earlier than they were; `BeamError` when one
+        beam alone sees the tool grown or shrunk; `WrongToolError` when both do.
         """
         later = self.latency_s - healthy.latency_s
         sigma = float(np.hypot(self.latency_sigma_s, healthy.latency_sigma_s))
@@ -314,10 +302,7 @@ def require_even(rates_hz: Sequence[float], limits: TraitLimits) -> None:
     Measured under loss it would hide what is lost later. A loss that is alike in all steps does
     not show.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When the slowest and the fastest step differ by more than the limit.
+    Raises `TooFewSamplesError` when the slowest and the fastest step differ by more than the limit.
     """
     slowest, fastest = min(rates_hz), max(rates_hz)
     if _beyond(1.0 - slowest / fastest, 0.0, limits.lost):
@@ -394,10 +379,7 @@ class ToolConfig:
     def of_document(cls, document: Mapping[str, Any]) -> "ToolConfig":
         """Read what `document` gave, also after JSON.
 
-        Raises
-        ------
-        InputError
-            When it has other settings than this version knows.
+        Raises `InputError` when it has other settings than this version knows.
         """
         parts: dict[str, Any] = {
             "motion": MeasuringMotion,
@@ -508,11 +490,8 @@ class ToolRun:
     def take(self, edges: Sequence[EdgeSample], stamps: NDArray[np.int64], q: Array) -> None:
         """Add the awaited step with its edges and joint readings.
 
-        Raises
-        ------
-        RobocalError
-            When the edges make no sense, no tool explains the steps so far, or they differ from the
-            healthy tool's in what no bend changes.
+        Raises `RobocalError` when the edges make no sense, no tool explains the steps so far, or
+        they differ from the healthy tool's in what no bend changes.
         """
         step, rule = self.awaited, self.config.input
         beams: list[Beam] = [sample.beam for sample in edges]

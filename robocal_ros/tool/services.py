@@ -432,10 +432,8 @@ class TcfMotion:
     def activate(self, session: ToolSession) -> None:
         """Begin, disarmed.
 
-        Raises
-        ------
-        InputError
-            When a limit is given for another number of joints, or the robot has none.
+        Raises `InputError` when a limit is given for another number of joints, or the robot has
+        none.
         """
         require_limits(session.nominal, self._config)
         self._looked_s = -math.inf

@@ -173,10 +173,7 @@ class ToolResults:
     def taught(self, mode: str) -> Array:
         """What a mode measures (4, 4), as it was taught: the tool, or the mandrel.
 
-        Raises
-        ------
-        ConflictError
-            When there is no mandrel, or nobody knows how it measures.
+        Raises `ConflictError` when there is no mandrel, or nobody knows how it measures.
         """
         if mode not in (WITNESS, WITNESS_REFERENCE):
             return self._config.T_flange_taught
@@ -205,10 +202,7 @@ class ToolResults:
     def finish(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         """Solve a complete run.
 
-        Raises
-        ------
-        RobocalError
-            When no tool explains it, or the result cannot be kept.
+        Raises `RobocalError` when no tool explains it, or the result cannot be kept.
         """
         ends = {
             FULL: self._full,
@@ -424,13 +418,7 @@ class ToolSession(SessionBase):
         return None if self.run is None else self.run.awaited
 
     def add(self, sample: JointSample | EdgeSample) -> None:
-        """Take a sample.
-
-        Raises
-        ------
-        InputError
-            When it cannot be used; the message says why.
-        """
+        """Take a sample. Raises `InputError` when it cannot be used; the message says why."""
         if isinstance(sample, JointSample):
             self._add_joints(sample)
         else:
@@ -606,12 +594,8 @@ def tool_session_as_recorded(
 ) -> ToolSession:
     """Make a session with the recorded settings; an empty history gets what was in force.
 
-    Raises
-    ------
-    WrongRobotError
-        The recording was made with another nominal model.
-    InputError
-        The configuration cannot be read.
+    Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
+    configuration cannot be read.
     """
     arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
     config = ToolConfig.of_document(arguments["config"])

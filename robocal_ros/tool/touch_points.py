@@ -112,12 +112,8 @@ def fit_four(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
 
     ``sigma_m`` of one touch; None where it is to be estimated from the residuals.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than four touches.
-    RankDeficientError
-        When the flange was turned about one axis only (rank 5 of 6), or hardly at all.
+    Raises `TooFewSamplesError`: fewer than four touches; `RankDeficientError` when the flange was
+    turned about one axis only (rank 5 of 6), or hardly at all.
     """
     count = len(T_base_flange)
     if count < FEWEST_TOUCHES:
@@ -148,12 +144,8 @@ def fit_seven(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
     along its x, from P6 to P7 along its z. With both in base, y = z x x, orthonormalised, and
     ``R_flange_tool = R_base_flange^T [x y z]``.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        As `fit_four`; when the moves are short or nearly parallel.
-    InputError
-        When the flange turned between the last three.
+    Raises `TooFewSamplesError` or `RankDeficientError` as `fit_four`; when the moves are short or
+    nearly parallel; `InputError` when the flange turned between the last three.
     """
     touches = fit_four(T_base_flange[:-3], sigma_m)
     last = T_base_flange[-3:]
@@ -220,10 +212,7 @@ def sweep_axis(
     ``up``, ``down`` (2,): flange x_b at break and restore of each beam; ``turned_*`` the same after
     the turn by 90 deg. In m.
 
-    Raises
-    ------
-    InputError
-        When an edge is missing.
+    Raises `InputError` when an edge is missing.
     """
     lean = _middle(up, "upper beam") - _middle(down, "lower beam")
     turned = _middle(turned_up, "upper beam, turned") - _middle(turned_down, "lower beam, turned")
@@ -245,6 +234,9 @@ def parallel_tip(
 ) -> Array:
     """Tip (3,) in the flange frame, m, with the straightened tool.
 
+    Raises `ResidualError` when the re-sweep shows a tool that still leans; `RankDeficientError`
+    when both sweeps have one orientation.
+
     Parameters
     ----------
     x_beam_m : place of both beams along x_b, m.
@@ -252,13 +244,6 @@ def parallel_tip(
     x_straight : flange x_b at break and restore, of the upper and the lower beam, at each of them.
     z_first_break_m : flange height at the first break of the upper beam, driving down: the tip is
         D = z - h_up below the flange (eq. 4-7).
-
-    Raises
-    ------
-    ResidualError
-        When the re-sweep shows a tool that still leans.
-    RankDeficientError
-        When both sweeps have one orientation.
     """
     rows, right = [np.array([0.0, 0.0, 1.0])], [beams.up_m - z_first_break_m]
     frame = T_straight[0]
@@ -306,21 +291,15 @@ class ParallelFit:
 def fit_parallel(beams: ParallelBeams, x_beam_m: float | None, edges: Edges) -> ParallelFit:
     """Axis from the sweeps ``straight`` and ``turned``; the tip where it was straightened too.
 
+    Raises `TooFewSamplesError` when a sweep is missing; `InputError` when edges are odd in number,
+    the flange is turned otherwise than methods say, or the place of the beams is missing;
+    `ResidualError` or `RankDeficientError` as `parallel_tip`.
+
     Parameters
     ----------
     x_beam_m : place of both beams along x_b, m; needed for the tip.
     edges : flange poses T_base_flange (m, 4, 4) at the edges, by sweep and beam: break and restore,
         or several of both; ``plunge`` of the upper beam has its first break.
-
-    Raises
-    ------
-    TooFewSamplesError
-        When a sweep is missing.
-    InputError
-        When edges are odd in number, the flange is turned otherwise than methods say, or the place
-        of the beams is missing.
-    ResidualError, RankDeficientError
-        As `parallel_tip`.
     """
     more = [name for name, _ in edges if name not in FIRST]
     _require(edges, [*FIRST, *AGAIN] if more else FIRST)
