@@ -6,11 +6,11 @@ callback lets an exception out: in rclpy's events executor one of an action's cl
 process. docs/joint_correction.md tells it to users.
 """
 
-import functools
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from robocal_ros.correction.robot_state import SentPath
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.samples import TAUGHT
+from robocal_ros.motion.driver import guarded
 from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 
 Result = FollowJointTrajectory.Result
@@ -73,9 +74,10 @@ class TrajectoryProxy:
         name: str,
         correct: Callable[[Any], tuple[Any, SentPath | None]],
         sent: Callable[[], None],
-        lost: Callable[[str], None],
+        lost: Callable[[str], object],
     ) -> None:
         self._node, self._correct, self._sent, self._lost = node, correct, sent, lost
+        self._safe = partial(guarded, node)
         self._goals: list[_Goal] = []
         self._clients: dict[str, ActionClient] = {}
         self.controller = ""  # resolved name of the controller's action; empty when closed
@@ -119,21 +121,6 @@ class TrajectoryProxy:
         """Take both ends down."""
         for end in (self._server, *self._clients.values()):
             end.destroy()
-
-    def _safe(self, act: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
-        """``act``, of which no exception gets out; ``otherwise`` is its answer then."""
-
-        @functools.wraps(act)
-        def callback(*given: Any) -> Any:
-            try:
-                return act(*given)
-            except Exception:
-                self._node.get_logger().error(
-                    f"a defect of this software, please report it:\n{traceback.format_exc()}"
-                )
-                return otherwise
-
-        return callback
 
     def _when_done(self, future: Future, act: Callable[[_Goal, Any], None], goal: _Goal) -> None:
         future.add_done_callback(self._safe(lambda done: act(goal, done.result())))
@@ -192,10 +179,30 @@ class TrajectoryProxy:
         return GoalResponse.REJECT
 
     def _begin(self, caller: ServerGoalHandle) -> None:
+        """Correct the goal and send it."""
         caller.execute()
-        goal = _Goal(caller)
+        goal, request = _Goal(caller), caller.request
         try:
-            self._forward(goal, caller.request)
+            goal.servers, client = self._servers(), self._clients[self.controller]
+            if not (goal.servers and client.server_is_ready()):
+                raise ControllerError(f"no controller offers {self.controller}: start it")
+            if len(goal.servers) > 1:  # each of them would move the robot
+                raise ControllerError(
+                    f"{len(goal.servers)} nodes offer {self.controller}: end all but one; one that "
+                    "was killed counts until DDS gives it up"
+                )
+            request.trajectory, goal.path = self._correct(request.trajectory)
+            self._goals.append(goal)
+            future = client.send_goal_async(
+                request,
+                self._safe(lambda message: self._feedback(goal, message.feedback)),
+                caller.goal_id,
+            )
+            goal.asked_s = time.monotonic()
+            if goal.path is not None:
+                goal.path.begin(goal.asked_s)
+            self._sent()
+            self._when_done(future, self._answered, goal)
         except RobocalError as error:
             about_joints = isinstance(error, RefusedError) and error.reason in _ABOUT_JOINTS
             code = Result.INVALID_JOINTS if about_joints else Result.INVALID_GOAL
@@ -206,29 +213,6 @@ class TrajectoryProxy:
             self._node.get_logger().error(traceback.format_exc())
             self._fail(goal, f"a defect of this software, please report it: {error!r}")
 
-    def _forward(self, goal: _Goal, request: Any) -> None:
-        """Correct the goal and send it."""
-        goal.servers, client = self._servers(), self._clients[self.controller]
-        if not (goal.servers and client.server_is_ready()):
-            raise ControllerError(f"no controller offers {self.controller}: start it")
-        if len(goal.servers) > 1:  # each of them would move the robot
-            raise ControllerError(
-                f"{len(goal.servers)} nodes offer {self.controller}: end all but one; one that was "
-                "killed counts until DDS gives it up"
-            )
-        request.trajectory, goal.path = self._correct(request.trajectory)
-        self._goals.append(goal)
-        future = client.send_goal_async(
-            request,
-            self._safe(lambda message: self._feedback(goal, message.feedback)),
-            goal.caller.goal_id,
-        )
-        goal.asked_s = time.monotonic()
-        if goal.path is not None:
-            goal.path.begin(goal.asked_s)
-        self._sent()
-        self._when_done(future, self._answered, goal)
-
     def _cancelled(self, caller: ServerGoalHandle) -> CancelResponse:
         for goal in self._goals:
             if goal.caller is caller:
@@ -238,9 +222,18 @@ class TrajectoryProxy:
 
     def _forward_cancel(self, goal: _Goal) -> None:
         goal.cancel = True
-        if goal.accepted is not None:  # else it follows the acceptance
-            goal.asked_s = time.monotonic()
-            self._when_done(goal.accepted.cancel_goal_async(), self._cancel_answered, goal)
+        if goal.accepted is None:  # it follows the acceptance
+            return
+
+        def answered(goal: _Goal, answer: Any) -> None:
+            goal.asked_s = None
+            if answer.return_code == CancelGoal.Response.ERROR_NONE:
+                self._stopped(goal)  # it holds from now on, its result follows
+            elif answer.return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID:
+                self._fail(goal, f"{self.controller} does not know the goal any more")
+
+        goal.asked_s = time.monotonic()
+        self._when_done(goal.accepted.cancel_goal_async(), answered, goal)
 
     def _answered(self, goal: _Goal, accepted: ClientGoalHandle) -> None:
         goal.asked_s = None
@@ -257,13 +250,6 @@ class TrajectoryProxy:
         if not goal.over:
             goal.result = accepted.get_result_async()
             self._when_done(goal.result, self._finished, goal)
-
-    def _cancel_answered(self, goal: _Goal, answer: Any) -> None:
-        goal.asked_s = None
-        if answer.return_code == CancelGoal.Response.ERROR_NONE:
-            self._stopped(goal)  # it holds from now on, its result follows
-        elif answer.return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID:
-            self._fail(goal, f"{self.controller} does not know the goal any more")
 
     def _feedback(self, goal: _Goal, feedback: Any) -> None:
         """Un-correct feedback and pass it on; what one of its points lacks has no error."""

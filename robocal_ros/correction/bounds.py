@@ -166,17 +166,6 @@ def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialAr
             )
 
 
-def require_solved(result: StagedResult) -> None:
-    """Refuse a point that has no solution near by."""
-    solved = result.arm.converged
-    if result.tool is not None:
-        solved = solved & result.tool.converged
-    if not solved.all():
-        point = int(np.argmin(solved)) + 1
-        detail = f"the pose is at the edge of the reach (point {point})"
-        raise RefusedError(Reason.NOT_SOLVED, detail)
-
-
 def require_limits(q: Array, arm: SerialArm) -> None:
     """Refuse joints (m, n) beyond the arm's limits, and what is no number."""
     inside = (q >= arm.lower - ROUNDING) & (q <= arm.upper + ROUNDING)
@@ -346,7 +335,13 @@ class DesiredOffset:
         if self.stage is None:
             return np.zeros_like(q), None
         result = self.stage.correct(q)
-        require_solved(result)
+        solved = result.arm.converged
+        if result.tool is not None:
+            solved = solved & result.tool.converged
+        if not solved.all():
+            point = int(np.argmin(solved)) + 1
+            detail = f"the pose is at the edge of the reach (point {point})"
+            raise RefusedError(Reason.NOT_SOLVED, detail)
         policy = self._config.policy
         if policy is Policy.REFUSE:
             require_within(result, self._config, self._arm)
@@ -452,7 +447,11 @@ class CorrectionGate:
             raise RefusedError(Reason.WRONG_ROBOT, detail)
         self.waiting = None
         if self._model is not None and not again:
-            if _same(model, self._model):
+            known = self._model
+            same = np.array_equal(model.mdh, known.mdh) and np.array_equal(
+                model.T_base_root, known.T_base_root
+            )
+            if same and model.revision == known.revision:
                 self._model = model
                 return
             if not _later(model, self._model):
@@ -568,7 +567,11 @@ class ToolGate:
         """
         if not tool.accepted:
             raise RefusedError(Reason.NOT_ACCEPTED, f"tool revision {tool.revision}")
-        self._require_frames(tool)
+        parent, child = self._config.flange_frame, self._config.tool_frame
+        if child and tool.child != child:
+            raise RefusedError(Reason.BAD_TOOL, f"child '{tool.child}', expected '{child}'")
+        if tool.parent != parent:
+            raise RefusedError(Reason.BAD_TOOL, f"parent '{tool.parent}', expected '{parent}'")
         if tool.T_flange_tool is not None:
             self._require_small(tool.T_flange_tool)
         self.refused = None
@@ -596,13 +599,6 @@ class ToolGate:
         """Use the tool that waits, if there is one."""
         self.in_use, self.waiting = self.waiting or self.in_use, None
 
-    def _require_frames(self, tool: OfferedTool) -> None:
-        parent, child = self._config.flange_frame, self._config.tool_frame
-        if child and tool.child != child:
-            raise RefusedError(Reason.BAD_TOOL, f"child '{tool.child}', expected '{child}'")
-        if tool.parent != parent:
-            raise RefusedError(Reason.BAD_TOOL, f"parent '{tool.parent}', expected '{parent}'")
-
     def _require_small(self, T_flange_tool: Array) -> None:
         taught, bound = self._taught, self._config.tool
         shift = float(np.linalg.norm(T_flange_tool[:3, 3] - taught[:3, 3]))
@@ -613,14 +609,6 @@ class ToolGate:
                 f"{shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg from the taught tool, "
                 f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
             )
-
-
-def _same(a: OfferedModel, b: OfferedModel) -> bool:
-    return (
-        a.revision == b.revision
-        and np.array_equal(a.mdh, b.mdh)
-        and np.array_equal(a.T_base_root, b.T_base_root)
-    )
 
 
 def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:

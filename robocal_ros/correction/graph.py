@@ -73,22 +73,23 @@ class Leases:
 
     def words(self, now_s: float) -> str:
         """Who holds one, and what for; empty when nobody does."""
-        held = [
-            f"{holder}: {lease.purpose or 'no purpose told'}"
-            for holder, lease in self._held.items()
-            if lease.held and now_s - lease.heard_s <= LEASE_S
-        ]
-        return "; ".join([*held, *filter(None, [self.lost(now_s)])])
+        return "; ".join([*self._holders(now_s, lost=False), *filter(None, [self.lost(now_s)])])
 
     def lost(self, now_s: float) -> str:
         """Whose lease ended by silence while the robot may still move by it; empty: nobody's."""
         return "; ".join(
-            f"{holder}: {lease.purpose or 'no purpose told'}: it has not renewed its lease for "
-            f"{LEASE_S:g} s, it died or hangs, and the robot may still move by it: the lease "
-            f"lasts until the robot has stood for {STOOD_S:g} s"
-            for holder, lease in self._held.items()
-            if lease.held and now_s - lease.heard_s > LEASE_S
+            f"{holder}: it has not renewed its lease for {LEASE_S:g} s, it died or hangs, and the "
+            "robot may still move by it: the lease lasts until the robot has stood for "
+            f"{STOOD_S:g} s"
+            for holder in self._holders(now_s, lost=True)
         )
+
+    def _holders(self, now_s: float, *, lost: bool) -> list[str]:
+        return [
+            f"{holder}: {lease.purpose or 'no purpose told'}"
+            for holder, lease in self._held.items()
+            if lease.held and (now_s - lease.heard_s > LEASE_S) is lost
+        ]
 
 
 class JointSources:
@@ -253,16 +254,13 @@ class CommandSources:
         last, before_s = self._topic, self._heard_s
         self._topic, self._heard_s, self._gone = topic, now_s, ""
         if now_s - before_s <= self._at_once_s:
+            rivals, count = "", self.inputs[topic].get_publisher_count()
             if topic != last:
-                self._name(f"commands come on {last} and {topic} at once: stop one of them", now_s)
-            elif (count := self.inputs[topic].get_publisher_count()) > 1:
-                self._name(f"{topic} has {count} publishers: stop all but one", now_s)
-        return self._rivals_at(now_s)
-
-    def _name(self, rivals: str, now_s: float) -> None:
-        self._rivals, self._rivals_s = rivals, now_s
-
-    def _rivals_at(self, now_s: float) -> str:
+                rivals = f"commands come on {last} and {topic} at once: stop one of them"
+            elif count > 1:
+                rivals = f"{topic} has {count} publishers: stop all but one"
+            if rivals:
+                self._rivals, self._rivals_s = rivals, now_s
         return self._rivals if now_s - self._rivals_s <= self._at_once_s else ""
 
     def look(self) -> None:
@@ -272,4 +270,5 @@ class CommandSources:
 
     def words(self, now_s: float) -> str:
         """What is wrong; empty when all is well."""
-        return self._rivals_at(now_s) or self._gone
+        lately = now_s - self._rivals_s <= self._at_once_s
+        return (self._rivals if lately else "") or self._gone

@@ -330,22 +330,19 @@ class StagedCorrection:
         if q is not self._solved:
             self.correct_one(q, self._one)
         found, self._solved = np.empty(self.n), None
-        whole = not self._one[:, self.n + solution.WEAK].any()
-        if not (whole and self._by_chain(corrected, velocity, q, self._back_works, found)):
+        works, whole = self._back_works, not self._one[:, self.n + solution.WEAK].any()
+        if not (
+            whole
+            and self.n == 6
+            and not self._free
+            and solution.velocity_by_chain(corrected, velocity, q, works[0], works[-1], found)
+        ):
             given = self._largest, self._free, self._works
             at_q = self._one[-1, : self.n].copy()
             solution.taught_velocity_by_differences(
                 q, velocity, at_q, *given, self._spare, self._one, found
             )
         return found
-
-    def _by_chain(
-        self, before: Array, velocity: Array, after: Array, works: Array, out: Array
-    ) -> bool:
-        """Velocities ``out`` (n,) at ``after`` by the chain rule; whether that is possible."""
-        if self.n != 6 or self._free:
-            return False
-        return solution.velocity_by_chain(before, velocity, after, works[0], works[-1], out)
 
     def uncorrect(self, corrected: Array) -> Array:
         """Taught joints (m, n) of corrected ones: the inverse of `correct`.

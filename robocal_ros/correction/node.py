@@ -166,7 +166,11 @@ class JointCorrectionNode(HouseNode):
         self._listen(TARGETS, targets, partial(act, TARGETS), endpoints.HEARTBEAT)
         commands = partial(ArrayMessage, self._names)
         self._listen(COMMANDS, commands, partial(act, COMMANDS), endpoints.HEARTBEAT)
-        self._listen(TRAJECTORY, self._read_path, self._on_path, endpoints.RELIABLE)
+        counted = self._session.counted
+        self._listen(
+            TRAJECTORY, lambda came: counted(lambda: PathMessage(came)), self._on_path,
+            endpoints.RELIABLE,
+        )  # fmt: skip
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_service(Trigger, "~/acknowledge", self._on_acknowledge)
         self.add_service(Trigger, "~/take_over", self._on_take_over)
@@ -181,7 +185,12 @@ class JointCorrectionNode(HouseNode):
         if self.settings[ACTION]:
             if self._proxy is None:
                 self._proxy = TrajectoryProxy(
-                    self, f"~/{ACTION}", self._correct_goal, self._goal_sent, self._goal_lost
+                    self,
+                    f"~/{ACTION}",
+                    self._correct_goal,
+                    self._goal_sent,
+                    # the robot may still follow it, and is stopped by where it is
+                    lambda why: self._stop_by_readings(why, time.monotonic()),
                 )
             self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
@@ -337,29 +346,22 @@ class JointCorrectionNode(HouseNode):
         self._track.read(command, now)
         self._put_out(STATES, message, command, taught)
 
-    def _read_path(self, came: bytes) -> PathMessage:
-        return self._session.counted(lambda: PathMessage(came))
-
     def _on_path(self, message: PathMessage) -> None:
-        if not message.points:
-            self._stop_for_no_points()
+        if not message.points:  # what its sender means: a controller drops it and drives on
+            words = (
+                f"{TRAJECTORY} has no points, which stops no robot: a controller drops it and "
+                "drives on; the robot is slowed down in its place"
+            )
+            if self._log_limit.allows(TRAJECTORY, words, time.monotonic()):
+                self.get_logger().error(words)
+            if not self._shadow:
+                self._stop(f"{TRAJECTORY} without points")
             return
         self._put_out(TRAJECTORY, message, *self._corrected(message))
         self._by_action = False
         if self._session.output.path is not None:
             self._session.output.path.begin(time.monotonic())
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
-
-    def _stop_for_no_points(self) -> None:
-        """Do what its sender means: a controller drops such a trajectory and drives on."""
-        words = (
-            f"{TRAJECTORY} has no points, which stops no robot: a controller drops it and drives "
-            "on; the robot is slowed down in its place"
-        )
-        if self._log_limit.allows(TRAJECTORY, words, time.monotonic()):
-            self.get_logger().error(words)
-        if not self._shadow:
-            self._stop(f"{TRAJECTORY} without points")
 
     def _corrected(
         self, message: PathMessage, *, is_goal: bool = False
@@ -397,10 +399,6 @@ class JointCorrectionNode(HouseNode):
         """Tell what a goal is corrected by."""
         self._by_action = True
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
-
-    def _goal_lost(self, why: str) -> None:
-        """The robot may still follow it, and is stopped by where it is."""
-        self._stop_by_readings(why, time.monotonic())
 
     def _stop(self, why: str) -> None:
         """Bring what this node moves to rest: by what was put out, else by where the robot is."""

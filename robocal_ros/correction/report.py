@@ -247,7 +247,17 @@ class CorrectionReport:
             faults = [*faults, f"{Reason.START_MISMATCH.value}: {status.mismatch}"]
         for fault in faults:
             health.worsen(ERROR, fault)
-        for warning in [*warnings, *_warnings(status), self.log.damage, self.log.fault]:
+        waits = status.waiting_revision
+        of_model = {
+            status.stale: True,
+            f"model revision {status.revision}: {status.survey}": status.survey.beyond,
+            f"model revision {waits} was refused, ~/take_over looks at it again": waits is not None,
+            "enabled, but neither a model nor a tool was taken over": (
+                status.enabled and status.revision is None and not status.new_tool
+            ),
+        }
+        found = [words for words, is_so in of_model.items() if is_so]
+        for warning in [*warnings, *found, self.log.damage, self.log.fault]:
             if warning:
                 health.worsen(WARN, warning)
         health.values = _figures(status)
@@ -256,20 +266,6 @@ class CorrectionReport:
 
 def _counts(what: str, counts: Mapping[Reason, int]) -> dict[str, Sequence[Any]]:
     return {f"{what}_reasons": [r.value for r in counts], what: list(counts.values())}
-
-
-def _warnings(status: CorrectionStatus) -> list[str]:
-    """What an operator should look at."""
-    said = [status.stale]
-    if status.survey.beyond:
-        said.append(f"model revision {status.revision}: {status.survey}")
-    if status.waiting_revision is not None:
-        said.append(
-            f"model revision {status.waiting_revision} was refused, ~/take_over looks at it again"
-        )
-    if status.enabled and status.revision is None and not status.new_tool:
-        said.append("enabled, but neither a model nor a tool was taken over")
-    return said
 
 
 def _figures(status: CorrectionStatus) -> dict[str, object]:

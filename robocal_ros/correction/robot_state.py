@@ -577,6 +577,8 @@ class RobotTrack:
     ----------
     near : (n,) one that moved by less within `STANDING_S` stands, rad (prismatic: m).
     age_limit_s : older readings tell nothing.
+
+    ``velocity`` (n,): as read last; NaN where there is none.
     """
 
     def __init__(self, arm: SerialArm, near: Array, age_limit_s: float) -> None:
@@ -584,7 +586,8 @@ class RobotTrack:
         self._near, self._age_limit_s = near, age_limit_s
         changes = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
         self._turned = 0.5 * VELOCITY_S * changes + near / LEAST_TRACK_S
-        self._q, self._qd = np.full(arm.n, np.nan), np.full(arm.n, np.nan)
+        self._q = np.full(arm.n, np.nan)
+        self.velocity = np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
         self._place, self._place_s = np.full(arm.n, np.nan), np.inf  # where it stands, since when
@@ -604,9 +607,9 @@ class RobotTrack:
         if was_silent:  # what it did meanwhile is not known
             self._track.clear()
         self._q[self._index] = np.clip(state.position[self._column], -FARTHEST, FARTHEST)
-        self._qd[self._index] = np.nan
+        self.velocity[self._index] = np.nan
         if state.velocity is not None and len(state.velocity) == len(state.names):
-            self._qd[self._index] = state.velocity[self._column]
+            self.velocity[self._index] = state.velocity[self._column]
         self._read_s[self._index] = now_s
         self._track.append((now_s, self._q.copy()))
         while len(self._track) > 2 and self._track[1][0] <= now_s - STANDING_S:
@@ -617,40 +620,32 @@ class RobotTrack:
     def _silent(self, now_s: float) -> bool:
         return not now_s - float(np.min(self._read_s)) <= self._age_limit_s
 
-    @property
-    def velocity(self) -> Array:
-        """(n,) as read last; NaN where there is none."""
-        return self._qd
-
     def here(self, now_s: float) -> tuple[Array, Array] | None:
-        """Joints and speeds (n,) now; None where they were not all read lately."""
+        """Joints and speeds (n,) now; None where they were not all read lately.
+
+        Those read last, where the readings of before bear them out; else those of most readings
+        (Theil-Sen: the medians of the slopes of pairs, and of where each reading puts it): a stop
+        from a single wild reading would be a motion of its own.
+        """
         if self._silent(now_s):
             return None
-        q, qd = self._newest()
-        here = q + qd * (now_s - float(np.min(self._read_s)))
-        return (here, qd) if np.isfinite(here).all() else None
-
-    def _newest(self) -> tuple[Array, Array]:
-        """Joints and speeds (n,) as read last, where the readings of before bear them out.
-
-        Else those of most readings (Theil-Sen: the medians of the slopes of pairs, and of where
-        each reading puts it): a stop from a single wild reading would be a motion of its own.
-        """
-        read = self._qd if self._qd.any() else np.nan * self._qd  # some drivers say 0 in motion
+        # some drivers say 0 in motion
+        place, speed = self._q, self.velocity if self.velocity.any() else np.nan * self.velocity
         since_s = self._track[-1][0] - VELOCITY_S
         count = max(sum(at_s >= since_s for at_s, _ in self._track), LEAST)
         recent = list(self._track)[-count:]
         times, q = np.array([at_s for at_s, _ in recent]), np.array([place for _, place in recent])
         i, j = np.triu_indices(len(times), 1)
         apart = times[j] - times[i] >= LEAST_TRACK_S
-        if not apart.any():
-            return self._q, read
-        i, j = i[apart], j[apart]
-        slope = np.median((q[j] - q[i]) / (times[j] - times[i])[:, None], axis=0)
-        place = np.median(q + (times[-1] - times)[:, None] * slope, axis=0)
-        speed = np.where(np.abs(read - slope) <= self._turned, read, slope)
-        beside = self._turned * max(float(times[-1] - times[0]), LEAST_TRACK_S)
-        return np.where(np.abs(self._q - place) <= beside, self._q, place), speed
+        if apart.any():
+            i, j = i[apart], j[apart]
+            slope = np.median((q[j] - q[i]) / (times[j] - times[i])[:, None], axis=0)
+            middle = np.median(q + (times[-1] - times)[:, None] * slope, axis=0)
+            speed = np.where(np.abs(speed - slope) <= self._turned, speed, slope)
+            beside = self._turned * max(float(times[-1] - times[0]), LEAST_TRACK_S)
+            place = np.where(np.abs(self._q - middle) <= beside, self._q, middle)
+        here = place + speed * (now_s - float(np.min(self._read_s)))
+        return (here, speed) if np.isfinite(here).all() else None
 
     def behind(self, told: tuple[Array, Array], here: tuple[Array, Array]) -> bool:
         """Whether the robot is where a controller has it, but for its lag."""

@@ -101,10 +101,8 @@ class CorrectionSession:
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
         self._held: dict[Reason, str] = {}
-        self._interrupted: tuple[SentPath | None, StreamPhase] = (
-            None,
-            StreamPhase.IDLE,
-        )  # by the last path
+        # what the last path interrupted
+        self._interrupted: tuple[SentPath | None, StreamPhase] = None, StreamPhase.IDLE
         # of each kind and source: the last stamp, ns, and when it came
         self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
         self._refused: Counter[Reason] = Counter()
@@ -288,8 +286,7 @@ class CorrectionSession:
 
         Its first point lies ``ahead_s`` ahead. A stream ends by its `tail`.
         """
-        stream = RefusedError(Reason.STOPPED, "a stop was asked for")
-        self.stream.end(stream, now_s)
+        self.stream.end(RefusedError(Reason.STOPPED, "a stop was asked for"), now_s)
         stopped = self._paths.stop(now_s, ahead_s)
         if stopped is None:
             return None
@@ -313,14 +310,14 @@ class CorrectionSession:
         ``age_s``: how old they were on arrival, by their stamp. Joints of others pass as they are;
         velocities of which one is not finite are none.
         """
-        return self.counted(lambda: self._read(state, now_s, age_s))
-
-    def _read(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
-        self._require_order("reading", state, state.names, now_s)
-        index, column = self._state.find(state)
-        self._state.read(index, state.position[column], now_s, age_s)
-        self.output.note_place(now_s)
-        q, position, velocity = self._uncorrected(state, index, column, now_s)
+        try:
+            self._require_order("reading", state, state.names, now_s)
+            index, column = self._state.find(state)
+            self._state.read(index, state.position[column], now_s, age_s)
+            self.output.note_place(now_s)
+            q, position, velocity = self._uncorrected(state, index, column, now_s)
+        except RefusedError as error:
+            raise self._count(error) from None
         self._taught[:] = q
         return replace(state, position=position, velocity=velocity, mark=TAUGHT)
 

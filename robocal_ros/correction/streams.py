@@ -145,11 +145,6 @@ class TargetStream:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
         return elapsed_s > HELD_PERIODS * self._step_period_s()
 
-    def _usable_s(self, now_s: float) -> float:
-        """Time that the next output may use: a robot that stands makes no longer step."""
-        elapsed = max(now_s - self._output.out_s, 0.0)
-        return min(elapsed, self._step_period_s()) if self._holds(elapsed) else elapsed
-
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
 
@@ -171,7 +166,12 @@ class TargetStream:
             self.period_s, self._beat_s = np.nan, now_s
         self._note_interval(now_s)
         if index is not self._index or self.phase is StreamPhase.IDLE:
-            self._choose(index, q, now_s)
+            new = index[self._active[index] == 0.0]
+            if len(new):
+                self._begin(new, q, now_s)
+            self._active[:] = 0.0
+            self._active[index] = 1.0
+            self._index = index
         self._goal = q
         self._note(self._way, q, now_s, SPEED_S)
         self._velocity[:] = 0.0
@@ -181,15 +181,6 @@ class TargetStream:
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self._advance(now_s)
         return self._message(command)
-
-    def _choose(self, index: Index, q: Array, now_s: float) -> None:
-        """Other joints than before go out from now on; those that are new begin."""
-        new = index[self._active[index] == 0.0]
-        if len(new):
-            self._begin(new, q, now_s)
-        self._active[:] = 0.0
-        self._active[index] = 1.0
-        self._index = index
 
     def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
         """Go on after a pause only where the robot is where it was left, and can be there soon.
@@ -233,7 +224,9 @@ class TargetStream:
         """Put out what came in last, or as much of the way there as the speeds allow."""
         output = self._output
         self.come_to_rest(now_s)
-        elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
+        elapsed = longest = max(now_s - output.out_s, 0.0)
+        if self._holds(elapsed):  # a robot that stands makes no longer step
+            longest = min(elapsed, self._step_period_s())
         before, window = output.out.copy(), max(SENT_S, SENT_PERIODS * self._step_period_s())
         if longest < elapsed:  # the time in which the robot stood is no part of its motion
             self._sent.clear()

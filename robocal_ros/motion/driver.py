@@ -12,6 +12,7 @@ measured; as lines, where the hardware tells no velocities: the controller would
 a speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers 4.42.1).
 """
 
+import functools
 import time
 import traceback
 from array import array
@@ -503,14 +504,23 @@ class MotionDriver:
             robot.scaled(scaling, now_s)
 
 
-def guarded(node: EndpointNode, callback: Callable[[Future], None]) -> Callable[[Future], None]:
-    """For a client's callback: an exception in it would end the process."""
+def guarded(
+    node: EndpointNode, act: Callable[..., Any], otherwise: Any = None
+) -> Callable[..., Any]:
+    """``act`` as an action's or a client's callback, where an exception would end the process.
 
-    def call(future: Future) -> None:
+    ``otherwise`` is its answer then.
+    """
+
+    @functools.wraps(act)
+    def call(*given: Any) -> Any:
         try:
-            callback(future)
+            return act(*given)
         except Exception:
-            node.get_logger().error(traceback.format_exc())
+            node.get_logger().error(
+                f"a defect of this software, please report it:\n{traceback.format_exc()}"
+            )
+            return otherwise
 
     return call
 
