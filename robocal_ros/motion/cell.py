@@ -183,10 +183,7 @@ class MotionCell:
     def joints(self, path: TipPath, q_now: Array) -> JointPlan:
         """A plan along a path that begins where the robot stands.
 
-        Raises
-        ------
-        LimitError
-            As `kinematics.inverse.follow`.
+        Raises `LimitError` as `kinematics.inverse.follow`.
         """
         found = follow(
             self.arm, path.T_base_tip, path.twist, path.twist_rate, q_now, self.tool.p_tip
@@ -220,10 +217,7 @@ class MotionCell:
         The distance to be kept is what a stop from there needs, and the way from one checked
         instant to the next.
 
-        Raises
-        ------
-        LimitError
-            Names what comes near, where, and by how much.
+        Raises `LimitError`, which names what comes near, where, and by how much.
         """
         seen = self._sampled(plan)
         require_within_limits(self.arm, seen.q)
@@ -279,10 +273,7 @@ def joint_way(cell: MotionCell, q_from: ArrayLike, q_to: ArrayLike) -> JointPlan
 
     As fast as the limits of joints and tip allow; nothing of the cell is looked at.
 
-    Raises
-    ------
-    LimitError
-        When an end lies beyond a joint limit.
+    Raises `LimitError` when an end lies beyond a joint limit.
     """
     start, end = np.array(q_from, dtype=np.float64), np.array(q_to, dtype=np.float64)
     require_within_limits(cell.arm, np.stack([start, end]))
@@ -304,11 +295,8 @@ def departure(cell: MotionCell, q_now: ArrayLike, q_home: ArrayLike) -> JointPla
     Up along the laser's z, over the housing, down, each a straight line of the tip; then the
     joints go to the taught ones exactly.
 
-    Raises
-    ------
-    LimitError
-        Where the way passes a joint limit, the reach, a singularity or the housing, or ends in
-        another posture than the taught one.
+    Raises `LimitError` where the way passes a joint limit, the reach, a singularity or the housing,
+    or ends in another posture than the taught one.
     """
     q, home = np.array(q_now, dtype=np.float64), np.array(q_home, dtype=np.float64)
     corners = raised_way(cell, cell.T_base_tip(q), cell.T_base_tip(home), cell.housing.retract_m)
@@ -327,10 +315,8 @@ def departure(cell: MotionCell, q_now: ArrayLike, q_home: ArrayLike) -> JointPla
 def along(cell: MotionCell, q: Array, corners: list[Array], name: str) -> JointPlan:
     """Straight from pose to pose of the tip (4, 4), from joints (n,), at rest at each.
 
-    Raises
-    ------
-    LimitError
-        Where the way passes a joint limit, the reach, a singularity, or the housing.
+    Raises `LimitError` where the way passes a joint limit, the reach, a singularity, or the
+    housing.
     """
     plans: list[JointPlan] = []
     here = cell.T_base_tip(q)

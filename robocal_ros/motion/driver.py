@@ -256,10 +256,7 @@ MOTION = (
 def driving_config(settings: Mapping[str, Any], **plunge: float) -> DrivingConfig:
     """Settings of what moves, in SI; ``plunge``: further limits of `MotionLimits`.
 
-    Raises
-    ------
-    InputError
-        When sizes contradict each other.
+    Raises `InputError` when sizes contradict each other.
     """
     return DrivingConfig(
         housing=Housing(
@@ -290,10 +287,7 @@ def driving_config(settings: Mapping[str, Any], **plunge: float) -> DrivingConfi
 def require_limits(arm: SerialArm, config: DrivingConfig) -> None:
     """Refuse to move a robot whose limits are not known.
 
-    Raises
-    ------
-    InputError
-        When a limit is given for another number of joints, or the robot has none.
+    Raises `InputError` when a limit is given for another number of joints, or the robot has none.
     """
     config.limits.of_joints(arm)
     if not np.all(np.isfinite([arm.lower, arm.upper])):
@@ -319,11 +313,6 @@ def goal_tolerances(arm: SerialArm, config: DrivingConfig) -> dict[str, Any]:
         "goal_tolerance": of_joints(near),
         "goal_time_tolerance": Duration(sec=GOAL_TIME_S),
     }
-
-
-def trajectory_message(plan: JointPlan, names: Sequence[str]) -> JointTrajectory:
-    """A plan for a trajectory controller, which begins when it arrives."""
-    return joint_trajectory(names, *plan.points())
 
 
 CONTROLLER = (
@@ -409,7 +398,7 @@ class MotionDriver:
                 trusted=not self._rejected,
             )
         else:
-            message = trajectory_message(plan, self._names)
+            message = joint_trajectory(self._names, *plan.points())
         self._newest += 1
         number = self._newest
         if self._client is None or not self._client.server_is_ready():
@@ -480,7 +469,8 @@ class MotionDriver:
         self._controller.take(message, self._scaling.at(now_s), now_s)
         if robot is not None:
             robot.held_s = self._controller.held_s
-            self._tell_scaling(robot, now_s)
+            if (scaling := self._scaling.at(now_s)) is not None:
+                robot.scaled(scaling, now_s)
         reference = message.reference
         if len(reference.positions) != count or len(reference.velocities) != count:
             return  # a controller that holds may leave them out
@@ -495,12 +485,7 @@ class MotionDriver:
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()
         self._scaling.slider(message.data, now_s)
-        if robot is not None:
-            self._tell_scaling(robot, now_s)
-
-    def _tell_scaling(self, robot: RobotWatch, now_s: float) -> None:
-        scaling = self._scaling.at(now_s)
-        if scaling is not None:
+        if robot is not None and (scaling := self._scaling.at(now_s)) is not None:
             robot.scaled(scaling, now_s)
 
 

@@ -286,10 +286,7 @@ class MotionLimits:
     def of_joints(self, arm: SerialArm) -> tuple[Array, Array, Array]:
         """Velocity, acceleration and stop deceleration, (n,) each.
 
-        Raises
-        ------
-        InputError
-            When one is given for another number of joints.
+        Raises `InputError` when one is given for another number of joints.
         """
         found = []
         for name in ("joint_velocity", "joint_acceleration", "stop_deceleration"):
@@ -332,10 +329,8 @@ def stop(
     limit leaves, and all slow down harder; but never in less than ``shortest_s``. A joint that
     would still pass its limit begins slower: no stop leads beyond one.
 
-    Raises
-    ------
-    InputError
-        When a value is not finite: then only a hold or the controller's own stop is left.
+    Raises `InputError` when a value is not finite: then only a hold or the controller's own stop is
+    left.
     """
     here, velocity = np.asarray(q, dtype=np.float64), np.asarray(qd, dtype=np.float64)
     if here.shape != (arm.n,) or velocity.shape != (arm.n,):

@@ -298,10 +298,8 @@ class RobotWatch:
     def require_on_plan(self, now_s: float, rest_s: float) -> None:
         """Look after a motion; ``rest_s``: the robot may come to its end so late.
 
-        Raises
-        ------
-        LeftPlanError
-            When the robot is beside its path, behind what its controller sends it, or stands.
+        Raises `LeftPlanError` when the robot is beside its path, behind what its controller sends
+        it, or stands.
         """
         driving, plan = self._driving, self._plan
         tip_m, joint_rad = self.away()
@@ -576,10 +574,7 @@ class Gap:
     def begin(self, gap_s: float, now_s: float) -> None:
         """A gap of a length at the most begins.
 
-        Raises
-        ------
-        InputError
-            When the length makes no sense.
+        Raises `InputError` when the length makes no sense.
         """
         if not 0.0 < gap_s <= LONGEST_GAP_S:
             raise InputError(

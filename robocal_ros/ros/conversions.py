@@ -9,11 +9,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, Transform, TransformStamped
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
-from robocal_msgs.msg import (
-    CalibrationQuality,
-    CalibrationSummary,
-    KinematicModel,
-)
+from robocal_msgs.msg import CalibrationQuality, CalibrationSummary, KinematicModel
 from std_msgs.msg import Header
 
 from robocal_ros.ground import frames
@@ -64,10 +60,7 @@ def kinematic_model(
 ) -> KinematicModel:
     """A model document (``model_document``) as a message.
 
-    Raises
-    ------
-    InputError
-        When a number is not finite.
+    Raises `InputError` when a number is not finite.
     """
     mdh = np.array(model["mdh"], dtype=np.float64)
     covariance = np.array(model.get("covariance", []), dtype=np.float64)
@@ -117,10 +110,7 @@ def verdict_message(
 def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Header) -> Any:
     """The verdict on a thermal model; without one the figures are 0 and the reason says why.
 
-    Raises
-    ------
-    InputError
-        When a figure is not finite.
+    Raises `InputError` when a figure is not finite.
     """
     cycle_id = str(outcome.command.arguments.get("cycle_id", ""))
     message = verdict_message(outcome, robot=robot, serial=serial, stamp=stamp, cycle_id=cycle_id)
@@ -142,10 +132,7 @@ def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Heade
 def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
     """Tell errors, mm, by the names ``mean_mm``, ``rms_mm``, ``p95_mm`` and ``max_mm``.
 
-    Raises
-    ------
-    InputError
-        When one is not finite.
+    Raises `InputError` when one is not finite.
     """
     for name in _ERRORS:
         _require_finite(f"{whose}_{name}", [errors[name]])
@@ -190,10 +177,7 @@ MM = 1e-3
 def joints_of(arm: SerialArm, numbers: Sequence[float], name: str) -> Array:
     """Joints (n,) in rad (prismatic: m) of degrees (mm).
 
-    Raises
-    ------
-    InputError
-        When there is not one for each joint.
+    Raises `InputError` when there is not one for each joint.
     """
     given = np.array(numbers, dtype=np.float64)
     if given.shape != (arm.n,) or not np.all(np.isfinite(given)):
@@ -206,21 +190,16 @@ def joints_of(arm: SerialArm, numbers: Sequence[float], name: str) -> Array:
 def joint_poses(arm: SerialArm, texts: Sequence[str], name: str) -> Array:
     """Poses (m, n) in rad (prismatic: m) of a parameter ``name``, a text for each; m may be 0.
 
-    Raises
-    ------
-    InputError
-        When a text is no list of a number for each joint.
+    Raises `InputError` when a text is no list of a number for each joint.
     """
-    poses = [_pose(arm, text, f"{name}, pose {i}") for i, text in enumerate(texts, start=1)]
+    poses = []
+    for i, text in enumerate(texts, start=1):
+        try:
+            numbers = [float(word) for word in text.replace(",", " ").split()]
+        except ValueError as error:
+            raise InputError(f"{name}, pose {i}: '{text}' is no list of numbers") from error
+        poses.append(joints_of(arm, numbers, f"{name}, pose {i}"))
     return np.array(poses, dtype=np.float64).reshape(-1, arm.n)
-
-
-def _pose(arm: SerialArm, text: str, name: str) -> Array:
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError as error:
-        raise InputError(f"{name}: '{text}' is no list of numbers") from error
-    return joints_of(arm, numbers, name)
 
 
 class StaticTf:

@@ -64,10 +64,8 @@ class Setting:
     def accept(self, value: object) -> Value:
         """Return ``value`` as this parameter's type.
 
-        Raises
-        ------
-        InputError
-            When the type is wrong, a number is out of bounds or not finite, or a check fails.
+        Raises `InputError` when the type is wrong, a number is out of bounds or not finite, or a
+        check fails.
         """
         typed = _typed(value, self.default)
         if typed is None:
@@ -190,11 +188,8 @@ class ParameterTable:
     def read(self) -> dict[str, Any]:
         """Return every value by name.
 
-        Raises
-        ------
-        InputError
-            When a parameter was given a bad value at the start, or is none of this node; names
-            all of them.
+        Raises `InputError` when a parameter was given a bad value at the start, or is none of this
+        node; names all of them.
         """
         faults = [*self._faults.values(), *self._unknown]
         if faults:
@@ -246,10 +241,7 @@ def pose_settings(name: str, place: str, turn: str) -> tuple[Setting, Setting]:
 def given_pose(settings: Mapping[str, Any], name: str) -> NDArray[np.float64] | None:
     """The pose (4, 4), m; None where both parameters are at their default.
 
-    Raises
-    ------
-    InputError
-        When the quaternion is not of unit length.
+    Raises `InputError` when the quaternion is not of unit length.
     """
     xyz_mm, quat = settings[f"{name}_xyz_mm"], settings[f"{name}_quat_xyzw"]
     if xyz_mm == ORIGIN and quat == UNTURNED:

@@ -125,11 +125,8 @@ def open_history(
 
     ``owner``: a damaged history is set aside; who only adds to it is refused.
 
-    Raises
-    ------
-    RobocalError
-        As `CalibrationHistory.open`; also where no serial is set and the history was begun with
-        another robot file: nothing else tells two robots of one type apart.
+    Raises `RobocalError` as `CalibrationHistory.open`; also where no serial is set and the history
+    was begun with another robot file: nothing else tells two robots of one type apart.
     """
     serial, state_dir = settings["serial"] or NO_SERIAL, _folder(settings)
     history = CalibrationHistory.open(
@@ -141,26 +138,23 @@ def open_history(
     )
     if serial == NO_SERIAL:
         try:
-            _require_robot_file(history, nominal, settings["robot"])
+            own = {"robot": nominal.name, "robot_file_hash": robot_file_hash(settings["robot"])}
+            kept = StateFile(history.path, "robot_file")
+            known = kept.load()
+            if known is None:
+                kept.save(own)
+            elif known != own:
+                raise WrongRobotError(
+                    f"no serial is set, and {history.path} was begun with another robot file (hash "
+                    f"{known.get('robot_file_hash')} of robot '{known.get('robot')}', this is "
+                    f"{own['robot_file_hash']} of '{nominal.name}'): set the serial of each robot; "
+                    "if it is the same robot with its file changed, remove the folder "
+                    f"{kept.path.parent}"
+                )
         except BaseException:
             history.close()
             raise
     return serial, history
-
-
-def _require_robot_file(history: CalibrationHistory, nominal: SerialArm, robot: str) -> None:
-    """Refuse a nameless history that was begun with another robot file than this one."""
-    kept = StateFile(history.path, "robot_file")
-    own, known = {"robot": nominal.name, "robot_file_hash": robot_file_hash(robot)}, kept.load()
-    if known is None:
-        kept.save(own)
-    elif known != own:
-        raise WrongRobotError(
-            f"no serial is set, and {history.path} was begun with another robot file (hash "
-            f"{known.get('robot_file_hash')} of robot '{known.get('robot')}', this is "
-            f"{own['robot_file_hash']} of '{nominal.name}'): set the serial of each robot; if it "
-            f"is the same robot with its file changed, remove the folder {kept.path.parent}"
-        )
 
 
 def history_notice(settings: Mapping[str, Any]) -> str:
@@ -175,10 +169,7 @@ def history_notice(settings: Mapping[str, Any]) -> str:
 def acknowledge_history(settings: Mapping[str, Any], by: str) -> None:
     """Write down that somebody knows of a damaged history.
 
-    Raises
-    ------
-    StorageError
-        When it cannot be written.
+    Raises `StorageError` when it cannot be written.
     """
     folder = _folder(settings) or state_folder()
     acknowledge(history_path(settings["serial"] or NO_SERIAL, folder), by, time.time_ns())

@@ -270,12 +270,8 @@ def configured_with(
 def recorded_arguments(nominal: SerialArm, configured: Command, names: Sequence[str]) -> Document:
     """Arguments of a configuration with ``config`` and these names.
 
-    Raises
-    ------
-    WrongRobotError
-        The recording was made with another nominal model.
-    InputError
-        One is missing.
+    Raises `WrongRobotError` where the recording was made with another nominal model; `InputError`
+    where one is missing.
     """
     require_robot(nominal, configured)
     arguments = configured.arguments

@@ -152,10 +152,7 @@ def outcome_text(outcome: Outcome) -> str:
 def read_command(name: str, stamp_ns: int, arguments: str) -> Command:
     """Read a recorded command.
 
-    Raises
-    ------
-    InputError
-        When the text is no such record, or of a newer version.
+    Raises `InputError` when the text is no such record, or of a newer version.
     """
     try:
         record = json.loads(arguments)
@@ -177,13 +174,7 @@ WHY = "in force when the recording began"
 
 
 def require_robot(nominal: SerialArm, configured: Command) -> None:
-    """Refuse a robot that the recording was not made with.
-
-    Raises
-    ------
-    WrongRobotError
-        Always then; the message names both models.
-    """
+    """Refuse a robot that the recording was not made with: `WrongRobotError` names both models."""
     recorded = str(configured.arguments.get("model_hash", ""))
     if recorded != nominal.model_hash:
         raise WrongRobotError(
@@ -252,10 +243,7 @@ def decide(
     A command with ``choose`` (`ONLY`, `NEWEST`) in place of an id is about a candidate that is
     pending now, not when it was given. The outcome's command says which: replay obeys that.
 
-    Raises
-    ------
-    RobocalError
-        When the history refuses.
+    Raises `RobocalError` when the history refuses.
     """
     command = named(history, command, kind)
     arguments = command.arguments

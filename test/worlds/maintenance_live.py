@@ -20,7 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.kinematics.arm import inverse
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody, joint_way
-from robocal_ros.motion.driver import trajectory_message
+from robocal_ros.motion.driver import joint_trajectory
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import REST_RAD
 from robocal_ros.ros import endpoints
@@ -210,7 +210,7 @@ class LiveCell:
 
         self.graph.drive(
             ROBOT,
-            trajectory_message(plan, self.arm.joint_names),
+            joint_trajectory(self.arm.joint_names, *plan.points()),
             lambda: near(end, REST_RAD) or not near(stood, 10.0 * REST_RAD),
             subscribers=2,  # the robot, and `sent`
         )
