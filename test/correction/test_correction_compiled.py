@@ -28,21 +28,6 @@ def compiled() -> dict[str, int]:
     return found
 
 
-def warm() -> None:
-    """As at an installation."""
-    spec = importlib.util.spec_from_file_location("warm_kernels", TOOLS / "warm_kernels.py")
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    tool.main()
-
-
-def configure() -> None:
-    """As a node before it becomes active."""
-    load_kernels(NOMINAL)
-
-
 def use(policy: Policy, free_axis: bool) -> None:
     """A session's life: model, tool, streams through a singularity, trajectories, states, off."""
     robot = Robot(policy=policy, free_axis=free_axis)
@@ -52,7 +37,7 @@ def use(policy: Policy, free_axis: bool) -> None:
     robot.settle()
     robot.change_tool(bent_tool())
     robot.settle()
-    speed = np.array([0.0, 0.0, 0.0, 0.0, -0.5, 0.0])
+    speed = np.array([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])
     q = HOME.copy()
     while q[4] > -0.3:
         q = q + speed * 0.004
@@ -75,9 +60,9 @@ def use(policy: Policy, free_axis: bool) -> None:
         robot.stream(HOME)
 
 
-def main(how: str) -> None:
-    """Print which kernels were compiled, or loaded, later than they should."""
-    {"warm": warm, "configure": configure}[how]()
+def main() -> None:
+    """As a node: print which kernels were compiled, or loaded, later than they should."""
+    load_kernels(NOMINAL)
     before = compiled()
     for policy in Policy:
         for free_axis in (False, True):
@@ -91,10 +76,22 @@ def main(how: str) -> None:
     print(sorted(name for name, count in after.items() if count > before.get(name, 0)))
 
 
-@pytest.mark.parametrize("how", ["warm", "configure"])
-def test_nothing_is_compiled_while_commands_are_corrected(how: str) -> None:
+def test_an_installation_compiles_what_a_node_loads(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = importlib.util.spec_from_file_location("warm_kernels", TOOLS / "warm_kernels.py")
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    assert tool.load_kernels is load_kernels
+    loaded: list[int] = []
+    monkeypatch.setattr(tool, "load_kernels", lambda arm: loaded.append(arm.n))
+    tool.main()
+    assert loaded == [6]
+
+
+def test_nothing_is_compiled_while_commands_are_corrected() -> None:
     """In a process of its own: here other tests have called the kernels."""
-    run = [sys.executable, __file__, how]
+    run = [sys.executable, __file__]
     worlds = str(Path(__file__).parents[1] / "worlds")
     found = os.pathsep.join(filter(None, (worlds, os.environ.get("PYTHONPATH"))))
     environment = os.environ | {"PYTHONPATH": found}
@@ -104,4 +101,4 @@ def test_nothing_is_compiled_while_commands_are_corrected(how: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main()

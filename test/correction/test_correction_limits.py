@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from correction_robot import (
+    DT,
     HOME,
     NAMES,
     NOMINAL,
+    REST,
+    ROUNDING,
     Robot,
     bent_tool,
     distance,
@@ -18,11 +21,13 @@ from correction_robot import (
     pose,
     refused,
     still,
+    swing,
 )
 
-from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.interface import Reason, TrajectoryCommand
+from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
+from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCommand
 from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 
 def test_joint_limits_hold_after_the_correction(warm: Robot) -> None:
@@ -180,3 +185,342 @@ def test_the_frames_of_a_tool_are_those_configured() -> None:
     assert not robot.session.status().new_tool
     robot.session.offer_tool(named)
     assert robot.session.status().new_tool
+
+
+# ---- What the session does not take: bad values, clocks, its own output --------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite(warm: Robot, bad: float) -> None:
+    q = HOME.copy()
+    q[3] = bad
+    session, now = warm.session, warm.now
+    assert "joint_a4" in refused(Reason.NOT_FINITE, session.target, JointCommand(NAMES, q), now)
+    fast = JointCommand(NAMES, HOME, velocity=q)
+    refused(Reason.NOT_FINITE, session.target, fast, now)
+    refused(Reason.NOT_FINITE, session.reading, JointCommand(NAMES, q), now)
+    assert session.reading(fast, now).velocity is None  # a driver that has none says NaN
+    points, times = np.stack([HOME, q]), np.array([0.0, 1.0])
+    trajectory = TrajectoryCommand(NAMES, points, times)
+    assert "point 2" in refused(Reason.NOT_FINITE, session.trajectory, trajectory, now)
+    still = np.stack([HOME, HOME])
+    for rates in ({"velocity": points}, {"velocity": still, "acceleration": points}):
+        trajectory = TrajectoryCommand(NAMES, still, times, **rates)
+        refused(Reason.NOT_FINITE, session.trajectory, trajectory, now)
+    assert session.status().refused[Reason.NOT_FINITE] == 6
+    assert np.all(np.isfinite(warm.read(HOME).position))
+
+
+def test_doubled_and_misfitting_joints(warm: Robot) -> None:
+    session, now = warm.session, warm.now
+    doubled = (NAMES[0], *NAMES[:5])
+    refused(Reason.DOUBLED_JOINT, session.target, JointCommand(doubled, HOME), now)
+    refused(Reason.DOUBLED_JOINT, session.reading, JointCommand(doubled, HOME), now)
+    refused(Reason.WRONG_SIZE, session.target, JointCommand(NAMES, HOME[:5]), now)
+    refused(Reason.WRONG_SIZE, session.reading, JointCommand(NAMES, HOME[:5]), now)
+    refused(Reason.UNKNOWN_JOINT, session.target, JointCommand((), np.empty(0)), now)
+
+
+def test_time_that_goes_backwards(warm: Robot) -> None:
+    session = warm.session
+    warm.stream(stamp_ns=2_000_000_000)
+    refused(Reason.TIME_BACKWARDS, warm.stream, stamp_ns=1_999_000_000)
+    command = replace(swing(m=3), time_from_start_s=np.array([0.0, 1.0, 1.0]))
+    refused(Reason.TIME_BACKWARDS, session.trajectory, command, warm.now)
+    command = replace(command, time_from_start_s=np.array([-0.1, 1.0, 2.0]))
+    refused(Reason.TIME_BACKWARDS, session.trajectory, command, warm.now)
+    # after a look by the operator any source time will do
+    session.acknowledge(warm.now)
+    warm.stream(stamp_ns=5)
+
+
+def test_readings_of_a_clock_that_was_set_back_are_taken(warm: Robot) -> None:
+    q = warm.stream()
+    warm.read(q, stamp_ns=10_000_000_000)
+    refused(Reason.TIME_BACKWARDS, warm.read, q, stamp_ns=9_900_000_000)
+    warm.read(q, stamp_ns=1_000_000_000)
+
+
+def test_a_source_whose_clock_was_set_back_goes_on(warm: Robot) -> None:
+    """A simulator that was started again, or one stamp from the future."""
+    warm.stream(stamp_ns=10**15)
+    warm.stream(stamp_ns=10**9)
+    refused(Reason.TIME_BACKWARDS, warm.stream, stamp_ns=9 * 10**8)
+
+
+def test_a_trajectory_for_later_does_not_bar_those_that_come_before(warm: Robot) -> None:
+    later = replace(still(), stamp_ns=1_000_000_000_000)
+    warm.session.trajectory(later, warm.now, 600.0)
+    sooner = replace(still(first_s=0.5), stamp_ns=400_000_000_000)
+    warm.session.trajectory(sooner, warm.now, 10.0)
+
+
+def test_a_model_that_is_the_reference_to_rounding_corrects_nothing() -> None:
+    """A file's decimals and a quaternion on the way leave 1e-13 of it."""
+    robot = Robot()
+    robot.read(HOME)
+    robot.session.offer_model(offer(NOMINAL.with_mdh(NOMINAL.mdh + 1e-13)))
+    robot.session.enable(True)
+    assert np.array_equal(robot.stream(), HOME)
+    status = robot.session.status()
+    assert status.settled
+    assert not status.active
+
+
+def test_own_output_that_comes_back(warm: Robot) -> None:
+    session, now = warm.session, warm.now
+    out = warm.stream()
+    marked = JointCommand(NAMES, HOME, mark=CORRECTED)
+    refused(Reason.OWN_OUTPUT, session.target, marked, warm.now)
+    refused(Reason.OWN_OUTPUT, session.trajectory, replace(swing(), mark=CORRECTED), warm.now)
+    for mark in (CORRECTED, TAUGHT):
+        refused(Reason.OWN_OUTPUT, session.reading, replace(marked, mark=mark), warm.now)
+    # the same target again is no loop
+    assert np.array_equal(warm.stream(), out)
+    assert now < warm.now
+
+
+# ---- What is done with a command whose correction exceeds a bound, and what is refused anyway ----
+
+
+TIGHT = ShiftBounds(0.2e-3, np.radians(0.1), np.radians(0.3))
+WIDE = ShiftBounds(1e-3, np.radians(0.1), np.radians(0.3))
+LARGE = drifted(3.0)  # 0.3 mm at home: beyond the tight bound
+
+
+def corrected(policy: Policy, **config: Any) -> Robot:
+    """Enabled, with a drift that is too large at home; it was taken over before it was seen."""
+    robot = Robot(rested=False, **({"policy": policy, "thermal": TIGHT} | config))
+    robot.session.offer_model(offer(LARGE))
+    robot.rest()
+    robot.session.enable(True)
+    return robot
+
+
+def outputs(robot: Robot, count: int, q: np.ndarray = HOME) -> np.ndarray:
+    return np.array([robot.stream(q) for _ in range(count)])
+
+
+def speeds_are_the_blends(out: np.ndarray) -> bool:
+    return bool(np.abs(np.diff(out, axis=0)).max() <= REST * DT + ROUNDING)
+
+
+def test_the_drift_is_beyond_the_bound() -> None:
+    assert distance(pose(LARGE, HOME), pose(NOMINAL, HOME)) > 1.2 * TIGHT.tcp_m
+
+
+def test_clamped_it_goes_to_the_bound_and_no_further() -> None:
+    robot = corrected(Policy.CLAMP)
+    out = outputs(robot, 400)
+    assert speeds_are_the_blends(out)
+    made = distance(pose(LARGE, out[-1]), pose(LARGE, HOME))
+    assert made == pytest.approx(TIGHT.tcp_m, rel=1e-3)
+    rest = distance(pose(LARGE, out[-1]), pose(NOMINAL, HOME))
+    whole = distance(pose(LARGE, HOME), pose(NOMINAL, HOME))
+    assert rest == pytest.approx(whole - TIGHT.tcp_m, abs=2e-6)
+    status = robot.session.status()
+    assert status.settled
+    assert status.policy is Policy.CLAMP
+    assert status.clamped[Reason.TCP_BOUND] > 0
+    assert not status.passed
+    assert not status.refused
+    assert np.allclose(robot.read(out[-1]).position, HOME, rtol=0.0, atol=1e-11)
+
+
+def test_passed_on_the_offset_goes_on_the_way_there_and_comes_on_the_way_back() -> None:
+    arm, far = good_here_only()
+    robot = Robot(policy=Policy.PASS)
+    robot.session.offer_model(offer(arm))
+    robot.session.enable(True)
+    shift = first = robot.settle() - HOME
+    assert np.abs(shift).max() > 1e-4
+    way = np.linspace(0.0, 1.0, 800)
+    for x in np.concatenate([way, np.ones(200), way[::-1]]):
+        q = HOME + x * (far - HOME)
+        now = robot.stream(q) - q
+        # by the motion a correction of some mrad changes by some mrad per rad
+        assert np.abs(now - shift).max() <= REST * DT + 0.02 * np.abs(far - HOME).max() / 800
+        assert np.allclose(robot.read(robot.at).position, q, rtol=0.0, atol=1e-11)
+        shift = now
+        if x == 1.0:
+            there = now
+    assert np.array_equal(there, np.zeros(6))
+    assert robot.session.status().passed[Reason.TCP_BOUND] > 200
+    assert np.allclose(robot.settle() - HOME, first, rtol=0.0, atol=1e-11)
+    # of a direction that is weak for so large a drift, so much is given up as is reported
+    left = robot.session.status().remaining_m
+    assert distance(pose(arm, robot.at), pose(NOMINAL, HOME)) == pytest.approx(left, abs=1e-9)
+    assert left < 1e-2 * distance(pose(arm, HOME), pose(NOMINAL, HOME))
+
+
+def test_a_trajectory_is_clamped_or_passed_on_as_a_whole() -> None:
+    for policy in (Policy.CLAMP, Policy.PASS):
+        robot = corrected(policy)
+        robot.read(HOME)
+        out = robot.session.trajectory(still(), robot.now)
+        steps = np.abs(np.diff(out.position, axis=0)).max(axis=1)
+        assert steps.max() <= REST * 0.5 + ROUNDING
+        made = distance(pose(LARGE, out.position[-1]), pose(LARGE, HOME))
+        assert made == pytest.approx(TIGHT.tcp_m if policy is Policy.CLAMP else 0.0, abs=1e-7)
+        status = robot.session.status()
+        counted = status.clamped if policy is Policy.CLAMP else status.passed
+        assert counted == {Reason.TCP_BOUND: 1}
+
+
+def test_a_blend_along_a_trajectory_is_no_faster_where_a_bound_holds_on_a_part_of_it() -> None:
+    """The clamped shift is made on the first third of the blend, and then stays."""
+    robot = Robot(rested=False, policy=Policy.CLAMP, thermal=ShiftBounds(0.1e-3, 0.1, 0.1))
+    robot.session.offer_model(offer(LARGE))
+    robot.rest()
+    robot.session.enable(True)
+    robot.read(HOME)
+    times = np.linspace(0.0, 2.0, 201)
+    path = TrajectoryCommand(NAMES, np.tile(HOME, (201, 1)), times)
+    out = robot.session.trajectory(path, robot.now)
+    steps = np.abs(np.diff(out.position, axis=0)).max(axis=1)
+    assert 0.0 < steps.max() <= REST * 0.01 + ROUNDING
+
+
+@pytest.mark.parametrize("policy", [Policy.CLAMP, Policy.PASS])
+def test_towards_a_joint_limit_a_stream_goes_on(policy: Policy) -> None:
+    robot = Robot(policy=policy)
+    robot.session.offer_model(offer(drifted(3.0)))
+    robot.session.enable(True)
+    q = HOME.copy()
+    q[1] = NOMINAL.upper[1] - 1e-3
+    robot.at = q
+    robot.rest()
+    robot.settle(q)
+    last, worst = robot.at - q, 0.0
+    for x in np.concatenate([np.linspace(1e-3, 0.0, 400), np.linspace(0.0, 1e-3, 400)]):
+        q[1] = NOMINAL.upper[1] - x
+        shift = robot.stream(q) - q
+        assert robot.at[1] <= NOMINAL.upper[1] + 1e-12
+        assert np.allclose(robot.read(robot.at).position, q, rtol=0.0, atol=1e-11)
+        worst = max(worst, float(np.abs(shift - last).max()))
+        last = shift
+    # by a third of the motion where it fades, and by the blend where it is passed on
+    assert worst <= REST * DT + 1e-3 / 400 / 2
+    status = robot.session.status()
+    counted = status.clamped if policy is Policy.CLAMP else status.passed
+    assert counted[Reason.JOINT_LIMIT] > 0
+    assert not status.refused
+    # nothing can be done for a taught joint beyond it
+    q[1] = NOMINAL.upper[1] + 1e-4
+    refused(Reason.JOINT_LIMIT, robot.stream, q)
+
+
+# ---- velocity limits -----------------------------------------------------------------------------
+
+LIMIT = np.full(6, 1.0)
+
+
+def line(speed: float, m: int = 41) -> TrajectoryCommand:
+    """All joints at one speed."""
+    times = np.linspace(0.0, 0.4, m)
+    q = HOME + speed * times[:, None]
+    return TrajectoryCommand(NAMES, q, times, np.full((m, 6), speed))
+
+
+@pytest.mark.parametrize("policy", Policy)
+@pytest.mark.parametrize("with_rates", [False, True])
+def test_a_trajectory_beyond_a_velocity_limit(policy: Policy, with_rates: bool) -> None:
+    robot = Robot(policy=policy, velocity_limits=LIMIT)
+    robot.read(HOME)
+    for on in (False, True):
+        robot.session.enable(on)
+        path = line(1.01)
+        if not with_rates:
+            path = replace(path, velocity=None)
+        said = refused(Reason.VELOCITY_LIMIT, robot.session.trajectory, path, robot.now)
+        assert "joint_a1" in said
+    robot.session.trajectory(line(0.99), robot.now)
+
+
+def test_two_messages_at_once_after_a_delay_are_not_too_fast() -> None:
+    robot = Robot(velocity_limits=LIMIT)
+    q = HOME
+    for k in range(100):
+        q = HOME + 0.9 * DT * k
+        robot.stream(q, dt=1.9 * DT if k % 2 else 0.1 * DT)
+    assert not robot.session.status().refused
+
+
+def test_a_velocity_that_a_target_names_counts() -> None:
+    robot = Robot(velocity_limits=LIMIT)
+    robot.stream()
+    refused(Reason.VELOCITY_LIMIT, robot.stream, velocity=np.full(6, 1.1))
+    robot.stream(velocity=np.full(6, 0.9))
+
+
+# ---- what nobody can mean ------------------------------------------------------------------------
+
+
+def test_positions_that_look_like_degrees(robot: Robot) -> None:
+    session, now = robot.session, robot.now
+    degrees = np.degrees(HOME)
+    robot.read(HOME)
+    for act in (session.target, session.reading):
+        refused(Reason.DEGREES, act, JointCommand(NAMES, degrees), now)
+    path = TrajectoryCommand(NAMES, np.stack([HOME, degrees]), np.array([0.0, 1.0]))
+    refused(Reason.DEGREES, session.trajectory, path, now)
+    # a joint that may turn so far is not in degrees; one that is beyond its limit is just that
+    wide = replace(NOMINAL, upper=np.full(6, 20.0), lower=np.full(6, -20.0))
+    turning = Robot()
+    turning.session = type(session)(wide, wide, "s1")
+    turning.at = HOME + 15.0
+    turning.rest()
+    turning.stream(turning.at)
+    robot.at = HOME + np.array([0.0, 0.0, 0.0, 0.0, 5.0, 0.0])
+    robot.rest()
+    refused(Reason.JOINT_LIMIT, robot.stream, robot.at)
+
+
+def test_all_joints_far_beyond_their_limits_are_degrees_too() -> None:
+    """Small limits: ten degrees are less than two turns."""
+    narrow = replace(NOMINAL, upper=np.full(6, 0.5), lower=np.full(6, -0.5))
+    robot = Robot()
+    robot.session = type(robot.session)(narrow, narrow, "s1")
+    refused(Reason.DEGREES, robot.session.reading, JointCommand(NAMES, np.full(6, 5.1)), 1.0)
+    robot.session.reading(JointCommand(NAMES, np.array([0.4] + [5.1] * 5)), 1.0)
+
+
+def test_a_burst_is_refused_before_it_is_looked_at(robot: Robot) -> None:
+    robot.read(HOME)
+    points = np.broadcast_to(HOME, (100_001, 6))
+    path = TrajectoryCommand(NAMES, points, np.arange(100_001.0))
+    refused(Reason.BURST, robot.session.trajectory, path, robot.now)
+    robot.session.trajectory(line(0.1, m=10_000), robot.now)
+
+
+# ---- shadow --------------------------------------------------------------------------------------
+
+
+def test_in_shadow_mode_everything_passes_as_it_came_and_the_correction_is_shown() -> None:
+    robot = Robot(shadow=True)
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.offer_tool(bent_tool())
+    robot.session.enable(True)
+    for _ in range(3000):
+        assert np.array_equal(robot.stream(), HOME)
+        assert np.array_equal(robot.read(HOME).position, HOME)
+    status = robot.session.status()
+    assert status.shadow
+    assert status.settled
+    seen = Robot()
+    seen.session.offer_model(offer(drifted(2.0)))
+    seen.session.offer_tool(bent_tool())
+    seen.session.enable(True)
+    assert np.allclose(robot.session.offset(robot.now).offset, seen.settle() - HOME, atol=1e-12)
+    path = still(first_s=0.01)
+    assert robot.session.trajectory(path, robot.now) is path
+
+
+def test_in_shadow_mode_a_refusal_of_the_correction_is_only_counted() -> None:
+    robot = corrected(Policy.REFUSE, shadow=True)
+    long = TrajectoryCommand(NAMES, np.tile(HOME, (2, 1)), np.array([0.0, 60.0]))
+    assert robot.session.trajectory(long, robot.now) is long
+    assert robot.session.status().refused == {Reason.TCP_BOUND: 1}
+    marked = JointCommand(NAMES, HOME, mark=CORRECTED)
+    refused(Reason.OWN_OUTPUT, robot.session.target, marked, robot.now)
+    refused(Reason.NOT_FINITE, robot.stream, HOME * np.nan)

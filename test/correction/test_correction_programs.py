@@ -16,16 +16,22 @@ from robocal_ros.kinematics.robots import load_description
 BAGS = Path(__file__).parents[2] / "bags"
 PAUSE_S = 0.5  # nothing is commanded: the robot is read at its driver's rate meanwhile
 READ_S = 0.01
+PERIOD_S = 0.012
 LEFT_M = 2e-5  # where no direction is weak: what a good robot repeats to
 
 
 def program(name: str, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Times (m,) and joints (m, 6) of a recorded robot: targets as its program could send them."""
+    """Times (m,) and joints (m, 6) of a recorded robot: targets as its program could send them.
+
+    Those of a fast driver are thinned.
+    """
     with BagReader(BAGS / name) as bag:
         topics = [topic for topic in bag.info.topics if topic.endswith("joint_states")]
         read = [m.message for m in bag.messages(topics)]
     stamps = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in read])
     times, first = np.unique(stamps, return_index=True)
+    fewer = max(round(PERIOD_S / np.median(np.diff(times))), 1)
+    times, first = times[::fewer], first[::fewer]
     column = [list(read[0].name).index(joint) for joint in joints]
     return times - times[0], np.array([read[i].position for i in first])[:, column]
 

@@ -8,8 +8,11 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
+from robocal_ros.correction.robot_state import LAG_S, STANDING_S, VELOCITY_S, RobotTrack, SentPath
+from robocal_ros.correction.trajectories import AHEAD_S, GIVE_UP_S, PAUSED_S, RobotStop
+from robocal_ros.kinematics.robots import load_description
+from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan
 
-AHEAD_S = 0.06
 LIMIT = NOMINAL.upper[0] - 0.02  # of the program, which leaves room for the correction
 REACH = np.array([0.9, -0.3, 0.4, 0.6, -0.4, 0.8])
 
@@ -144,3 +147,302 @@ def test_readings_on_a_stop_are_uncorrected_with_what_the_path_had_there() -> No
     t = np.linspace(0.0, out.time_from_start_s[-1], 20_000)
     k = int(np.argmin(np.abs(shape(t)[:, 0] - stop.position[-1, 0])))
     assert np.abs(taught - own(t[k])).max() < 5e-4
+
+
+# ---- Stops that are watched, against a simulated controller that does as the real one ------------
+
+
+ROBOT = load_description("kr150_r3100")
+ARM = ROBOT.arm
+CYCLE_S = 0.004
+STOP_LOOK_S = 0.02  # a node looks so often
+DELAY_S = 0.01  # of trajectories, and of readings
+SPEED = np.array([0.9, -0.4, 0.5, 1.0, -0.2, 0.3])
+
+
+def lasts_s(plan: JointPlan) -> float:
+    """How long a stop lasts from its arrival on."""
+    return plan.duration_s - REACTION_S
+
+
+class SimulatedController:
+    """Drives on at constant speed; a trajectory is a cubic from where it is, after `DELAY_S`.
+
+    It begins as fast as the drives are, which a scaled clock slows down.
+
+    Parameters
+    ----------
+    losses : so many trajectories are lost.
+    reports : velocities in readings: "measured", "nan" or "zero".
+    """
+
+    def __init__(self, losses: int = 0, reports: str = "measured", scaling: float = 1.0) -> None:
+        self.now_s, self.losses, self.reports, self.scaling = 100.0, losses, reports, scaling
+        self.q, self.qd = HOME.copy(), SPEED.copy()
+        self.track = RobotTrack(ARM, np.full(6, 3.5e-4), 0.2)
+        self.stop = RobotStop(ARM, ROBOT.max_acceleration, self.track, self._take)
+        self.plans: list = []
+        self.out: list = []
+        self._coming: list = []
+        self._spline, self._began_s, self._clock_s = None, 0.0, 0.0
+
+    def _take(self, plan) -> None:
+        self.plans.append(plan)
+        if self.losses:
+            self.losses -= 1
+        else:
+            self._coming.append((self.now_s + DELAY_S, plan))
+
+    def cycle(self) -> None:
+        self.now_s += CYCLE_S
+        while self._coming and self._coming[0][0] <= self.now_s:
+            plan = self._coming.pop(0)[1]
+            ends = np.array([0.0, lasts_s(plan)])
+            self._spline = CubicHermiteSpline(
+                ends, [self.q, plan.q[-1]], [self.scaling * self.qd, 0.0 * self.qd]
+            )
+            self._clock_s = 0.0
+        before = self.q
+        if self._spline is None:
+            self.q = self.q + self.qd * CYCLE_S * self.scaling
+        else:
+            self._clock_s += CYCLE_S * self.scaling
+            at = min(self._clock_s, self._spline.x[-1])
+            self.q = self._spline(at)
+            self.qd = self._spline(at, 1) if at < self._spline.x[-1] else 0.0 * self.qd
+        self.out.append(self.q)
+        told = {
+            "measured": (self.q - before) / CYCLE_S,
+            "nan": np.full(6, np.nan),
+            "zero": np.zeros(6),
+        }[self.reports]
+        self.track.read(JointCommand(ARM.joint_names, self.q.copy(), told), self.now_s)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / CYCLE_S)):
+            self.cycle()
+
+    def stops(self) -> float:
+        """Time from the stop's begin until the robot stands."""
+        began_s = self.now_s
+        assert self.stop.begin("a test", self.now_s)
+        moved_s = began_s
+        while self.stop.look(self.now_s, self.scaling):
+            before = self.q
+            self.cycle()
+            moved_s = self.now_s if np.any(np.abs(self.q - before) > 1e-9) else moved_s
+        return moved_s - began_s
+
+
+@pytest.mark.parametrize("reports", ["measured", "nan", "zero"])
+def test_a_stop_goes_on_in_its_direction_and_ends_at_rest(reports):
+    robot = SimulatedController(reports=reports)
+    robot.run(0.3)
+    begin = len(robot.out)
+    took_s = robot.stops()
+    assert not robot.stop.fault
+    assert robot.stop.sent == 1
+    assert took_s <= 1.05 * lasts_s(robot.plans[0]) + DELAY_S + CYCLE_S
+    ways = np.diff(robot.out[begin - 1 :], axis=0)
+    assert np.all(ways * SPEED >= -1e-9)  # never back
+    rates = ways / CYCLE_S
+    most = 2.0 * np.abs(SPEED) / lasts_s(robot.plans[0])  # a cubic's own is 1.5 at its steepest
+    assert np.all(np.abs(np.diff(rates, axis=0)) <= most * CYCLE_S)
+
+
+@pytest.mark.parametrize("losses", [1, 2])
+def test_a_stop_that_is_lost_is_sent_again(losses):
+    robot = SimulatedController(losses)
+    robot.run(0.3)
+    took_s = robot.stops()
+    assert robot.stop.sent == losses + 1
+    assert not robot.stop.fault
+    assert took_s <= 1.5 * lasts_s(robot.plans[0])
+
+
+@pytest.mark.parametrize("scaling", [0.1, 0.5])
+def test_a_controller_that_runs_slowly_is_waited_for(scaling):
+    robot = SimulatedController(scaling=scaling)
+    robot.run(0.3)
+    robot.stops()
+    assert robot.stop.sent == 1
+    assert not robot.stop.fault
+
+
+def test_a_robot_that_does_not_stop_is_told():
+    robot = SimulatedController(losses=10_000)
+    robot.run(0.3)
+    robot.stops()
+    assert "the robot still moves, stop it by hand" in robot.stop.fault
+    assert robot.stop.sent > 5
+
+
+def test_without_readings_no_stop_is_planned():
+    robot = SimulatedController()
+    assert not robot.stop.begin("a test", robot.now_s)
+    assert "joint states are missing or too old" in robot.stop.fault
+    robot.run(0.3)
+    assert robot.stop.begin("a test", robot.now_s)
+    assert not robot.stop.fault
+    assert not robot.stop.begin("a test", robot.now_s + 0.3)
+
+
+def test_a_robot_that_stands_holds_where_it_is():
+    robot = SimulatedController(reports="nan")
+    robot.qd = np.zeros(6)
+    robot.run(0.3)
+    robot.stops()
+    assert robot.stop.sent == 1
+    assert np.abs(np.array(robot.out) - HOME).max() < 1e-12
+
+
+def test_how_long_a_robot_has_stood():
+    robot = SimulatedController()
+    assert robot.track.stood_s(robot.now_s) == 0.0
+    robot.run(0.5)
+    assert robot.track.stood_s(robot.now_s) < 2.0 * CYCLE_S
+    robot.qd = np.full(6, 1e-3)  # it creeps
+    robot.run(2.0)
+    assert robot.track.stood_s(robot.now_s) < 0.4
+    robot.qd = np.zeros(6)
+    robot.run(2.0)
+    assert robot.track.stood_s(robot.now_s) == pytest.approx(2.0, abs=0.4)
+    assert robot.track.stood_s(robot.now_s + 0.3) == 0.0  # not read now
+    robot.now_s += 1.0
+    robot.run(0.1)
+    assert robot.track.stood_s(robot.now_s) < 0.1  # what it did meanwhile is not known
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.1])
+def test_whether_a_robot_follows_its_path(late_s):
+    robot = SimulatedController()
+    began_s, lasts_s = robot.now_s + late_s, 4.0
+    rows = np.zeros((2, 6))
+    path = SentPath(
+        index=np.arange(6), begin_s=began_s - late_s, times=np.array([0.0, lasts_s]),
+        out=np.stack([HOME, HOME + lasts_s * SPEED]), velocity=None,
+        acceleration=None, known_times=np.array([0.0, lasts_s]), offsets=rows, rates=rows,
+        bends=rows, withheld=rows, stage=None,
+        led_from=HOME, put_s=began_s, at_once=True,
+    )  # fmt: skip
+    assert robot.track.follows(path, robot.now_s)  # nothing tells otherwise
+    robot.qd = np.zeros(6)
+    robot.run(late_s)
+    robot.qd = SPEED.copy()
+    robot.run(0.5)
+    assert robot.track.follows(path, robot.now_s)
+    path.scale(0.0, robot.now_s)
+    robot.run(1.0)
+    assert not robot.track.follows(path, robot.now_s)
+
+
+# ---- pauses -------------------------------------------------------------------------------------
+
+
+def pauses(robot: SimulatedController, seconds: float, held_s: float = -np.inf) -> bool:
+    """Watch a stop while the controller's clock stands; whether it is still under way."""
+    robot.scaling = 0.0
+    for _ in range(round(seconds / CYCLE_S)):
+        robot.cycle()
+        robot.stop.look(robot.now_s, 0.0, held_s)
+    return bool(robot.stop.why)
+
+
+@pytest.mark.parametrize("losses", [1, 2, 10_000])
+def test_a_stop_that_is_lost_in_a_pause_is_sent_until_the_robot_stands_by_itself(losses):
+    """Finding: after 0.1 s it was over; with the pause the old motion went on."""
+    robot = SimulatedController()
+    robot.run(0.3)
+    robot.scaling = 0.0
+    robot.run(0.3)
+    paused, robot.losses = robot.q, losses
+    assert robot.stop.begin("a test", robot.now_s, 0.0)
+    assert pauses(robot, 12.0)  # longer than what still moves is given
+    assert not robot.stop.fault
+    assert 2.0 * GIVE_UP_S < 12.0
+    assert 12.0 / PAUSED_S - 2 <= robot.stop.sent <= 12.0 / PAUSED_S + 2
+    robot.scaling, robot.losses = 1.0, 0
+    went_on_s = robot.now_s
+    while robot.stop.look(robot.now_s):
+        robot.cycle()
+    assert robot.now_s - went_on_s > STANDING_S
+    assert not robot.stop.fault
+    # Held in the pause it stays. Where each message was lost its motion goes on, is seen to within
+    # the time that readings take to tell a speed, and slows down as any stop that was lost once.
+    far = np.abs(robot.q - paused)
+    seen_s = VELOCITY_S + LAG_S + STOP_LOOK_S + DELAY_S
+    slows_s = 0.5 * max(np.max(np.abs(SPEED) / ROBOT.max_acceleration), SHORTEST_STOP_S)
+    assert np.all(far <= (np.abs(SPEED) * (seen_s + slows_s) if losses > 100 else 1e-9))
+
+
+def test_a_stop_that_a_controller_is_seen_to_take_in_a_pause_is_over():
+    robot = SimulatedController()
+    robot.run(0.3)
+    robot.scaling = 0.0
+    robot.run(0.3)
+    before_s = robot.now_s
+    assert robot.stop.begin("a test", robot.now_s, 0.0)
+    assert pauses(robot, 0.2, held_s=before_s - 0.1)  # that was an earlier motion
+    assert not pauses(robot, 0.2, held_s=robot.now_s)
+
+
+# ---- what is read -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("joint", "told"), [(0, 57.3), (2, 30.0), (5, 3.0), (5, -1e300), (1, np.inf), (0, 0.0)]
+)
+def test_a_velocity_that_the_positions_do_not_bear_out_is_not_stopped_from(joint, told):
+    """Finding: one velocity in degrees gave a stop that ended 230 deg ahead."""
+    robot = SimulatedController()
+    robot.qd = SPEED * [1, 1, 1, 1, 1, 0]
+    robot.run(0.3)
+    odd = robot.qd.copy()
+    odd[joint] = told
+    robot.track.read(JointCommand(ARM.joint_names, robot.q, odd), robot.now_s)
+    assert robot.stop.begin("a test", robot.now_s)
+    plan = robot.plans[0]
+    assert plan.qd[0] == pytest.approx(robot.qd, abs=1e-6)
+    assert plan.duration_s <= np.max(np.abs(SPEED) / ROBOT.max_acceleration) + REACTION_S
+
+
+@pytest.mark.parametrize("away", [-2.0, 0.3, 1e12])
+def test_a_single_wild_position_is_not_stopped_from(away):
+    robot = SimulatedController(reports="nan")
+    robot.run(0.3)
+    wild = robot.q + CYCLE_S * SPEED + away * np.eye(6)[3]
+    robot.track.read(JointCommand(ARM.joint_names, wild), robot.now_s + CYCLE_S)
+    assert robot.stop.begin("a test", robot.now_s + CYCLE_S)
+    assert robot.plans[0].q[0] == pytest.approx(robot.q + CYCLE_S * SPEED, abs=1e-3)
+    assert robot.plans[0].qd[0] == pytest.approx(SPEED, abs=1e-2)
+
+
+def test_a_stop_keeps_to_the_joints_speeds_and_limits():
+    """Even where all readings say that the robot is faster, and as good as at its limits."""
+    robot = SimulatedController()
+    robot.stop = RobotStop(
+        ARM, ROBOT.max_acceleration, robot.track, robot._take, ROBOT.max_velocity
+    )
+    robot.qd = 5.0 * ROBOT.max_velocity
+    robot.q = ARM.upper - 0.01 - 0.1 * robot.qd
+    robot.run(0.1)
+    assert robot.stop.begin("a test", robot.now_s)
+    plan = robot.plans[0]
+    assert np.all(plan.qd <= ROBOT.max_velocity + 1e-12)
+    between, _ = plan.at(np.linspace(0.0, plan.duration_s, 50))
+    assert np.all(between <= ARM.upper + REACTION_S * ROBOT.max_velocity)
+
+
+def test_a_stop_begins_where_the_controller_is_while_the_robot_follows_it():
+    robot = SimulatedController()
+    told = [HOME, SPEED]
+    robot.stop = RobotStop(
+        ARM, ROBOT.max_acceleration, robot.track, robot._take, reference=lambda now: tuple(told)
+    )
+    robot.run(0.3)
+    told[0] = robot.q + 0.014 * SPEED  # by which drives lag
+    assert robot.stop.begin("a test", robot.now_s)
+    assert robot.plans[0].q[0] == pytest.approx(told[0], abs=1e-12)
+    told[0] = robot.q + 0.3  # a robot that is held, or another one's controller
+    assert robot.stop.begin("a test", robot.now_s)
+    assert robot.plans[1].q[0] == pytest.approx(robot.q, abs=1e-6)

@@ -1,6 +1,7 @@
 """Where the robot is against its plan, and how fast its controller drives."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,10 @@ LIMITS = MotionLimits()
 DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=LIMITS)
 HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
 FASTEST = LIMITS.of_joints(ARM)[0]
+CELL = MotionCell(ARM, ToolBody(np.eye(4), 0.1, 0.008, 0.05), np.eye(4), DRIVING.housing, LIMITS)
+WAY = np.array([1.0, -0.3, 0.2, 0.5, -0.4, 0.1])
+FAST_CELL = replace(CELL, limits=MotionLimits(tcp_speed_m_s=0.25))
+FAST_PLAN = joint_way(FAST_CELL, HOME, HOME + 0.1 * WAY)
 # of a robot's joint states: 1 kHz to 25 Hz
 PERIODS_S = (0.001, 0.002, 0.004, 0.008, 0.02, 0.04)
 
@@ -92,16 +97,13 @@ def test_a_stop_of_a_motion_that_began_late_hurries_no_joint(
     late_s: float, lag_s: float, drives_s: float
 ) -> None:
     """Nothing but readings; drives that lag by no more than usual are not thrown back either."""
-    limits = MotionLimits(tcp_speed_m_s=0.25)
-    cell = MotionCell(
-        ARM, ToolBody(np.eye(4), 0.1, 0.008, 0.05), np.eye(4), DRIVING.housing, limits
-    )
-    plan = joint_way(cell, HOME, HOME + 0.1 * np.array([1.0, -0.3, 0.2, 0.5, -0.4, 0.1]))
+    plan = FAST_PLAN
     now_s = drives_s * plan.duration_s + late_s
     watch = RobotWatch(ARM, DRIVING)
-    watch.follow(plan, cell, 0.0)
-    for at_s in np.arange(-0.2, now_s, 0.004):
-        watch.reading(at_s, plan.at(max(at_s - late_s - lag_s, 0.0))[0], at_s)
+    watch.follow(plan, FAST_CELL, 0.0)
+    times = np.arange(-0.2, now_s, 0.008)
+    for at_s, q in zip(times, plan.places(np.maximum(times - late_s - lag_s, 0.0)), strict=True):
+        watch.reading(at_s, q, at_s)
         watch.away()
     found, velocity = watch.state(now_s, keeps=True)
     command, _ = plan.at(now_s - late_s)
@@ -113,14 +115,11 @@ def test_a_stop_of_a_motion_that_began_late_hurries_no_joint(
 @pytest.mark.parametrize("stall_s", [0.05, 0.2, 0.4])
 def test_readings_that_waited_for_a_busy_node_are_no_robot_beside_its_path(stall_s: float) -> None:
     """They come at once; the first is looked at, and then the last: the robot went on meanwhile."""
-    cell = MotionCell(
-        ARM, ToolBody(np.eye(4), 0.1, 0.008, 0.05), np.eye(4), DRIVING.housing, LIMITS
-    )
-    plan = joint_way(cell, HOME, HOME + np.array([1.0, -0.3, 0.2, 0.5, -0.4, 0.1]))
+    plan = joint_way(CELL, HOME, HOME + WAY)
     stalls_s = 0.5 * plan.duration_s
     watch = RobotWatch(ARM, DRIVING)
     watch.reading(-0.008, HOME, -0.008)
-    watch.follow(plan, cell, 0.0)
+    watch.follow(plan, CELL, 0.0)
     for at_s in np.arange(0.0, plan.duration_s, 0.008):
         heard_s = at_s
         if stalls_s <= at_s < stalls_s + stall_s:
