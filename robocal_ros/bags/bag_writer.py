@@ -374,12 +374,7 @@ class BagRecording:
         return StorageError(f"{self.folder}: recording broke off: {error.strerror or error}")
 
     def _describe(self) -> None:
-        try:
-            write_text(self.folder / "metadata.yaml", yaml.safe_dump(self._metadata()))
-        except InputError as error:
-            raise self._broken(error) from error
-
-    def _metadata(self) -> dict[str, Any]:
+        """Write ``metadata.yaml``."""
         files = self._files
         start, end = min(f["start_ns"] for f in files), max(f["end_ns"] for f in files)
         topics = [
@@ -394,7 +389,7 @@ class BagRecording:
             }
             for topic, msgtype in sorted(self._types.items())
         ]
-        return {
+        metadata = {
             "rosbag2_bagfile_information": {
                 "version": 5,
                 "storage_identifier": "mcap",
@@ -411,6 +406,10 @@ class BagRecording:
                 ],
             }
         }  # fmt: skip
+        try:
+            write_text(self.folder / "metadata.yaml", yaml.safe_dump(metadata))
+        except InputError as error:
+            raise self._broken(error) from error
 
 
 def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:

@@ -479,8 +479,18 @@ def _add_block(stream: IO[bytes], file: McapFile, block: Block) -> None:
     stream.seek(block.offset)
     data = stream.read(block.size)
     try:
-        content = _unpacked(data) if block.chunked else memoryview(data)
-        _definitions(content, file)
+        content, at = _unpacked(data) if block.chunked else memoryview(data), 0
+        while at < len(content):
+            opcode, length = HEAD.unpack_from(content, at)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                body = ReadDataStream(BytesIO(content[at + HEAD.size : at + HEAD.size + length]))
+                if opcode == Opcode.SCHEMA:
+                    schema = Schema.read(body)
+                    file.schemas[schema.id] = schema
+                else:
+                    channel = Channel.read(body)
+                    file.channels[channel.id] = channel
+            at += HEAD.size + length
         found = _stored(content)
     except DAMAGE as error:
         _lose(file, block, data, error)
@@ -509,21 +519,6 @@ def _unpacked(record: bytes) -> memoryview:
     stream = ReadDataStream(BytesIO(record[HEAD.size :]))
     content, length = get_chunk_data_stream(Chunk.read(stream), validate_crc=True)
     return memoryview(content.read(length))
-
-
-def _definitions(content: memoryview, file: McapFile) -> None:
-    at = 0
-    while at < len(content):
-        opcode, length = HEAD.unpack_from(content, at)
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            body = ReadDataStream(BytesIO(content[at + HEAD.size : at + HEAD.size + length]))
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(body)
-                file.schemas[schema.id] = schema
-            else:
-                channel = Channel.read(body)
-                file.channels[channel.id] = channel
-        at += HEAD.size + length
 
 
 class Stretch(NamedTuple):
@@ -591,10 +586,10 @@ def message_reader(
     come in blocks.
     """
     topic, msgtype = file.channels[channel].topic, file.msgtype(channel)
-    if types is None:
-        return _OneByOne(lambda found, place: bytes(found.data(place)))
 
     def decode(found: Messages, place: int) -> Any:
+        if types is None:
+            return bytes(found.data(place))
         try:
             return types.deserialize_cdr(found.data(place), msgtype)
         except (SerdeError, KeyError) as error:
@@ -604,30 +599,24 @@ def message_reader(
                 file=str(file.path),
             ) from error
 
-    as_defined = types.fielddefs.get(msgtype) == ros_types().fielddefs[JOINT_STATE]
-    gathered = topic in blocks and msgtype == JOINT_STATE and as_defined
-    return _JointReader(decode) if gathered else _OneByOne(decode)
-
-
-class _OneByOne:
-    """Reader of any topic."""
-
-    def __init__(self, decode: Decode) -> None:
-        self._decode = decode
-
-    def __call__(self, found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:
+    def one_by_one(found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:
         for place in range(start, stop):
-            yield place, self._decode(found, place)
+            yield place, decode(found, place)
+
+    if types is None or topic not in blocks or msgtype != JOINT_STATE:
+        return one_by_one
+    as_defined = types.fielddefs.get(msgtype) == ros_types().fielddefs[JOINT_STATE]
+    return _JointReader(decode) if as_defined else one_by_one
 
 
-class _JointReader(_OneByOne):
+class _JointReader:
     """Reader of a topic of joint states: as decoded one by one, many times faster.
 
     What can be used comes in blocks (`JointBlock`), what is odd as messages.
     """
 
     def __init__(self, decode: Decode) -> None:
-        super().__init__(decode)
+        self._decode = decode
         self._layouts: list[tuple[JointLayout, tuple[str, ...]]] = []
 
     def __call__(self, found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:

@@ -139,7 +139,10 @@ def read_cells(path: Path, check: Callable[[list[str], str], None]) -> Cells:
         raise InputError("the table has a header but no measurements", file=file)
     for number, row in zip(numbers, rows, strict=True):
         if len(row) != len(header):
-            raise InputError(_ragged(row, len(header)), file=file, row=number)
+            message = f"{len(row)} cells, but the header has {len(header)} columns"
+            if len(row) > len(header):
+                message += "; is the decimal mark a comma? It must be a point"
+            raise InputError(message, file=file, row=number)
     names = [name.strip() for name in header]
     columns = zip(*rows, strict=True)
     return Cells(file, tuple(numbers), dict(zip(names, columns, strict=True)))
@@ -165,13 +168,6 @@ def write_cells(path: Path, columns: Mapping[str, Sequence[str]]) -> None:
     write_text(path, text.getvalue())
 
 
-def _ragged(row: list[str], width: int) -> str:
-    message = f"{len(row)} cells, but the header has {width} columns"
-    if len(row) > width:
-        message += "; is the decimal mark a comma? It must be a point"
-    return message
-
-
 # ---- columns of a measurement table: names, units, and what is missing or unknown ---------------
 #
 # The contract is written in docs/files.md.
@@ -184,6 +180,7 @@ EULER = ("rx_deg", "ry_deg", "rz_deg")
 ROTATION_VECTOR = ("rvx_rad", "rvy_rad", "rvz_rad")
 QUATERNION = ("qx", "qy", "qz", "qw")
 ORIENTATIONS = (EULER, ROTATION_VECTOR, QUATERNION)
+_POSES = tuple(name for group in (*POSITION.values(), *ORIENTATIONS) for name in group)
 NUMBERS = ("stamp_s", "sigma_mm")
 WORDS = ("target", "sample", "pose", "cycle")
 JOINT = re.compile(r"q[1-9][0-9]?_(deg|rad|mm|m)")
@@ -222,14 +219,6 @@ def joint_units(arm: SerialArm, joint: int) -> Mapping[str, float]:
     return LENGTH_UNITS if arm.prismatic[joint] else ANGLE_UNITS
 
 
-def known_columns(arm: SerialArm) -> tuple[str, ...]:
-    """Every column name that a table for this arm may have."""
-    joints = [f"q{i + 1}_{unit}" for i in range(arm.n) for unit in joint_units(arm, i)]
-    positions = [name for names in POSITION.values() for name in names]
-    orientations = [name for names in ORIENTATIONS for name in names]
-    return (*joints, *positions, *orientations, *NUMBERS, *WORDS)
-
-
 def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> TableLayout:
     """Understand a header.
 
@@ -238,9 +227,8 @@ def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> TableLayout
     InputError
         For an unknown, missing, doubled or nameless column, and for mixed units.
     """
-    names = [name.strip() for name in header]
-    _check_separator(names, file)
-    _check_known(names, known_columns(arm), file, arm)
+    names = _names(header, file)
+    _check_known(names, (*_of_joints(arm), *_POSES, *NUMBERS, *WORDS), file, arm)
     place = {name: i for i, name in enumerate(names)}
     joints, factors = _joint_columns(place, arm, file)
     position, factor = _position_columns(place, file)
@@ -257,10 +245,8 @@ def read_joint_columns(
     InputError
         As `read_layout`.
     """
-    names = [name.strip() for name in header]
-    _check_separator(names, file)
-    joints = [f"q{i + 1}_{unit}" for i in range(arm.n) for unit in joint_units(arm, i)]
-    _check_known(names, ("stamp_s", *joints), file, arm)
+    names = _names(header, file)
+    _check_known(names, ("stamp_s", *_of_joints(arm)), file, arm)
     if "stamp_s" not in names:
         _fail("column stamp_s is missing", file)
     return _joint_columns({name: i for i, name in enumerate(names)}, arm, file)
@@ -279,15 +265,10 @@ def read_pose_columns(
         As `read_layout`; for a position without an orientation, and when neither pose nor joints
         are there.
     """
-    names = [name.strip() for name in header]
-    _check_separator(names, file)
+    names = _names(header, file)
     joints = [name for name in names if JOINT.fullmatch(name)]
-    known = [*words, *(name for group in (*POSITION.values(), *ORIENTATIONS) for name in group)]
-    if arm is None:
-        _check_known(names, [*known, *joints], file)
-    else:
-        of_arm = [f"q{i + 1}_{unit}" for i in range(arm.n) for unit in joint_units(arm, i)]
-        _check_known(names, [*known, *of_arm], file, arm)
+    own = joints if arm is None else _of_joints(arm)
+    _check_known(names, [*words, *_POSES, *own], file, arm)
     place = {name: i for i, name in enumerate(names)}
     columns: tuple[str, ...] = ()
     factors = np.zeros(0)
@@ -315,8 +296,7 @@ def check_plain(
     InputError
         For an unknown, missing, doubled or nameless column.
     """
-    names = [name.strip() for name in header]
-    _check_separator(names, file)
+    names = _names(header, file)
     _check_known(names, (*required, *optional), file)
     missing = [name for name in required if name not in names]
     if missing:
@@ -329,16 +309,20 @@ def _fail(message: str, file: str, column: str | None = None) -> NoReturn:
     )
 
 
-def _check_separator(names: list[str], file: str) -> None:
-    if len(names) > 1:
-        return
+def _of_joints(arm: SerialArm) -> list[str]:
+    return [f"q{i + 1}_{unit}" for i in range(arm.n) for unit in joint_units(arm, i)]
+
+
+def _names(header: Sequence[str], file: str) -> list[str]:
+    names = [name.strip() for name in header]
     for sign, called in SEPARATORS.items():
-        if sign in names[0]:
+        if len(names) == 1 and sign in names[0]:
             _fail(
                 f"columns are separated by {called}; separate them by commas, with a point as "
                 f"the decimal mark",
                 file,
             )
+    return names
 
 
 def _check_known(
