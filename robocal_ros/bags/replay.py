@@ -249,9 +249,7 @@ def replay(
 
 
 def _submit_next(
-    session: Replayed,
-    expected: Iterator[tuple[Command, Mapping[str, Any]]],
-    ids: Mapping[int, int],
+    session: Replayed, expected: Iterator[tuple[Command, Mapping[str, Any]]], ids: Mapping[int, int]
 ) -> Mapping[str, Any] | None:
     following = next(expected, None)
     if following is None:

@@ -10,12 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.main import (
-    CliResult,
-    Document,
-    count,
-    text,
-)
+from robocal_ros.cli.main import CliResult, Document, count, text
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -55,11 +55,7 @@ from robocal_ros.thermal.session import (
     take_message,
     window_commands,
 )
-from robocal_ros.tool.session import (
-    is_tool_session,
-    take_tool_message,
-    tool_session_as_recorded,
-)
+from robocal_ros.tool.session import is_tool_session, take_tool_message, tool_session_as_recorded
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -10,13 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cli.main import (
-    ROBOT_HELP,
-    CliResult,
-    Document,
-    describe_robot,
-    warn,
-)
+from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, warn
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text
 from robocal_ros.ground.frames import transform_document
