@@ -1,6 +1,5 @@
 """Parameters of the joint correction node."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.limiter import OffsetLimits
-from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import (
@@ -20,7 +18,7 @@ from robocal_ros.kinematics.robots import (
     robot_file_hash,
 )
 from robocal_ros.ros.base import NO_SERIAL
-from robocal_ros.ros.parameters import Setting, advanced
+from robocal_ros.ros.parameters import Setting, advanced, given_pose, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR
 
 Array = NDArray[np.float64]
@@ -28,14 +26,6 @@ Array = NDArray[np.float64]
 NOMINAL = "nominal"
 # Parameters that go to the session as they are.
 SAME = ("stream_gap_s", "joint_state_age_s", "flange_frame", "model_age_s", "free_axis", "shadow")
-
-
-def _tool_fault(values: list[float]) -> str | None:
-    if len(values) != 7:
-        return "not seven numbers: x, y, z, qx, qy, qz, qw"
-    if any(values) and abs(math.hypot(*values[3:]) - 1.0) > 1e-3:
-        return "the quaternion is not of unit length"
-    return None
 
 
 SETTINGS = (
@@ -46,12 +36,11 @@ SETTINGS = (
         "Model that the program was made with: nominal, or path of a robot file that holds the "
         "calibrated cold model of a taught program",
     ),
-    Setting(
-        "taught_tool",
-        [0.0] * 7,
-        "Tool on the flange that the program was made with: x, y, z in m, qx, qy, qz, qw; all "
-        "zero: the tool of the robot file",
-        check=_tool_fault,
+    *pose_settings(
+        "taught",
+        "Tool on the flange that the program was made with; as the quaternion at its default: the "
+        "robot file's",
+        "Its orientation: z from flange to tip",
     ),
     Setting(
         "command_joints",
@@ -177,10 +166,8 @@ def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
         lower=np.maximum(nominal.lower, reference.lower),
         upper=np.minimum(nominal.upper, reference.upper),
     )
-    tool = settings["taught_tool"]
-    if any(tool):
-        reference = replace(reference, T_flange_tool=frames.transform_from_quat(tool[:3], tool[3:]))
-    return nominal, reference
+    tool = given_pose(settings, "taught")
+    return nominal, reference if tool is None else replace(reference, T_flange_tool=tool)
 
 
 def command_joints(settings: Mapping[str, Any], arm: SerialArm) -> tuple[str, ...]:

@@ -76,10 +76,9 @@ def test_a_trajectory_keeps_its_times(graph: Any) -> None:
 
 
 def test_a_new_tool_and_a_taught_one(graph: Any) -> None:
-    tool = [0.01, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
-    line = Line(graph, enable_on_start=True, taught_tool=tool)
+    line = Line(graph, enable_on_start=True, taught_xyz_mm=[10.0, 0.0, 250.0])
     T = np.eye(4)
-    T[:3, 3] = tool[:3]
+    T[:3, 3] = [0.01, 0.0, 0.25]
     new = T.copy()
     new[0, 3] = 0.012
     line.take(tool_message(new), line.to_tool, "tool")
@@ -319,11 +318,11 @@ def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
     assert distance(actual, out.points[0].positions) < 1e-9
 
 
-@pytest.mark.parametrize("parameters", [{"taught_tool": [1.0]}, {"taught_tool": [0.1] * 7}])
-def test_a_tool_that_makes_no_sense_is_named(graph: Any, parameters: dict[str, Any]) -> None:
-    node = graph.add(JointCorrectionNode, parameters)
+@pytest.mark.parametrize(("name", "value"), [("xyz_mm", [1.0]), ("quat_xyzw", [0.1] * 4)])
+def test_a_tool_that_makes_no_sense_is_named(graph: Any, name: str, value: list[float]) -> None:
+    node = graph.add(JointCorrectionNode, {f"taught_{name}": value})
     assert not node.is_active
-    assert "taught_tool" in node._full_health().message
+    assert f"taught_{name}" in node._full_health().message
 
 
 def test_as_a_process_it_answers_and_streams(graph: Any) -> None:

@@ -85,12 +85,12 @@ class Cell:
 
     def start(self, name: str) -> None:
         """Start a node, or start it anew."""
-        tool = {"taught_xyz_mm": f"[{', '.join(str(1e3 * x) for x in TAUGHT_M)}]"}
+        tool = {"taught_xyz_mm": [1e3 * x for x in TAUGHT_M]}
         parameters: dict[str, Any] = {"serial": "s1", "robot": "kr150_r3100"}
         parameters |= {
             "thermal_node": {},
             "tcf_node": tool | {"laser": self._laser},
-            "joint_correction_node": {"taught_tool": [*TAUGHT_M, 0.0, 0.0, 0.0, 1.0]},
+            "joint_correction_node": tool,
         }[name]
         remap = {"kinematic_model": "/thermal_node/model", "tool": "/tcf_node/tool"}
         mine = remap if name == "joint_correction_node" else None
@@ -123,9 +123,15 @@ class Cell:
 
     def _obey(self, message: JointState) -> None:
         stamp = message.header.stamp
-        self._answered, taught = self.taught[stamp.sec * 10**9 + stamp.nanosec]
         assert list(message.name) == NAMES
         out, now = np.array(message.position), time.monotonic()
+        answer = self.taught.get(stamp.sec * 10**9 + stamp.nanosec)
+        if answer is None:  # the node slows down what it hears no more of: the planner is there
+            _, before, out_before = self.sent[-1]
+            taught = before + out - out_before
+            self._answered += np.mean(taught - before) / (SWING_RAD * np.cos(self._answered))
+        else:
+            self._answered, taught = answer
         self.sent.append((now, taught, out))
         self.robot, self._heard = out, now
 

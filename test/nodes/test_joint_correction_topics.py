@@ -208,8 +208,7 @@ def test_offsets_are_worked_out_for_who_listens(graph: Any) -> None:
 
 
 def test_the_status_tells_what_is_in_use(graph: Any) -> None:
-    tool = [0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
-    line = Line(graph, taught_tool=tool)
+    line = Line(graph, taught_xyz_mm=[0.0, 0.0, 250.0])
     first = line.told(state=CorrectionStatus.OFF)
     assert first.robot == NOMINAL.name
     assert first.serial == "s1"
@@ -256,8 +255,7 @@ def test_a_mismatch_is_a_state_of_its_own(graph: Any) -> None:
 
 
 def test_a_measured_tool_waits_for_the_robot_to_stand(graph: Any) -> None:
-    tool = [0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
-    line = Line(graph, enable_on_start=True, taught_tool=tool)
+    line = Line(graph, enable_on_start=True, taught_xyz_mm=[0.0, 0.0, 250.0])
     T = np.eye(4)
     T[:3, 3] = (0.002, 0.0, 0.25)
     line.target()
