@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.messages import joint_names
-from robocal_ros.ros.graph import KILLED, clients, own_endpoint, publishers, strangers
+from robocal_ros.ros.graph import KILLED, commanding, own_endpoint, publishers
 
 LEASE_S = 1.0  # a lease that was not renewed for so long is lost: its holder died, or hangs
 STOOD_S = 1.0  # a lost one is over when the robot has stood for so long
@@ -208,15 +208,10 @@ class GraphWatch:
 
         ``stood_s``: how long the robot has stood, as far as that is known.
         """
-        node, own, found = self._node, self._own, []
+        node = self._node
         leasing = publishers(node, self._lease_topic)
         cell = [one for one in leasing if one.name not in self.leases.others]
-        for topic, count in self._commands.items():
-            others = strangers(publishers(node, topic), own, count, cell)
-            found += [f"{who} publishes {topic}" for who in others]
-        for action, count in self._actions.items():
-            others = strangers(clients(node, action), own, count, cell)
-            found += [f"{who} is a client of {action}" for who in others]
+        found = commanding(node, self._own, self._commands, self._actions, cell)
         joints = self._sources.look(now_s)
         self.commanders = "; ".join([*found, *filter(None, [joints])])
         self.leases.look(now_s, stood_s)
@@ -224,10 +219,6 @@ class GraphWatch:
         if self.commanders:
             return GraphViolation(Reason.OTHER_COMMANDER, f"{self.commanders}. End it; {KILLED}")
         return GraphViolation(Reason.LEASED, self.lease) if self.lease else None
-
-    def close(self) -> None:
-        """Release what was opened."""
-        self._sources.close()
 
 
 class CommandSources:

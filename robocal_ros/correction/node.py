@@ -198,15 +198,12 @@ class JointCorrectionNode(HouseNode):
         # A controller takes trajectories beside its action, on a topic that nobody here publishes.
         beside = {f"{name.rpartition('/')[0]}/{TRAJECTORY}": 0 for name in actions}
         beside.pop(self.resolve_topic_name(TRAJECTORY), None)  # the program's, which comes in here
+        sources = JointSources(self, self.resolve_topic_name(STATES), self._arm_names)
+        lease_topic = self.resolve_topic_name(LEASE)
         self._graph = GraphWatch(
-            self,
-            beside | commands,
-            actions,
-            JointSources(self, self.resolve_topic_name(STATES), self._arm_names),
-            self._leases,
-            self.resolve_topic_name(LEASE),
+            self, beside | commands, actions, sources, self._leases, lease_topic
         )
-        self._release.append(self._graph.close)
+        self._release.append(sources.close)
 
     def activate(self) -> None:
         """Look who else is there, and tell at once what is done.

@@ -11,7 +11,7 @@ used, of rmw_fastrtps and Fast DDS:
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,6 +100,27 @@ def strangers(
     return sorted(names)
 
 
+def commanding(
+    node: Node,
+    own: Endpoint,
+    topics: Mapping[str, int],
+    actions: Mapping[str, int],
+    cell: Sequence[Endpoint],
+) -> list[str]:
+    """Who else publishes a topic, or is a client of an action, in words; see `strangers`.
+
+    By resolved names, each with how many endpoints of its own this node has there.
+    """
+    found = []
+    for topic, count in topics.items():
+        others = strangers(publishers(node, topic), own, count, cell)
+        found += [f"{who} publishes {topic}" for who in others]
+    for action, count in actions.items():
+        others = strangers(clients(node, action), own, count, cell)
+        found += [f"{who} is a client of {action}" for who in others]
+    return found
+
+
 class CommandPath:
     """Looks at who commands a robot.
 
@@ -112,10 +133,11 @@ class CommandPath:
     def __init__(
         self, node: Node, topic: str, action: str, cell: Sequence[str], mine: str = ""
     ) -> None:
-        self._node, self._mine, self._action = node, mine, action
+        self._node, self._mine = node, mine
         # A controller takes trajectories on the topic beside its action too.
         beside = [f"{action.rpartition('/')[0]}/joint_trajectory"] if action else []
-        self._topics = sorted({topic, *beside})
+        self._topics = dict.fromkeys(sorted({topic, *beside}), 1)
+        self._actions = {action: 1} if action else {}
         self._cell = [node.resolve_topic_name(each) for each in cell]
         self._own = own_endpoint(node)
         self.violation = ""
@@ -131,12 +153,7 @@ class CommandPath:
                 "robot; end the others"
             )
         cell = [one for each in self._cell for one in publishers(node, each)]
-        for topic in self._topics:
-            others = strangers(publishers(node, topic), self._own, 1, cell)
-            found += [f"{who} publishes {topic}" for who in others]
-        if self._action:
-            others = strangers(clients(node, self._action), self._own, 1, cell)
-            found += [f"{who} is a client of {self._action}" for who in others]
+        found += commanding(node, self._own, self._topics, self._actions, cell)
         self.violation = "; ".join(found)
         if found:
             self.violation += (

@@ -372,23 +372,10 @@ def test_without_limits_nothing_is_enabled_and_a_stream_is_ended_in_order() -> N
     assert speeds[-1] < np.radians(5.0)
 
 
-def test_without_limits_a_stream_after_a_long_pause_does_not_jump() -> None:
-    robot, q = under_way(**NO_LIMITS)
+@pytest.mark.parametrize("limits", [LIMITS, NO_LIMITS], ids=["limits", "no limits"])
+def test_after_a_long_stall_the_stream_is_held_and_looked_at(limits: dict[str, np.ndarray]) -> None:
+    robot, q = under_way(**limits)
     q[0] += np.radians(60.0) * 0.5
-    before = robot.at.copy()
-    robot.rest(0.49)
-    refused(Reason.START_MISMATCH, robot.stream, q, dt=0.01)
-    assert np.array_equal(robot.at, before)
-
-
-def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
-    robot, speed = Robot(), np.radians(60.0)
-    q = HOME.copy()
-    robot.stream(q)
-    for _ in range(50):
-        q[0] += speed * DT
-        robot.stream(q)
-    q[0] += speed * 0.5
     before = robot.at.copy()
     robot.rest(0.49)
     refused(Reason.START_MISMATCH, robot.stream, q, dt=0.01)
@@ -496,12 +483,8 @@ def test_a_stream_of_some_joints_then_of_all_moves_no_other_joint_at_once() -> N
 
 def test_refused_messages_leave_nothing_to_jump_to() -> None:
     """Twenty-three refused, then one that could be taken: the robot is no longer there."""
-    robot, speed = Robot(), np.radians(60.0)
-    q, held = HOME.copy(), []
-    robot.stream(q)
-    for _ in range(30):
-        q[0] += speed * DT
-        robot.stream(q)
+    speed, held = np.radians(60.0), []
+    robot, q = under_way(speed)
     for _ in range(23):
         q[0] += speed * DT
         bad = q.copy()
@@ -547,13 +530,8 @@ def test_a_stream_that_hardly_moves_is_followed(period_s: float) -> None:
 
 
 def test_a_last_message_that_came_late_is_still_reached() -> None:
-    robot, speed = Robot(), np.radians(60.0)
-    q = HOME.copy()
-    robot.stream(q)
-    for _ in range(50):
-        q[0] += speed * DT
-        robot.stream(q)
-    q[0] += speed * 0.06
+    robot, q = under_way()
+    q[0] += np.radians(60.0) * 0.06
     robot.stream(q, dt=0.06)
     assert robot.session.status().lag_s > 0.0
     for _ in range(100):

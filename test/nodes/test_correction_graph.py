@@ -49,9 +49,9 @@ class Watched:
         self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
         self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
         self.leases = Leases("kr150", "s1")
-        sources = JointSources(self.own, "/joint_states", NAMES)
+        self.sources = JointSources(self.own, "/joint_states", NAMES)
         self.watch = GraphWatch(
-            self.own, {PATH: 1}, {ACTION: 1}, sources, self.leases, "/motion_lease"
+            self.own, {PATH: 1}, {ACTION: 1}, self.sources, self.leases, "/motion_lease"
         )
 
     def process(self, name: str) -> Process:
@@ -71,7 +71,7 @@ class Watched:
         self.graph.spin_until(look, f"{reason} {words}, not {found}", within_s)
 
     def end(self) -> None:
-        self.watch.close()
+        self.sources.close()
         self.client.destroy()
         for other in self.others:
             other.end()
