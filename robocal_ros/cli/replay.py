@@ -43,8 +43,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
-from robocal_ros.session.base import SessionBase
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Command, Outcome, SessionBase
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.session import (
     ThermalSession,

@@ -32,8 +32,7 @@ from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
-from robocal_ros.session.base import GAP_NS, Ignored
-from robocal_ros.session.events import Command
+from robocal_ros.session.events import GAP_NS, Command, Ignored
 
 Array = NDArray[np.float64]
 

@@ -64,14 +64,16 @@ from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_ey
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
-from robocal_ros.session.base import (
+from robocal_ros.session.events import (
+    Command,
     Handler,
     HistoryFollower,
+    Outcome,
     SessionBase,
     configured_with,
     recorded_arguments,
+    seeded,
 )
-from robocal_ros.session.events import Command, Outcome, seeded
 
 Array = NDArray[np.float64]
 Samples = Sequence[HandEyeSample]

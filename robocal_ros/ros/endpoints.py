@@ -24,7 +24,7 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.session.base import MOST_REASONS, kind_of
+from robocal_ros.session.events import MOST_REASONS, kind_of
 
 
 def _profile(

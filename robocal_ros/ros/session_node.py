@@ -34,7 +34,6 @@ from robocal_ros.ros.endpoints import (
 )
 from robocal_ros.ros.graph import SourceGuard
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.session.base import Ignored
 from robocal_ros.session.events import (
     ACCEPT,
     CONFIGURE,
@@ -43,6 +42,7 @@ from robocal_ros.session.events import (
     REJECT,
     ROLLBACK,
     Command,
+    Ignored,
     Outcome,
     arguments_text,
     outcome_text,

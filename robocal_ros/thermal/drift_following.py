@@ -23,7 +23,7 @@ from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry
 from robocal_ros.identification import Method
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.session.base import HistoryFollower
+from robocal_ros.session.events import HistoryFollower
 from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work, process_of
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of

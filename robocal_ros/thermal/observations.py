@@ -29,8 +29,7 @@ from robocal_ros.ground.samples import (
     TemperatureSample,
 )
 from robocal_ros.session import events
-from robocal_ros.session.base import Ignored
-from robocal_ros.session.events import Command
+from robocal_ros.session.events import Command, Ignored
 from robocal_ros.thermal.drift_following import InForce, ThermalConfig
 
 Array = NDArray[np.float64]

@@ -16,14 +16,16 @@ from robocal_ros.history.history_records import HEALTHY_TOOL, MANDREL, THERMAL, 
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
-from robocal_ros.session.base import (
+from robocal_ros.session.events import (
+    Command,
     Handler,
     HistoryFollower,
+    Outcome,
     SessionBase,
     configured_with,
     recorded_arguments,
+    seeded,
 )
-from robocal_ros.session.events import Command, Outcome, seeded
 from robocal_ros.tool.crossed_model import Held
 from robocal_ros.tool.edges import (
     AHEAD_NS,
