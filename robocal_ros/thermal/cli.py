@@ -1,7 +1,6 @@
 """Commands of ``robocal thermal``: calibrate-sensor, identify, learn-prior, plan-poses, screen."""
 
 import argparse
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -175,7 +174,11 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm
     if args.arrangement == FLANGE:
-        document = identify_flange_files(arm, args.data, args.check)
+        sessions = [read_measurements(path, arm) for path in args.data]
+        check = None if args.check is None else read_measurements(args.check, arm)
+        judged = identify_and_judge_flange_sensor(arm, sessions, check)
+        read = {"sessions": [str(path) for path in args.data], "check": _name(args.check)}
+        document = flange_sensor_document(judged) | {"data": read}
     else:
         document = identify_fixed_files(arm, args)
     document |= {"arrangement": args.arrangement, "warnings": warnings}
@@ -362,38 +365,12 @@ def check_visits(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visi
     return check
 
 
-def identify_flange_files(
-    arm: SerialArm, data_files: Sequence[Path], check_file: Path | None
-) -> Document:
-    """Identify geometry, hand-eye and spheres from sessions; judge on the check session.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be read.
-    TooFewSamplesError, RankDeficientError
-        When the data cannot answer.
-    """
-    sessions = [read_measurements(path, arm) for path in data_files]
-    check = None if check_file is None else read_measurements(check_file, arm)
-    judged = identify_and_judge_flange_sensor(arm, sessions, check)
-    return flange_sensor_document(judged) | {
-        "data": {"sessions": [str(path) for path in data_files], "check": _name(check_file)}
-    }
-
-
 POSES, CANDIDATES = 6, 1000
 FIELD_MM = "570,430,700,550,850"
 
 
 def _field(value: str) -> tuple[float, ...]:
-    """Type of five lengths in mm.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
+    """Type of five lengths in mm."""
     numbers = tuple(positive(part) for part in value.split(","))
     if len(numbers) != 5 or numbers[3] >= numbers[4]:
         raise argparse.ArgumentTypeError(
@@ -441,7 +418,44 @@ def run_plan_poses(args: argparse.Namespace) -> CliResult:
     """Do ``plan-poses``. Raises `RobocalError` for what a user can mend."""
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm
-    document: Document = plan_files(arm, args) | {"warnings": warnings}
+    sensor = read_sensor(args.sensor, arm)
+    own = None if args.own is None else read_measurements(args.own, arm).q
+    found = plan_cycle(
+        arm,
+        sensor.T_sensor_base,
+        sensor.sphere_in_flange,
+        SensorField(*(1e-3 * x for x in args.field_mm)),
+        prior=drift_prior(arm) if args.prior is None else read_prior(args.prior, arm),
+        sigma_m=args.sigma_mm * 1e-3,
+        count=args.poses,
+        candidates=args.candidates,
+        working=None if args.working is None else read_measurements(args.working, arm).q,
+        own=own,
+        seed=args.seed,
+    )
+    plan, unit = found.plan, np.where(arm.prismatic, 1e3, np.degrees(1.0))
+    names = [f"q{i}_{'mm' if slides else 'deg'}" for i, slides in enumerate(arm.prismatic, 1)]
+    poses = [{"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, 1)]
+    if args.output is not None:
+        rows = [[pose["pose"], *(f"{value:.4f}" for value in pose["joints"])] for pose in poses]
+        lines = [",".join(row) for row in [["pose", *names], *rows]]
+        write_text(args.output, "\n".join(lines) + "\n")
+    document: Document = {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "columns": names,
+        "poses": poses,
+        "predicted_mm": plan.predicted_rms_m * 1e3,
+        "random_mm": plan.random_rms_m * 1e3,
+        "before_mm": plan.before_rms_m * 1e3,
+        "gain": 1.0 - plan.predicted_rms_m / plan.random_rms_m,
+        "working_poses": found.working,
+        "candidates": found.candidates,
+        "own_mm": None if found.own_rms_m is None else found.own_rms_m * 1e3,
+        "own_poses": None if own is None else len(own),
+        "output": None if args.output is None else str(args.output),
+        "warnings": warnings,
+    }
     warn(warnings)
     return CliResult(document, partial(_show_plan_poses, document=document))
 
@@ -467,55 +481,6 @@ def _show_plan_poses(console: "Console", document: Document) -> None:
     console.print(table)
     if document["output"]:
         console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
-
-
-def plan_files(arm: SerialArm, args: argparse.Namespace) -> Document:
-    """Plan, compare, and write the poses.
-
-    Raises
-    ------
-    InputError, WrongRobotError
-        When a file cannot be read or belongs to another robot.
-    LimitError, TooFewSamplesError
-        When the sphere cannot be brought into the field often enough.
-    """
-    sensor = read_sensor(args.sensor, arm)
-    own = None if args.own is None else read_measurements(args.own, arm).q
-    found = plan_cycle(
-        arm,
-        sensor.T_sensor_base,
-        sensor.sphere_in_flange,
-        SensorField(*(1e-3 * x for x in args.field_mm)),
-        prior=drift_prior(arm) if args.prior is None else read_prior(args.prior, arm),
-        sigma_m=args.sigma_mm * 1e-3,
-        count=args.poses,
-        candidates=args.candidates,
-        working=None if args.working is None else read_measurements(args.working, arm).q,
-        own=own,
-        seed=args.seed,
-    )
-    plan, unit = found.plan, np.where(arm.prismatic, 1e3, np.degrees(1.0))
-    names = [f"q{i}_{'mm' if slides else 'deg'}" for i, slides in enumerate(arm.prismatic, 1)]
-    poses = [{"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, 1)]
-    if args.output is not None:
-        rows = [[pose["pose"], *(f"{value:.4f}" for value in pose["joints"])] for pose in poses]
-        lines = [",".join(row) for row in [["pose", *names], *rows]]
-        write_text(args.output, "\n".join(lines) + "\n")
-    return {
-        "robot": arm.name,
-        "model_hash": arm.model_hash,
-        "columns": names,
-        "poses": poses,
-        "predicted_mm": plan.predicted_rms_m * 1e3,
-        "random_mm": plan.random_rms_m * 1e3,
-        "before_mm": plan.before_rms_m * 1e3,
-        "gain": 1.0 - plan.predicted_rms_m / plan.random_rms_m,
-        "working_poses": found.working,
-        "candidates": found.candidates,
-        "own_mm": None if found.own_rms_m is None else found.own_rms_m * 1e3,
-        "own_poses": None if own is None else len(own),
-        "output": None if args.output is None else str(args.output),
-    }
 
 
 WANTED = 8

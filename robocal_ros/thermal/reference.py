@@ -57,8 +57,12 @@ class ColdSpots:
         """Average the visits of each pose and target, without those that others contradict."""
         target = data.target_index(cell.targets)
         _, spot = np.unique(pose_groups(data.q) * len(cell.targets) + target, return_inverse=True)
-        error = cell.residual(data)
-        keep = _consistent(error, spot)
+        error, count = cell.residual(data), np.bincount(spot)
+        median = np.array([np.median(error[spot == s], axis=0) for s in range(len(count))])
+        away = np.linalg.norm(error - median[spot], axis=1)
+        judged, keep = count[spot] >= FEWEST_TO_JUDGE, np.ones(len(error), dtype=np.bool_)
+        if np.any(judged):
+            keep = ~judged | (away <= CONTRADICTION * np.median(away[judged]))
         visits = np.bincount(spot[keep])
         mean = np.zeros((len(visits), len(data)))
         mean[spot[keep], np.flatnonzero(keep)] = 1.0 / visits[spot[keep]]
@@ -166,17 +170,6 @@ class ColdSpots:
         T_target_flange = np.linalg.inv(self.cell.T_flange_target[:, :3, :3])
         own = T[:, :3, :3] @ T_target_flange[target]
         return J, np.concatenate([np.broadcast_to(np.eye(3), own.shape), own], axis=2)
-
-
-def _consistent(error: Array, spot: Index) -> NDArray[np.bool_]:
-    """Which cold errors (m, 3) agree with the median of their spot (three visits or more)."""
-    count = np.bincount(spot)
-    median = np.array([np.median(error[spot == s], axis=0) for s in range(len(count))])
-    away = np.linalg.norm(error - median[spot], axis=1)
-    judged = count[spot] >= FEWEST_TO_JUDGE
-    if not np.any(judged):
-        return np.ones(len(error), dtype=np.bool_)
-    return np.asarray(~judged | (away <= CONTRADICTION * np.median(away[judged])))
 
 
 @dataclass(frozen=True)
