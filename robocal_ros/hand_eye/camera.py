@@ -393,11 +393,7 @@ def calibrate_camera(
         raise InputError(wrong)
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
     result, state = (_classic if how.method == "classic" else _best)(fit, how)
-    result = replace(
-        result,
-        rejected={**rejected, **result.rejected},
-        more=about | result.more,
-    )
+    result = replace(result, rejected={**rejected, **result.rejected}, more=about | result.more)
     return result if check is None else _judged(result, check, state)
 
 

@@ -322,9 +322,7 @@ def _calibrate(corners: Array, board: Chessboard, size: tuple[int, int]) -> Intr
     finally:
         cv2.setNumThreads(threads)
     return Intrinsics(
-        np.asarray(matrix, dtype=np.float64),
-        np.asarray(distortion, dtype=np.float64).ravel(),
-        size,
+        np.asarray(matrix, dtype=np.float64), np.asarray(distortion, dtype=np.float64).ravel(), size
     )
 
 

@@ -32,12 +32,7 @@ from robocal_ros.hand_eye.data import (
     flange_poses,
 )
 from robocal_ros.hand_eye.files import PoseTable, read_flange_mount, read_pose_table, read_profiles
-from robocal_ros.hand_eye.result import (
-    METHODS,
-    HandEyeSettings,
-    by_shot,
-    hand_eye_document,
-)
+from robocal_ros.hand_eye.result import METHODS, HandEyeSettings, by_shot, hand_eye_document
 from robocal_ros.hand_eye.session import HandEyeConfig, is_hand_eye_session
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
 from robocal_ros.hand_eye.targets import (

@@ -272,9 +272,7 @@ class Standstills:
         return True
 
 
-def captured_marks(
-    commands: Sequence[tuple[Command, Mapping[str, Any]]],
-) -> dict[int, str] | None:
+def captured_marks(commands: Sequence[tuple[Command, Mapping[str, Any]]]) -> dict[int, str] | None:
     """Stamp and mark of the shots that a recorded session holds in the end.
 
     ``commands``: each with its recorded outcome. None: they tell of no data set.

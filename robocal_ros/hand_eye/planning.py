@@ -37,12 +37,7 @@ from robocal_ros.hand_eye.targets import (
     StepTarget,
     target_of,
 )
-from robocal_ros.hand_eye.tasks import (
-    FEWEST_SPHERES,
-    HandEyeData,
-    SphereTask,
-    StepTask,
-)
+from robocal_ros.hand_eye.tasks import FEWEST_SPHERES, HandEyeData, SphereTask, StepTask
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import CalibrationState
 from robocal_ros.kinematics import SerialArm
@@ -153,15 +148,7 @@ def check_plan(
             target, T_base_flange, state, information, noise, sensor, limit_m, wanted
         )
     return PlanReport(
-        rank,
-        len(information),
-        tuple(words),
-        sigma,
-        error,
-        unseen,
-        proposed,
-        better,
-        verdict,
+        rank, len(information), tuple(words), sigma, error, unseen, proposed, better, verdict
     )
 
 

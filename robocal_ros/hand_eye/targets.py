@@ -14,9 +14,7 @@ import yaml
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import (
-    InputError,
-)
+from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import write_text
 from robocal_ros.ground.frames import Document, transform_document
 from robocal_ros.hand_eye.camera_data import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics

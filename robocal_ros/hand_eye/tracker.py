@@ -499,11 +499,7 @@ def solve_tracker(
 
 
 def _classic(
-    data: TrackerData,
-    target: TrackerTarget,
-    classic: Classic,
-    best: HandEyeResult,
-    limit_m: float,
+    data: TrackerData, target: TrackerTarget, classic: Classic, best: HandEyeResult, limit_m: float
 ) -> HandEyeResult:
     """The closed form; its error is its distance from the best estimate, with that one's own."""
     away_m = apart(

@@ -56,11 +56,7 @@ def figure(svg: str, caption: str) -> str:
     )
 
 
-def table(
-    head: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    words: Sequence[int] = (),
-) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[int] = ()) -> str:
     """A table; columns ``words`` are text."""
 
     def cells(tag: str, values: Sequence[str]) -> str:

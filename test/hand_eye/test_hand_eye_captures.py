@@ -2,15 +2,7 @@
 
 import numpy as np
 import pytest
-from hand_eye_driver import (
-    FRAME,
-    SPHERE,
-    START_NS,
-    Recorded,
-    namespace,
-    profile,
-    sphere_set,
-)
+from hand_eye_driver import FRAME, SPHERE, START_NS, Recorded, namespace, profile, sphere_set
 from hand_eye_laser import SHOTS, STEP, begun, driver_of
 
 from robocal_ros.ground.errors import Code

@@ -4,13 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hand_eye_driver import (
-    ARM,
-    FRAME,
-    SPHERE,
-    START_NS,
-    joints,
-)
+from hand_eye_driver import ARM, FRAME, SPHERE, START_NS, joints
 from hand_eye_laser import SHOTS, WARM, begun, driver_of
 
 from robocal_ros.bags.bags import read_data_set, write_data_set

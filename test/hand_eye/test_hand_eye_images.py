@@ -6,15 +6,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from board_driver import (
-    COLUMNS,
-    LENS,
-    ROWS,
-    SQUARE_M,
-    board_file,
-    board_set,
-    image,
-)
+from board_driver import COLUMNS, LENS, ROWS, SQUARE_M, board_file, board_set, image
 from hand_eye_driver import ARM, CAMERA, FRAME, SPHERE, Driver, Recorded, namespace
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2

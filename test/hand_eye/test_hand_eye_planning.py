@@ -16,13 +16,7 @@ from hand_eye_sets import (
 )
 from scipy.optimize import minimize
 
-from bench.hand_eye_cell import (
-    SimulatedShots,
-    TrueStairs,
-    edge_shots,
-    sphere_shots,
-    step_shots,
-)
+from bench.hand_eye_cell import SimulatedShots, TrueStairs, edge_shots, sphere_shots, step_shots
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code

@@ -4,12 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_eye_driver import (
-    ARM,
-    CENTRE,
-    SPHERE,
-    sphere_set,
-)
+from hand_eye_driver import ARM, CENTRE, SPHERE, sphere_set
 from hand_eye_laser import TARGETS, driver_of
 
 from robocal_ros.cell_sim.sensors import ProfileSensor
