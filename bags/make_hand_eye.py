@@ -55,6 +55,7 @@ from bench.hand_eye_cell import (
     step_shots,
     taught,
 )
+from bench.hand_eye_files import write_shots, write_target
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim.beams import Q_NEAR
@@ -63,7 +64,6 @@ from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
 from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.files import write_shots
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.targets import (
     LaserTarget,
@@ -72,7 +72,6 @@ from robocal_ros.hand_eye.targets import (
     Staircase,
     StepTarget,
     read_target,
-    write_target,
 )
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session.events import Outcome

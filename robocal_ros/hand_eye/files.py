@@ -8,10 +8,10 @@ The contracts are written in docs/hand_eye.md and docs/hand_eye_tracker.md. A mo
 in YAML or JSON, with ``quat_xyzw`` or ``rpy_deg`` (about the fixed x, y, z).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -204,19 +204,6 @@ def read_profiles(folder: Path, table: PoseTable) -> list[Profile | TooFewSample
     return profiles
 
 
-def write_profile(path: Path, points: Array) -> None:
-    """Write a profile (n, 2), m; what is not-a-number becomes an empty cell.
-
-    Raises `InputError` when it cannot be written.
-    """
-    seen = np.all(np.isfinite(points), axis=1)
-    columns = {}
-    for axis, column in enumerate(PROFILE):
-        cells = zip(texts(points[:, axis] * 1e3), seen, strict=True)
-        columns[column] = [cell if there else "" for cell, there in cells]
-    write_cells(path, columns)
-
-
 def write_pose_table(
     path: Path,
     T_base_flange: Array,
@@ -246,21 +233,6 @@ def write_pose_table(
     columns |= dict(zip(POSITION["mm"], map(texts, T_base_flange[:, :3, 3].T * 1e3), strict=True))
     columns |= dict(zip(QUATERNION, map(texts, frames.quat_xyzw(T_base_flange).T), strict=True))
     write_cells(path, columns)
-
-
-def write_shots(
-    path: Path, folder: Path, T_base_flange: Array, profiles: Mapping[str, Array], **more: Any
-) -> None:
-    """Write a table of shots and, into ``folder``, the profile of each by the name of its shot.
-
-    ``more`` as in `write_pose_table`.
-
-    Raises `InputError` when one of them cannot be written.
-    """
-    files = [f"{name}.csv" for name in profiles]
-    for file, points in zip(files, profiles.values(), strict=True):
-        write_profile(folder / file, points)
-    write_pose_table(path, T_base_flange, files, names=tuple(profiles), **more)
 
 
 def read_tracker_points(

@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.files import write_text
-from robocal_ros.ground.frames import Document, transform_document
+from robocal_ros.ground.frames import Document
 from robocal_ros.hand_eye.camera_data import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics
 from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
@@ -387,31 +385,6 @@ def _check_near(fields: Fields, key: str, point_mm: Array) -> None:
         fields.fail(
             f"is {distance:.4g} mm from the base: is it a thousand times too far, in µm?", key
         )
-
-
-def write_target(path: Path, target: LaserTarget) -> None:
-    """Write a target file, corners in full; the file appears whole or not at all.
-
-    Raises `InputError` when it cannot be written.
-    """
-    document: Document = {"kind": KIND_OF[type(target)]}
-    if isinstance(target, SphereTarget):
-        document["radius_mm"] = target.radius_m * 1e3
-    elif isinstance(target, LineTarget):
-        document["point_mm"] = (target.point_base * 1e3).tolist()
-        document["direction"] = target.direction_base.tolist()
-    else:
-        marks = target.corners.items()
-        document |= {
-            "T_base_user": transform_document(target.T_base_user),
-            "corners_mm": {mark: (rows * 1e3).tolist() for mark, rows in marks},
-            "edge_user": target.edge_user.tolist(),
-            "sigma_mm": target.sigma_m * 1e3,
-            "user_sigma_mm": target.user_sigma_m * 1e3,
-            "user_sigma_deg": float(np.degrees(target.user_sigma_rad)),
-        }
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**16)
-    write_text(path, text)
 
 
 def read_tracker_target(path: Path) -> TrackerTarget:

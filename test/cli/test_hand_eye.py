@@ -34,13 +34,14 @@ from bench.hand_eye_cell import (
     sphere_shots,
     view,
 )
+from bench.hand_eye_files import write_target
 from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.files import read_flange_mount, read_pose_table, write_pose_table
-from robocal_ros.hand_eye.targets import LineTarget, write_target
+from robocal_ros.hand_eye.targets import LineTarget
 from robocal_ros.kinematics.robots import load_robot
 
 FOLDERS = ("sphere", "step", "line", "groove")

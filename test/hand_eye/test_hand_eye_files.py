@@ -12,6 +12,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from bench.hand_eye_files import write_profile, write_target
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.hand_eye.data import Profile
@@ -22,7 +23,6 @@ from robocal_ros.hand_eye.files import (
     read_profile,
     read_profiles,
     write_pose_table,
-    write_profile,
 )
 from robocal_ros.hand_eye.targets import (
     BoardTarget,
@@ -33,7 +33,6 @@ from robocal_ros.hand_eye.targets import (
     read_target,
     target_document,
     target_of,
-    write_target,
 )
 from robocal_ros.kinematics.robots import load_robot
 

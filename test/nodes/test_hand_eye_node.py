@@ -24,13 +24,14 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from bench.hand_eye_files import write_target
 from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.data import Capture
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.hand_eye.services import HandEyeOutputs
-from robocal_ros.hand_eye.targets import LineTarget, write_target
+from robocal_ros.hand_eye.targets import LineTarget
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import pose_message
 from robocal_ros.ros.endpoints import ERROR

@@ -16,12 +16,13 @@ from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
 from bench.hand_eye_cell import TrueStairs, edge_shots, step_shots
+from bench.hand_eye_files import write_target
 from robocal_ros.bags.bags import write_data_set
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.result import HandEyeSettings
-from robocal_ros.hand_eye.targets import Staircase, StepTarget, write_target
+from robocal_ros.hand_eye.targets import Staircase, StepTarget
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import pose_message

@@ -12,10 +12,11 @@ from robocal_msgs.msg import HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import CalibrateHandEye, CaptureHandEye, StartHandEye
 from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 
+from bench.hand_eye_files import write_target
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.hand_eye.node import HandEyeNode
-from robocal_ros.hand_eye.targets import SphereTarget, write_target
+from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.ros import endpoints
 
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)

@@ -17,15 +17,14 @@ from bench.hand_eye_cell import (
     sphere_shots,
     step_shots,
 )
+from bench.hand_eye_files import write_shots, write_target
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.files import write_shots
 from robocal_ros.hand_eye.targets import (
     LaserTarget,
     LineTarget,
     SphereTarget,
     Staircase,
     StepTarget,
-    write_target,
 )
 
 Array = NDArray[np.float64]
