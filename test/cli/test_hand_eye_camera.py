@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from bench import hand_eye_sets
 from bench.hand_eye_cell import TruePose
 from robocal_ros.cli.main import main
-from robocal_ros.hand_eye.camera import METHODS, distances
-from robocal_ros.hand_eye.camera import METHODS as CORE_METHODS
+from robocal_ros.hand_eye.camera import distances
 from robocal_ros.hand_eye.camera_data import CLOSED_FORMS
 from robocal_ros.hand_eye.camera_fit import fit_pairs
 from robocal_ros.hand_eye.files import write_pose_table
@@ -105,10 +104,6 @@ def test_joints_are_enough_where_the_robot_is_known(robocal, folder: Path) -> No
     pairs = ("--poses", "joints.csv", "--measured", "joint_boards.csv")
     assert near(robocal(*pairs, "--robot", "ur10"))
     assert "name the robot" in robocal(*pairs, status=2)["error"]["message"]
-
-
-def test_methods_are_those_of_the_core() -> None:
-    assert METHODS == CORE_METHODS
 
 
 def test_streams_tell_the_offset(robocal) -> None:

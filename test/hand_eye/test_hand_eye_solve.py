@@ -37,11 +37,9 @@ from robocal_ros.ground.errors import (
     RankDeficientError,
     ResidualError,
     RobocalError,
-    TooFewSamplesError,
 )
-from robocal_ros.hand_eye.data import profile_of
 from robocal_ros.hand_eye.mount_fit import fit_mount
-from robocal_ros.hand_eye.result import HandEyeSettings, hand_eye_document, point_covariance
+from robocal_ros.hand_eye.result import HandEyeSettings, point_covariance
 from robocal_ros.hand_eye.solve import features, held_out, look, solve_joint, solve_task, verify
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask
@@ -77,11 +75,6 @@ def result(data):
 def few():
     """As many as tell a mistake, whose sides are tried in all patterns at once."""
     return sphere_data(count=6)
-
-
-@pytest.fixture(scope="module")
-def edge():
-    return data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
 
 
 class TestSphere:
@@ -141,13 +134,6 @@ class TestSphere:
         sigma = np.sqrt(np.diag(point_covariance(result, np.zeros((1, 3)))[0]).max())
         assert np.linalg.norm(error[:3, 3]) < 0.02 * sigma
 
-    def test_document_holds_what_people_ask_for(self, result):
-        document = hand_eye_document(result)
-        assert document["T_flange_sensor"]["quat_xyzw"]
-        assert len(document["residual_mm"]["per_sample"]) == 15
-        assert document["sigma"]["xyz_mm"][0] > 0.0
-        assert document["leave_one_out_mm"]["max"] >= document["leave_one_out_mm"]["mean"]
-
     def test_held_out_shots_of_the_same_sphere(self, result):
         other = held_out(
             SphereTask(SPHERE), sphere_data(9, 10), result.T_flange_sensor, result.place
@@ -180,57 +166,14 @@ class TestMistakes:
     def test_poses(self, few, change, words):
         self.refused(replace(few, T_base_flange=change(few.T_base_flange)), *words)
 
-    def test_pairs_shifted_by_one_among_many(self, data):
-        T = np.roll(data.T_base_flange, 1, axis=0)
-        self.refused(replace(data, T_base_flange=T), "shifted by one")
-
-    def test_two_pairs_swapped(self, data):
-        T = data.T_base_flange.copy()
-        T[[3, 8]] = T[[8, 3]]
-        rejected = solve(replace(data, T_base_flange=T)).rejected
-        assert set(rejected) == {"p4", "p9"}
-        assert rejected["p4"] == "fits the pose of p9, not its own: swapped?"
-
-    def test_profiles_in_another_unit(self, data):
-        with pytest.raises(InputError, match="thousand times too small"):
-            profile_of(1e-3 * data.profiles[0].points, "p1")
-
-    @pytest.mark.parametrize("radius_m", [0.0195, 0.021, 0.025])
+    @pytest.mark.parametrize("radius_m", [0.0195, 0.025])
     def test_wrong_radius(self, few, radius_m):
         self.refused(few, "radius", error=RobocalError, target=SphereTarget(radius_m))
-
-    def test_too_few_profiles(self):
-        self.refused(sphere_data(3, 4), "4 profiles", "at least 5", error=TooFewSamplesError)
-
-    def test_an_empty_profile_is_named_and_the_others_are_used(self, data):
-        empty = TooFewSamplesError("profile p2 has 0 points")
-        profiles = [data.profiles[0], empty, *data.profiles[2:]]
-        found = solve(replace(data, profiles=profiles))
-        assert "0 points" in found.rejected["p2"]
-        assert chi_square(found, TRUE) < FAR_OFF
-
-    def test_rotation_about_one_axis(self):
-        """As with a P-R-P arm: what lies along the axis is not seen."""
-        cell = replace(CELL, tilt_rad=0.0)
-        self.refused(sphere_data(4, 15, cell), "translation", "tilt the flange about another axis",
-                     error=RankDeficientError)  # fmt: skip
 
     def test_no_rotation_at_all(self):
         cell = replace(CELL, tilt_rad=0.0, roll_rad=0.0)
         self.refused(sphere_data(5, 15, cell), "translation", "turn the flange about two axes",
                      error=RankDeficientError)  # fmt: skip
-
-    def test_sphere_seen_always_at_the_same_place(self, data):
-        """The sphere stays where it is in the profile: nothing tells where the sensor turns."""
-        rng = np.random.default_rng(6)
-        at = np.array([0.0, 0.55 * RADIUS_M, 0.2])
-        R = frames.exp_rotation(np.radians(25.0) * rng.uniform(-1.0, 1.0, (12, 3)))
-        sensor = frames.transform(R, CENTRE - R @ at)
-        one = data.profiles[0]
-        same = HandEyeData(
-            tuple(f"p{i}" for i in range(12)), sensor @ frames.invert(TRUE), [one] * 12
-        )
-        self.refused(same, "not determined", "at other distances", error=RankDeficientError)
 
 
 class TestStep:
@@ -254,10 +197,6 @@ class TestStep:
         found, exact = solve_step(shots, known), solve_step(shots)
         assert chi_square(found, TRUE) < FAR_OFF
         assert np.trace(found.covariance[:3, :3]) > 2.0 * np.trace(exact.covariance[:3, :3])
-
-    def test_one_line_of_corners_from_one_pose_is_refused(self):
-        with pytest.raises(RankDeficientError, match="one line"):
-            solve_step(self.shots(1, 1))
 
     def test_a_left_handed_target_file(self):
         drawn = stairs_target()
@@ -316,47 +255,21 @@ class TestLine:
             solve_task(LineTask(LINE, EdgeRule()), data, "best", SETTINGS)
 
 
-@pytest.fixture(scope="module")
-def ball_and_edge():
+@pytest.mark.parametrize("share", [0.98, 1.02, 1.2])
+def test_targets_together_find_a_wrong_radius(share):
     rng = np.random.default_rng(5)
     ball = data_of(sphere_shots(CELL, CENTRE, RADIUS_M, 12, rng))
-    return ball, data_of(edge_shots(CELL, T_BASE_USER, 12, rng))
-
-
-def test_targets_together_beat_each_alone(ball_and_edge):
-    ball, edge = ball_and_edge
-    parts = [(SphereTask(SPHERE), ball), (LineTask(None, EdgeRule()), edge)]
-    both = solve_joint(parts, SETTINGS)
-    alone = solve_task(SphereTask(SPHERE), ball, "best", SETTINGS)
-    assert chi_square(both, TRUE) < FAR_OFF
-    assert both.working_error_m < alone.working_error_m
-    assert {name.partition("/")[0] for name in both.samples} == {"sphere", "line"}
-
-
-@pytest.mark.parametrize("share", [0.98, 1.02, 1.2])
-def test_targets_together_find_a_wrong_radius(ball_and_edge, share):
-    ball, edge = ball_and_edge
+    edge = data_of(edge_shots(CELL, T_BASE_USER, 12, rng))
     parts = [(SphereTask(SphereTarget(share * RADIUS_M)), ball), (LineTask(None, EdgeRule()), edge)]
     with pytest.raises(RobocalError, match="radius"):
         solve_joint(parts, SETTINGS)
 
 
-class TestVerify:
-    def test_the_true_mount_passes_on_another_target(self, result, edge):
-        seen = verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
-        assert seen.verdict.accept
-
-    def test_a_place_that_was_not_reached_blames_no_mount(self, result, edge, monkeypatch):
-        monkeypatch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
-        with pytest.raises(RankDeficientError, match="still crept"):
-            verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
-
-    def test_a_knocked_sensor_does_not(self, result):
-        knocked = result.T_flange_sensor @ frames.transform(
-            frames.exp_rotation([0.0, 0.05, 0.0]), [2e-3, 0.0, 0.0]
-        )
-        seen = verify(SphereTask(SPHERE), sphere_data(7, 10), knocked, SETTINGS)
-        assert seen.verdict.code is Code.RESIDUAL_TOO_LARGE
+def test_a_place_that_was_not_reached_blames_no_mount(result, monkeypatch):
+    edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
+    monkeypatch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
+    with pytest.raises(RankDeficientError, match="still crept"):
+        verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
 
 
 class TestStepMistakes:

@@ -87,21 +87,6 @@ def test_what_is_no_shot_is_named(pairs):
         assert word in why
 
 
-def test_of_several_at_one_standstill_the_first_counts(pairs):
-    robot = robot_of(pairs)
-    for q, shot in SHOTS:
-        robot.move(q)
-        robot.rest(0.4)
-        robot.rest(0.6, shot)
-    robot.rest(0.3)
-    kept, rejected = first_of_each(pairs.found, RULE.tolerance_rad)
-    assert len(pairs.found) == 18
-    for one, (q, _) in zip(kept, SHOTS, strict=True):
-        assert one.q == pytest.approx(q, abs=5e-7)
-    assert len(rejected) == 15
-    assert "same standstill as shot_01" in rejected["shot_02"]
-
-
 def test_a_pose_that_is_met_again_later_is_a_standstill_of_its_own():
     shot = SHOTS[0][1](1)
     there = StandingShot("a", shot, Q_NEAR)
