@@ -20,6 +20,7 @@ from maintenance_cell import (
     Cell,
     bent,
     config_of,
+    new_tool,
     opened,
     passed,
     proposed,
@@ -33,6 +34,7 @@ from maintenance_tools import (
 )
 from tool_driver import TAUGHT
 
+from robocal_ros.correction.interface import CorrectionState, ToldCorrection
 from robocal_ros.ground.errors import Code, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
@@ -244,3 +246,63 @@ def test_a_tool_that_may_be_the_stations_waits_for_a_person(history, cause):
     assert "nothing proves that the tool has changed and not the beam station" in result.message
     assert result.accepted == ()
     assert cell.session.decide(ACCEPT, number, "a person", "", cell.wall_ns).done
+
+
+SILENT_S = 5.0
+OFF = ToldCorrection(state=CorrectionState.OFF, enabled=False)
+ON = ToldCorrection(state=CorrectionState.ON, enabled=True, tool_revision=1)
+
+
+@pytest.fixture
+def corrected(history) -> Cell:
+    """A bent tool was measured, accepted and checked; the line asked before it was."""
+    config = config_of(bounds=AcceptBounds(automatic=True), correction_silent_s=SILENT_S)
+    corrected = opened(history, config=config, check=bent(), drift=KNOWN)
+    line(corrected)
+
+    def full(corrected: Cell):
+        corrected.check = passed()
+        return new_tool(proposed(corrected.history))
+
+    corrected.full = full
+    corrected.run("c1", LONG_S)
+    assert corrected.finish().accepted
+    assert corrected.history.head(TOOL).revision == 1
+    return corrected
+
+
+def line(corrected: Cell, told: ToldCorrection | None = None):
+    """What it reads, when the correction has just said so."""
+    if told is not None:
+        corrected.session.correction(told, corrected.now_s)
+    return corrected.session.accuracy(corrected.now_s, corrected.wall_ns)
+
+
+def test_a_power_cut_that_leaves_the_correction_off_is_told_at_once(corrected):
+    assert line(corrected, ON).level is AccuracyLevel.OK
+    corrected.restart()
+    corrected.session.drift(KNOWN, corrected.now_s)
+    found = line(corrected, OFF)
+    assert found.level is AccuracyLevel.DEGRADED
+    assert found.reason == "correction: joint_correction_node is OFF: call ~/enable"
+    assert found.error is None  # what is known of model and tool is not what the robot does
+    assert line(corrected, ON).level is AccuracyLevel.OK
+
+
+def test_a_correction_that_falls_silent_is_told(corrected):
+    line(corrected, ON)
+    corrected.pass_time(SILENT_S - 0.1)
+    assert line(corrected).level is AccuracyLevel.OK
+    corrected.pass_time(0.2)
+    found = line(corrected)
+    assert (found.level, "is silent" in found.reason) == (AccuracyLevel.DEGRADED, True)
+
+
+def test_a_tool_that_the_correction_refused_is_told_once_it_must_have_heard_of_it(corrected):
+    refused = replace(ON, tool_revision=0, last_refusal="4.0 deg from the taught tool")
+    assert line(corrected, refused).level is AccuracyLevel.OK  # tcf_node follows within a second
+    corrected.pass_time(SILENT_S + 0.1)
+    found = line(corrected, refused)
+    assert found.level is AccuracyLevel.DEGRADED
+    assert "corrects with tool revision 0, in force is revision 1" in found.reason
+    assert "4.0 deg from the taught tool" in found.reason
