@@ -428,22 +428,15 @@ class NodeReports:
 
     def __init__(self, config: MaintenanceConfig) -> None:
         self._config = config
-        self._drift: tuple[Drift, float] | None = None
-        self._correction: tuple[ToldCorrection, float] | None = None
+        # what was told, and when
+        self.told_drift: tuple[Drift, float] | None = None
+        self.told_correction: tuple[ToldCorrection, float] | None = None
         self._in_force: tuple[int, int] | None = None
         self._since_s = -np.inf  # from when on that is in force, as far as it was looked at
 
-    def take_drift(self, drift: Drift, now_s: float) -> None:
-        """Keep what the thermal node says."""
-        self._drift = drift, now_s
-
-    def take_correction(self, told: ToldCorrection, now_s: float) -> None:
-        """Keep what the joint correction says."""
-        self._correction = told, now_s
-
     def drift(self, now_s: float) -> Drift | None:
         """None while the thermal node is silent."""
-        drift = self._drift
+        drift = self.told_drift
         return drift[0] if drift is not None and now_s - drift[1] <= self._config.silent_s else None
 
     def uncorrected(self, thermal: Head, tool: Head, now_s: float) -> str:
@@ -452,7 +445,7 @@ class NodeReports:
         What has just come into force reaches the correction by way of another node: until it has,
         as long as it may be silent, the revision before is no fault.
         """
-        silent_s, told = self._config.correction_silent_s, self._correction
+        silent_s, told = self._config.correction_silent_s, self.told_correction
         if silent_s == 0.0:
             return ""
         in_force = thermal.revision, tool.revision

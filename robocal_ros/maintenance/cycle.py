@@ -70,7 +70,7 @@ class ThermalPart:
         """The longest first step of a gap, before it is planned: one pose, with its way home."""
         ways = self._cell.ways
         homes = max((ways.home_s(i) for i in range(1, ways.count + 1)), default=0.0)
-        return self._first_s(ways.longest_line_s(), homes)
+        return self._first_s(max(ways.line_s), homes)
 
     def drop_old(self) -> str:
         """Give up an open cycle whose last pose is too old, and say so; empty: there is none."""

@@ -55,7 +55,7 @@ class Route:
 
 
 class Ways:
-    """Plans for one robot; planned from where it stands.
+    """Plans for one robot; planned from where it stands. ``line_s``: of each taught line.
 
     Raises `InputError` when poses have another number of joints, or ``tool_home_s`` is too short;
     `LimitError` when a taught way breaks a limit, or cuts into the station's housing.
@@ -84,7 +84,7 @@ class Ways:
             for number, plan in enumerate(lines, start=1):
                 self.cell.require_clear(plan, f"taught way {number}")
             self._require_time(config.times.tool_home_s)
-        self._line_s = [plan.duration_s for plan in lines]
+        self.line_s = [plan.duration_s for plan in lines]
 
     @property
     def count(self) -> int:
@@ -93,11 +93,7 @@ class Ways:
 
     def home_s(self, pose: int) -> float:
         """Duration of the way home from a pose."""
-        return min(sum(self._line_s[:pose]), sum(self._line_s[pose:]))
-
-    def longest_line_s(self) -> float:
-        """Duration of the longest taught line."""
-        return max(self._line_s)
+        return min(sum(self.line_s[:pose]), sum(self.line_s[pose:]))
 
     def beside(self, place: Line, q: Array) -> Array:
         """How far each joint (n,) is from a taught line, or from a point of the ring, rad (m)."""

@@ -305,10 +305,6 @@ class CellInterface(Asking):
         # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
         return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + self.tool_home_s
 
-    def may_wait(self) -> bool:
-        """Whether nothing moves, and a heartbeat from after the own pause is yet to come."""
-        return not (self.robot.moving or self.tool.armed) and self.gap.waits(self.now_s)
-
     def begin(self, gap_s: float) -> None:
         """A run is to begin, with the robot at home."""
         self.gap.begin(gap_s, self.now_s)

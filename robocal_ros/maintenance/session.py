@@ -78,8 +78,8 @@ class Conductor:
             return
         run.at(wall_ns)
         try:
-            if cell.may_wait():
-                return
+            if not (cell.robot.moving or cell.tool.armed) and cell.gap.waits(cell.now_s):
+                return  # a heartbeat from after the own pause is yet to come
             if why := cell.gap.over(cell.now_s):
                 self.give_up(why)
                 return
@@ -311,11 +311,11 @@ class MaintenanceSession:
 
     def drift(self, drift: Drift, now_s: float) -> None:
         """What the thermal part believes of the accuracy."""
-        self._reports.take_drift(drift, now_s)
+        self._reports.told_drift = drift, now_s
 
     def correction(self, told: ToldCorrection, now_s: float) -> None:
         """What the joint correction says of itself."""
-        self._reports.take_correction(told, now_s)
+        self._reports.told_correction = told, now_s
 
     def answered(self, number: int, answer: DriverAnswer) -> None:
         """What came of a request."""
