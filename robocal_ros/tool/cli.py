@@ -211,10 +211,10 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
         document = run_document(known, found, circles, judge_run(found, ToolLimits()))
     document["warnings"] = warnings
     warn(warnings)
-    return CliResult(document, partial(_show_run, document=document))
+    return CliResult(document, partial(_show_tool, document=document))
 
 
-def _show_run(console: "Console", document: Document) -> None:
+def _show_tool(console: "Console", document: Document) -> None:
     from rich.text import Text
 
     verdict = document["verdict"]
@@ -227,11 +227,12 @@ def _show_run(console: "Console", document: Document) -> None:
     )
     console.print(f"Tip in the flange frame, mm: {tip}")
     for name, key in (("Axis", "axis"), ("Orientation, quaternion x y z w", "quat_xyzw")):
-        console.print(f"{name}: {' '.join(f'{value:.6f}' for value in document[key])}")
-    for radius in document["tool_radius_mm"] or ():
+        if document.get(key) is not None:
+            console.print(f"{name}: {' '.join(f'{value:.6f}' for value in document[key])}")
+    for radius in document.get("tool_radius_mm") or ():
         console.print(Text(f"Tool radius on {radius['circle']}: {radius['x']:.3f} mm as the x-beam "
                            f"sees it, {radius['y']:.3f} mm as the y-beam"))  # fmt: skip
-    if document["latency_s"] is not None:
+    if document.get("latency_s") is not None:
         console.print(f"Latency of the input: {document['latency_s'] * 1e3:.3f} ms")
 
 
@@ -357,21 +358,7 @@ def run_points(args: argparse.Namespace) -> CliResult:
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
     document: Document = {"method": args.method}
     document |= touch_document(fit(read_flange_poses(args.data), sigma_m))
-    return CliResult(document, partial(_show_points, document=document))
-
-
-def _show_points(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    verdict = document["verdict"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
-    pairs = zip(document["tcp_mm"], document["sigma_mm"], strict=True)
-    tip = ", ".join(f"{value:.3f} ± {sigma:.3f}" for value, sigma in pairs)
-    console.print(f"Tip in the flange frame, mm: {tip}")
-    if document["quat_xyzw"] is not None:
-        quat = " ".join(f"{value:.6f}" for value in document["quat_xyzw"])
-        console.print(f"Orientation, quaternion x y z w: {quat}")
+    return CliResult(document, partial(_show_tool, document=document))
 
 
 def add_parallel(parser: argparse.ArgumentParser) -> None:

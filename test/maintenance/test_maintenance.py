@@ -41,11 +41,6 @@ from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 SMALL = ToolError(1e-4, 1.5e-4)
 
 
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
-
-
 def test_a_long_gap_takes_everything_in_its_order(cell):
     assert cell.run("c1", LONG_S) is Code.ACCEPT
     result = cell.finish()

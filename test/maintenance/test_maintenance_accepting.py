@@ -20,7 +20,6 @@ from maintenance_cell import (
     Cell,
     bent,
     config_of,
-    new_tool,
     opened,
     passed,
     proposed,
@@ -30,6 +29,7 @@ from maintenance_tools import (
     automatic,
     measured_in_full,
     modes,
+    straightened,
     thermal_candidate,
 )
 from tool_driver import TAUGHT
@@ -54,11 +54,6 @@ from robocal_ros.tool.run import rows_of
 
 UNSOUND = (AccuracyLevel.FAULT, None)  # None: silent
 BESIDE = np.eye(4) + 1e-5 * np.eye(4, k=3)  # a hundredth of a millimetre
-
-
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
 
 
 @pytest.mark.parametrize("how", [REFUSED, SILENT])
@@ -256,26 +251,20 @@ ON = ToldCorrection(state=CorrectionState.ON, enabled=True, tool_revision=1)
 @pytest.fixture
 def corrected(history) -> Cell:
     """A bent tool was measured, accepted and checked; the line asked before it was."""
-    config = config_of(bounds=AcceptBounds(automatic=True), correction_silent_s=SILENT_S)
-    corrected = opened(history, config=config, check=bent(), drift=KNOWN)
-    line(corrected)
-
-    def full(corrected: Cell):
-        corrected.check = passed()
-        return new_tool(proposed(corrected.history))
-
-    corrected.full = full
-    corrected.run("c1", LONG_S)
-    assert corrected.finish().accepted
-    assert corrected.history.head(TOOL).revision == 1
-    return corrected
+    cell = automatic(history, correction_silent_s=SILENT_S)
+    line(cell)
+    cell.full = straightened
+    cell.run("c1", LONG_S)
+    assert cell.finish().accepted
+    assert cell.history.head(TOOL).revision == 1
+    return cell
 
 
-def line(corrected: Cell, told: ToldCorrection | None = None):
+def line(cell: Cell, told: ToldCorrection | None = None):
     """What it reads, when the correction has just said so."""
     if told is not None:
-        corrected.session.correction(told, corrected.now_s)
-    return corrected.session.accuracy(corrected.now_s, corrected.wall_ns)
+        cell.session.correction(told, cell.now_s)
+    return cell.session.accuracy(cell.now_s, cell.wall_ns)
 
 
 def test_a_power_cut_that_leaves_the_correction_off_is_told_at_once(corrected):

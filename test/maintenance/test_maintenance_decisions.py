@@ -14,7 +14,6 @@ from maintenance_cell import (
     POSES,
     Cell,
     kinds,
-    opened,
     passed,
     proposed,
     thermal_proposed,
@@ -35,11 +34,6 @@ from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.deciding import HELD_S, Decider
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
-
-
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
 
 
 @contextmanager

@@ -157,11 +157,6 @@ UNKNOWN = set(Code) - {
 }
 
 
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
-
-
 @pytest.mark.parametrize("how", [REFUSED, SILENT])
 def test_a_thermal_node_that_fails_leaves_the_measurement(cell, how):
     cell.services["thermal"] = how

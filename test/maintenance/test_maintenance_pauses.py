@@ -5,26 +5,20 @@ import pytest
 from maintenance_cell import (
     BEAT_S,
     DRIVING,
-    KNOWN,
     LAG_S,
     LATE_S,
     LONG_S,
     SILENT,
     STALE_S,
     TICK_S,
-    Cell,
     ToolNode,
-    bent,
-    config_of,
     kinds,
-    new_tool,
     opened,
-    passed,
-    proposed,
 )
+from maintenance_tools import automatic, straightened, until_sent
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.maintenance import AcceptBounds, MaintenanceState
+from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.robot_interface import DEAF_S, Stop
 from robocal_ros.maintenance.session import UNSAVED_S
 from robocal_ros.motion.plan import SHORTEST_STOP_S
@@ -33,11 +27,6 @@ from robocal_ros.tool.driving import SETTLED_S
 
 PAUSES_S = (0.3, 0.6, 3.0)
 FRESH_WITHIN_S = DRAIN_S + STALE_S  # after a pause
-
-
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
 
 
 @pytest.mark.parametrize("pause_s", PAUSES_S)
@@ -65,9 +54,7 @@ def test_a_pause_of_its_own_that_a_cycle_bears_in_a_motion(history, beats_every_
         cell = opened(history)
         cell.beats_every_s = beats_every_s
         cell.pass_time(1.0)
-        assert cell.run("c1", LONG_S) is Code.ACCEPT
-        while "Move" not in kinds(cell):
-            cell.step()
+        until_sent(cell)
         cell.pass_time(0.4 + late_s)
         assert cell.moved_s == cell.now_s
         cell.pause(pause_s)
@@ -78,18 +65,8 @@ def test_a_pause_of_its_own_that_a_cycle_bears_in_a_motion(history, beats_every_
 @pytest.mark.parametrize("pause_s", PAUSES_S)
 def test_nor_does_one_between_two_measurements(history, pause_s):
     """Check, full measurement and acceptance are each kept before the tool node is armed again."""
-    cell = opened(
-        history,
-        config=config_of(bounds=AcceptBounds(automatic=True)),
-        check=bent(),
-        drift=KNOWN,
-    )
-
-    def full(cell: Cell):
-        cell.check = passed()
-        return new_tool(proposed(cell.history))
-
-    cell.full = full
+    cell = automatic(history)
+    cell.full = straightened
     cell.shelf.takes = lambda: cell.pause(pause_s)
     cell.run("c1", LONG_S)
     result = cell.finish()
@@ -133,9 +110,7 @@ def test_a_false_that_waited_ends_the_cycle_at_once(cell):
 
 
 def test_a_pause_in_a_motion_stops_the_robot(cell):
-    cell.run("c1", LONG_S)
-    while "Move" not in kinds(cell):
-        cell.step()
+    until_sent(cell)
     cell.pause(0.6)
     result = cell.finish()
     assert result.code is Code.CONFLICT
@@ -145,9 +120,7 @@ def test_a_pause_in_a_motion_stops_the_robot(cell):
 
 def test_a_stop_after_a_suspend_begins_where_the_robot_stands(cell):
     """Host and controller slept in the middle of a motion."""
-    cell.run("c1", LONG_S)
-    while "Move" not in kinds(cell):
-        cell.step()
+    until_sent(cell)
     cell.pass_time(0.6)
     assert cell.moved_s == cell.now_s
     cell.session.slept(3600.0)
@@ -159,9 +132,7 @@ def test_a_stop_after_a_suspend_begins_where_the_robot_stands(cell):
 
 
 def test_a_stop_does_not_wait_for_the_disk(cell):
-    cell.run("c1", LONG_S)
-    while "Move" not in kinds(cell):
-        cell.step()
+    until_sent(cell)
     cell.pass_time(0.5)
     cell.shelf.takes = lambda: cell.pause(0.6)
     cell.is_open, closed_s = False, cell.now_s
@@ -207,9 +178,7 @@ def test_a_fault_is_written_though_nobody_says_whether_the_robot_rests(cell):
 
 
 def test_a_fault_that_is_not_on_the_disk_yet_outlives_a_kill(cell):
-    cell.run("c1", LONG_S)
-    while "Move" not in kinds(cell):
-        cell.step()
+    until_sent(cell)
     cell.is_open = False
     while cell.state is MaintenanceState.RUNNING:
         cell.step()

@@ -32,11 +32,6 @@ from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
 
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
-
-
 def until_measuring(cell: Cell, pose: int) -> None:
     cell.run("c1", LONG_S)
     while not cell.session.status(cell.now_s).doing.startswith(f"measuring pose {pose}"):

@@ -30,11 +30,6 @@ WITHOUT_WAY = DriverAnswer(Code.LIMIT_EXCEEDED, "the housing would be hit")
 OTHER_MODEL = "another thermal model is in force than it was checked with: check it"
 
 
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
-
-
 def test_a_check_in_the_future_is_none(cell, monkeypatch):
     """The computer's clock was set back by a day."""
     cell.run("c1", LONG_S)

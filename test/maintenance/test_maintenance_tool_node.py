@@ -34,11 +34,6 @@ from robocal_ros.tool.driving import SETTLED_S
 GONE_S = 6.0  # the tool node is looked for as long
 
 
-@pytest.fixture
-def cell(history) -> Cell:
-    return opened(history)
-
-
 def test_a_tool_node_that_never_confirms_is_a_fault(cell):
     cell.services["disarm"] = SILENT
     cell.run("c1", LONG_S)

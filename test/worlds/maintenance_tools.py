@@ -10,6 +10,7 @@ from maintenance_cell import (
     config_of,
     new_tool,
     opened,
+    passed,
     proposed,
     thermal_proposed,
 )
@@ -54,6 +55,19 @@ def measured_in_full(cell: Cell, **given: Any) -> int:
     number = proposed(cell.history, **given)
     cell.full = lambda cell: new_tool(number)
     return number
+
+
+def straightened(cell: Cell) -> DriverAnswer:
+    """A full measurement whose candidate passes the next check."""
+    cell.check = passed()
+    return new_tool(proposed(cell.history))
+
+
+def until_sent(cell: Cell) -> None:
+    """A cycle, until its first motion goes out."""
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    while not any(isinstance(request, ask.Move) for request in cell.log):
+        cell.step()
 
 
 def until_verified(cell: Cell) -> None:
