@@ -291,14 +291,9 @@ SAME_MODEL = 1e-12  # of packed models that are the same
 class DesiredOffset:
     """Corrected less taught joints, as the model and the tool in use want it.
 
-    Attributes
-    ----------
-    stage : the correction in use; None while nothing is to be corrected.
-    known : the same as if it were on: a robot may show it that was corrected before.
-    figures : what is said of the messages, see `limiter`.
-    clamped, passed : how many messages were corrected in part, or not at all, for what bound.
-    made : whether the last message was corrected with ``stage``.
-    fast : whether `put_out` worked out the velocities too.
+    ``stage``: the correction in use, None while nothing is to be corrected; ``known``: the same as
+    if it were on, a robot may show it that was corrected before. ``clamped``, ``passed``: how many
+    messages were corrected in part, or not at all, for what bound.
     """
 
     def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
@@ -307,9 +302,10 @@ class DesiredOffset:
         self._actual = self._reference
         self.stage: StagedCorrection | None = None
         self.known: StagedCorrection | None = None
-        self.figures = np.zeros(FIGURES)
+        self.figures = np.zeros(FIGURES)  # what is said of the messages, see `limiter`
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
+        # whether the last message was corrected with ``stage``, and its velocities are worked out
         self.made = self.fast = False
         self._zero = np.zeros(reference.n)
         self._span = np.array([reference.lower, reference.upper], dtype=np.float64)

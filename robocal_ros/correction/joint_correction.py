@@ -87,27 +87,18 @@ def plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
 class CorrectionResult:
     """Corrected joints with what is left and what was done; scalars for one point, else (m,).
 
-    Attributes
-    ----------
-    q : (n,) or (m, n) corrected joints, rad (prismatic: m).
-    position_error_m, rotation_error_rad : error that remains at the tool; with a free axis,
-        here and below, a rotation is that of the axis.
-    iterations : Newton steps taken.
-    converged : False where the point could not be solved; ``q`` then is the input.
-    tcp_shift_m, tcp_rotation_rad : error at the tool without the correction.
-    weak : whether a weak direction was given up, in part or in full.
-    joint_shift : (n,) or (m, n) corrected less given joints.
+    With a free axis a rotation is that of the axis.
     """
 
-    q: Array
-    position_error_m: Array
+    q: Array  # (n,) or (m, n) corrected joints, rad (prismatic: m)
+    position_error_m: Array  # that remains at the tool
     rotation_error_rad: Array
-    iterations: NDArray[np.int64]
-    converged: NDArray[np.bool_]
-    tcp_shift_m: Array
+    iterations: NDArray[np.int64]  # Newton steps taken
+    converged: NDArray[np.bool_]  # False where there is no solution; ``q`` then is the input
+    tcp_shift_m: Array  # error at the tool without the correction
     tcp_rotation_rad: Array
-    weak: NDArray[np.bool_]
-    joint_shift: Array
+    weak: NDArray[np.bool_]  # whether a weak direction was given up, in part or in full
+    joint_shift: Array  # (n,) or (m, n) corrected less given joints
 
 
 class JointCorrection:
@@ -245,11 +236,7 @@ class StagedResult:
 
 
 class StagedCorrection:
-    """Correction from a reference model to an actual one.
-
-    Attributes
-    ----------
-    stages : 1, or 2 with a changed tool.
+    """Correction from a reference model to an actual one, in 1 stage, or 2 with a changed tool.
 
     Parameters
     ----------

@@ -46,15 +46,10 @@ MOST_LAYOUTS = 16  # of readings, by their joints' names, that are remembered
 class RobotState:
     """The arm's joints: where they were read, and where the controller is, by a steady clock.
 
-    Parameters
-    ----------
-    age_limit_s : readings that are older, by stamp or by arrival, tell nothing.
-    near : (n,) a robot that moved by less within `RESPONSE_S` stands, rad (prismatic: m).
-
-    Attributes
-    ----------
-    measured : (n,) last readings, NaN before the first.
-    scaling : how fast the controller's clock runs, 0 to 1; 1 where nobody says.
+    ``age_limit_s``: readings that are older, by stamp or by arrival, tell nothing. ``near`` (n,): a
+    robot that moved by less within `RESPONSE_S` stands, rad (prismatic: m).
+    ``measured`` (n,): last readings, NaN before the first. ``scaling``: how fast the controller's
+    clock runs, 0 to 1; 1 where nobody says.
     """
 
     def __init__(self, arm: SerialArm, age_limit_s: float, near: Array) -> None:
@@ -573,12 +568,9 @@ DECELERATION = {False: 10.0, True: 1.0}  # turning rad/s^2, sliding m/s^2, where
 class RobotTrack:
     """Where the robot is and how fast it moves, by its controller's own readings.
 
-    Parameters
-    ----------
-    near : (n,) one that moved by less within `STANDING_S` stands, rad (prismatic: m).
-    age_limit_s : older readings tell nothing.
-
-    ``velocity`` (n,): as read last; NaN where there is none.
+    ``near`` (n,): one that moved by less within `STANDING_S` stands, rad (prismatic: m).
+    ``age_limit_s``: older readings tell nothing. ``velocity`` (n,): as read last; NaN where there
+    is none.
     """
 
     def __init__(self, arm: SerialArm, near: Array, age_limit_s: float) -> None:

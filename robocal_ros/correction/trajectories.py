@@ -467,11 +467,8 @@ class RobotStop:
     send : puts a plan out, which goes on for `REACTION_S` from now.
     reference : joints and unscaled velocities (n,) where the controller is; None: not known.
 
-    Attributes
-    ----------
-    why : of the stop under way; empty when none is.
-    fault : why the robot did not stop; empty when it did.
-    sent : how often the stop was sent.
+    ``why``: of the stop under way, empty when none is. ``fault``: why the robot did not stop, empty
+    when it did. ``sent``: how often the stop was sent.
     """
 
     def __init__(
