@@ -35,7 +35,6 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.session import (
     hand_eye_session_as_recorded,
-    is_hand_eye_session,
     take_hand_eye_message,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -43,18 +42,17 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome, SessionBase
+from robocal_ros.session.events import Command, Outcome, SessionBase, session_kind
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.session import (
     ThermalSession,
     accepting,
     automatic_commands,
-    is_thermal_session,
     session_as_recorded,
     take_message,
     window_commands,
 )
-from robocal_ros.tool.session import is_tool_session, take_tool_message, tool_session_as_recorded
+from robocal_ros.tool.session import take_tool_message, tool_session_as_recorded
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -180,10 +178,7 @@ Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
 Samples = Iterator[BagMessage]
 Watch = Callable[[str, BagOverview], Samples]
-_OF_OTHER_NODES = (
-    (is_tool_session, replay_tool, "tool"),
-    (is_hand_eye_session, replay_hand_eye, "hand-eye"),
-)
+_OF_OTHER_NODES = {"tool": replay_tool, "hand_eye": replay_hand_eye}
 
 
 @dataclass(frozen=True)
@@ -235,14 +230,14 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
         history = opened.enter_context(
             CalibrationHistory.open(serial, model_hash=arm.model_hash, state_dir=state)
         )
-        for is_of, replayed, node in _OF_OTHER_NODES:
-            if not is_of(recording.configured):
-                continue
+        kind = session_kind(recording.configured)
+        if kind in _OF_OTHER_NODES:
             if given:
                 raise InputError(
-                    f"the bag is of a {node} node: --auto, --cold and --warm are for thermal ones"
+                    f"the bag is of a {kind.replace('_', '-')} node: --auto, --cold and --warm are "
+                    "for thermal ones"
                 )
-            return replayed(recording, arm, history, watch("replaying", recording))
+            return _OF_OTHER_NODES[kind](recording, arm, history, watch("replaying", recording))
         kept = _GOES_ON.format(history.path) if history.list(1) else ""
         session = _session(recording, arm, history)
         commands = _commands(request, recording, arm, history, watch)
@@ -275,7 +270,7 @@ def _require_commands(request: ReplayRequest, recording: BagOverview) -> None:
     if not recording.commands:
         configured = recording.configured
         words = _NO_COMMANDS if configured is None else f"{recording.events}: {UNASKED}"
-        words += _WINDOWS if configured is None or is_thermal_session(configured) else ""
+        words += _WINDOWS if session_kind(configured) in ("", "thermal") else ""
         words += "" if request.robot_named or configured is not None else _NO_ROBOT
         raise InputError(words, file=str(request.bag))
     if any(command.name == MAINTAIN for command, _ in recording.commands):

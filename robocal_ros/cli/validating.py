@@ -38,7 +38,6 @@ from robocal_ros.cli.replay import ReplayRequest, replay_bag, seconds
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
-from robocal_ros.hand_eye.session import is_hand_eye_session
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Action, Entry
 from robocal_ros.kinematics import SerialArm
@@ -46,7 +45,7 @@ from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.report.figures import CellCourse, Drawn, cell_drawn, thermal_figures, tool_figures
 from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors, figures_of
 from robocal_ros.session import events
-from robocal_ros.session.events import ACCEPT, Command
+from robocal_ros.session.events import ACCEPT, Command, session_kind
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.reference import (
     ColdReference,
@@ -55,8 +54,7 @@ from robocal_ros.thermal.reference import (
     reference_of,
     true_errors,
 )
-from robocal_ros.thermal.session import ThermalSession, is_thermal_session
-from robocal_ros.tool.session import is_tool_session
+from robocal_ros.thermal.session import ThermalSession
 
 Array = NDArray[np.float64]
 Truth = Sequence[tuple[int, Array]]  # stamps, ns, and transforms (4, 4) from then on
@@ -65,7 +63,6 @@ HOUR_NS = 3.6e12
 ACCURACY = "accuracy_state"
 ROUTINE = (events.START, events.CAPTURE, events.SAMPLE, events.TOOL_STEP, events.STEP_BEGINS)
 _EVERY_ENTRY = 1_000_000
-_SESSIONS = (is_thermal_session, is_tool_session, is_hand_eye_session)
 
 
 @dataclass(frozen=True)
@@ -139,7 +136,7 @@ def _recordings(
     begin = begin_ns(reader)
     for topic in (topic for topic in reader.info.topics if topic_kind(topic) == EVENTS):
         configured = first_configuration(reader.messages([topic]))
-        if any(is_of(configured) for is_of in _SESSIONS):
+        if session_kind(configured):
             recording = open_recording(reader, {EVENTS: topic})
             if not recording.commands:
                 skipped[topic] = UNASKED
@@ -212,11 +209,11 @@ class _SessionReplay:
                 failed.code = Code[replayed["error"]["code"]]
                 raise failed
             common = self._common(replayed)
-            if is_tool_session(configured):
+            if session_kind(configured) == "tool":
                 runs = tool_runs(replayed, self._truth.transforms(TOOL, namespace))
                 found = {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
                 return common | found, tool_figures(runs, self._mark)
-            if is_hand_eye_session(configured):
+            if session_kind(configured) == "hand_eye":
                 made = calibrations(replayed, self._truth.transforms(HAND_EYE, namespace))
                 final = replayed["final_sensor"]
                 return common | {"kind": "hand_eye", "calibrations": made, "final": final}, []

@@ -33,7 +33,7 @@ from robocal_ros.hand_eye.data import (
 )
 from robocal_ros.hand_eye.files import PoseTable, read_flange_mount, read_pose_table, read_profiles
 from robocal_ros.hand_eye.result import METHODS, HandEyeSettings, by_shot, hand_eye_document
-from robocal_ros.hand_eye.session import HandEyeConfig, is_hand_eye_session
+from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
 from robocal_ros.hand_eye.targets import (
     KIND_OF,
@@ -46,6 +46,7 @@ from robocal_ros.hand_eye.targets import (
 from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session.events import session_kind
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -298,7 +299,7 @@ def _recorded(recording: BagOverview, arm: SerialArm) -> BagShots:
             file=path,
         )
     rule, configured = StandstillRule(), recording.configured
-    if configured is not None and is_hand_eye_session(configured):
+    if configured is not None and session_kind(configured) == "hand_eye":
         rule = HandEyeConfig.of_document(configured.arguments["config"]).standstill
     standstills = Standstills(arm.joint_names, rule)
     for recorded in recording.samples():

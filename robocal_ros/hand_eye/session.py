@@ -65,6 +65,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
 from robocal_ros.session.events import (
+    OWN,
     Command,
     Handler,
     HistoryFollower,
@@ -77,8 +78,6 @@ from robocal_ros.session.events import (
 
 Array = NDArray[np.float64]
 Samples = Sequence[HandEyeSample]
-
-OWN = "sensor"  # only a hand-eye session's configuration has it
 
 
 @dataclass(frozen=True)
@@ -542,13 +541,8 @@ def configuration(session: HandEyeSession, topics: Mapping[str, str]) -> Command
     ``topics``: name of each input's topic.
     """
     current = session.current
-    in_force = {"model": current.thermal.model, OWN: current.head.model}
+    in_force = {"model": current.thermal.model, OWN["hand_eye"]: current.head.model}
     return configured_with(session, topics, asdict(session.config), in_force)
-
-
-def is_hand_eye_session(configured: Command | None) -> bool:
-    """Whether a configuration was recorded by a hand-eye session."""
-    return configured is not None and OWN in configured.arguments
 
 
 def hand_eye_session_as_recorded(
@@ -559,8 +553,11 @@ def hand_eye_session_as_recorded(
     Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
     configuration cannot be read.
     """
-    arguments = recorded_arguments(nominal, configured, ("model", OWN))
+    arguments = recorded_arguments(nominal, configured, ("model", OWN["hand_eye"]))
     config = HandEyeConfig.of_document(arguments["config"])
-    in_force = {THERMAL: arguments["model"], hand_eye_kind(config.sensor_frame): arguments[OWN]}
+    in_force = {
+        THERMAL: arguments["model"],
+        hand_eye_kind(config.sensor_frame): arguments[OWN["hand_eye"]],
+    }
     seeded(history, nominal, in_force, software)
     return HandEyeSession(nominal, history, config, software)

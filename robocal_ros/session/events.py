@@ -178,6 +178,16 @@ BY = "replay"
 WHY = "in force when the recording began"
 
 
+# By kind of session: an argument that only its configuration has.
+OWN = {"thermal": "tracker", "tool": "healthy", "hand_eye": "sensor"}
+
+
+def session_kind(configured: Command | None) -> str:
+    """Which kind of session recorded a configuration; empty where that is not known."""
+    arguments = {} if configured is None else configured.arguments
+    return next((kind for kind, own in OWN.items() if own in arguments), "")
+
+
 def require_robot(nominal: SerialArm, configured: Command) -> None:
     """Refuse a robot that the recording was not made with: `WrongRobotError` names both models."""
     recorded = str(configured.arguments.get("model_hash", ""))

@@ -37,6 +37,7 @@ from robocal_ros.session import events
 from robocal_ros.session.events import (
     CONFIGURE,
     NEWEST,
+    OWN,
     Command,
     Outcome,
     decide,
@@ -71,7 +72,6 @@ Array = NDArray[np.float64]
 SAME_CLOCK_NS = 1_000_000_000
 REMEMBERED = 200  # calibrations back to which a cycle's id is known
 DUE_AHEAD_S = 300.0  # a measurement is due so long before the bound reaches the tolerance
-OWN = "tracker"  # only a thermal session's configuration has it
 LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
 NO_REFERENCE = "no cold reference: capture it before the first cycle"
 
@@ -418,7 +418,7 @@ def session_as_recorded(
     arguments = configured.arguments
     try:
         in_force = {THERMAL: arguments["model"], REFERENCE: arguments["reference"]}
-        tracker = arguments[OWN]
+        tracker = arguments[OWN["thermal"]]
     except KeyError as error:
         raise InputError(f"the recorded configuration lacks {error}") from error
     config = config_of(arguments)
@@ -443,14 +443,9 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
         "config": asdict(session.config),
         "model": session.in_force.model,
         "reference": session.reference_model,
-        OWN: None if session.follower is None else session.follower.state.document(),
+        OWN["thermal"]: None if session.follower is None else session.follower.state.document(),
     }
     return Command(CONFIGURE, arguments, session.newest_joints_ns, session.desk.marks)
-
-
-def is_thermal_session(configured: Command | None) -> bool:
-    """Whether a configuration was recorded by a thermal session."""
-    return configured is not None and OWN in configured.arguments
 
 
 def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:

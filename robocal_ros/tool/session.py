@@ -17,6 +17,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
 from robocal_ros.session.events import (
+    OWN,
     Command,
     Handler,
     HistoryFollower,
@@ -568,7 +569,6 @@ class ToolSession(SessionBase):
 
 
 IN_FORCE = {"model": THERMAL, "tool": TOOL, "healthy": HEALTHY_TOOL}
-OWN = "healthy"  # only a tool session's configuration has it
 
 
 def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
@@ -580,15 +580,10 @@ def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
     in_force = {
         "model": current.thermal.model,
         "tool": current.head.model,
-        OWN: current.healthy.model,
+        OWN["tool"]: current.healthy.model,
         "mandrel": current.mandrel.model,
     }
     return configured_with(session, topics, session.config.document(), in_force)
-
-
-def is_tool_session(configured: Command | None) -> bool:
-    """Whether a configuration was recorded by a tool session."""
-    return configured is not None and OWN in configured.arguments
 
 
 def tool_session_as_recorded(
