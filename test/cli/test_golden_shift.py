@@ -25,7 +25,7 @@ BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "golden_excerpt.mcap"
 SCHEMAS = {"thermal_node": "replay.json", "tcf_node": "replay.tool.json"}
 BENT = ShiftPlan(
-    hours=0.1, first_s=60.0, every_s=150.0, incidents=(Incident(0.0, "collision", 2.0),)
+    hours=0.1, first_s=60.0, every_s=150.0, points=500, incidents=(Incident(0.0, "collision", 2.0),)
 )
 
 
