@@ -183,7 +183,7 @@ class MotionCell:
     def joints(self, path: TipPath, q_now: Array) -> JointPlan:
         """A plan along a path that begins where the robot stands.
 
-        Raises `LimitError` as `kinematics.inverse.follow`.
+        Raises `LimitError` as `kinematics.arm.follow`.
         """
         found = follow(
             self.arm, path.T_base_tip, path.twist, path.twist_rate, q_now, self.tool.p_tip
