@@ -132,16 +132,14 @@ def test_one_call_makes_a_warm_robot_with_a_bent_tool_accurate(warm):
 
 def test_gaps_that_hold_half_of_the_poses_complete_a_cycle_as_all_is_set(history, captured):
     """Gaps begin every five minutes; one that falls out does no harm."""
-    given = {name: shipped(name) for name in ("maintenance_node", "thermal_node")}
-    within_s = given["maintenance_node"]["resume_within_s"]
     cell = MaintainedCell(
         history,
         from_s=captured.now_s,
         T_base_laser=None,
         measurements=20,  # of ten in a second
-        resume_within_s=within_s,
+        resume_within_s=shipped("maintenance_node")["resume_within_s"],
     )
-    assert cell.thermal.config.cycle_timeout_s == given["thermal_node"]["cycle_timeout_s"]
+    assert cell.thermal.config.cycle_timeout_s == ThermalConfig().cycle_timeout_s  # as the node's
     cell.production(3.0, KELVIN)
     for number, every_s in enumerate((EVERY_S, 2.0 * EVERY_S), start=1):
         first = cell.maintain(f"{number}a", HALF_S)
