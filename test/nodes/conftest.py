@@ -36,7 +36,7 @@ NO_CALL = SimpleNamespace(id="")  # of a test without parameters
 DEADLINE_S = 30.0  # of what takes a second, on a machine that is busy otherwise
 ENDS_WITHIN_S = 10.0
 DISCOVERY_S = 0.25
-GONE_WITHIN_S = 1.0
+GONE_WITHIN_S = 0.25  # of another one
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -254,11 +254,13 @@ class Graph:
             # what the traceback of a failed test keeps would command the next one's robot
             if isinstance(waitable, (ActionClient, ActionServer)):
                 waitable.destroy()
-        # Fast DDS may crash where a participant ends just as it learns that another one has; one
+        # Fast DDS may crash where a participant ends just as it learns that another one has. One
         # that was killed stays known for long.
-        until_s = time.monotonic() + GONE_WITHIN_S
-        while len(self.probe.get_node_names()) > 1 and time.monotonic() < until_s:
+        known, until_s = self.probe.get_node_names(), time.monotonic() + GONE_WITHIN_S
+        while len(known) > 1 and time.monotonic() < until_s:
             time.sleep(0.01)
+            if (names := self.probe.get_node_names()) != known:
+                known, until_s = names, time.monotonic() + GONE_WITHIN_S
         self.probe.destroy_node()
         self.context.try_shutdown()
 
