@@ -29,7 +29,7 @@ pytestmark = pytest.mark.cell
 GAP_S = 120.0  # a tool that is found bent is measured in the same gap
 AHEAD_S = 2.0  # until stamps have passed those of a clock that was ahead
 WITHIN_S = 45.0
-SHORT = "clock_jump wrong_tool beam_dirty beams_dead joints_silent station_knocked"
+SHORT = "clock_jump beams_dead joints_silent station_knocked"
 WANTED = os.environ.get("ROBOCAL_FAULTS", SHORT).split()
 ALL = [fault for fault, code in RIGHT.items() if code is not Code.SENSOR_OR_ROBOT_MOVED]
 # the collision last: its candidate waits for a person
