@@ -109,7 +109,11 @@ class HouseNode(EndpointNode):
         """Open the outputs, then `activate`."""
         super().on_activate(state)
         result = self._attempt("activate", self.activate)
-        if result != TransitionCallbackReturn.SUCCESS:
+        if result == TransitionCallbackReturn.SUCCESS:
+            names = [name for name in ("robot", SERIAL.name) if self.settings.get(name)]
+            said = ", ".join(f"{name} {self.settings[name]}" for name in names)
+            self.get_logger().info(f"active: {said}" if said else "active")
+        else:
             super().on_deactivate(state)
         return result
 
