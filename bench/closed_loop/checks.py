@@ -2,8 +2,7 @@
 
 Each seed is another cell, commissioned once, then checked with one fault after the other: by a
 quick check of the tool, by a full measurement where only that tells the station from the tool, or
-by a thermal cycle where the sphere sensor shows it. Each takes half a
-second, where a whole gap takes several.
+by a thermal cycle where the sphere sensor shows it.
 
 There are as many cells as prove a power of 90 %, with 95 % confidence, of a size that is missed in
 no more than one of them: 46. A size that is missed more often in the first few is tried in no

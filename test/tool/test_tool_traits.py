@@ -5,32 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
+from tool_driver import TAUGHT, TRUTH
 
 from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.ground.errors import Code, RobocalError, TooFewSamplesError
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.tool.edges import BeamError
 from robocal_ros.tool.run import ClockError, RunTraits, TraitLimits, WrongToolError, require_even
-from robocal_ros.tool.session import ToolSession
 
 RADIUS_M = 2.5e-3
 SECOND_NS = 1_000_000_000
-
-
-@pytest.fixture
-def driver(tmp_path):
-    """The healthy tool was measured."""
-    cell = noisy_cell()
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
-        made = Driver(
-            ToolSession(cell.arm, history, config_of(cell), "test"),
-            cell,
-            RoundTool.cylinder(TAUGHT, RADIUS_M),
-        )
-        assert made.measure("reference").done
-        yield made
 
 
 def edited(driver, edit):

@@ -98,21 +98,6 @@ HARM_M = 1e-4  # more than this nobody may take for the tool's who has not prove
 RADIUS_M = 2.5e-3
 
 
-@pytest.fixture
-def driver(tmp_path):
-    """The healthy tool was measured."""
-    cell = noisy_cell()
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
-        made = Driver(
-            ToolSession(cell.arm, history, config_of(cell), "test"),
-            cell,
-            RoundTool.cylinder(TAUGHT, RADIUS_M),
-        )
-        assert made.measure("reference").done
-        made.history = history
-        yield made
-
-
 def knocked(station: BeamStation, fault: Fault, size: float, seed: int) -> BeamStation:
     return Faults({fault: size_of(fault, size)}, seed).station(station)
 
