@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.ground.frames import Document
+from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 
 # ---- names and choice of the identifiable model parameters --------------------------------------
 
@@ -162,6 +163,8 @@ class SerialArm:
     lower, upper : (n,) limits of q in rad or m; infinite where unknown.
     T_base_root : (4, 4) pose of the first joint's frame in the robot's base.
     T_flange_tool : (4, 4) tool mounted on the flange.
+    functions : what each joint turns besides what is read; None: nothing.
+    load : what gravity pulls at; None: not known.
     """
 
     name: str
@@ -173,6 +176,8 @@ class SerialArm:
     upper: Array
     T_base_root: Array = field(default_factory=_identity)
     T_flange_tool: Array = field(default_factory=_identity)
+    functions: JointFunctions | None = None
+    load: ArmLoad | None = None
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
@@ -187,6 +192,11 @@ class SerialArm:
             object.__setattr__(self, name, value)
         if not (np.all(np.isfinite(self.mdh)) and np.all(np.abs(self.sign) == 1.0)):
             raise ValueError(f"{self.name}: mdh must be finite and sign +1 or -1")
+        functions, load = self.functions, self.load
+        if (functions and len(functions.step) != n) or (load and len(load.mass) != n):
+            raise ValueError(f"{self.name}: joint functions or load are not of {n} joints")
+        if functions and load is None and np.any(functions.compliance):
+            raise ValueError(f"{self.name}: compliances without a load: of what is not known")
 
     @property
     def n(self) -> int:
@@ -199,6 +209,14 @@ class SerialArm:
         from robocal_ros.kinematics import kernels
 
         return kernels.pack_links(self.mdh, self.sign, self.prismatic)
+
+    @cached_property
+    def layer(self) -> Array:
+        """Constants of the joint functions (n + 1, 7 + m) for the kernels; of an arm with some."""
+        from robocal_ros.kinematics import kernels
+
+        assert self.functions is not None
+        return kernels.pack_layer(self.functions, self.load)
 
     @cached_property
     def parameters(self) -> ParameterSet:
@@ -229,11 +247,56 @@ class SerialArm:
             raise ValueError(f"q has shape {joints.shape}, expected (..., {self.n})")
         return np.ascontiguousarray(joints.reshape(-1, self.n)), joints.shape[:-1]
 
+    def turned(self, q: ArrayLike) -> Array:
+        """What a rigid arm would read (..., n) where this one reads q (..., n).
+
+        q + delta(q) + c tau(q), with the torques of the arm as it stands at q: see
+        `joint_functions`. Without joint functions it is q.
+        """
+        from robocal_ros.kinematics import kernels
+
+        joints, lead = self._batch(q)
+        if self.functions is None:
+            return joints.reshape(*lead, self.n)
+        turned = np.empty(joints.shape)
+        kernels.turned_batch(joints, self.links, self.T_base_root, self.layer, turned)
+        return turned.reshape(*lead, self.n)
+
+    def turned_jacobian(self, q: ArrayLike) -> Array:
+        """Derivative (..., n, n) of `turned` by q: I + diag(delta') + diag(c) d tau / d q."""
+        from robocal_ros.kinematics import kernels
+
+        joints, lead = self._batch(q)
+        if self.functions is None:
+            return np.broadcast_to(np.eye(self.n), (*lead, self.n, self.n))
+        S = np.empty((*joints.shape, self.n))
+        kernels.turned_jacobian_batch(joints, self.links, self.T_base_root, self.layer, S)
+        return S.reshape(*lead, self.n, self.n)
+
+    def read(self, turned: ArrayLike) -> Array:
+        """The q (..., n) of which `turned` makes these: its inverse, to 1e-13 rad.
+
+        Raises
+        ------
+        LimitError
+            Where there is none, as the compliances are too large for the load.
+        """
+        from robocal_ros.kinematics import kernels
+
+        joints, lead = self._batch(turned)
+        if self.functions is None:
+            return joints.reshape(*lead, self.n)
+        q = np.empty(joints.shape)
+        found = kernels.read_batch(joints, self.links, self.T_base_root, self.layer, q)
+        if found < len(joints):
+            raise LimitError(f"{self.name}: the load bends its joints further than they resist")
+        return q.reshape(*lead, self.n)
+
     def fk(self, q: ArrayLike) -> Array:
         """T_base_flange (..., 4, 4) at joint vectors (..., n)."""
         from robocal_ros.kinematics import kernels
 
-        joints, lead = self._batch(q)
+        joints, lead = self._batch(self.turned(q))
         T = np.empty((len(joints), 4, 4))
         kernels.fk_batch(joints, self.links, self.T_base_root, T)
         return T.reshape(*lead, 4, 4)
@@ -242,16 +305,21 @@ class SerialArm:
         """Geometric Jacobian (..., 6, n): [v; w] of the flange in base axes per unit joint rate."""
         from robocal_ros.kinematics import kernels
 
-        joints, lead = self._batch(q)
+        joints, lead = self._batch(self.turned(q))
         J = np.empty((len(joints), 6, self.n))
         kernels.jacobian_batch(joints, self.links, self.T_base_root, J)
-        return J.reshape(*lead, 6, self.n)
+        J = J.reshape(*lead, 6, self.n)
+        return J if self.functions is None else J @ self.turned_jacobian(q)
 
     def parameter_jacobian(self, q: ArrayLike, p_flange: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-        """Twist (..., 6, k) in base of the frame at ``p_flange`` (3,) per unit free parameter."""
+        """Twist (..., 6, k) in base of the frame at ``p_flange`` (3,) per unit free parameter.
+
+        That the torques, too, depend on the parameters is left out: of a compliant joint's turn,
+        some mrad, a parameter of 1 mm or 1 mrad changes a thousandth.
+        """
         from robocal_ros.kinematics import kernels
 
-        joints, lead = self._batch(q)
+        joints, lead = self._batch(self.turned(q))
         k = len(self.parameters)
         T, J = np.empty((len(joints), 4, 4)), np.zeros((len(joints), 6, k))
         tool = np.eye(4)[None]
@@ -380,6 +448,7 @@ def follow(
         raise LimitError("poses or joints are not finite: check where they come from")
     ends = np.stack([arm.T_base_root, np.eye(4)])
     ends[1, :3, 3] = p_flange
+    near = arm.turned(near)
     path = JointDerivatives(*(np.zeros((len(goals), arm.n)) for _ in range(3)))
     reached, outcome = newton.follow_batch(
         goals,
@@ -393,12 +462,29 @@ def follow(
         path.qd,
         path.qdd,
     )
+    if arm.functions is not None:
+        path = _as_read(arm, JointDerivatives(*(x[:reached] for x in (path.q, path.qd, path.qdd))))
     require_within_limits(arm, path.q[:reached])
     require_regular(arm, path.q[:reached])
     if outcome != newton.REACHED:
         why = "the arm is singular there" if outcome == newton.SINGULAR else _UNREACHED
         raise LimitError(f"{_pose(goals, reached)}: {why}. {_WHAT_TO_DO}")
     return path
+
+
+# Where rounding and what the spline's third derivative leaves weigh alike.
+_AHEAD_S = 1e-5
+
+
+def _as_read(arm: SerialArm, turned: JointDerivatives) -> JointDerivatives:
+    """What the arm reads while a rigid one would read ``turned``."""
+    q = arm.read(turned.q)
+    S = arm.turned_jacobian(q)
+    qd = np.linalg.solve(S, turned.qd[..., None])
+    step = _AHEAD_S * qd[..., 0]
+    change = (arm.turned_jacobian(q + step) - arm.turned_jacobian(q - step)) / (2.0 * _AHEAD_S)
+    qdd = np.linalg.solve(S, turned.qdd[..., None] - change @ qd)
+    return JointDerivatives(q, np.asarray(qd[..., 0]), np.asarray(qdd[..., 0]))
 
 
 def require_within_limits(arm: SerialArm, q: Array) -> None:

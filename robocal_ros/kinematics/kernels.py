@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.compiled import inlined, kernel, lean
+from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 
 # ---- sines --------------------------------------------------------------------------------------
 
@@ -400,3 +401,183 @@ def parameter_batch(
                 base_columns(T_root, base_column, T_out, J, k)
             if tool_column[target[k]] >= 0:
                 tool_columns(T_flange, tool_column[target[k]], J, k)
+
+
+# ---- joint functions and winding under load: what the joints turn besides what is read ----------
+#
+# ``layer`` (n + 1, 7 + k), see `pack_layer`: all about a joint in a row, behind them the payload.
+
+
+PER_STEP, COMPLIANCE, MASS, CENTRE, TABLE = 1, 2, 3, 4, 7
+# A joint's row of scratch: axis, a point of it, what of the arm it moves; turned value, its slope.
+MOVED, TURNED, SLOPE, SCRATCH = 6, 9, 10, 11
+MOST_ROUNDS = 20
+EXACT_TURN = 1e-13  # rad, m
+
+
+def pack_layer(functions: JointFunctions, load: ArmLoad | None) -> Array:
+    """Constants of the joints' own functions for the kernels.
+
+    Of a joint: first knot, 1 / spacing, compliance, mass and its centre, the coefficients. The
+    last row: gravity (base), mass of the payload and its centre.
+    """
+    n, m = functions.coefficients.shape
+    packed = np.zeros((n + 1, TABLE + m))
+    packed[:n, 0], packed[:n, PER_STEP] = functions.first, 1.0 / functions.step
+    packed[:n, COMPLIANCE], packed[:n, TABLE:] = functions.compliance, functions.coefficients
+    if load is not None:
+        packed[:n, MASS], packed[:n, CENTRE:TABLE] = load.mass, load.centre
+        packed[n, :MASS], packed[n, MASS] = load.gravity, load.payload_mass
+        packed[n, CENTRE:TABLE] = load.payload_centre
+    return packed
+
+
+@lean
+def _spline(row: Array, q: float) -> tuple[float, float]:
+    """Value and slope of a joint's cubic B-spline; zero outside its table."""
+    count = row.shape[0] - TABLE
+    u = (q - row[0]) * row[PER_STEP]
+    if not (u >= 0.0 and u < count + 3):
+        return 0.0, 0.0
+    cell = int(u)
+    s = u - cell
+    r = 1.0 - s
+    c0 = row[TABLE + cell - 3] if 3 <= cell < count + 3 else 0.0
+    c1 = row[TABLE + cell - 2] if 2 <= cell < count + 2 else 0.0
+    c2 = row[TABLE + cell - 1] if 1 <= cell < count + 1 else 0.0
+    c3 = row[TABLE + cell] if cell < count else 0.0
+    b1, b2 = 4.0 - 3.0 * s * s * (1.0 + r), 4.0 - 3.0 * r * r * (1.0 + s)
+    value = (c0 * r * r * r + c1 * b1 + c2 * b2 + c3 * s * s * s) / 6.0
+    rise = 0.5 * ((c3 - c2) * s * s + (c1 - c0) * r * r) + (c2 - c1) * (0.5 + s * r)
+    return value, rise * row[PER_STEP]
+
+
+@lean
+def _moved_point(frame: Frame, c0: float, c1: float, c2: float, mass: float, sums: Array) -> None:
+    """Add a mass at a point of a frame, and its moment about the base's origin."""
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
+    sums[0] += mass * (p0 + c0 * x0 + c1 * y0 + c2 * z0)
+    sums[1] += mass * (p1 + c0 * x1 + c1 * y1 + c2 * z1)
+    sums[2] += mass * (p2 + c0 * x2 + c1 * y2 + c2 * z2)
+
+
+@lean
+def _weigh(q: Array, links: Array, T_root: Array, layer: Array, scratch: Array) -> None:
+    """Per joint its axis and how the moment of all mass moves with it: their rows of scratch.
+
+    The potential is -g . sum m p: its derivatives by the joints are the torques, its second
+    derivatives their change.
+    """
+    n = links.shape[0]
+    frame = _root(T_root)
+    for i in range(n):
+        row = scratch[i]
+        s = links[i, 7]
+        row[0], row[1], row[2] = s * frame[6], s * frame[7], s * frame[8]
+        row[3], row[4], row[5] = frame[9], frame[10], frame[11]
+        c, sine = cos_sin(_theta(links, i, q[i]))
+        frame = _bend(links, i, _link(links, i, q[i], c, sine, frame))
+        moved = row[MOVED:TURNED]
+        moved[0], moved[1], moved[2] = 0.0, 0.0, 0.0
+        part = layer[i]
+        _moved_point(frame, part[CENTRE], part[CENTRE + 1], part[CENTRE + 2], part[MASS], moved)
+        if i == n - 1:
+            part = layer[n]
+            _moved_point(frame, part[CENTRE], part[CENTRE + 1], part[CENTRE + 2], part[MASS], moved)
+    mass, m0, m1, m2 = layer[n, MASS], 0.0, 0.0, 0.0
+    for back in range(n):
+        i = n - 1 - back
+        row = scratch[i]
+        mass += layer[i, MASS]
+        m0, m1, m2 = m0 + row[MOVED], m1 + row[MOVED + 1], m2 + row[MOVED + 2]
+        a0, a1, a2 = row[0], row[1], row[2]
+        if links[i, 8] > 0.5:
+            row[MOVED], row[MOVED + 1], row[MOVED + 2] = mass * a0, mass * a1, mass * a2
+        else:
+            r0, r1, r2 = m0 - mass * row[3], m1 - mass * row[4], m2 - mass * row[5]
+            row[MOVED], row[MOVED + 1] = a1 * r2 - a2 * r1, a2 * r0 - a0 * r2
+            row[MOVED + 2] = a0 * r1 - a1 * r0
+
+
+@lean
+def turn_joints(q: Array, links: Array, T_root: Array, layer: Array, scratch: Array) -> None:
+    """What a rigid arm would read at joints ``q`` (n,), and slopes 1 + delta', into ``scratch``."""
+    n, bends = links.shape[0], False
+    for i in range(n):
+        value, slope = _spline(layer[i], q[i])
+        scratch[i, TURNED], scratch[i, SLOPE] = q[i] + value, 1.0 + slope
+        bends = bends or layer[i, COMPLIANCE] > 0.0
+    if bends:
+        _weigh(q, links, T_root, layer, scratch)
+        for i in range(n):
+            torque = 0.0
+            for r in range(3):
+                torque += layer[n, r] * scratch[i, MOVED + r]
+            scratch[i, TURNED] += layer[i, COMPLIANCE] * torque
+
+
+@lean
+def read_joints(
+    turned: Array, links: Array, T_root: Array, layer: Array, scratch: Array, q: Array
+) -> bool:
+    """Joints ``q`` (n,) of which `turn_joints` makes ``turned``; False where they are not found.
+
+    Newton's method with the functions' slopes; what is left is of the order of how the load
+    changes, a thousandth of it each round.
+    """
+    n = q.shape[0]
+    for i in range(n):
+        q[i] = turned[i]
+    for _ in range(MOST_ROUNDS):
+        turn_joints(q, links, T_root, layer, scratch)
+        size = 0.0
+        for i in range(n):
+            step = (turned[i] - scratch[i, TURNED]) / scratch[i, SLOPE]
+            q[i] += step
+            size = max(size, abs(step))
+        if size <= EXACT_TURN:
+            return True
+    return False
+
+
+@kernel
+def turned_batch(q: Array, links: Array, T_root: Array, layer: Array, out: Array) -> None:
+    """What a rigid arm would read (m, n) at joints (m, n)."""
+    scratch = np.empty((q.shape[1], SCRATCH))
+    for k in range(q.shape[0]):
+        turn_joints(q[k], links, T_root, layer, scratch)
+        for i in range(q.shape[1]):
+            out[k, i] = scratch[i, TURNED]
+
+
+@kernel
+def turned_jacobian_batch(q: Array, links: Array, T_root: Array, layer: Array, out: Array) -> None:
+    """Derivatives (m, n, n) of `turned_batch` by the joints read."""
+    n = q.shape[1]
+    scratch = np.empty((n, SCRATCH))
+    for k in range(q.shape[0]):
+        turn_joints(q[k], links, T_root, layer, scratch)
+        _weigh(q[k], links, T_root, layer, scratch)
+        for i in range(n):
+            for j in range(i + 1):
+                # d tau_i / d q_j: what joint i moves turns about axis j, or slides with it
+                a, w, change = scratch[j], scratch[i], 0.0
+                if links[j, 8] < 0.5:
+                    change = (
+                        layer[n, 0] * (a[1] * w[MOVED + 2] - a[2] * w[MOVED + 1])
+                        + layer[n, 1] * (a[2] * w[MOVED] - a[0] * w[MOVED + 2])
+                        + layer[n, 2] * (a[0] * w[MOVED + 1] - a[1] * w[MOVED])
+                    )
+                out[k, i, j] = layer[i, COMPLIANCE] * change
+                out[k, j, i] = layer[j, COMPLIANCE] * change
+            out[k, i, i] += scratch[i, SLOPE]
+
+
+@kernel
+def read_batch(turned: Array, links: Array, T_root: Array, layer: Array, out: Array) -> int:
+    """Joints (m, n) of which `turned_batch` makes ``turned``; of how many they were found."""
+    scratch, found = np.empty((turned.shape[1], SCRATCH)), 0
+    for k in range(turned.shape[0]):
+        if read_joints(turned[k], links, T_root, layer, scratch, out[k]):
+            found += 1
+    return found

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_arms import arms, twist
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -50,37 +51,6 @@ def by_definition(arm: SerialArm, q: np.ndarray) -> np.ndarray:
         d, theta = (d + moved, theta) if arm.prismatic[i] else (d, theta + moved)
         T = T @ along(2, d) @ about(2, theta) @ along(0, a) @ about(0, alpha) @ about(1, beta)
     return T
-
-
-def twist(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Displacement [v; w] (6,) from one pose to another, in base axes."""
-    turn = frames.log_rotation(after[:3, :3] @ before[:3, :3].T)
-    return np.concatenate([after[:3, 3] - before[:3, 3], turn])
-
-
-KINDS = st.sampled_from(["six revolute", "parallel axes", "sliding"])
-
-
-@st.composite
-def arms(draw: st.DrawFn) -> tuple[SerialArm, np.ndarray]:
-    """An arm of a kind, off its nominal geometry, and a joint vector."""
-    kind, rng = draw(KINDS), np.random.default_rng(draw(st.integers(0, 2**31)))
-    n = {"six revolute": 6, "parallel axes": 6, "sliding": int(rng.integers(2, 8))}[kind]
-    mdh = rng.uniform(-1.0, 1.0, (n, 5)) * [1.0, np.pi, 1.0, np.pi, 0.02]
-    if kind == "parallel axes":
-        mdh[1:3, ALPHA] = rng.normal(0.0, 1e-3, 2)
-    prismatic = rng.random(n) < 0.5 if kind == "sliding" else np.zeros(n, dtype=bool)
-    arm = SerialArm(
-        kind,
-        tuple(f"joint_{i + 1}" for i in range(n)),
-        mdh,
-        rng.choice([-1.0, 1.0], n),
-        prismatic,
-        np.full(n, -np.inf),
-        np.full(n, np.inf),
-        T_base_root=frames.transform(frames.exp_rotation(rng.normal(size=3)), rng.normal(size=3)),
-    )
-    return arm, rng.uniform(-2.0, 2.0, n)
 
 
 # ---- Known poses ---------------------------------------------------------------------------------
