@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 
 import rclpy
 from lifecycle_msgs.msg import State
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -234,9 +234,12 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
+        executor, ending = _executor(events), threading.Event()
+        _watch_signals(ending, executor.wake)  # before a start that may have kernels to compile
         node = node_class()
         node.autostart()
-        _spin(node, events)
+        executor.add_node(node)
+        _spin(executor, ending, events)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
@@ -249,20 +252,19 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
         rclpy.try_shutdown()
 
 
-def _spin(node: HouseNode, events: bool) -> None:
-    ending = threading.Event()
+def _executor(events: bool) -> Executor:
     if not events:
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        _watch_signals(ending, executor.wake)
+        return SingleThreadedExecutor()
+    from rclpy.experimental.events_executor import EventsExecutor
+
+    return EventsExecutor()
+
+
+def _spin(executor: Executor, ending: threading.Event, events: bool) -> None:
+    if not events:
         while rclpy.ok() and not ending.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
         return
-    from rclpy.experimental.events_executor import EventsExecutor
-
-    executor = EventsExecutor()
-    executor.add_node(node)
-    _watch_signals(ending, executor.wake)
     memory = QuietMemory()
     while rclpy.ok() and not ending.is_set():
         # A new future each time: one that never ends would gather callbacks.
@@ -272,7 +274,7 @@ def _spin(node: HouseNode, events: bool) -> None:
 
 
 def _watch_signals(ending: threading.Event, wake: Callable[[], object]) -> None:
-    """End the spinning at the first signal, the process at a second one."""
+    """End the spinning at the first signal, the process at a second one, in the start too."""
 
     def watch() -> None:
         signal.sigwait(ENDING)

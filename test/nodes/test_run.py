@@ -51,6 +51,17 @@ def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) 
     assert "Traceback" not in sleeper.output
 
 
+def test_a_second_signal_ends_a_start_that_takes_long(graph: Any, tmp_path: Path) -> None:
+    path = tmp_path / "sleeper.py"
+    text = SCRIPT.replace("EVENTS", "True").replace("import sys", "import sys, time")
+    starts = "print('starts', flush=True); time.sleep(600)"
+    path.write_text(text.replace("def configure(self):", f"def configure(self):\n        {starts}"))
+    sleeper = graph.start(path)
+    graph.spin_until(lambda: "starts" in sleeper.output, "the start")
+    sleeper.process.send_signal(signal.SIGINT)
+    assert sleeper.stop(signal.SIGTERM) == 128 + signal.SIGTERM
+
+
 def test_a_bug_in_a_timer_is_told_and_the_node_lives_on(graph: Any, script: Path) -> None:
     sleeper = graph.start(script)
     graph.call(Trigger, "/sleeper/break")
