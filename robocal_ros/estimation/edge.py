@@ -7,7 +7,7 @@ neighbouring surfaces meet, each fitted by a robust line (of an edge, the two of
 turn); where a surface falls away and its neighbour is not seen, the edge is where it ends.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from robocal_ros.estimation.surfaces import (
+    OPPOSITE,
     SMOOTHED,
     SurfaceRule,
     Surfaces,
+    mirror,
     off_chord,
     ordered,
     smoothed,
@@ -81,7 +83,7 @@ class CornerFit:
 def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
     """Find the corners of straight surfaces in points (n, 2) of a profile: x, z in m.
 
-    Points are in the order of the sensor's columns; the sensor looks along +z.
+    Points are in the order of the sensor's columns.
 
     Raises
     ------
@@ -92,7 +94,8 @@ def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
         where surfaces end without one.
     """
     rows = points[np.all(np.isfinite(points), axis=1)]
-    profile, noise = ordered(rows, "corners")
+    turned = mirror(rule.towards)
+    profile, noise = ordered(rows * turned, "corners")
     backwards = rows[-1, 0] < rows[0, 0]
     found = (_classic_corners if rule.classic else _best_corners)(profile, noise, rule)
     if backwards:
@@ -104,6 +107,12 @@ def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
             found.left_out[::-1],
             noise,
         )
+    found = replace(
+        found,
+        points=found.points * turned,
+        covariance=found.covariance * np.outer(turned, turned),
+        left_out=found.left_out * turned,
+    )
     _require(found, rule)
     return found
 
@@ -230,8 +239,6 @@ class EdgeFit:
 def fit_edge(points: Array, rule: EdgeRule) -> EdgeFit:
     """Find the edge or groove in points (n, 2) of a profile: x, z in m.
 
-    The sensor looks along +z.
-
     Raises
     ------
     TooFewSamplesError
@@ -239,30 +246,42 @@ def fit_edge(points: Array, rule: EdgeRule) -> EdgeFit:
     ResidualError
         No such feature, or several that could be meant: the message says where.
     """
-    profile, noise = ordered(points, rule.kind)
-    return _classic(profile, noise, rule.kind) if rule.classic else _best(profile, noise, rule)
+    turned = mirror(rule.towards)
+    profile, noise = ordered(points * turned, rule.kind)
+    found = (_classic if rule.classic else _best)(profile, noise, rule)
+    return EdgeFit(found.point * turned, found.covariance * np.outer(turned, turned))
 
 
 def _best(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
+    candidates = _candidates(profile, noise, rule)
+    if len(candidates) == 1:
+        return candidates[0]
+    others = [] if candidates else _candidates(profile * mirror(True), noise, rule)
+    if len(others) == 1:
+        other = "groove" if rule.kind == "edge" else "edge"
+        where = places(others[0].point[None] * mirror(not rule.towards))
+        raise ResidualError(
+            f"the profile shows one {other}, at {where}, and no {rule.kind}: if z of this sensor "
+            f"grows the other way set z_grows {OPPOSITE[rule.towards]}, else the line is a {other}"
+        )
+    seen = np.array([c.point for c in candidates]).reshape(-1, 2) * mirror(rule.towards)
+    where = f", at {places(seen)}" if candidates else ""
+    raise ResidualError(
+        f"the profile shows {len(candidates)} {rule.kind}s{where}, expected one: let the laser "
+        f"line cross the {rule.kind} so that both of its sides are seen, and nothing else like it"
+    )
+
+
+def _candidates(profile: Array, noise: float, rule: EdgeRule) -> list[EdgeFit]:
+    """What could be meant: the sharpest corners of this kind, else the ends of surfaces."""
     found = surfaces(profile, noise, rule)
     sign = 1.0 if rule.kind == "edge" else -1.0
     corners = [c for c in found.corners if c is not None and sign * c.turn_rad > 0.0]
     if corners:
         sharpest = max(abs(corner.turn_rad) for corner in corners)
-        corners = [c for c in corners if abs(c.turn_rad) >= _RIVAL * sharpest]
-        candidates = [EdgeFit(corner.point, corner.covariance) for corner in corners]
-    elif rule.kind == "edge":
-        candidates = _ends(found, profile)
-    else:
-        candidates = []
-    if len(candidates) != 1:
-        where = f", at {places(np.array([c.point for c in candidates]))}" if candidates else ""
-        raise ResidualError(
-            f"the profile shows {len(candidates)} {rule.kind}s{where}, expected one: let "
-            f"the laser line cross the {rule.kind} so that both of its sides are seen, and nothing "
-            "else like it"
-        )
-    return candidates[0]
+        sharp = [c for c in corners if abs(c.turn_rad) >= _RIVAL * sharpest]
+        return [EdgeFit(corner.point, corner.covariance) for corner in sharp]
+    return _ends(found, profile) if rule.kind == "edge" else []
 
 
 def _ends(found: Surfaces, profile: Array) -> list[EdgeFit]:
@@ -291,8 +310,9 @@ def _ends(found: Surfaces, profile: Array) -> list[EdgeFit]:
     return ends
 
 
-def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
+def _classic(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
     """Extremum of the second derivative of the smoothed profile, refined by a parabola."""
+    kind = rule.kind
     x, first = np.unique(profile[:, 0], return_index=True)
     if len(x) < 2 * _WINDOW:
         raise TooFewSamplesError(

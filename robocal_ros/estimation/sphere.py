@@ -22,8 +22,10 @@ from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.estimation.surfaces import (
     FEWEST_POINTS,
     MAD,
+    OPPOSITE,
     SMALLEST_M,
     local_noise,
+    mirror,
     on_curve,
     smoothed,
 )
@@ -184,12 +186,14 @@ class ArcRule:
     radius_tolerance_m : how far the arc's radius may exceed the sphere's.
     radius_sigma_m : largest standard deviation of the arc's radius; a short arc has a larger one.
     noise_m : largest standard deviation of a point along its normal.
+    towards : whether z grows towards the sensor (a height), not away from it (a distance).
     """
 
     radius_m: float
     radius_tolerance_m: float = 1e-4
     radius_sigma_m: float = 4e-4
     noise_m: float = 2e-4
+    towards: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,21 +219,23 @@ class ArcFit:
 def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
     """Fit the near side of a circle to points (n, 2) of a profile: x, z in the sensor frame, m.
 
-    Points are in the order of the sensor's columns; the sensor looks along +z. The circle's
-    radius is 0.2 R to R of the sphere.
+    Points are in the order of the sensor's columns. The circle's radius is 0.2 R to R of the
+    sphere.
 
     Raises
     ------
     TooFewSamplesError
         Fewer than 20 points on a circle.
     ResidualError
-        No arc, an arc larger than the sphere, too much noise, a surface that is not round, or an
-        arc too short to know its radius: the message holds the figure that failed.
+        No arc, one that opens the other way, an arc larger than the sphere, too much noise, a
+        surface that is not round, or an arc too short to know its radius: the message holds the
+        figure that failed.
     InputError
         The radius as given is a thousand times too small or too large for the arc that is there.
     """
     finite = np.all(np.isfinite(points), axis=1)
-    rows = np.ascontiguousarray(points[finite], dtype=np.float64)
+    turned = mirror(rule.towards)
+    rows = np.ascontiguousarray(points[finite] * turned, dtype=np.float64)
     if len(rows) < FEWEST_POINTS:
         raise TooFewSamplesError(
             f"{len(rows)} points give no arc: at least {FEWEST_POINTS} are needed; check the "
@@ -240,10 +246,13 @@ def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
         _require(fit, rows, rule)
     except RobocalError:
         _blame_radius(rows, rule)
+        _blame_sense(rows, rule)
         raise
     used = np.zeros(len(finite), dtype=np.bool_)
     used[np.flatnonzero(finite)[fit.used]] = True
-    return ArcFit(fit.centre, fit.radius_m, fit.covariance, fit.noise_m, used)
+    axes = np.append(turned, 1.0)
+    covariance = fit.covariance * np.outer(axes, axes)
+    return ArcFit(fit.centre * turned, fit.radius_m, covariance, fit.noise_m, used)
 
 
 def _fitted(points: Array, rule: ArcRule) -> ArcFit:
@@ -380,6 +389,20 @@ def _blame_radius(points: Array, rule: ArcRule) -> None:
             f"is given as {rule.radius_m * 1e3:.6g} mm, 1000 times too {word} for this arc: check "
             "its unit"
         )
+
+
+def _blame_sense(points: Array, rule: ArcRule) -> None:
+    """Raise when the arc is there, and opens the other way."""
+    turned = points * mirror(True)
+    try:
+        fit = _fitted(turned, rule)
+        _require(fit, turned, rule)
+    except RobocalError:
+        return
+    raise ResidualError(
+        f"the profile shows an arc of radius {fit.radius_m * 1e3:.3f} mm that opens the wrong way: "
+        f"z of this sensor grows the other way, set z_grows {OPPOSITE[rule.towards]}"
+    )
 
 
 # ---- the centre of a reference sphere of known radius, from a cloud of points of its cap --------

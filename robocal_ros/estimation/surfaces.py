@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
+OPPOSITE = {False: "towards", True: "away"}  # what to set where ``towards`` is wrong
+
 _SPLIT = 8.0  # standard deviations of a point
 _SPLIT_COLUMNS = 3.0  # a corner lies between two columns
 _OVERLAP = 5.0  # columns by which pieces may pass their corner
@@ -169,6 +171,7 @@ class SurfaceRule:
 
     Attributes
     ----------
+    towards : whether z grows towards the sensor (a height), not away from it (a distance).
     least_turn_rad : of the surface at a corner.
     sigma_m : largest standard deviation of a corner in any direction; a worse one is left out.
     margin_m : points so near to a corner are left out, for no edge is sharp.
@@ -176,6 +179,7 @@ class SurfaceRule:
     reach : how far a surface may be extended to a corner, of the part of it that is seen.
     """
 
+    towards: bool = False
     least_turn_rad: float = float(np.radians(20.0))
     sigma_m: float = 1e-4
     margin_m: float = 2e-4
@@ -353,6 +357,11 @@ def _corner(a: Flank, b: Flank, slack: float, rule: SurfaceRule) -> Corner | Non
     if float(np.linalg.eigvalsh(covariance)[-1]) > rule.sigma_m**2:
         return None
     return Corner(point, covariance, turn)
+
+
+def mirror(towards: bool) -> Array:
+    """Factors (2,) of x and z that make a sensor's profile one whose z grows away from it."""
+    return np.array([1.0, -1.0 if towards else 1.0])
 
 
 FEWEST_POINTS = 20

@@ -15,7 +15,6 @@ from robocal_ros.bags.replay import topic_kind
 from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, input_topic, positive, text
 from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
-from robocal_ros.estimation.edge import CornerRule, EdgeRule
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import transform_document
@@ -23,6 +22,7 @@ from robocal_ros.ground.samples import StandstillRule
 from robocal_ros.hand_eye.data import (
     FEATURES,
     PROFILE,
+    Z_GROWS,
     Profile,
     StandingShot,
     Standstills,
@@ -40,10 +40,9 @@ from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LaserTarget,
     SphereTarget,
-    StepTarget,
     read_target,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, task_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session.events import session_kind
@@ -71,7 +70,7 @@ def add_shots(parser: argparse.ArgumentParser) -> None:
         "--profiles",
         type=Path,
         metavar="DIR",
-        help="folder of the profiles, tables of x_mm and z_mm",
+        help="folder of the profiles, tables of x_mm and z_mm; default: that of --poses",
     )
     parser.add_argument(
         "--bag",
@@ -88,6 +87,18 @@ def add_shots(parser: argparse.ArgumentParser) -> None:
         help="topic of an input in the bag: joint_states, profile, session_events",
     )
     add_robot(parser, "bags and tables of joints")
+    add_sense(parser)
+
+
+def add_sense(parser: argparse.ArgumentParser) -> None:
+    """Offer which way the sensor's z grows."""
+    parser.add_argument(
+        "--z-grows",
+        choices=Z_GROWS,
+        default=Z_GROWS[0],
+        help="z of the profiles: away from the sensor, a distance (the default), or towards it, a "
+        "height",
+    )
 
 
 def add_robot(parser: argparse.ArgumentParser, needed: str = "tables of joints") -> None:
@@ -192,9 +203,9 @@ def given_shots(
     `read_bag_shots`.
     """
     if args.bag is None:
-        if args.poses is None or args.profiles is None:
-            raise InputError("give the shots: --poses with --profiles, or --bag")
-        return read_shots(judges or args.poses, args.profiles, arm)
+        if args.poses is None:
+            raise InputError("give the shots: --poses, or --bag")
+        return read_shots(judges or args.poses, args.profiles or args.poses.parent, arm)
 
     if args.poses is not None or args.profiles is not None:
         raise InputError("the shots are given twice: --bag, and --poses or --profiles; keep one")
@@ -240,19 +251,6 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> Las
         return None
     missing = {"sphere": "give the sphere: --radius-mm or --target", "step": "give --target"}
     raise InputError(missing[kind])
-
-
-def task_of(target: LaserTarget | None, feature: str | None, classic: bool = False) -> Task:
-    """The estimator's view of a target, of a line by its ``feature``.
-
-    ``classic``: corners and edges in the published form.
-    """
-    if isinstance(target, SphereTarget):
-        return SphereTask(target)
-    if isinstance(target, StepTarget):
-        return StepTask(target, CornerRule(classic=classic))
-    rule = EdgeRule(kind="groove" if feature == "groove" else "edge", classic=classic)
-    return LineTask(target, rule)
 
 
 def read_bag_shots(path: Path, arm: SerialArm, topics: Mapping[str, str]) -> BagShots:
@@ -436,7 +434,8 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
     """Do ``sphere``, ``step`` or ``line``. Raises `RobocalError` for what a user can mend."""
     arm, settings = arm_of(args), settings_of(args)
     target = given_target(kind, args.target, getattr(args, "radius_mm", None))
-    task = task_of(target, getattr(args, "line_kind", None), args.method == "classic")
+    classic, towards = args.method == "classic", args.z_grows == "towards"
+    task = task_of(target, getattr(args, "line_kind", None), classic, towards)
     shots = given_shots(args, arm)
     judges = None if args.check is None else given_shots(args, arm, args.check)
     if judges is not None:
@@ -470,6 +469,7 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
             help=f"folder with poses.csv, profiles/ and target.yaml of a {kind}{without}",
         )
     add_feature(parser)
+    add_sense(parser)
     add_robot(parser)
     add_limits(parser, "default: from the residuals")
     parser.add_argument(
@@ -491,7 +491,8 @@ def run_joint(args: argparse.Namespace) -> CliResult:
     for kind, folder in folders.items():
         file, profiles = folder / "target.yaml", folder / "profiles"
         known = kind != "line" or file.exists()
-        task = task_of(given_target(kind, file if known else None, None), args.line_kind)
+        target = given_target(kind, file if known else None, None)
+        task = task_of(target, args.line_kind, towards=args.z_grows == "towards")
         shots = read_shots(folder / "poses.csv", profiles, arm)
         parts.append((task, shots.data))
         if args.check is not None and (folder / args.check).exists():
@@ -526,7 +527,8 @@ def run_verify(args: argparse.Namespace) -> CliResult:
     """Do ``verify``. Raises `RobocalError` for what a user can mend."""
     settings = settings_of(args)
     T_flange_sensor = read_flange_mount(args.result)
-    task = task_of(given_target(args.target_kind, args.target, args.radius_mm), args.line_kind)
+    target = given_target(args.target_kind, args.target, args.radius_mm)
+    task = task_of(target, args.line_kind, towards=args.z_grows == "towards")
     shots = given_shots(args, arm_of(args))
     found = verify(task, shots.data, T_flange_sensor, settings)
     errors = errors_document(summarise(found.distance_m))

@@ -37,6 +37,7 @@ from robocal_ros.session.events import GAP_NS, Command, Ignored
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 10
+NO_RETURN_M = 0.02  # from all points: what lies nearer may be a surface
 NARROWEST_M, WIDEST_M = 1e-3, 20.0  # no line laser's field of view is outside of this
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
 SHOTS = (PROFILE, TARGET_POSE, IMAGE)
@@ -49,8 +50,8 @@ AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a sho
 class Profile:
     """Points of one profile.
 
-    ``points`` (n, 2) x along the laser line and z along the beam, sensor frame, m, in the order of
-    the sensor's columns; its plane is y = 0. Finite: what the sensor did not see is left out.
+    ``points`` (n, 2) x along the laser line and z along the beam, either way, sensor frame, m, in
+    the order of the sensor's columns; its plane is y = 0. What the sensor did not see is left out.
     ``name``: of the shot, for reports.
     """
 
@@ -59,7 +60,10 @@ class Profile:
 
 
 def profile_of(points: ArrayLike, name: str) -> Profile:
-    """Check and wrap points (n, 2), m; columns without a return (not-a-number) are left out.
+    """Check and wrap points (n, 2), m; columns without a return are left out.
+
+    Those are not-a-number, or hold one z that recurs and lies farther from all others than these
+    extend: what stands for no return depends on the sensor (0, -32768 steps, -99.9999 mm …).
 
     Raises `InputError` when the points are not (n, 2), or their extent is that of another unit;
     `TooFewSamplesError` when nearly nothing was seen.
@@ -68,6 +72,12 @@ def profile_of(points: ArrayLike, name: str) -> Profile:
     if rows.ndim != 2 or rows.shape[1] != 2:
         raise InputError(f"profile {name} has shape {rows.shape}, not (points, 2)")
     rows = rows[np.all(np.isfinite(rows), axis=1)]
+    for value in (np.min(rows[:, 1], initial=np.inf), np.max(rows[:, 1], initial=-np.inf)):
+        same = rows[:, 1] == value
+        if np.sum(same) > 1 and len(others := rows[~same, 1]) >= FEWEST_POINTS:
+            apart = float(np.min(np.abs(others - value)))
+            if apart > max(float(np.ptp(others)), NO_RETURN_M):
+                rows = rows[~same]
     if len(rows) < FEWEST_POINTS:
         raise TooFewSamplesError(
             f"profile {name} has {len(rows)} points (at least {FEWEST_POINTS}): check the exposure "
@@ -320,6 +330,7 @@ TO_HAND: Mount = "to-hand"
 MOUNTS = (IN_HAND, TO_HAND)
 WITHOUT_FILE = ("line", "camera")  # solved with the sensor's place
 FEATURES: tuple[Feature, ...] = ("edge", "groove")
+Z_GROWS = ("away", "towards")  # of a line laser's z, from the sensor: a distance or a height
 TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
 
 MOST_CAPTURES = 500

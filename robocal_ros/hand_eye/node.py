@@ -15,7 +15,15 @@ from sensor_msgs.msg import Image, JointState, PointCloud2
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, Silence
-from robocal_ros.hand_eye.data import FEATURES, IMAGE, MOUNTS, PROFILE, TARGET_POSE, TOPIC_OF
+from robocal_ros.hand_eye.data import (
+    FEATURES,
+    IMAGE,
+    MOUNTS,
+    PROFILE,
+    TARGET_POSE,
+    TOPIC_OF,
+    Z_GROWS,
+)
 from robocal_ros.hand_eye.result import METHODS
 from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
 from robocal_ros.hand_eye.session import (
@@ -66,6 +74,12 @@ SETTINGS = (
     Setting("target", "sphere", "Target where a call names none", choices=tuple(TOPIC_OF)),
     Setting("target_file", "", "File where a call names none; for the target that it describes"),
     Setting("feature", FEATURES[0], "What a line is in a profile", choices=FEATURES),
+    Setting(
+        "z_grows",
+        Z_GROWS[0],
+        "z of a line laser: away from the sensor, a distance, or towards it, a height",
+        choices=Z_GROWS,
+    ),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
     length(
@@ -131,6 +145,7 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
         robot_sigma_m=settings["robot_sigma_mm"] * 1e-3 or None,
         robot_sigma_rad=float(np.radians(settings["robot_sigma_deg"])) or None,
         limit_m=settings["limit_mm"] * 1e-3,
+        z_grows=settings["z_grows"],
     )
 
 

@@ -37,6 +37,7 @@ from robocal_ros.hand_eye.data import (
     TO_HAND,
     TOPIC_OF,
     WITHOUT_FILE,
+    Z_GROWS,
     Capture,
     DataSet,
     HandEyeSample,
@@ -91,6 +92,7 @@ class HandEyeConfig:
     axis, one sigma; None: found from the samples, but the second of a line laser as
     `HandEyeSettings`.
     ``limit_m``: largest expected error at the working distance that is accepted.
+    ``z_grows``: of a line laser, away from the sensor or towards it.
     """
 
     base_frame: str = "base"
@@ -101,6 +103,7 @@ class HandEyeConfig:
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
     limit_m: float = 1e-3
+    z_grows: str = Z_GROWS[0]
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
@@ -172,9 +175,8 @@ def solved(
         raise TooFewSamplesError("nothing was captured yet: capture the target from several poses")
     if data.kind == "camera":
         return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
-    from robocal_ros.estimation.edge import EdgeRule
     from robocal_ros.hand_eye.solve import solve_task
-    from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
+    from robocal_ros.hand_eye.tasks import HandEyeData, task_of
 
     names = tuple(str(sample.handle) for sample in samples)
     shots = HandEyeData(
@@ -185,9 +187,7 @@ def solved(
     )
     settings = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad, config.limit_m)
     target: Any = target_of(data.target)
-    task: Task = LineTask(target, EdgeRule(kind=data.feature))
-    if data.kind != "line":
-        task = SphereTask(target) if data.kind == "sphere" else StepTask(target)
+    task = task_of(target, data.feature, towards=config.z_grows == "towards")
     return solve_task(task, shots, cast(Method, method), settings)
 
 

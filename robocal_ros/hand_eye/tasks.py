@@ -11,7 +11,14 @@ from typing import ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.edge import CornerFit, CornerRule, EdgeRule, fit_corners, fit_edge
+from robocal_ros.estimation.edge import (
+    CornerFit,
+    CornerRule,
+    EdgeRule,
+    Kind,
+    fit_corners,
+    fit_edge,
+)
 from robocal_ros.estimation.estimation import solve
 from robocal_ros.estimation.sphere import ArcRule, fit_arc
 from robocal_ros.ground import frames
@@ -39,7 +46,7 @@ from robocal_ros.hand_eye.mount_problem import (
     same_pose,
 )
 from robocal_ros.hand_eye.result import PoseNoise, TargetKind
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.hand_eye.targets import LaserTarget, LineTarget, SphereTarget, StepTarget
 
 Array = NDArray[np.float64]
 Fit = TypeVar("Fit")
@@ -184,17 +191,19 @@ class SphereTask(Task):
 
     A circle tells the sphere's centre but for the side: y = +-sqrt(R^2 - r^2). The sides are found
     with the pose: of all patterns of a few profiles, the right one agrees best (with rotation
-    columns that are a rotation; the mirrored pattern has the determinant -1).
+    columns that are a rotation; the mirrored pattern has the determinant -1). ``towards``: see
+    `ArcRule`.
     """
 
     target: SphereTarget
+    towards: bool = False
 
     kind = "sphere"
     fewest = FEWEST_SPHERES
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Circles."""
-        rule = ArcRule(self.target.radius_m)
+        rule = ArcRule(self.target.radius_m, towards=self.towards)
         arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
         rejected = {name: str(error) for name, error in errors.items()}
         wrong = [error for error in errors.values() if isinstance(error, InputError)]
@@ -290,7 +299,8 @@ class SphereTask(Task):
         for share in RADII:
             radius_m = share * self.target.radius_m
             words = f"the profiles fit a sphere of radius {radius_m * 1e3:.3g} mm or so"
-            yield f"{words}: check which sphere is mounted", SphereTask(SphereTarget(radius_m))
+            other = replace(self, target=SphereTarget(radius_m))
+            yield f"{words}: check which sphere is mounted", other
 
     def more(self, fit: MountFit, read: Read) -> Document:
         """How far profile points are from the sphere, all profiles together."""
@@ -690,3 +700,18 @@ def _match_nearest(fit: CornerFit, predicted: Array) -> Match:
     mine = np.argmin(gap, axis=1)[rows] == np.arange(len(predicted))
     near = mine & (least < NEAR * apart.min(axis=1))
     return rows[near].astype(np.int64), np.flatnonzero(near).astype(np.int64)
+
+
+def task_of(
+    target: LaserTarget | None, feature: str | None, classic: bool = False, towards: bool = False
+) -> Task:
+    """The estimator's view of a target, of a line by its ``feature``.
+
+    ``classic``: corners and edges in the published form; ``towards``: z grows towards the sensor.
+    """
+    if isinstance(target, SphereTarget):
+        return SphereTask(target, towards)
+    if isinstance(target, StepTarget):
+        return StepTask(target, CornerRule(towards, classic=classic))
+    kind: Kind = "groove" if feature == "groove" else "edge"
+    return LineTask(target, EdgeRule(towards, kind=kind, classic=classic))

@@ -179,7 +179,8 @@ POSITION = {unit: tuple(f"{axis}_{unit}" for axis in "xyz") for unit in LENGTH_U
 EULER = ("rx_deg", "ry_deg", "rz_deg")
 ROTATION_VECTOR = ("rvx_rad", "rvy_rad", "rvz_rad")
 QUATERNION = ("qx", "qy", "qz", "qw")
-ORIENTATIONS = (EULER, ROTATION_VECTOR, QUATERNION)
+FANUC = ("w_deg", "p_deg", "r_deg")
+ORIENTATIONS = (EULER, ROTATION_VECTOR, FANUC, QUATERNION)
 _POSES = tuple(name for group in (*POSITION.values(), *ORIENTATIONS) for name in group)
 NUMBERS = ("stamp_s", "sigma_mm")
 WORDS = ("target", "sample", "pose", "cycle")
@@ -554,6 +555,9 @@ def read_rotations(table: Cells, kind: tuple[str, ...]) -> Array:
     if kind == EULER:
         # intrinsic XYZ: turn about x, then about the new y, then about the new z
         rotations = Rotation.from_euler("XYZ", values, degrees=True)
+    elif kind == FANUC:
+        # about the fixed x (W), then y (P), then z (R)
+        rotations = Rotation.from_euler("xyz", values, degrees=True)
     elif kind == ROTATION_VECTOR:
         rotations = Rotation.from_rotvec(values)
     else:

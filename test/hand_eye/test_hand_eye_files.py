@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from bench.hand_eye_files import write_profile, write_target
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
-from robocal_ros.hand_eye.data import Profile
+from robocal_ros.hand_eye.data import Profile, profile_of
 from robocal_ros.hand_eye.files import (
     PoseTable,
     exported,
@@ -160,6 +160,26 @@ def shots(folder: Path, files: list[str]) -> PoseTable:
 
 
 POINTS = np.column_stack([np.linspace(-0.02, 0.02, 30), np.linspace(0.19, 0.21, 30)])
+
+
+@pytest.mark.parametrize("nothing", [0.0, -32.768, -99999.9999])
+def test_a_value_that_stands_for_no_return_is_left_out(nothing):
+    """What the maker writes where nothing returned is told by its distance from all else."""
+    x = np.linspace(-0.02, 0.02, 400)
+    seen = np.column_stack([x, 0.2 + 0.1 * x])
+    rows = seen.copy()
+    rows[::7, 1] = nothing * 1e-3
+    found = profile_of(rows, "one")
+    np.testing.assert_array_equal(found.points, np.delete(seen, np.s_[::7], axis=0))
+    wall = np.where(x < 0.0, 0.2, 0.215)  # a surface lies nearer, even one without noise
+    assert len(profile_of(np.column_stack([x, wall]), "two").points) == len(x)
+
+
+def test_a_flange_is_read_as_fanuc_tells_it(path):
+    """W, P, R turn about the fixed axes: R = Rz Ry Rx."""
+    path.write_text("profile,x_mm,y_mm,z_mm,w_deg,p_deg,r_deg\na.csv,800,0,300,-170,20,35\n")
+    expected = Rotation.from_euler("ZYX", [35.0, 20.0, -170.0], degrees=True).as_matrix()
+    np.testing.assert_allclose(read_pose_table(path).T_base_flange[0, :3, :3], expected)
 
 
 def test_profiles_are_read_without_their_gaps(tmp_path):
