@@ -32,8 +32,9 @@ from robocal_ros.hand_eye.data import profile_of
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings
 from robocal_ros.hand_eye.solve import solve_task
+from robocal_ros.hand_eye.stairs import StepTask
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
 
 Array = NDArray[np.float64]
 

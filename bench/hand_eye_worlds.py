@@ -43,8 +43,9 @@ from robocal_ros.hand_eye.mount_problem import (
 )
 from robocal_ros.hand_eye.result import PoseNoise, increment
 from robocal_ros.hand_eye.solve import look
+from robocal_ros.hand_eye.stairs import StepTask
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.hand_eye.tasks import LineTask, SphereTask, StepTask, Task
+from robocal_ros.hand_eye.tasks import LineTask, SphereTask, Task
 
 Array = NDArray[np.float64]
 

@@ -35,6 +35,7 @@ from robocal_ros.hand_eye.files import PoseTable, read_flange_mount, read_pose_t
 from robocal_ros.hand_eye.result import METHODS, HandEyeSettings, by_shot, hand_eye_document
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
+from robocal_ros.hand_eye.stairs import task_of
 from robocal_ros.hand_eye.targets import (
     KIND_OF,
     BoardTarget,
@@ -42,7 +43,7 @@ from robocal_ros.hand_eye.targets import (
     SphereTarget,
     read_target,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, task_of
+from robocal_ros.hand_eye.tasks import HandEyeData
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session.events import session_kind

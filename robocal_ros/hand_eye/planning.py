@@ -30,6 +30,7 @@ from robocal_ros.hand_eye.mount_problem import (
 )
 from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, at_origin, expected_error_m
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
+from robocal_ros.hand_eye.stairs import StepTask
 from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LaserTarget,
@@ -37,7 +38,7 @@ from robocal_ros.hand_eye.targets import (
     StepTarget,
     target_of,
 )
-from robocal_ros.hand_eye.tasks import FEWEST_SPHERES, HandEyeData, SphereTask, StepTask
+from robocal_ros.hand_eye.tasks import FEWEST_SPHERES, HandEyeData, SphereTask
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import CalibrationState
 from robocal_ros.kinematics import SerialArm

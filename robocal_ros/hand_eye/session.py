@@ -176,7 +176,8 @@ def solved(
     if data.kind == "camera":
         return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
     from robocal_ros.hand_eye.solve import solve_task
-    from robocal_ros.hand_eye.tasks import HandEyeData, task_of
+    from robocal_ros.hand_eye.stairs import task_of
+    from robocal_ros.hand_eye.tasks import HandEyeData
 
     names = tuple(str(sample.handle) for sample in samples)
     shots = HandEyeData(

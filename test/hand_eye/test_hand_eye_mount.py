@@ -31,7 +31,7 @@ from robocal_ros.hand_eye.mount_problem import (
 )
 from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, by_shot, increment
 from robocal_ros.hand_eye.solve import features, judge, looked
-from robocal_ros.hand_eye.tasks import StepTask
+from robocal_ros.hand_eye.stairs import StepTask
 
 X = CELL.T_flange_sensor
 FEATURE_M = 5e-6

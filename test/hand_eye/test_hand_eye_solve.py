@@ -41,8 +41,9 @@ from robocal_ros.ground.errors import (
 from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.result import HandEyeSettings, point_covariance
 from robocal_ros.hand_eye.solve import features, held_out, look, solve_joint, solve_task, verify
+from robocal_ros.hand_eye.stairs import StepTask
 from robocal_ros.hand_eye.targets import SphereTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, StepTask
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor
