@@ -321,10 +321,11 @@ class DriftTracker:
                 process.setup_sigma_m**2 * np.eye(SETUP),
             ),
         ):
+            size = 2 * len(variance)
             for rows in (mean[:, None], P, P.T):  # F P F^T by blocks: the rest of F is one
-                before = rows[part].reshape(2, len(variance), -1)
-                rows[part] = np.tensordot(F, before, 1).reshape(2 * len(variance), -1)
-            P[part, part] += np.kron(noise, variance)
+                rows[part] = (F @ rows[part].reshape(2, -1)).reshape(size, -1)
+            both = noise[:, None, :, None] * variance[:, None, :]
+            P[part, part] += both.reshape(size, size)
         return DriftState(time_s, mean, P)
 
     def drift(self, time_s: float) -> tuple[Array, Array]:
@@ -333,7 +334,9 @@ class DriftTracker:
         Where motor temperatures are in use, those after the last reading are held, with a doubt
         that grows.
         """
-        state = self.at(time_s)
+        state, k = self.at(time_s), self.count
+        if self.heat is None:
+            return state.mean[:k], state.covariance[:k, :k]
         rows = self.drift_rows(time_s)
         covariance = rows @ state.covariance @ rows.T + self._swing(time_s)
         return rows @ state.mean, covariance
