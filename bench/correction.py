@@ -28,7 +28,8 @@ from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimit
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import link_transform, load_description, load_robot
+from robocal_ros.kinematics.robots import load_description, load_robot
+from robocal_ros.kinematics.universal_robots import link_transform
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,8 @@ from bench.tables import Goal, Table
 from bench.ur10_campaigns import data_folder, halves, load_campaign
 from robocal_ros.estimation.assessment import ErrorSummary, summarise
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
-from robocal_ros.kinematics.robots import factory_arm, load_robot, nominal_arm, parse_settings
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.universal_robots import factory_arm, nominal_arm, parse_settings
 
 LARGEST_MEAN_MM = {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365}
 LARGEST_LATER_MEAN_MM = {"B": 0.455, "C": 0.52, "D": 0.40}

@@ -18,7 +18,8 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel, identify
 from robocal_ros.identification.solve import CellProblem, make_layout
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import link_transform, load_robot
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.universal_robots import link_transform
 
 Array = NDArray[np.float64]
 

@@ -15,12 +15,12 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import (
+from robocal_ros.kinematics.robots import save_robot
+from robocal_ros.kinematics.universal_robots import (
     factory_arm,
     factory_dh,
     nominal_arm,
     parse_settings,
-    save_robot,
 )
 
 if TYPE_CHECKING:

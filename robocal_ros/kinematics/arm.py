@@ -5,7 +5,7 @@ robot file and the start of a node do not need.
 """
 
 import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -227,9 +227,15 @@ class SerialArm:
     def model_hash(self) -> str:
         """Identity of the model (16 hex digits): its numbers to 1e-9 m or rad, and its joints.
 
-        The same file gives the same hash on every machine; name, limits and tool do not enter.
+        The same file gives the same hash on every machine; name, limits, tool, payload and
+        mounting do not enter. Compliances do to 1e-15 rad/(N m), the links' mass with them.
         """
-        numbers = np.round(np.hstack([self.mdh.ravel(), self.T_base_root[:3].ravel()]), 9) + 0.0
+        parts = [self.mdh, self.T_base_root[:3]]
+        if self.functions is not None:
+            f = self.functions
+            parts += [f.first, f.step, f.coefficients, 1e6 * f.compliance]
+            parts += [self.load.mass, self.load.centre] if self.load and any(f.compliance) else []
+        numbers = np.round(np.hstack([part.ravel() for part in parts]), 9) + 0.0
         joints = zip(self.joint_names, self.sign, self.prismatic, strict=True)
         words = [f"{name}{sign:+.0f}{int(slides)}" for name, sign, slides in joints]
         text = "|".join([*words, *(f"{x:.9f}" for x in numbers)])
@@ -240,6 +246,13 @@ class SerialArm:
         arm = replace(self, mdh=np.asarray(mdh, dtype=np.float64))
         arm.__dict__["parameters"] = self.parameters
         return arm
+
+    def with_model(
+        self, mdh: ArrayLike, functions: JointFunctions | None, identified: ArmLoad | None
+    ) -> "SerialArm":
+        """Return the same arm with another model; of its load the payload and mounting are kept."""
+        load = self.load if identified is None else identified.carrying(self.load)
+        return replace(self, functions=functions, load=load).with_mdh(mdh)
 
     def _batch(self, q: ArrayLike) -> tuple[Array, tuple[int, ...]]:
         joints = np.asarray(q, dtype=np.float64)
@@ -296,7 +309,9 @@ class SerialArm:
         """T_base_flange (..., 4, 4) at joint vectors (..., n)."""
         from robocal_ros.kinematics import kernels
 
-        joints, lead = self._batch(self.turned(q))
+        joints, lead = self._batch(q)
+        if self.functions is not None:
+            joints = self.turned(joints)
         T = np.empty((len(joints), 4, 4))
         kernels.fk_batch(joints, self.links, self.T_base_root, T)
         return T.reshape(*lead, 4, 4)
@@ -305,7 +320,9 @@ class SerialArm:
         """Geometric Jacobian (..., 6, n): [v; w] of the flange in base axes per unit joint rate."""
         from robocal_ros.kinematics import kernels
 
-        joints, lead = self._batch(self.turned(q))
+        joints, lead = self._batch(q)
+        if self.functions is not None:
+            joints = self.turned(joints)
         J = np.empty((len(joints), 6, self.n))
         kernels.jacobian_batch(joints, self.links, self.T_base_root, J)
         J = J.reshape(*lead, 6, self.n)
@@ -319,7 +336,9 @@ class SerialArm:
         """
         from robocal_ros.kinematics import kernels
 
-        joints, lead = self._batch(self.turned(q))
+        joints, lead = self._batch(q)
+        if self.functions is not None:
+            joints = self.turned(joints)
         k = len(self.parameters)
         T, J = np.empty((len(joints), 4, 4)), np.zeros((len(joints), 6, k))
         tool = np.eye(4)[None]
@@ -336,8 +355,11 @@ class SerialArm:
 
 
 def model_document(arm: SerialArm) -> Document:
-    """A model in full precision, SI; ``arm_of`` reads it back to the last bit."""
-    return {
+    """A model in full precision, SI; ``arm_of`` reads it back to the last bit.
+
+    ``functions`` and ``load`` are there where the arm has them.
+    """
+    document: Document = {
         "robot": arm.name,
         "joint_names": list(arm.joint_names),
         "sign": arm.sign.tolist(),
@@ -345,11 +367,72 @@ def model_document(arm: SerialArm) -> Document:
         "mdh": arm.mdh.tolist(),
         "T_base_root": arm.T_base_root.tolist(),
     }
+    if arm.functions is not None:
+        document["functions"] = _as_lists(arm.functions)
+    if arm.load is not None:
+        document["load"] = _as_lists(arm.load)
+    return document
+
+
+def _as_lists(part: JointFunctions | ArmLoad) -> Document:
+    return {f.name: np.asarray(getattr(part, f.name)).tolist() for f in fields(part)}
 
 
 def arm_of(model: Document, nominal: SerialArm) -> SerialArm:
-    """The nominal arm with the parameters of a model document."""
-    return nominal.with_mdh(np.array(model["mdh"], dtype=np.float64))
+    """The nominal arm with the parameters and joint functions of a model document.
+
+    Payload and mounting are the nominal arm's where it says them, see `ArmLoad.carrying`.
+    """
+    return nominal.with_model(np.array(model["mdh"]), *layer_of(model))
+
+
+def layer_of(model: Document) -> tuple[JointFunctions | None, ArmLoad | None]:
+    """Joint functions of a model document, and the load that it was identified with."""
+    functions, load = model.get("functions"), model.get("load")
+    return (
+        None if functions is None else JointFunctions(**functions),
+        None if load is None else ArmLoad(**load),
+    )
+
+
+_POSES = 2000  # over the joints' range, among which the largest shift is sought
+
+
+def payload_note(arm: SerialArm, identified: ArmLoad | None) -> str:
+    """What it may cost that an arm carries, or hangs, otherwise than when it was identified.
+
+    Empty where it does not, or where one of the loads is not known.
+    """
+    load = arm.load
+    if load is None or identified is None or _same_load(load, identified):
+        return ""
+    note = (
+        f"the model was identified with a payload of {_in_words(identified)}, "
+        f"the robot file says {_in_words(load)}"
+    )
+    if arm.functions is None or not np.any(arm.functions.compliance):
+        return f"{note}: how far that bends the arm is not in the model"
+    far = np.pi  # where a joint has no limits
+    lower, upper = np.maximum(arm.lower, -far), np.minimum(arm.upper, far)
+    q = np.random.default_rng(0).uniform(lower, upper, (_POSES, arm.n))
+    before = replace(arm, load=identified)
+    shift = np.max(np.linalg.norm((arm.fk(q) - before.fk(q))[:, :3, 3], axis=1))
+    return (
+        f"{note}: its compliances make of that up to {1e3 * shift:.2g} mm at the flange, of which "
+        "nothing was measured"
+    )
+
+
+def _same_load(a: ArmLoad, b: ArmLoad) -> bool:
+    pulled = a.payload_mass == b.payload_mass and np.array_equal(a.gravity, b.gravity)
+    return pulled and (a.payload_mass == 0.0 or np.array_equal(a.payload_centre, b.payload_centre))
+
+
+def _in_words(load: ArmLoad) -> str:
+    centre, pull = (
+        ", ".join(f"{x:.4g}" for x in v) for v in (1e3 * load.payload_centre, load.gravity)
+    )
+    return f"{load.payload_mass:.4g} kg at ({centre}) mm and gravity along ({pull})"
 
 
 def parameters_document(

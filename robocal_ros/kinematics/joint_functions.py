@@ -7,7 +7,7 @@ far the gravity torque about the axis winds the joint (a joint that slides: metr
 Both come before the geometric chain: `SerialArm.turned` gives what a rigid arm would read.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -128,3 +128,18 @@ class ArmLoad:
             object.__setattr__(self, name, value)
         if not (np.all(self.mass >= 0.0) and 0.0 <= self.payload_mass < np.inf):
             raise ValueError("load: a mass must not be below 0")
+
+    def carrying(self, present: "ArmLoad | None") -> "ArmLoad":
+        """These links with the payload and the mounting of another load; None: their own.
+
+        A compliance belongs to the mass of the links that it was identified with. What the arm
+        carries and how it is mounted may have changed since.
+        """
+        if present is None:
+            return self
+        return replace(
+            self,
+            payload_mass=present.payload_mass,
+            payload_centre=present.payload_centre,
+            gravity=present.gravity,
+        )

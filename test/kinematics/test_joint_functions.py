@@ -1,5 +1,7 @@
 """Joint functions and winding under load: against the definition, numeric derivatives, and back."""
 
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +12,17 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import SMALLEST_SINGULAR_VALUE, follow, inverse
+from robocal_ros.kinematics.arm import (
+    SMALLEST_SINGULAR_VALUE,
+    arm_of,
+    follow,
+    inverse,
+    model_document,
+    payload_note,
+)
 from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
-from robocal_ros.kinematics.robots import link_transform, load_robot
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.universal_robots import link_transform
 
 NM = 1e-9
 # Knots of half the length over which a real UR10's functions change; their size, compliances of
@@ -151,6 +161,56 @@ def test_joints_of_a_path_and_their_rates_are_those_that_are_read():
     # 6 SIZE / STEP^3 jumps: times the rate squared, h and a metre
     np.testing.assert_allclose(found.qdd, -np.sin(t)[:, None] * swing, rtol=0.0, atol=2e-5)
     np.testing.assert_allclose(inverse(arm, arm.fk(q), q[0]), q, rtol=0.0, atol=FOUND)
+
+
+@given(arms(), st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_a_model_document_reads_back_to_the_last_bit(drawn, seed):
+    bare, q = drawn
+    arm = with_layer(bare, seed)
+    document = json.loads(json.dumps(model_document(arm)))
+    nominal = replace(bare, mdh=bare.mdh + 1e-3)
+    back = arm_of(document, nominal)
+    np.testing.assert_array_equal(back.fk(q), arm.fk(q))
+    assert back.model_hash == arm.model_hash != bare.model_hash
+    # a document of before has no functions, and neither has its arm
+    plain = arm_of(model_document(bare), replace(arm, mdh=nominal.mdh))
+    np.testing.assert_array_equal(plain.fk(q), bare.fk(q))
+
+
+def test_the_hash_tells_functions_and_compliances_apart_but_not_what_is_carried():
+    arm = with_layer(load_robot("ur10"), 7)
+    functions, load = arm.functions, arm.load
+    carried = replace(load, payload_mass=9.0, gravity=np.array([0.0, 9.8, 0.0]))
+    assert replace(arm, load=carried).model_hash == arm.model_hash
+    different = [
+        replace(arm, functions=replace(functions, first=functions.first + 1e-6)),
+        replace(arm, functions=replace(functions, coefficients=functions.coefficients * 1.01)),
+        replace(arm, functions=replace(functions, compliance=functions.compliance * 1.01)),
+        replace(arm, load=replace(load, mass=load.mass + 0.1)),
+        replace(arm, functions=None),
+    ]
+    assert len({other.model_hash for other in [arm, *different]}) == 1 + len(different)
+
+
+def test_a_model_is_used_with_what_the_robot_file_says_it_carries_and_tells_what_that_may_cost():
+    nominal = load_robot("ur10")
+    identified = with_layer(nominal, 7)
+    load = replace(identified.load, payload_mass=0.0)
+    identified = replace(identified, load=load)
+    carries = replace(load, mass=np.ones(6), payload_mass=5.0, payload_centre=np.full(3, 0.1))
+    used = arm_of(model_document(identified), replace(nominal, load=carries))
+    np.testing.assert_array_equal(used.load.mass, load.mass)
+    assert used.load.payload_mass == 5.0
+    q = np.random.default_rng(1).uniform(used.lower / 2.0, used.upper / 2.0, (5000, 6))
+    moved = np.linalg.norm((used.fk(q) - identified.fk(q))[:, :3, 3], axis=1)
+    note = payload_note(used, load)
+    found = re.search(r"payload of 0 kg .* says 5 kg .* up to ([0-9.]+) mm", note)
+    # the largest of so many poses, in words of two digits
+    assert float(found[1]) == pytest.approx(1e3 * np.max(moved), rel=0.15)
+    assert payload_note(identified, load) == payload_note(nominal, load) == ""
+    bare = replace(used, functions=None)
+    assert payload_note(bare, load).endswith("how far that bends the arm is not in the model")
 
 
 def parts(**changed):

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import ParameterSet, SerialArm, kernels
 from robocal_ros.kinematics.arm import ALPHA, BETA
-from robocal_ros.kinematics.robots import (
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.universal_robots import (
     factory_arm,
     factory_dh,
     hayati_from_dh,
-    load_robot,
     nominal_arm,
     parse_settings,
 )
