@@ -17,6 +17,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.files import nearest, quoted, read_text, share_folders, write_text
 from robocal_ros.kinematics.arm import SerialArm
+from robocal_ros.kinematics.joint_functions import STANDARD_GRAVITY, ArmLoad, JointFunctions
 
 # ---- values of a YAML file by key, checked; errors name file, place and key ---------------------
 
@@ -128,6 +129,18 @@ class Fields:
             self.fail(f"must be a list of {count} numbers", key)
         return [self._number(item, key) for item in value]
 
+    def row(self, key: str) -> list[float]:
+        """A list of finite numbers; none when it is left out."""
+        value = self.values.get(key, [])
+        return self.numbers(key, len(value) if isinstance(value, list) else 0, ())
+
+    def rows(self, key: str, count: int, width: int) -> list[list[float]]:
+        """A list of ``count`` lists of ``width`` finite numbers."""
+        value = self._get(key)
+        if not isinstance(value, list) or len(value) != count:
+            self.fail(f"must be {count} lists of {width} numbers", key)
+        return [Fields({key: row}, self.file, self.place).numbers(key, width) for row in value]
+
     def _number(self, value: Any, key: str) -> float:
         if isinstance(value, str):  # YAML 1.1 takes 1e-3 for a text
             try:
@@ -216,7 +229,7 @@ def load_description(name: str | Path) -> RobotDescription:
     """Everything that a robot file says; see ``load_robot``."""
     path = find_robot(name)
     top = Fields(load_yaml(read_text(path, "robot file"), str(path)), str(path), "")
-    top.only("robot", "convention", "joints", "base", "tool")
+    top.only("robot", "convention", "joints", "base", "tool", "load", "functions")
     robot = top.text("robot")
     convention = top.choice("convention", CONVENTIONS)
     joints = [_Joint(fields, convention) for fields in top.items("joints", "joint")]
@@ -234,6 +247,8 @@ def load_description(name: str | Path) -> RobotDescription:
         upper=np.array([joint.upper for joint in joints]),
         T_base_root=_pose(top, "base"),
         T_flange_tool=_pose(top, "tool"),
+        load=_load(top.below("load"), len(joints)) if "load" in top.values else None,
+        functions=_functions(top, joints) if "functions" in top.values else None,
     )
     velocity = np.array([joint.max_velocity for joint in joints])
     given = np.array([joint.max_acceleration for joint in joints])
@@ -329,6 +344,10 @@ def save_robot(
         if not np.array_equal(T, np.eye(4)):
             xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
             document[key] = {"xyz_mm": xyz, "quat_xyzw": frames.quat_xyzw(T).tolist()}
+    if arm.load is not None:
+        document["load"] = _load_document(arm.load)
+    if arm.functions is not None:
+        document["functions"] = _functions_document(arm, arm.functions)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
     remarks = "".join(f"# {line}\n" for line in comment.splitlines())
     write_text(Path(path), remarks + text)
@@ -394,6 +413,84 @@ def _joint_document(
     if like is not None and not like.acceleration_assumed[joint]:
         acceleration = float(like.max_acceleration[joint])
         document[f"max_acceleration_{unit}_s2"] = _shown(acceleration, factor)
+    return document
+
+
+# ---- what gravity pulls at, and what joints turn besides what is read ---------------------------
+
+# Per kind of joint (slides or not): keys of first knot and spacing, of the function, of the
+# compliance, and their units.
+_FUNCTION_KEYS = {
+    False: ("first_deg", "step_deg", "coefficients_urad", "compliance_urad_nm"),
+    True: ("first_mm", "step_mm", "coefficients_um", "compliance_um_n"),
+}
+_MICRO = 1e-6
+
+
+def _load(fields: Fields, n: int) -> ArmLoad:
+    fields.only("masses_kg", "centres_mm", "payload_kg", "payload_centre_mm", "gravity_m_s2")
+    centres = fields.rows("centres_mm", n, 3)
+    try:
+        return ArmLoad(
+            np.array(fields.numbers("masses_kg", n)),
+            np.array(centres) * MM,
+            fields.number("payload_kg", 0.0),
+            np.array(fields.numbers("payload_centre_mm", 3, (0.0, 0.0, 0.0))) * MM,
+            np.array(fields.numbers("gravity_m_s2", 3, (0.0, 0.0, -STANDARD_GRAVITY))),
+        )
+    except ValueError as error:
+        fields.fail(f"cannot be: {error}")
+
+
+def _load_document(load: ArmLoad) -> dict[str, Any]:
+    return {
+        "masses_kg": load.mass.tolist(),
+        "centres_mm": [[_shown(x, MM) for x in row] for row in load.centre.tolist()],
+        "payload_kg": load.payload_mass,
+        "payload_centre_mm": [_shown(x, MM) for x in load.payload_centre.tolist()],
+        "gravity_m_s2": load.gravity.tolist(),
+    }
+
+
+def _functions(top: Fields, joints: Sequence["_Joint"]) -> JointFunctions:
+    """Of the joints that are named; the others have none."""
+    names = [joint.name for joint in joints]
+    first, step, compliance = np.zeros(len(names)), np.ones(len(names)), np.zeros(len(names))
+    tables: list[list[float]] = [[] for _ in names]
+    for fields in top.items("functions", "joint function"):
+        i = names.index(fields.choice("name", names))
+        keys = _FUNCTION_KEYS[joints[i].prismatic]
+        _, unit = UNITS[joints[i].prismatic]
+        fields.only("name", *keys)
+        first[i] = fields.number(keys[0], 0.0) * unit
+        step[i] = fields.positive(keys[1], 1.0) * unit
+        tables[i] = [value * _MICRO for value in fields.row(keys[2])]
+        compliance[i] = fields.number(keys[3], 0.0) * _MICRO
+    if np.any(compliance) and "load" not in top.values:
+        top.fail("hold compliances, and there is no load", "functions")
+    width = max(len(table) for table in tables)
+    padded = np.array([table + [0.0] * (width - len(table)) for table in tables])
+    try:
+        return JointFunctions(first, step, padded, compliance)
+    except ValueError as error:
+        top.fail(f"cannot be: {error}", "functions")
+
+
+def _functions_document(arm: SerialArm, functions: JointFunctions) -> list[dict[str, Any]]:
+    document = []
+    for i, name in enumerate(arm.joint_names):
+        prismatic = bool(arm.prismatic[i])
+        numbers = zip(
+            _FUNCTION_KEYS[prismatic],
+            (functions.first, functions.step, functions.coefficients, functions.compliance),
+            (UNITS[prismatic][1], UNITS[prismatic][1], _MICRO, _MICRO),
+            strict=True,
+        )
+        row: dict[str, Any] = {"name": name}
+        for key, values, unit in numbers:
+            value = values[i].tolist()
+            row[key] = [_shown(x, unit) for x in value] if values.ndim > 1 else _shown(value, unit)
+        document.append(row)
     return document
 
 

@@ -12,6 +12,7 @@ import pytest
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 from robocal_ros.kinematics.robots import (
     find_robot,
     load_description,
@@ -200,6 +201,75 @@ def test_a_nominal_arm_keeps_its_identity_through_a_file(tmp_path: Path, name: s
     assert copy.model_hash == arm.model_hash
     assert copy.mdh.tolist() == arm.mdh.tolist()
     assert copy.name == arm.name
+
+
+def test_joint_functions_and_load_are_saved_and_read_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for bare in (load_robot("ur10"), load_robot(write(tmp_path, GOOD))):
+        n = bare.n
+        made = JointFunctions(
+            rng.normal(size=n),
+            rng.uniform(0.03, 0.1, n),
+            rng.normal(0.0, 1e-4, (n, 40)),
+            rng.uniform(0.0, 1e-6, n),
+        )
+        load = ArmLoad(rng.uniform(0, 9, n), rng.normal(size=(n, 3)), 5.0, [0.1, 0, 0], [0, 9.8, 0])
+        save_robot(replace(bare, functions=made, load=load), tmp_path / "whole.yaml")
+        back = load_robot(tmp_path / "whole.yaml")
+        for field in ("first", "step", "coefficients", "compliance"):
+            found = getattr(back.functions, field)
+            np.testing.assert_allclose(found, getattr(made, field), rtol=1e-15)
+        for field in ("mass", "centre", "payload_mass", "payload_centre", "gravity"):
+            found = getattr(back.load, field)
+            np.testing.assert_allclose(found, getattr(load, field), rtol=1e-15)
+
+
+def test_the_links_of_the_ur10_weigh_no_more_than_the_arm_and_lie_within_its_reach() -> None:
+    load = load_robot("ur10").load
+    assert 25.0 < np.sum(load.mass) < 28.9  # kg: the whole arm, by its user manual
+    assert np.max(np.linalg.norm(load.centre, axis=1)) < 0.612  # m: its longest link
+    assert load.payload_mass == 0.0
+    np.testing.assert_allclose(load.gravity, [0.0, 0.0, -9.80665])
+
+
+LAYER = """
+load: {masses_kg: [1, 2], centres_mm: [[0, 0, 0], [1, 2, 3]]}
+functions:
+  - {name: one, first_deg: -10, step_deg: 5, coefficients_urad: [1, 2, 1], compliance_urad_nm: 0.5}
+"""
+
+
+def test_a_joint_that_is_not_named_has_no_function(tmp_path: Path) -> None:
+    arm = load_robot(write(tmp_path, GOOD + LAYER))
+    at = np.array([[np.radians(2.5), 0.1]])
+    assert arm.functions.delta(at)[0, 1] == 0.0
+    assert arm.functions.compliance.tolist() == [0.5e-6, 0.0]
+    assert arm.functions.first[0] == pytest.approx(np.radians(-10.0))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("name: one, first", "name: three, first", "joint function 1, name is 'three'; it must be"),
+        ("step_deg: 5", "step_deg: 0", "step_deg is 0; it must be above 0"),
+        ("first_deg", "first_mm", "'first_mm' is not a known key .*'first_deg'"),
+        ("[1, 2, 1]", "[1, .nan, 1]", "coefficients_urad is nan, not a finite"),
+        ("[1, 2, 1]", "3", "coefficients_urad must be a list"),
+        ("[1, 2, 1]", "[1, 90000, 1]", "functions cannot be: .* joint 1 has a slope"),
+        ("compliance_urad_nm: 0.5", "compliance_urad_nm: -1", "compliances not below"),
+        ("[1, 2]", "[1]", "load, masses_kg must be a list of 2 numbers"),
+        ("[1, 2]", "[1, -2]", "load cannot be: load: a mass must not be below 0"),
+        ("[[0, 0, 0], ", "[", "load, centres_mm must be 2 lists of 3 numbers"),
+        ("[0, 0, 0]", "[0, 0]", "load, centres_mm must be a list of 3 numbers"),
+        ("load: {masses_kg: [1, 2], centres_mm: [[0, 0, 0], [1, 2, 3]]}", "", "there is no load"),
+    ],
+)
+def test_what_is_wrong_with_functions_and_load_is_named(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    assert LAYER.count(old) == 1
+    with pytest.raises(InputError, match=words):
+        load_robot(write(tmp_path, GOOD + LAYER.replace(old, new)))
 
 
 def test_joint_speeds_are_kept(tmp_path: Path) -> None:
