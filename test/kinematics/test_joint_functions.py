@@ -194,7 +194,7 @@ def test_the_hash_tells_functions_and_compliances_apart_but_not_what_is_carried(
 
 
 def test_a_model_is_used_with_what_the_robot_file_says_it_carries_and_tells_what_that_may_cost():
-    nominal = load_robot("ur10")
+    nominal = replace(load_robot("ur10"), load=None)
     identified = with_layer(nominal, 7)
     load = replace(identified.load, payload_mass=0.0)
     identified = replace(identified, load=load)
@@ -243,7 +243,7 @@ def test_a_load_that_does_not_fit_is_refused():
         ArmLoad(np.array([-1.0]), np.zeros((1, 3)))
     with pytest.raises(ValueError, match="centre must be"):
         ArmLoad(np.ones(2), np.zeros((1, 3)))
-    bare = load_robot("ur10")
+    bare = replace(load_robot("ur10"), load=None)
     with pytest.raises(ValueError, match="not of 6 joints"):
         replace(bare, functions=JointFunctions(**parts()))
     winds = parts(compliance=np.ones(6), first=np.zeros(6), step=np.ones(6))
