@@ -30,12 +30,13 @@ from session_events import EventLog
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # for the bench
 
+from bench.cell_samples import Sample  # noqa: E402
 from bench.closed_loop import setting  # noqa: E402
 from bench.closed_loop.judging import Figures  # noqa: E402
 from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
 from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
 from robocal_ros.bags.bag_writer import BagWriter, ros_time  # noqa: E402
-from robocal_ros.cell_sim.cell import Happened, Sample  # noqa: E402
+from robocal_ros.cell_sim.cell import Happened  # noqa: E402
 from robocal_ros.ground.samples import (  # noqa: E402
     JOINTS,
     REFERENCE_SPHERE,

@@ -56,9 +56,9 @@ from bench.hand_eye_cell import (
     taught,
 )
 from bench.hand_eye_files import write_shots, write_target
+from bench.measured_runs import Q_NEAR
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table

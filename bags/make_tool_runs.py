@@ -11,6 +11,7 @@ tool, which is accepted and passes. The bag holds:
 """
 
 import json
+import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,23 +20,22 @@ from typing import Any
 import numpy as np
 from session_events import EventLog
 
-from robocal_ros import __version__
-from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim.beams import (
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
+
+from bench.measured_runs import (
     BETA_RAD,
     GAP_M,
     Q_NEAR,
     T_BASE_LASER,
     TAUGHT,
-    BeamStation,
-    RoundTool,
-    TrueInput,
-    TrueNoise,
-    beams_of,
-    bent,
+    RobotProgram,
+    Sample,
+    ToolCell,
     laser_of,
 )
-from robocal_ros.cell_sim.tool_cell import RobotProgram, Sample, ToolCell
+from robocal_ros import __version__
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot

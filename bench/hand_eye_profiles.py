@@ -23,8 +23,8 @@ from bench.hand_eye_worlds import (
     X,
     squared_error,
 )
+from bench.measured_runs import Q_NEAR
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames

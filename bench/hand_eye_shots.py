@@ -24,7 +24,7 @@ from bench.hand_eye_worlds import (
     T_BASE_USER,
     calibrated,
 )
-from robocal_ros.cell_sim.beams import Q_NEAR
+from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.robot import Warmth
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.laser_tracker import Sizes, TrackerCell, prp_cell, six_axis_cell
+from bench.measured_runs import Q_NEAR
 from bench.tables import Goal, Table
-from robocal_ros.cell_sim.beams import Q_NEAR
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.tracker import SENSOR, solve_best
 from robocal_ros.hand_eye.tracker_data import TrackerNoise

@@ -11,8 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.tables import Goal, Table
-from robocal_ros.cell_sim.beams import (
+from bench.measured_runs import (
     BETA_RAD,
     GAP_M,
     NO_NOISE,
@@ -20,6 +19,13 @@ from robocal_ros.cell_sim.beams import (
     Q_NEAR,
     T_BASE_LASER,
     TAUGHT,
+    MeasuredRun,
+    RunPlan,
+    ToolCell,
+    point_sigma,
+)
+from bench.tables import Goal, Table
+from robocal_ros.cell_sim.beams import (
     BeamStation,
     RoundTool,
     TrueBeam,
@@ -27,15 +33,7 @@ from robocal_ros.cell_sim.beams import (
     TrueNoise,
     beams_of,
 )
-from robocal_ros.cell_sim.tool_cell import (
-    CYLINDER_M,
-    Circle,
-    MeasuredRun,
-    RunPlan,
-    ToolCell,
-    laser_points,
-    point_sigma,
-)
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M, Circle, laser_points
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.circle import CircleMotion, classic_tool, closed_form, fit_circle, label_edges

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.cell_samples import CellSamples, Sample, programme
 from bench.closed_loop import setting
 from bench.closed_loop.suite import Clock, Record, Suite, unrecorded
-from robocal_ros.cell_sim.cell import CellSamples, Happened, Sample, SimulatedCell, poses
-from robocal_ros.cell_sim.tool_cell import programme
+from robocal_ros.cell_sim.cell import Happened, SimulatedCell, poses
 from robocal_ros.correction.interface import RefusedError, TrajectoryCommand
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from robocal_ros.cell_sim.cell import SPIN_RAD, T_BASE_LASER, TAUGHT, CellPlan, known_laser, poses
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M, point_sigma
+from bench.cell_samples import SPIN_RAD
+from bench.measured_runs import point_sigma
+from robocal_ros.cell_sim.cell import T_BASE_LASER, TAUGHT, CellPlan, known_laser, poses
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M
 from robocal_ros.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import MotionLimits

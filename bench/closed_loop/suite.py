@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.cell_samples import Sample
 from bench.closed_loop import setting
 from bench.closed_loop.carrying import Carrier
 from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
 from robocal_ros import __version__
-from robocal_ros.cell_sim.cell import Sample
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import JointCommand
 from robocal_ros.correction.session import CorrectionSession

@@ -15,12 +15,13 @@ from typing import Any
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
+from bench.cell_samples import CellSamples
 from bench.closed_loop import setting
 from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
 from bench.live.graph import LiveError
 from bench.startup import ROOT
-from robocal_ros.cell_sim.cell import CellSamples, SimulatedCell, kr150_cell
+from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, save_robot

@@ -22,10 +22,10 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from bench.cell_samples import programme
 from bench.live.cell import PROGRAM, ROBOT, TRUTH
 from bench.live.graph import CellController, LiveError
 from robocal_ros.cell_sim.cell import poses
-from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints

@@ -80,20 +80,11 @@ from robocal_ros.cell_sim.trajectory_controller import (
     JointMotion,
     Trajectory,
 )
-from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
-from robocal_ros.ground.samples import (
-    MEASURED_POINT,
-    REFERENCE_SPHERE,
-    SPHERE_CLOUD,
-    JointSample,
-    PointSample,
-    TemperatureSample,
-)
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.screening import THRESHOLD_M
-from robocal_ros.tool.edges import BeamEdge, EdgeSample
+from robocal_ros.tool.edges import BeamEdge
 from robocal_ros.tool.run import PlannedStep
 
 Array = NDArray[np.float64]
@@ -199,7 +190,6 @@ def known_laser(
 TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.40])  # the pin, longer than the ball's stem
 PIN_RADIUS_M = 2.5e-3
 T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.03, 0.01]), [1.25, 1.00, 0.60])
-SPIN_RAD = float(np.radians(-135.0))  # of the flange about the laser's z, where the robot measures
 BEAM_ANGLE_RAD = float(np.radians(91.4))
 BEAM_GAP_M = 5.8e-5
 INPUT = TrueInput(latency_s=0.004)
@@ -292,65 +282,7 @@ class Happened:
     temperatures: list[Temperatures]
 
 
-Sample = JointSample | PointSample | TemperatureSample | EdgeSample
-
 OTHER_STATION = "_other"
-
-
-class CellSamples:
-    """Makes samples of what happened, with stamps from ``start_ns`` on.
-
-    ``joint_names`` of the arm; ``station`` and ``frame`` of beams and sphere sensor; ``rule``: of
-    the sphere in a cloud.
-    """
-
-    def __init__(
-        self,
-        joint_names: tuple[str, ...],
-        rule: SphereRule,
-        start_ns: int = 1_790_000_000_000_000_000,
-        station: str = "station",
-        frame: str = "sensor",
-    ) -> None:
-        self._names, self._rule, self._start_ns = joint_names, rule, start_ns
-        self._station, self._frame = station, frame
-
-    def ns(self, time_s: float) -> int:
-        """Stamp of a time of the cell."""
-        return self._start_ns + round(time_s * 1e9)
-
-    def of(self, came: Happened, faults: Faults) -> list[Sample]:
-        """Samples in the order of their stamps; ``faults`` of the cell.
-
-        Raises `TooFewSamplesError` or `ResidualError` when a cloud holds no sphere as the rule
-        wants it.
-        """
-        samples: list[Sample] = [
-            JointSample(self.ns(t), self._names, q)
-            for t, q in zip(came.time_s.tolist(), came.q, strict=True)
-        ]
-        station = station_name(self._station, faults)
-        samples += [
-            EdgeSample(self.ns(e.time_s), station, e.beam, e.blocked, e.sigma_s) for e in came.edges
-        ]
-        frame = self._frame
-        for shot in came.shots:
-            at = self.ns(shot.time_s)
-            floor = PointSample(at, frame, "floor", shot.floor, REFERENCE_SPHERE)
-            if len(shot.points):
-                fit = fit_sphere(shot.points.astype(np.float32).astype(np.float64), self._rule)
-                sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
-                ball = PointSample(at, frame, "ball", fit.centre, SPHERE_CLOUD, sigma_m)
-            else:
-                ball = PointSample(at, frame, "ball", shot.centre, MEASURED_POINT)
-            samples += [ball, floor]
-        for told in came.temperatures:
-            at = self.ns(told.time_s)
-            samples += [
-                TemperatureSample(at, name, celsius)
-                for name, celsius in zip(self._names, told.celsius.tolist(), strict=True)
-            ]
-        return sorted(samples, key=lambda sample: sample.stamp_ns)
 
 
 def station_name(name: str, faults: Faults) -> str:

@@ -1,27 +1,21 @@
 """A robot that carries a tool through a beam station: its motions, edges and joint readings.
 
 The robot goes where it is told but for its scatter; its joint readings show where it was told to
-go. What it is told follows from what the estimators say after each step, as in a real cell. Also
-the robot's own program, which drives such steps and a production programme.
+go. Also the calibration of a station's beams with a cylinder, and the program of a step.
 """
 
 import csv
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
-from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.tool.circle import CircleMethod, CircleMotion, CommandedCircle, fit_circle
-from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
-from robocal_ros.tool.edges import BEAMS, BeamEdge, EdgeSample, StepKind
-from robocal_ros.tool.laser_frame import JointPath, LaserFrame, axis_from_centres, upright_pose
+from robocal_ros.tool.edges import BEAMS
 from robocal_ros.tool.run import PlannedStep
 
 Array = NDArray[np.float64]
@@ -137,185 +131,7 @@ class Sweep:
         return _moved(self.T_base_start, (time_s / self.duration_s)[:, None] * self.along)
 
 
-ABOVE_TIP_M = 5e-3  # where the lower circles meet the tool
-PLANNING = Held(along_m=5e-3)
 NEWTON_STEPS = 12
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """Size and speed of the motions; ``rate_hz`` of the joint readings."""
-
-    radius: float = 0.012
-    speed: float = 0.05
-    height: float = 0.05  # between the circles
-    plunge_depth: float = 0.007
-    plunge_speed: float = 0.01
-    transfer_s: float = 0.3
-    ripple: float = 0.0
-    rate_hz: float = 125.0
-
-
-@dataclass(eq=False)
-class ToolCell:
-    """Robot, station, and the laser frame that the robot knows; one run at a time.
-
-    Attributes
-    ----------
-    q_near : (n,) joints near the station, where inverse kinematics begin.
-    """
-
-    arm: SerialArm
-    station: BeamStation
-    laser: LaserFrame
-    q_near: Array
-    plan: RunPlan = field(default_factory=RunPlan)
-    robot: RobotNoise = field(default_factory=RobotNoise)
-
-    @property
-    def up(self) -> Array:
-        """Upward axis of the laser frame, base."""
-        return self.laser.T_base_laser[:3, 2]
-
-    def pose(self, T_flange_tool: Array, above_tip: float) -> Array:
-        """Flange pose with the tool upright and a point of its axis on the crossing."""
-        down = frames.transform(
-            self.laser.T_base_laser[:3, :3] @ np.diag([1.0, -1.0, -1.0]), [0.0] * 3
-        )
-        point = T_flange_tool[:3, 3] - above_tip * T_flange_tool[:3, 2]
-        return upright_pose(self.laser, down, T_flange_tool[:3, 2], point)
-
-    def full_run(
-        self,
-        tool: RoundTool,
-        taught: Array,
-        rng: np.random.Generator,
-        method: CircleMethod = "best",
-    ) -> "MeasuredRun":
-        """Two circles of the tool as it is, one of it set upright, and two plunges."""
-        run = MeasuredRun(self, tool, taught, rng)
-        low = self.pose(taught, ABOVE_TIP_M)
-        run.circle("low", low)
-        run.circle("high", raised(low, -self.plan.height * self.up))
-        run.circle("upright", run.upright(method))
-        top = run.top(method)
-        for name in ("plunge_1", "plunge_2"):
-            run.plunge(name, top)
-        return run
-
-    def quick_run(self, tool: RoundTool, stored: Array, rng: np.random.Generator) -> "MeasuredRun":
-        """One circle and one plunge with the stored tool upright."""
-        run = MeasuredRun(self, tool, stored, rng)
-        run.circle("circle", self.pose(stored, ABOVE_TIP_M))
-        run.plunge("plunge", self.pose(stored, -0.5 * self.plan.plunge_depth))
-        return run
-
-
-class MeasuredRun:
-    """A run as it grows: steps with their edges, motions, joint readings."""
-
-    def __init__(
-        self, cell: ToolCell, tool: RoundTool, taught: Array, rng: np.random.Generator
-    ) -> None:
-        self.cell, self.tool, self.taught, self._rng = cell, tool, taught, rng
-        self.steps: list[BeamStep] = []
-        self.moves: list[Circle | Plunge] = []
-        self._time: list[Array] = []
-        self._q: list[Array] = []
-
-    @property
-    def duration_s(self) -> float:
-        """From the first motion to the end of the last."""
-        return self.moves[-1].span[1] - self.moves[0].span[0]
-
-    @property
-    def path(self) -> JointPath:
-        """The joint readings so far."""
-        return JointPath(self.cell.arm, np.concatenate(self._time), np.concatenate(self._q))
-
-    def estimate(self, held: Held = PLANNING) -> ToolEstimate:
-        """The tool as all steps so far show it."""
-        cell = self.cell
-        return estimate_tool(
-            cell.laser, self.path, self.steps, self.taught, noise=cell.robot, held=held
-        )
-
-    def commanded(self, i: int) -> CommandedCircle:
-        """Circle ``i`` as commanded."""
-        move, laser = self.moves[i], self.cell.laser
-        if not isinstance(move, Circle):
-            raise ValueError(f"step {i} is not a circle")
-        start = move.start_rad - move.direction * 2.0 * np.pi * move.start_s / move.period_s
-        motion = CircleMotion(
-            move.radius, move.period_s, start, move.direction, laser.beam_angle_rad
-        )
-        return CommandedCircle(motion, move.T_base_centre, self.steps[i].edges)
-
-    def circle(self, name: str, T_base_centre: Array) -> None:
-        """Run a circle; directions alternate."""
-        plan = self.cell.plan
-        period = 2.0 * np.pi * plan.radius / plan.speed
-        move = Circle(
-            T_base_centre=T_base_centre,
-            R_base_laser=self.cell.laser.T_base_laser[:3, :3],
-            radius=plan.radius,
-            period_s=period,
-            direction=-1 if len(self.moves) % 2 else 1,
-            ripple=plan.ripple,
-            phase_rad=2.0 * np.pi * self._rng.random(),
-        )
-        self._run(name, move)
-
-    def plunge(self, name: str, T_base_top: Array) -> None:
-        """Run a plunge."""
-        plan = self.cell.plan
-        depth, speed, down = plan.plunge_depth, plan.plunge_speed, -self.cell.up
-        self._run(name, Plunge(T_base_top, down, depth, speed))
-
-    def upright(self, method: CircleMethod) -> Array:
-        """Centre of the next circle, with the tool set upright as the circles so far show it."""
-        laser, first = self.cell.laser, self.commanded(0)
-        if method == "best":
-            seen = self.estimate()
-            point = seen.tip - ABOVE_TIP_M * seen.axis
-            return upright_pose(laser, first.T_base_centre, seen.axis, point)
-        second = self.commanded(1)
-        low, high = (fit_circle(of.motion, of.edges, "classic").centre for of in (first, second))
-        v = axis_from_centres(laser, (first.T_base_centre, second.T_base_centre), (low, high))
-        T = first.T_base_centre
-        on_axis = laser.T_base_laser[:3, 3] + laser.T_base_laser[:3, :2] @ low
-        return upright_pose(laser, T, v, T[:3, :3].T @ (on_axis - T[:3, 3]))
-
-    def top(self, method: CircleMethod) -> Array:
-        """Where the plunges begin, with the upright axis on the crossing."""
-        rise, last = 0.5 * self.cell.plan.plunge_depth, self.commanded(2)
-        if method == "best":
-            seen = self.estimate()
-            T = upright_pose(self.cell.laser, last.T_base_centre, seen.axis, seen.tip)
-            return raised(T, rise * self.cell.up)
-        centre = fit_circle(last.motion, last.edges, "classic").centre
-        T = raised(last.T_base_centre, -(self.cell.laser.T_base_laser[:3, :2] @ centre))
-        return raised(T, (ABOVE_TIP_M + rise) * self.cell.up)
-
-    def _run(self, name: str, move: Circle | Plunge) -> None:
-        plan = self.cell.plan
-        next_s = float(self._time[-1][-1]) + plan.transfer_s if self._time else 0.0
-        move = replace(move, start_s=next_s - move.span[0])
-        count = int(np.ceil((move.span[1] - move.span[0]) * plan.rate_hz)) + 1
-        time = move.span[0] + np.arange(count) / plan.rate_hz
-        q = joints_at(self.cell.arm, move(time), self._q[-1][-1] if self._q else self.cell.q_near)
-        if self._q:
-            share = np.linspace(0.0, 1.0, int(plan.transfer_s * plan.rate_hz) + 1)[1:-1]
-            smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-            old = self._q[-1][-1]
-            self._time.append(self._time[-1][-1] + share * plan.transfer_s)
-            self._q.append(old + smooth[:, None] * (q[0] - old))
-        self._time.append(time)
-        self._q.append(q)
-        edges = self.cell.station.edges(self.tool, move, move.window, self._rng)
-        self.moves.append(move)
-        kind: StepKind = "circle" if isinstance(move, Circle) else "plunge"
-        self.steps.append(BeamStep(name, kind, edges))
 
 
 def raised(T: Array, by: Array) -> Array:
@@ -379,14 +195,6 @@ def laser_points(
             both = 0.5 * (places[0] + places[1][::-1])
             found[f"{name}{first}"], found[f"{name}{first + 1}"] = both
     return found
-
-
-def point_sigma(station: BeamStation) -> float:
-    """Standard deviation of a coordinate of A ... D across its beam, m."""
-    source, noise, speed = station.input, station.noise, SWEEP_M / SWEEP_S
-    stamp = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
-    edge = np.hypot(noise.edge_m, speed * stamp)
-    return float(np.sqrt(noise.step_m**2 / 2.0 + edge**2 / 4.0))
 
 
 JITTER_RAD = 1e-6  # of a resting joint's reading: servo hum and encoder counts
@@ -500,101 +308,6 @@ def _way(arm: SerialArm, step: PlannedStep, q_now: Array, T_start: Array) -> Arr
     for T in poses:
         way.append(joints_at(arm, T[None], way[-1])[0])
     return np.array(way)
-
-
-Sample = JointSample | EdgeSample
-Edit = Callable[[PlannedStep, list[BeamEdge]], list[BeamEdge]]
-
-TRANSFER_S = 0.384  # from step to step
-REST_S = 0.25  # after a step
-RIPPLE = 0.02  # of the speed on a circle
-
-
-class RobotProgram:
-    """Gives the samples of each motion in the order of their stamps.
-
-    Attributes
-    ----------
-    edit : what happens to the edges of a step before they are reported: faults.
-    now_s : end of the last motion, since ``start_ns``.
-    """
-
-    def __init__(
-        self,
-        cell: ToolCell,
-        tool: RoundTool,
-        rng: np.random.Generator,
-        start_ns: int,
-        station: str = "",
-        edit: Edit = lambda step, edges: edges,
-    ) -> None:
-        self.cell, self.tool, self.edit, self.station = cell, tool, edit, station
-        self.start_ns, self.now_s = start_ns, 0.0
-        self.q = cell.q_near.copy()
-        self._rng = rng
-
-    def rest(self, seconds: float) -> list[Sample]:
-        """Stand still."""
-        rate_hz = self.cell.plan.rate_hz
-        count = int(seconds * rate_hz)
-        time = self.now_s + np.arange(count) / rate_hz
-        return self._samples(time, np.tile(self.q, (count, 1)), [])
-
-    def drive(self, step: PlannedStep) -> list[Sample]:
-        """Go to a step's start, drive it, and rest."""
-        move = step_move(step, self.now_s + TRANSFER_S + 1.0 / self.cell.plan.rate_hz, RIPPLE, 0.0)
-        count = int(np.ceil((move.span[1] - move.span[0]) * self.cell.plan.rate_hz)) + 1
-        time = move.span[0] + np.arange(count) / self.cell.plan.rate_hz
-        q = joints_at(self.cell.arm, move(time), self.q)
-        steps = round(TRANSFER_S * self.cell.plan.rate_hz) + 1
-        share = np.linspace(0.0, 1.0, steps)[:, None]
-        smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-        way = self.now_s + np.arange(steps) / self.cell.plan.rate_hz
-        there = self._samples(way, self.q + smooth * (q[0] - self.q), [])
-        edges = self.cell.station.edges(self.tool, move, move.window, self._rng)
-        driven = self._samples(time, q, self.edit(step, edges))
-        return there + driven + self.rest(REST_S)
-
-    def ns(self, time_s: float) -> int:
-        """Stamp of a time since the start."""
-        return self.start_ns + round(time_s * 1e9)
-
-    def _samples(self, time: Array, q: Array, edges: Sequence[BeamEdge]) -> list[Sample]:
-        names = self.cell.arm.joint_names
-        samples: list[Sample] = [
-            JointSample(self.ns(t), names, joints)
-            for t, joints in zip(time.tolist(), q, strict=True)
-        ]
-        samples += [
-            EdgeSample(self.ns(e.time_s), self.station, e.beam, e.blocked, e.sigma_s) for e in edges
-        ]
-        self.now_s = float(time[-1]) + 1.0 / self.cell.plan.rate_hz
-        self.q = q[-1]
-        return sorted(samples, key=lambda sample: sample.stamp_ns)
-
-
-SPEED_RAD_S = 1.5  # of the fastest joint at its peak
-POSE_REST_S = 0.5
-SHORTEST_MOTION_S = 0.5
-
-
-def programme(
-    q_start: ArrayLike, poses: ArrayLike, speed: float = SPEED_RAD_S, rest_s: float = POSE_REST_S
-) -> tuple[Array, Array, Array, Array]:
-    """Times (k,) from 0, joints, velocities and accelerations (k, n) of a way through poses.
-
-    From ``q_start`` (n,) at rest to each of ``poses`` (m, n) in turn, with a rest at each: what
-    `SimulatedCell.follow` takes. ``speed``: of the fastest joint, rad/s
-    (prismatic: m/s); ``rest_s`` longer than 0.
-    """
-    points = np.vstack([np.asarray(q_start)[None], np.asarray(poses)])
-    moves = np.maximum(
-        PEAK * np.max(np.abs(np.diff(points, axis=0)), axis=1) / speed, SHORTEST_MOTION_S
-    )
-    depart = np.cumsum(moves + rest_s)
-    time = np.column_stack([depart - rest_s, depart]).ravel()
-    q = np.repeat(points[1:], 2, axis=0)
-    return time, q, np.zeros_like(q), np.zeros_like(q)
 
 
 def read_poses(path: Path, *kinds: str) -> NDArray[np.float64]:

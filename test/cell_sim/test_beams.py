@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from bench.measured_runs import NO_NOISE, PERFECT
 from robocal_ros.cell_sim.beams import (
-    NO_NOISE,
-    PERFECT,
     BeamStation,
     RoundTool,
     TrueBeam,

@@ -21,23 +21,21 @@ from kr150_shift import (
     worked,
 )
 
+from bench.cell_samples import SPIN_RAD, CellSamples, programme
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.cell import (
     DUTY,
     FLOOR,
-    SPIN_RAD,
     T_BASE_LASER,
     T_FLANGE_LASER,
     TARGET,
     TARGET_RADIUS_M,
     TAUGHT,
-    CellSamples,
     SimulatedCell,
     kr150_cell,
     poses,
 )
 from robocal_ros.cell_sim.robot import Effects, Warmth, shift, turn
-from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody

@@ -12,7 +12,7 @@ from bench.laser_tracker import (
     six_axis_cell,
     true_flange,
 )
-from robocal_ros.cell_sim.beams import Q_NEAR
+from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.sensors import Ball, Scene
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.data import Profile, profile_of

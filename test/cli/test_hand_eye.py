@@ -35,7 +35,7 @@ from bench.hand_eye_cell import (
     view,
 )
 from bench.hand_eye_files import write_target
-from robocal_ros.cell_sim.beams import Q_NEAR
+from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.cli.main import main

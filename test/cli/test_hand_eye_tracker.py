@@ -9,7 +9,7 @@ from command import robocal, robocal_json
 from tracker_files import SCAN, tracker_files
 
 from bench.laser_tracker import TrackerCell, prp_cell, six_axis_cell
-from robocal_ros.cell_sim.beams import Q_NEAR
+from bench.measured_runs import Q_NEAR
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.files import read_tracker_points
 from robocal_ros.hand_eye.targets import read_tracker_target

@@ -8,7 +8,7 @@ import pytest
 
 from bench.hand_eye_tracker import spread
 from bench.laser_tracker import TrackerCell, prp_cell, six_axis_cell
-from robocal_ros.cell_sim.beams import Q_NEAR
+from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.sensors import Prism, Stem
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (

@@ -246,8 +246,8 @@ class Graph:
         """End everything."""
         for ended in self.at_close:
             ended()
-        # Fast DDS crashes, once in 40 times, where a participant ends soon after others that it knows
-        # were killed: who can leaves by itself.
+        # Fast DDS crashes, once in 40 times, where a participant ends soon after others that it
+        # knows were killed: who can leaves by itself.
         for executable in self._executables:
             executable.process.send_signal(signal.SIGINT)  # nothing where it has ended
         until_s = time.monotonic() + LEAVES_WITHIN_S

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
+from bench.cell_samples import SPIN_RAD
 from robocal_ros.bags.recorder_node import RecorderNode
-from robocal_ros.cell_sim.cell import SPIN_RAD, TAUGHT, poses
+from robocal_ros.cell_sim.cell import TAUGHT, poses
 from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode

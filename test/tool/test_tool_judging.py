@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, TrueInput, TrueNoise, laser_of
+from bench.measured_runs import TAUGHT, laser_of
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise
 from robocal_ros.ground import frames
 from robocal_ros.tool.crossed_model import Held
 from robocal_ros.tool.judging import (

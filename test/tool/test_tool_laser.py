@@ -9,20 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tool_tables import PUBLISHED_MM
 
-from robocal_ros.cell_sim.beams import (
+from bench.measured_runs import (
     BETA_RAD,
     GAP_M,
     NO_NOISE,
     PERFECT,
     T_BASE_LASER,
-    BeamStation,
-    TrueBeam,
-    TrueInput,
-    TrueNoise,
-    beams_of,
     laser_of,
+    point_sigma,
 )
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M, laser_points, point_sigma
+from robocal_ros.cell_sim.beams import BeamStation, TrueBeam, TrueInput, TrueNoise, beams_of
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M, laser_points
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, WrongRobotError
 from robocal_ros.kinematics.robots import load_robot

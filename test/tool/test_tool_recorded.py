@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, bent
+from bench.measured_runs import TAUGHT
+from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 from beam_cell import SILENT, make_cell
 
-from robocal_ros.cell_sim.beams import (
+from bench.measured_runs import (
     BETA_RAD,
     T_BASE_LASER,
     TAUGHT,
-    RoundTool,
-    TrueInput,
-    TrueNoise,
-    bent,
+    MeasuredRun,
+    RunPlan,
+    ToolCell,
     laser_of,
 )
-from robocal_ros.cell_sim.tool_cell import MeasuredRun, RunPlan, ToolCell
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError
 from robocal_ros.tool.circle import classic_tool, fit_circle

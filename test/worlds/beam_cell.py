@@ -4,20 +4,18 @@ from functools import cache
 
 import numpy as np
 
-from robocal_ros.cell_sim.beams import (
+from bench.measured_runs import (
     BETA_RAD,
     GAP_M,
     NO_NOISE,
     PERFECT,
     Q_NEAR,
     T_BASE_LASER,
-    BeamStation,
-    TrueInput,
-    TrueNoise,
-    beams_of,
+    RunPlan,
+    ToolCell,
     laser_of,
 )
-from robocal_ros.cell_sim.tool_cell import RunPlan, ToolCell
+from robocal_ros.cell_sim.beams import BeamStation, TrueInput, TrueNoise, beams_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import RobotNoise

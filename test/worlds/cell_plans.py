@@ -5,15 +5,8 @@ from dataclasses import replace
 import numpy as np
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import (
-    NO_NOISE,
-    PERFECT,
-    TAUGHT,
-    RoundTool,
-    TrueInput,
-    TrueNoise,
-    bent,
-)
+from bench.measured_runs import NO_NOISE, PERFECT, TAUGHT
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.cell_sim.cell import CellPlan, Happened, SimulatedCell, rigid_robot
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.cell_sim.beams import laser_of
-from robocal_ros.cell_sim.cell import SPIN_RAD, TAUGHT, Happened, SimulatedCell, kr150_cell, poses
+from bench.cell_samples import SPIN_RAD, programme
+from bench.measured_runs import laser_of
+from robocal_ros.cell_sim.cell import TAUGHT, Happened, SimulatedCell, kr150_cell, poses
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.cell_sim.tool_cell import programme
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.run import MeasuringPlan

@@ -12,9 +12,9 @@ from robocal_msgs.msg import BeamEvent, ToolStep
 from sensor_msgs.msg import JointState
 from tool_driver import TAUGHT, Driver, noisy_cell
 
+from bench.measured_runs import ToolCell
 from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.cell_sim.messages import planned_step
-from robocal_ros.cell_sim.tool_cell import ToolCell
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.ros import endpoints
 from robocal_ros.tool.laser_frame import LaserFile, write_laser

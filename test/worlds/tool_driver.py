@@ -3,8 +3,8 @@
 import numpy as np
 from beam_cell import make_cell
 
-from robocal_ros.cell_sim.beams import TAUGHT, RoundTool, TrueInput, TrueNoise, bent
-from robocal_ros.cell_sim.tool_cell import RobotProgram, Sample, ToolCell
+from bench.measured_runs import TAUGHT, RobotProgram, Sample, ToolCell
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.edges import InputRule

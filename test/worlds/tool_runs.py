@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from tool_tables import write
 
+from bench.measured_runs import MeasuredRun, ToolCell, point_sigma
 from robocal_ros.cell_sim.beams import (
     BeamStation,
     RoundTool,
@@ -16,14 +17,7 @@ from robocal_ros.cell_sim.beams import (
     bent,
     crossings,
 )
-from robocal_ros.cell_sim.tool_cell import (
-    CYLINDER_M,
-    MeasuredRun,
-    Sweep,
-    ToolCell,
-    laser_points,
-    point_sigma,
-)
+from robocal_ros.cell_sim.tool_cell import CYLINDER_M, Sweep, laser_points
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, RobotNoise

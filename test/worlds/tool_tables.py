@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from bench.measured_runs import NO_NOISE, PERFECT
+from robocal_ros.cell_sim.beams import BeamStation, RoundTool, beams_of
 from robocal_ros.cell_sim.tool_cell import Circle
 from robocal_ros.ground import frames
 
