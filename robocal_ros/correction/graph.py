@@ -182,8 +182,9 @@ class GraphWatch:
     commands : resolved topics that this node commands the robot by, and how many publishers of
         its own each has.
     actions : likewise resolved names of the controller's action, and its own clients.
-    leases : of this robot; the nodes that publish on ``lease_topic`` move the robot for the cell,
-        with a lease; the others of their processes do not.
+    leases : of this robot; the managed nodes that publish on ``lease_topic`` move the robot for the
+        cell, with a lease; the others of their processes do not.
+    state_topic : where the robot's controller, and nobody else, says where it is.
     """
 
     def __init__(
@@ -194,9 +195,10 @@ class GraphWatch:
         sources: JointSources,
         leases: Leases,
         lease_topic: str,
+        state_topic: str,
     ) -> None:
         self._node, self._sources, self.leases = node, sources, leases
-        self._lease_topic = lease_topic
+        self._lease_topic, self._state_topic = lease_topic, state_topic
         self._commands, self._actions = dict(commands), dict(actions)
         self._own = own_endpoint(node)
         self.commanders = ""  # who else commands the robot, or publishes its joints
@@ -213,6 +215,9 @@ class GraphWatch:
         cell = [one for one in leasing if one.name not in self.leases.others]
         found = commanding(node, self._own, self._commands, self._actions, cell)
         joints = self._sources.look(now_s)
+        if len(controllers := publishers(node, self._state_topic)) > 1:
+            who = ", ".join(sorted(one.name for one in controllers))
+            found.append(f"{self._state_topic} has several publishers: {who}")
         self.commanders = "; ".join([*found, *filter(None, [joints])])
         self.leases.look(now_s, stood_s)
         self.lease, self.lost = self.leases.words(now_s), self.leases.lost(now_s)

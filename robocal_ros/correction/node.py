@@ -57,15 +57,13 @@ from robocal_ros.motion.robot_watch import SpeedScaling
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode, run
 from robocal_ros.ros.endpoints import Health, trigger_text
-from robocal_ros.ros.graph import SourceGuard
+from robocal_ros.ros.graph import ACTION, TRAJECTORY, SourceGuard, beside
 
 Array = NDArray[np.float64]
 
-TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
 COMMANDS = "joint_commands"
 STATES = "joint_states"
-ACTION = "follow_joint_trajectory"
 MODEL = "kinematic_model"
 TOOL = "tool"
 LEASE = "motion_lease"
@@ -196,13 +194,15 @@ class JointCorrectionNode(HouseNode):
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
         actions = {} if self._proxy is None else self._proxy.clients
         # A controller takes trajectories beside its action, on a topic that nobody here publishes.
-        beside = {f"{name.rpartition('/')[0]}/{TRAJECTORY}": 0 for name in actions}
-        beside.pop(self.resolve_topic_name(TRAJECTORY), None)  # the program's, which comes in here
+        paths = {beside(name, TRAJECTORY): 0 for name in actions}
+        paths.pop(self.resolve_topic_name(TRAJECTORY), None)  # the program's, which comes in here
+        if not self.settings[ACTION]:  # and beside its topic by an action, of which none is ours
+            name = beside(self._outputs[TRAJECTORY].topic_name, ACTION)
+            if name != self.resolve_topic_name(f"~/{ACTION}"):
+                actions = actions | {name: 0}
         sources = JointSources(self, self.resolve_topic_name(STATES), self._arm_names)
-        lease_topic = self.resolve_topic_name(LEASE)
-        self._graph = GraphWatch(
-            self, beside | commands, actions, sources, self._leases, lease_topic
-        )
+        told = (self.resolve_topic_name(LEASE), self.resolve_topic_name(CONTROLLER))
+        self._graph = GraphWatch(self, paths | commands, actions, sources, self._leases, *told)
         self._release.append(sources.close)
 
     def activate(self) -> None:
@@ -356,6 +356,8 @@ class JointCorrectionNode(HouseNode):
             return
         self._put_out(TRAJECTORY, message, *self._corrected(message))
         self._by_action = False
+        if self._proxy is not None:  # a controller would call a goal reached by another path's end
+            self._proxy.end(f"a trajectory on {TRAJECTORY} took its place")
         if self._session.output.path is not None:
             self._session.output.path.begin(time.monotonic())
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())

@@ -36,6 +36,8 @@ TRACK_S = 0.01  # between two places that are kept, s
 # A controller's reference that is older is none, s; of one that moves, which is carried on at its
 # speed: one and a half periods of joint_trajectory_controller's default, 50 Hz.
 REFERENCE_AGE_S, MOVING_AGE_S = 0.1, 0.03
+# Turning rad, sliding m: no drive leaves its reference so far aside, but for its lag.
+STRAYS = {False: 0.02, True: 0.01}
 STANDS = 1e-3  # rad/s (prismatic: m/s): a reference that is slower stands
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
@@ -59,6 +61,7 @@ class RobotState:
         self._all = np.arange(arm.n, dtype=np.int64)
         self._columns: dict[tuple[str, ...], tuple[tuple[str, ...], Index, Index]] = {}
         self._age_limit_s, self._near = age_limit_s, near
+        self._strays = np.maximum(near, np.where(arm.prismatic, STRAYS[True], STRAYS[False]))
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
@@ -194,6 +197,18 @@ class RobotState:
         if not np.all(age_s <= (MOVING_AGE_S if moves else REFERENCE_AGE_S)):
             return None
         return np.asarray(self._reference[index] + rate * np.maximum(age_s, 0.0))
+
+    def elsewhere(self, index: Index, place: Array, now_s: float) -> Array:
+        """Which joints (k,) were read lately beside ``place`` (k,), by more than robots lag."""
+        here = self.unwrapped(index, self.measured[index], place)
+        age_s = now_s - self._read_s[index]
+        fastest = np.abs(self._reference_rate[index])
+        if self._track:
+            since_s, before = self._track[0]
+            way = np.abs(self.measured - before)[index]
+            fastest = np.fmax(fastest, way / max(now_s - since_s, TRACK_S))
+        reach = self._strays[index] + (RESPONSE_S + np.clip(age_s, 0.0, self._age_limit_s)) * fastest
+        return np.asarray((age_s <= self._age_limit_s) & (np.abs(here - place) > reach))
 
     def require_fresh(self, index: Index, now_s: float) -> None:
         """Refuse while one of these joints has not been read, or not lately."""
@@ -413,11 +428,18 @@ class Output:
         what reads them may count no turns, what drives them does.
 
         Raises `RefusedError` when readings are missing, old or too few, or the robot moves and not
-        by what was put out.
+        by what was put out, or was read elsewhere than its controller says.
         """
         state = self._state
         known = state.reference(index, now_s)
         if known is not None:
+            if (elsewhere := state.elsewhere(index, known, now_s)).any():
+                j = int(np.argmax(elsewhere))
+                raise self.refuse(
+                    f"{state.names[index[j]]} was read at {state.measured[index[j]]:.6f}, and "
+                    f"controller_state has it at {known[j]:.6f}: it is of another controller, or "
+                    "the robot does not follow"
+                )
             return known, True
         state.require_fresh(index, now_s)
         measured, near = state.measured[index], self._near[index]

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.lifecycle import LifecycleNode
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from robocal_msgs.msg import GapOpen
@@ -30,6 +30,8 @@ from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.parameters import Setting
 
 PREFIX = 12  # bytes of a gid
+TRAJECTORY, ACTION = "joint_trajectory", "follow_joint_trajectory"  # a controller's two inputs
+_LIFECYCLE = "lifecycle_msgs/srv/GetState"
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
 KILLED = "one that was killed counts until DDS gives it up, after up to 20 s"
 
@@ -100,6 +102,26 @@ def strangers(
     return sorted(names)
 
 
+def _is_managed(node: Node, who: Endpoint) -> bool:
+    """Whether a node serves a lifecycle, as all of the cell's do and no player of a bag does.
+
+    One may whose name or services are not discovered yet.
+    """
+    if who.name.endswith(UNKNOWN):
+        return True
+    namespace, _, name = who.name.rpartition("/")
+    try:
+        served = node.get_service_names_and_types_by_node(name, namespace or "/")
+    except NodeNameNonExistentError:
+        return True
+    return not served or any(_LIFECYCLE in kinds for _, kinds in served)
+
+
+def beside(name: str, other: str) -> str:
+    """The topic, or action, of a controller that takes trajectories by ``name`` too."""
+    return f"{name.rpartition('/')[0]}/{other}"
+
+
 def commanding(
     node: Node,
     own: Endpoint,
@@ -109,9 +131,10 @@ def commanding(
 ) -> list[str]:
     """Who else publishes a topic, or is a client of an action, in words; see `strangers`.
 
-    By resolved names, each with how many endpoints of its own this node has there.
+    By resolved names, each with how many endpoints of its own this node has there. ``cell``: who
+    publishes what only the cell's nodes do; a bag's player may.
     """
-    found = []
+    found, cell = [], [one for one in cell if _is_managed(node, one)]
     for topic, count in topics.items():
         others = strangers(publishers(node, topic), own, count, cell)
         found += [f"{who} publishes {topic}" for who in others]
@@ -134,10 +157,10 @@ class CommandPath:
         self, node: Node, topic: str, action: str, cell: Sequence[str], mine: str = ""
     ) -> None:
         self._node, self._mine = node, mine
-        # A controller takes trajectories on the topic beside its action too.
-        beside = [f"{action.rpartition('/')[0]}/joint_trajectory"] if action else []
-        self._topics = dict.fromkeys(sorted({topic, *beside}), 1)
-        self._actions = {action: 1} if action else {}
+        # A controller takes trajectories on the topic beside its action, and the other way round.
+        topics = {topic, beside(action, TRAJECTORY)} if action else {topic}
+        self._topics = dict.fromkeys(sorted(topics), 1)
+        self._actions = {action: 1} if action else {beside(topic, ACTION): 0}
         self._cell = [node.resolve_topic_name(each) for each in cell]
         self._own = own_endpoint(node)
         self.violation = ""

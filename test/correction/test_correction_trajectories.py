@@ -373,6 +373,13 @@ def test_a_controllers_reference_is_as_old_as_what_it_said_of_the_joint() -> Non
         refused(Reason.START_MISMATCH, robot.stream, ahead)
 
 
+def test_a_controller_that_has_the_robot_elsewhere_is_another_robots() -> None:
+    """Finding: a target 28.6 deg beside the robot was accepted, as controller_state had it."""
+    robot = Robot()
+    robot.session.controller(NAMES, HOME + 0.5, 1.0, robot.now)
+    refused(Reason.START_MISMATCH, robot.stream, HOME + 0.5)
+
+
 # ---- Where the controller is: by its own words, which are old, between points, and in motion -----
 
 

@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 import rclpy
 from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionClient
 from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from robocal_msgs.msg import MotionLease
 from sensor_msgs.msg import JointState
@@ -19,20 +21,21 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
 from robocal_ros.correction.interface import Reason
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.graph import own_endpoint
+from robocal_ros.ros.graph import CommandPath, own_endpoint
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"
+STATED = "/arm_controller/controller_state"
 NAMES = [f"joint_a{i}" for i in range(1, 7)]
 
 
 class Process:
     """A DDS participant of its own, as another process has."""
 
-    def __init__(self, domain: int, name: str) -> None:
+    def __init__(self, domain: int, name: str, kind: type[Node] = Node) -> None:
         self.context = Context()
         rclpy.init(args=[], context=self.context, domain_id=domain)
-        self.node = Node(name, context=self.context)
+        self.node = kind(name, context=self.context)
 
     def end(self) -> None:
         self.node.destroy_node()
@@ -51,11 +54,11 @@ class Watched:
         self.leases = Leases("kr150", "s1")
         self.sources = JointSources(self.own, "/joint_states", NAMES)
         self.watch = GraphWatch(
-            self.own, {PATH: 1}, {ACTION: 1}, self.sources, self.leases, "/motion_lease"
+            self.own, {PATH: 1}, {ACTION: 1}, self.sources, self.leases, "/motion_lease", STATED
         )
 
-    def process(self, name: str) -> Process:
-        self.others.append(Process(self.graph.domain, name))
+    def process(self, name: str, kind: type[Node] = Node) -> Process:
+        self.others.append(Process(self.graph.domain, name, kind))
         return self.others[-1]
 
     def becomes(self, reason: Reason | None, words: str = "", within_s: float = 10.0) -> None:
@@ -113,7 +116,7 @@ def test_a_second_correction_node_under_the_same_or_another_name(
 
 
 def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None:
-    own = watched.process("some_name")
+    own = watched.process("some_name", LifecycleNode)
     own.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
     own.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     inbox = watched.graph.collect(MotionLease, "/motion_lease", endpoints.LATCHED)
@@ -133,7 +136,7 @@ def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None
 
 def test_another_node_of_a_holders_process_is_a_stranger(watched: Watched) -> None:
     """Finding: whatever a process with a publisher of leases did, it was the cell's own."""
-    own = watched.process("some_name")
+    own = watched.process("some_name", LifecycleNode)
     own.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
     own.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
@@ -144,6 +147,37 @@ def test_another_node_of_a_holders_process_is_a_stranger(watched: Watched) -> No
     planner.destroy_publisher(publisher)
     watched.becomes(None)
     planner.destroy_node()
+
+
+def test_a_player_of_a_bag_is_a_stranger_also_where_it_plays_leases(watched: Watched) -> None:
+    """Finding: who published leases, as a recording of everything does, commanded unseen."""
+    player = watched.process("rosbag2_player")
+    player.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    player.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    watched.becomes(Reason.OTHER_COMMANDER, f"/rosbag2_player publishes {PATH}")
+
+
+def test_a_client_of_the_action_beside_the_topic_is_a_stranger(watched: Watched) -> None:
+    """Finding: who moves by topic did not see a planner that moves by the controller's action."""
+    mover, planner = watched.process("tcf_node"), watched.process("planner")
+    topic, action = "/robot/joint_trajectory", "/robot/follow_joint_trajectory"
+    mover.node.create_publisher(JointTrajectory, topic, endpoints.RELIABLE)
+    path = CommandPath(mover.node, topic, "", ())
+    assert not path.look()
+    client = ActionClient(planner.node, FollowJointTrajectory, action)
+    words = f"/planner is a client of {action}"
+    watched.graph.spin_until(lambda: words in path.look(), words)
+    client.destroy()
+
+
+def test_the_robots_controller_alone_says_where_it_is(watched: Watched) -> None:
+    one, other = watched.process("controller_manager"), watched.process("next_robot")
+    one.node.create_publisher(JointTrajectoryControllerState, STATED, endpoints.RELIABLE)
+    watched.graph.spin_until(lambda: watched.own.count_publishers(STATED) == 1, "the controller")
+    watched.becomes(None)
+    other.node.create_publisher(JointTrajectoryControllerState, STATED, endpoints.RELIABLE)
+    words = f"{STATED} has several publishers: /controller_manager, /next_robot"
+    watched.becomes(Reason.OTHER_COMMANDER, words)
 
 
 def test_a_lease_that_ends_by_silence_lasts_until_the_robot_stands() -> None:
@@ -167,7 +201,7 @@ def test_a_lease_that_ends_by_silence_lasts_until_the_robot_stands() -> None:
 
 
 def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:
-    other = watched.process("next_cell")
+    other = watched.process("next_cell", LifecycleNode)
     other.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
     other.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     lease = MotionLease(robot="kr150", serial="s2", holder="/next_cell", held=True)

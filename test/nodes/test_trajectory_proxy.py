@@ -302,6 +302,16 @@ def test_a_new_goal_preempts(cell: Any) -> None:
     assert np.abs(tcp(ACTUAL, cell.robot.q) - tcp(NOMINAL, HOME)).max() < 1e-5
 
 
+def test_a_path_on_the_topic_takes_the_place_of_a_goal(cell: Any) -> None:
+    """Finding: the goal was told to have succeeded when the robot was at the other path's end."""
+    cell.begin()
+    paths = cell.graph.publisher(JointTrajectory, "joint_trajectory")
+    first = cell.send(HOME, MOVED, lasts_s=4.0).moves()
+    paths.publish(goal_of(HOME, HOME, starts_s=1.0, lasts_s=1.5).trajectory)
+    result = first.ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_string == "a trajectory on joint_trajectory took its place"
+
+
 def test_a_violated_tolerance_keeps_its_code(cell: Any) -> None:
     cell.begin()
     cell.robot.stuck = True
