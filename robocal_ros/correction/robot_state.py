@@ -207,7 +207,8 @@ class RobotState:
             since_s, before = self._track[0]
             way = np.abs(self.measured - before)[index]
             fastest = np.fmax(fastest, way / max(now_s - since_s, TRACK_S))
-        reach = self._strays[index] + (RESPONSE_S + np.clip(age_s, 0.0, self._age_limit_s)) * fastest
+        late_s = RESPONSE_S + np.clip(age_s, 0.0, self._age_limit_s)
+        reach = self._strays[index] + late_s * fastest
         return np.asarray((age_s <= self._age_limit_s) & (np.abs(here - place) > reach))
 
     def require_fresh(self, index: Index, now_s: float) -> None:
