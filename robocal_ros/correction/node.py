@@ -51,7 +51,7 @@ from robocal_ros.correction.settings import (
 from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, on_its_path
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
-from robocal_ros.motion.driver import StatedController
+from robocal_ros.motion.driver import HardStopService, StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.robot_watch import SpeedScaling
 from robocal_ros.ros import endpoints
@@ -122,6 +122,7 @@ class JointCorrectionNode(HouseNode):
             fastest[0],
             lambda now: self._controller.reference(names, now, self._scaling),
         )
+        self._hard_stop = HardStopService(self, self.settings["hard_stop_service"])
         self._stop_path: SentPath | None = None  # what was put out last when a stop was sent
         self._streams = CommandSources(max(config.stream_gap_s, ONE_SOURCE_S))
         self._paths = CommandSources(config.stream_gap_s)
@@ -454,7 +455,7 @@ class JointCorrectionNode(HouseNode):
         if not self._is_stopping():
             self._stop_timer.cancel()
             if self._stopping.fault:
-                self.get_logger().error(self._stopping.fault)
+                self._hard_stop(self._stopping.fault)
             if self._proxy is not None:
                 self._proxy.end("stopped")
 

@@ -17,6 +17,7 @@ from robocal_ros.kinematics.robots import (
     load_robot,
     robot_file_hash,
 )
+from robocal_ros.motion.driver import HARD_STOP
 from robocal_ros.ros.base import NO_SERIAL
 from robocal_ros.ros.parameters import Setting, advanced, given_pose, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR
@@ -89,6 +90,7 @@ SETTINGS = (
         "",
         "Action of the controller that goals of follow_joint_trajectory go to; empty: no action",
     ),
+    HARD_STOP,
     STATE_DIR,
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
     Setting(

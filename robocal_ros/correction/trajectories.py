@@ -543,7 +543,7 @@ class RobotStop:
             self.why = ""
             return False
         if now_s - self._began_s > GIVE_UP_S / max(scaling, 0.1):
-            self.fault = f"{self.why}: the robot still moves, stop it by hand"
+            self.fault = f"{self.why}: the robot still moves"
             self.why = ""
             return False
         here = self._track.here(now_s)

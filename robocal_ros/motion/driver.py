@@ -315,6 +315,11 @@ def goal_tolerances(arm: SerialArm, config: DrivingConfig) -> dict[str, Any]:
     }
 
 
+HARD_STOP = Setting(
+    "hard_stop_service",
+    "",
+    "std_srvs/Trigger that stops a robot which does not obey its stops; empty: there is none",
+)
 CONTROLLER = (
     Setting(
         "follow_joint_trajectory",
@@ -323,11 +328,7 @@ CONTROLLER = (
         "/joint_trajectory_controller/follow_joint_trajectory; empty, or while nobody serves it: "
         "motions go on ~/joint_trajectory, and no rejection is seen",
     ),
-    Setting(
-        "hard_stop_service",
-        "",
-        "std_srvs/Trigger that stops a robot which does not obey its stops; empty: there is none",
-    ),
+    HARD_STOP,
 )
 LEASE_S = 0.2  # between two messages of a lease that is held
 VIOLATIONS = {
@@ -336,12 +337,35 @@ VIOLATIONS = {
 }
 
 
+class HardStopService:
+    """Stops a robot that obeys no trajectory, by a ``std_srvs/Trigger``; empty: there is none."""
+
+    def __init__(self, node: EndpointNode, service: str) -> None:
+        self._node = node
+        self._client = node.add_client(Trigger, service) if service else None
+
+    def __call__(self, why: str) -> None:
+        """Call it, and tell why and what it answers."""
+        logger, client = self._node.get_logger(), self._client
+        if client is None:
+            logger.error(f"{why}: stop the robot by hand (hard_stop_service is empty)")
+            return
+        logger.error(f"{why}: {client.srv_name} is called")
+
+        def told(future: Future) -> None:
+            answer: Any = future.result()
+            logger.error(f"{client.srv_name}: {answer.success} {answer.message}")
+
+        client.call_async(Trigger.Request()).add_done_callback(guarded(self._node, told))
+
+
 class MotionDriver:
     """One client of the controller, and what the controller says of itself.
 
     ``reported``: takes what the controller makes of the motion that was sent last. ``tolerances``:
     of motions, see `goal_tolerances`; a stop has the controller's own, and is watched. ``robot``:
     where readings of the controller go now; None: nowhere. ``now``: their steady clock.
+    ``hard_stop``: for a robot that does not obey.
     ``way``: how the last motion went out, in words; empty before any.
     """
 
@@ -365,7 +389,7 @@ class MotionDriver:
         self._client = None
         if self.action:  # rclpy remaps the parts of an action, but not its name
             self._client = ActionClient(node, FollowJointTrajectory, self.action)
-        self._hard_stop = node.add_client(Trigger, hard_stop) if hard_stop else None
+        self.hard_stop = HardStopService(node, hard_stop)
         node.add_input(
             JointTrajectoryControllerState, "controller_state", self._take_state, endpoints.SENSOR
         )
@@ -441,21 +465,6 @@ class MotionDriver:
         """Of the newest motion; one before it ended because this one took its place."""
         if number == self._newest:
             self._reported(MotionReport(**found))
-
-    def hard_stop(self, why: str) -> None:
-        """The robot does not obey: stop it by the service, where there is one."""
-        logger = self._node.get_logger()
-        client = self._hard_stop
-        if client is None:
-            logger.error(f"{why}: stop it by hand (hard_stop_service is empty)")
-            return
-        logger.error(f"{why}: {client.srv_name} is called")
-
-        def told(future: Future) -> None:
-            answer: Any = future.result()
-            logger.error(f"{client.srv_name}: {answer.success} {answer.message}")
-
-        client.call_async(Trigger.Request()).add_done_callback(guarded(self._node, told))
 
     def _take_state(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()

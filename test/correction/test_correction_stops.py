@@ -273,7 +273,7 @@ def test_a_robot_that_does_not_stop_is_told():
     robot = SimulatedController(losses=10_000)
     robot.run(0.3)
     robot.stops()
-    assert "the robot still moves, stop it by hand" in robot.stop.fault
+    assert "the robot still moves" in robot.stop.fault
     assert robot.stop.sent > 5
 
 

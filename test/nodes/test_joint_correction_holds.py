@@ -16,6 +16,7 @@ from joint_correction_live import HOME, NAMES, NODE, NOMINAL, Line, drifted, joi
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 from scipy.interpolate import CubicHermiteSpline
@@ -74,11 +75,11 @@ class Moving(Line):
         graph.probe.create_timer(PERIOD_S, self._tick)
         graph.spin_for(0.5)
 
-    def other(self, name: str, **options: Any) -> Node:
+    def other(self, name: str, kind: type[Node] = Node, **options: Any) -> Node:
         """A node of another process."""
         context = Context()
         rclpy.init(args=[], context=context, domain_id=self.graph.domain)
-        node = Node(name, context=context, **options)
+        node = kind(name, context=context, **options)
         self.others.append((context, node))
         return node
 
@@ -258,7 +259,7 @@ def test_beside_the_action_nobody_publishes_the_controller_s_own_topic(graph: An
 def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
     line: Moving, how: str
 ) -> None:
-    measuring = line.other("some_name")
+    measuring = line.other("some_name", LifecycleNode)
     lease = measuring.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
     controller = measuring.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     line.graph.spin_until(lambda: line.node.count_publishers(PATH) == 2, "the own node")
@@ -288,7 +289,7 @@ def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
 
 def test_a_lease_whose_holder_died_lasts_while_the_robot_moves(line: Moving) -> None:
     """Finding: after a second the program began, while the dead node's motion was driven on."""
-    measuring = line.other("some_name")
+    measuring = line.other("some_name", LifecycleNode)
     lease = measuring.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
     controller = measuring.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     line.graph.spin_until(lambda: line.node.count_publishers(PATH) == 2, "the own node")
@@ -340,7 +341,7 @@ def test_a_second_driver_of_the_arm_is_told_and_one_of_a_gripper_is_not(line: Mo
     assert "/gripper" in told.commanders
 
 
-@pytest.mark.parametrize("lost", [0, 1])
+@pytest.mark.parametrize("lost", [0, 1, 2])
 def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> None:
     """Finding: the controller drops it with an error and drives on."""
     take, losses = line._plan, [lost]

@@ -440,7 +440,11 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
     cell = Cell(graph)
     robot = InParts(deaf, context=graph.context)
     graph.executor.add_node(robot)
-    node = graph.add(JointCorrectionNode, SETTINGS)
+    called: list[Any] = []
+    robot.create_service(
+        Trigger, "/hard_stop", lambda request, response: called.append(request) or response
+    )
+    node = graph.add(JointCorrectionNode, SETTINGS | {"hard_stop_service": "/hard_stop"})
     cell.begin(settled=False)
     sent = cell.send(HOME, MOVED, lasts_s=20.0)
     graph.spin_until(lambda: robot.q[0] > HOME[0] + 0.01, "the robot moves")
@@ -451,12 +455,14 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
     graph.spin_until(lambda: len(robot.goals) > 1 and robot.cancels, "stop and cancel")
     assert slows_down(robot.goals[1].trajectory.points)
     if deaf:
-        fault = "the robot still moves, stop it by hand"
+        fault = "the robot still moves"
         graph.spin_until(lambda: fault in node._stopping.fault, fault, 10.0)
+        graph.spin_until(lambda: called, "the hard stop")
         assert path.live(time.monotonic())
     else:
         graph.spin_until(lambda: not path.live(time.monotonic()), "it is known to stand", 5.0)
         assert time.monotonic() > robot._ends_s
+        assert not called
     cell.client.destroy()
     robot.without_answers.destroy_node()
     robot.destroy_node()
