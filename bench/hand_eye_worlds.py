@@ -222,7 +222,7 @@ def _corners(rng: np.random.Generator, poses: int) -> Array:
 
 def calibrated(task: Task, view: TargetView) -> MountFit:
     """As the solver does it with the features of profiles; no noise is told."""
-    fit = fit_mount((view,), look(task, view))
+    fit = fit_mount((view,), look(task, view)[0])
     require_seen(fit)
     return fit
 

@@ -234,6 +234,7 @@ class Descent(Generic[S]):
     ----------
     sizes : (m,) how many of its c components each sample has; the others are zero.
     freedom : how many numbers the noise was found from, where it was found from these data.
+    false_rejection : chance that clean data lose any sample.
     """
 
     problem: Problem[S]
@@ -241,6 +242,7 @@ class Descent(Generic[S]):
     scale_components: int
     sizes: NDArray[np.int64]
     freedom: float = np.inf
+    false_rejection: float = FALSE_REJECTION
 
     def run(
         self,
@@ -379,7 +381,7 @@ class Descent(Generic[S]):
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
         squared = np.sum(run.residual * whitened, axis=1)
-        probability = 1.0 - FALSE_REJECTION / m
+        probability = 1.0 - self.false_rejection / m
         if self.freedom == np.inf:
             largest = self.quantiles(probability)
         else:  # the noise itself is uncertain

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.descent import (
+    FALSE_REJECTION,
     FIRST_TOLERANCE,
     Descent,
     DescentState,
@@ -156,6 +157,7 @@ def solve(
     robust: bool = True,
     sizes: NDArray[np.int64] | None = None,
     freedom: float = np.inf,
+    false_rejection: float = FALSE_REJECTION,
 ) -> Estimate[S]:
     """Find the most likely state.
 
@@ -169,6 +171,7 @@ def solve(
         and Jacobians of the others are zero.
     freedom : how many numbers the sigmas were found from, where they come from these data: then
         a sample must be farther off to be an outlier (F distribution).
+    false_rejection : chance that clean data lose any sample.
 
     Raises
     ------
@@ -192,7 +195,7 @@ def solve(
             raise TooFewSamplesError(f"{m} samples give {equations} equations for {k} unknowns")
         _require_full_rank(observability(jacobian.reshape(-1, k)), problem.names)
     unscaled = 0 if noise_known else problem.scale_components
-    descent = Descent(problem, prior, unscaled, counts, freedom)
+    descent = Descent(problem, prior, unscaled, counts, freedom, false_rejection)
     run, keep = _settle(descent, DescentState(start, residual, jacobian, 0, False), robust, flat)
     information = information_of(run.jacobian, keep)
     seen = observability(rows_of(run.jacobian, keep), information)

@@ -172,8 +172,13 @@ _GRANTED = 1.5  # of the largest noise allowed, lest the table becomes part of a
 _ISOTROPIC = 5.0  # points' worth of belief that noise does not depend on the slope
 _STEEPEST = 0.05  # smallest share of variances of both directions
 _SURE = 4.0  # standard deviations
-_FORM_DEGREE = 6
-_FORM_M = 2e-5
+_FORM_DEGREE = 6  # of the polynomial that a smooth deviation is
+_ROUND = 0.01  # largest deviation of a sphere from its arc, of the arc's depth
+_FORM_SEEN = 0.999  # quantile of chi-square beyond which it is no noise
+
+
+class LargeArcError(ResidualError):
+    """An arc of a larger circle than a plane can cut out of the sphere."""
 
 
 @dataclass(frozen=True)
@@ -204,8 +209,10 @@ class ArcFit:
     ----------
     centre : (2,) x0, z0 of the circle, sensor frame, m.
     radius_m : r, of the circle.
-    covariance : (3, 3) of (x0, z0, r) from the points' scatter, m^2.
+    covariance : (3, 3) of (x0, z0, r) from the points' scatter and form, m^2.
     noise_m : standard deviation of a point along its normal, root mean square over the arc.
+    form_m : rms of the smooth deviation from the circle where it is more than noise, else 0: of
+        the sensor's linearity, of light that enters the surface, of the surface.
     used : (n,) which points were taken for the arc's.
     """
 
@@ -213,6 +220,7 @@ class ArcFit:
     radius_m: float
     covariance: Array
     noise_m: float
+    form_m: float
     used: Mask
 
 
@@ -252,7 +260,7 @@ def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
     used[np.flatnonzero(finite)[fit.used]] = True
     axes = np.append(turned, 1.0)
     covariance = fit.covariance * np.outer(axes, axes)
-    return ArcFit(fit.centre * turned, fit.radius_m, covariance, fit.noise_m, used)
+    return ArcFit(fit.centre * turned, fit.radius_m, covariance, fit.noise_m, fit.form_m, used)
 
 
 def _fitted(points: Array, rule: ArcRule) -> ArcFit:
@@ -286,8 +294,10 @@ def _fitted(points: Array, rule: ArcRule) -> ArcFit:
             break
         used = update
     circle, covariance = _improved(circle, points[used], ab)
-    noise = float(np.sqrt(np.mean(_parts(circle, points[used]) @ ab)))
-    return ArcFit(circle[:2], float(circle[2]), covariance, noise, used)
+    variance = _parts(circle, points[used]) @ ab
+    form, of_form = _form(circle, points[used], variance)
+    noise = float(np.sqrt(np.mean(variance)))
+    return ArcFit(circle[:2], float(circle[2]), covariance + of_form, noise, form, used)
 
 
 def _parts(circle: Array, points: Array) -> Array:
@@ -347,32 +357,42 @@ def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:
             f"the points scatter by {fit.noise_m * 1e3:.3f} mm about the arc (allowed "
             f"{rule.noise_m * 1e3:.3f} mm): clean the sphere and check the exposure"
         )
+    if fit.form_m > _ROUND * float(np.ptp(points[fit.used, 1])):
+        raise ResidualError(
+            f"the surface differs from an arc of radius {r * 1e3:.3f} mm by {fit.form_m * 1e3:.3f} "
+            "mm: it is not round; show the sphere to the sensor"
+        )
     if sigma > rule.radius_sigma_m or r < _SURE * sigma:
         raise ResidualError(
             f"the arc is too short: its radius of {r * 1e3:.3f} mm is known to {sigma * 1e3:.3f} "
             f"mm (allowed {rule.radius_sigma_m * 1e3:.3f} mm); show the sensor more of the sphere"
         )
     if r - R > max(rule.radius_tolerance_m, _SURE * sigma):
-        raise ResidualError(
+        raise LargeArcError(
             f"the profile shows an arc of radius {r * 1e3:.3f} mm, but a plane cuts a sphere of "
             f"radius {R * 1e3:.3f} mm in no larger circle than that: check which sphere is "
             "mounted, and the sensor's scale"
         )
-    form = _form(fit, points[fit.used])
-    if form > max(_FORM_M, np.sqrt(0.5) * fit.noise_m):
-        raise ResidualError(
-            f"the surface differs from an arc of radius {r * 1e3:.3f} mm by {form * 1e3:.3f} mm, "
-            "which is no noise: it is not round; show the sphere to the sensor"
-        )
 
 
-def _form(fit: ArcFit, points: Array) -> float:
-    """Root mean square of the smooth part of the residuals, m."""
-    _, residual = linearised(np.append(fit.centre, fit.radius_m), points)
+def _form(circle: Array, points: Array, variance: Array) -> tuple[float, Array]:
+    """Rms of the smooth part of the residuals, m, and what it does to the circle (3, 3).
+
+    Those degrees of a polynomial that no circle takes up tell how large each degree is, beyond the
+    noise of points (n,); those that look like a shift or another radius are taken for as large.
+    """
+    J, residual = linearised(circle, points)
     x = points[:, 0] - points[:, 0].mean()
-    basis = np.polynomial.legendre.legvander(x / np.max(np.abs(x)), _FORM_DEGREE)
-    smooth = basis @ np.linalg.lstsq(basis, residual, rcond=None)[0]
-    return float(np.sqrt(np.mean(smooth**2)))
+    shape = np.polynomial.legendre.legvander(x / np.max(np.abs(x)), _FORM_DEGREE)
+    Q = np.linalg.qr(np.column_stack([J, shape[:, 3:]]))[0]
+    seen = (Q.T @ residual)[3:]
+    noise = float(np.mean(variance))
+    total, count = float(np.sum(seen**2)), len(seen)
+    if total <= noise * chi2_quantile(_FORM_SEEN, count):
+        return 0.0, np.zeros((3, 3))
+    size = total / count / len(points) * (2 * np.arange(_FORM_DEGREE + 1) + 1.0)
+    pull = np.linalg.pinv(J) @ shape
+    return float(np.sqrt(total / len(points))), (pull * size) @ pull.T
 
 
 def _blame_radius(points: Array, rule: ArcRule) -> None:

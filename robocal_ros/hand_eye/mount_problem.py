@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.result import PoseNoise
+from robocal_ros.hand_eye.result import ARM_M, PoseNoise
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -30,7 +30,7 @@ SENSOR_UNKNOWNS = ("sensor x", "sensor y", "sensor z", "turn x", "turn y", "turn
 EQUATOR = 0.995  # share of the radius beyond which the circle's radius goes on straight
 FLATTEST = 0.02  # sine of the angle between edge and laser plane below which nothing is seen
 
-FIRST_NOISE = PoseNoise(5e-5, 5e-5, 1e-4)  # turns count as shifts at an arm's length of 1 m
+FIRST_NOISE = PoseNoise(5e-5, 5e-5 / ARM_M, 1e-4, 2e-5)
 NOISE_RANGE_M = (1e-6, 1e-2)
 FLAT = 0.02  # slope of the likelihood: a hundredth of the noise's own uncertainty
 NEAR = 0.2  # relative step in which the likelihood's bend is seen
@@ -401,10 +401,23 @@ class MountProblem:
         self._place[order] = np.arange(len(order)) - np.searchsorted(ordered, ordered)
         sizes = np.concatenate([np.full(len(v.sightings.names), v.model.components) for v in views])
         self.sizes = np.bincount(self.sample, weights=sizes).astype(np.int64)
+        self._visit, self.visits = self._numbered_visits()
         _, _, common, covariance = self.grouped(self.linear(near))
-        self.aimed = bool(np.any(common[..., 6:]))  # whether light is laid by eye
-        spread = covariance + common @ noise.covariance() @ np.swapaxes(common, 1, 2)
+        self.aimed = bool(np.any(common[..., 6:COMMON]))  # whether light is laid by eye
+        nuisance = common @ noise.covariance(self.visits) @ np.swapaxes(common, 1, 2)
+        spread = covariance + nuisance
         self._whitening = np.linalg.inv(np.linalg.cholesky(spread))
+
+    def _numbered_visits(self) -> tuple[Index, int]:
+        """Number (m,) of the visit within its sample, and how many one has; 0 where none has two.
+
+        A shot is a visit.
+        """
+        shots = np.concatenate([view.sightings.shot for view in self.views])
+        pairs, row = np.unique(np.column_stack([self.sample, shots]), axis=0, return_inverse=True)
+        number = np.arange(len(pairs)) - np.searchsorted(pairs[:, 0], pairs[:, 0])
+        most = int(number.max()) + 1
+        return number[row.ravel()].astype(np.int64), most if most > 1 else 0
 
     def linear(self, state: MountState) -> Linear:
         """Linearise all sightings."""
@@ -427,22 +440,27 @@ class MountProblem:
         return Linear(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def grouped(self, linear: Linear) -> tuple[Array, Array, Array, Array]:
-        """Samples (g, c ...): residual, Jacobian (k), common errors (8), covariance (c)."""
+        """Samples (g, c ...): residual, Jacobian (k), common errors (8 + 6 v), covariance (c)."""
         groups, width = len(self.poses), int(self._place.max()) + 1
         c, k = width * COMPONENTS, linear.jacobian.shape[2]
         at = self.sample, self._place
         residual = np.zeros((groups, width, COMPONENTS))
         jacobian = np.zeros((groups, width, COMPONENTS, k))
-        common = np.zeros((groups, width, COMPONENTS, COMMON))
+        common = np.zeros((groups, width, COMPONENTS, COMMON + 6 * self.visits))
         covariance = np.zeros((groups, width, COMPONENTS, width, COMPONENTS))
         row = np.arange(width)
         covariance[:, row, :, row, :] = np.eye(COMPONENTS)  # empty places stay zero, not singular
-        residual[at], jacobian[at], common[at] = linear.residual, linear.jacobian, linear.common
+        residual[at], jacobian[at] = linear.residual, linear.jacobian
+        common[(*at, slice(None), slice(COMMON))] = linear.common
+        for visit in range(self.visits):
+            own = self.sample[self._visit == visit], self._place[self._visit == visit]
+            columns = slice(COMMON + 6 * visit, COMMON + 6 * (visit + 1))
+            common[(*own, slice(None), columns)] = linear.common[self._visit == visit, :, :6]
         covariance[self.sample, self._place, :, self._place, :] = linear.covariance
         return (
             residual.reshape(groups, c),
             jacobian.reshape(groups, c, k),
-            common.reshape(groups, c, COMMON),
+            common.reshape(groups, c, -1),
             covariance.reshape(groups, c, c),
         )
 
@@ -501,8 +519,9 @@ class RestrictedLikelihood:
     ) -> None:
         r, J, G, C = (part[keep] for part in problem.grouped(problem.linear(state)))
         self.unknown = ["sigma_m"] if given is None else []
-        self.unknown += ["aim_m"] if np.any(G[..., 6:]) else []
-        self._own, self._noise = C, problem.noise
+        self.unknown += ["aim_m"] if np.any(G[..., 6:COMMON]) else []
+        self.unknown += ["repeat_m"] if problem.visits else []
+        self._own, self._noise, self._visits = C, problem.noise, problem.visits
         self._all = np.concatenate([r[..., None], J, G], axis=2)
         self._known = problem.prior()
         self._pull = self._known @ problem.deviation(state)
@@ -518,13 +537,14 @@ class RestrictedLikelihood:
     def at(self, log_sigma: Array) -> tuple[float, Array, Array, Array, Array]:
         """-2 log likelihood, normal matrix (k, k), the step (k,) to the best state there.
 
-        Then the whitened samples, and the covariance (8, 8) of what a pose has in common.
+        Then the whitened samples, and the covariance of what a pose has in common.
         """
-        common = self.noise(log_sigma).covariance()
-        G = self._all[..., -COMMON:]
+        common = self.noise(log_sigma).covariance(self._visits)
+        G = self._all[..., -len(common) :]
         L = np.linalg.cholesky(self._own + G @ common @ np.swapaxes(G, 1, 2))
         white = np.linalg.solve(L, self._all)
-        r, J = white[..., 0].ravel(), white[..., 1:-COMMON].reshape(-1, len(self._known))
+        r = white[..., 0].ravel()
+        J = white[..., 1 : -len(common)].reshape(-1, len(self._known))
         normal = J.T @ J + self._known
         gradient = J.T @ r + self._pull
         step = -np.linalg.solve(normal, gradient)
@@ -535,14 +555,14 @@ class RestrictedLikelihood:
     def with_slope(self, log_sigma: Array) -> tuple[float, Array]:
         """-2 log likelihood and its slope (n,)."""
         cost, normal, step, white, common = self.at(log_sigma)
-        J, G = white[..., 1:-COMMON], white[..., -COMMON:]
+        J, G = white[..., 1 : -len(common)], white[..., -len(common) :]
         left = white[..., 0] + J @ step
         JG = np.swapaxes(J, 1, 2) @ G
         grown = np.sum(G**2, axis=(0, 1)) - np.sum(JG * np.linalg.solve(normal, JG), axis=(0, 1))
         fitted = np.sum((left[:, None, :] @ G) ** 2, axis=(0, 1))
         each = 2.0 * np.diag(common) * (grown - fitted)
-        parts = {"sigma_m": each[:6].sum(), "aim_m": each[6:].sum()}
-        return cost, np.array([parts[field] for field in self.unknown])
+        parts = {"sigma_m": each[:6], "aim_m": each[6:COMMON], "repeat_m": each[COMMON:]}
+        return cost, np.array([parts[field].sum() for field in self.unknown])
 
 
 def restricted_noise(

@@ -19,7 +19,7 @@ TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
 
 METHODS: tuple[Method, ...] = ("best", "classic")
 MOST_REJECTED = 1.0 / 3.0
-ARM_M = 1.0
+ARM_M = 3.0  # a turn of the flange counts as the shift that goes with it there
 STRIDE = 8  # of the points that tell the field of view
 OUTSIDE = 0.02  # share of points beyond it on each side: spikes
 
@@ -30,16 +30,22 @@ class PoseNoise:
 
     ``sigma_m``, ``sigma_rad``: of a coordinate of the reported pose, and of its turn about an axis.
     ``aim_m``: of light that is laid on a mark by eye.
+    ``repeat_m``: of what changes from visit to visit of one pose, with its turn as of a shift.
     """
 
     sigma_m: float
     sigma_rad: float
     aim_m: float = 0.0
+    repeat_m: float = 0.0
 
-    def covariance(self) -> Array:
-        """(8, 8) of (v, w), flange axes, and of the shift and the turn of the light."""
-        sigma = np.repeat([self.sigma_m, self.sigma_rad, self.aim_m], [3, 3, 2])
-        return np.diag(sigma**2)
+    def covariance(self, visits: int = 0) -> Array:
+        """(8 + 6 visits) square: of (v, w), flange axes, of the shift and the turn of the light.
+
+        Then of (v, w) of each visit.
+        """
+        sigma = [self.sigma_m, self.sigma_rad, self.aim_m]
+        sigma += [self.repeat_m, self.repeat_m / ARM_M] * visits
+        return np.diag(np.repeat(sigma, [3, 3, 2] + [3, 3] * visits) ** 2)
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class HandEyeSettings:
 
     ``robot_sigma_m``, ``robot_sigma_rad``: standard deviation of a reported pose along and about
     each axis; None to estimate both from the profiles. Where the first is given alone, the second
-    is that shift at an arm's length of 1 m.
+    is that shift at an arm's length of 3 m.
     ``limit_m``: largest expected error (rms) of a point in the field that the profiles cover.
     ``residual_m``: largest distance (rms) of samples from the target.
     """

@@ -41,6 +41,7 @@ from robocal_ros.hand_eye.mount_problem import (
     MountProblem,
     MountState,
     TargetView,
+    in_plane,
     pivot_of,
 )
 from robocal_ros.hand_eye.result import (
@@ -67,6 +68,7 @@ SHOWN = 0.5  # of the profiles
 WRONG_M = 2e-3  # the same, from which something is wrong, whatever it is
 FEWEST_TOLD = 6  # numbers that tell the noise of poses, where it is found from the data
 LARGEST_POSE_M = 2e-3  # error of a pose in space that a robot may have
+CERTAIN = 1e3  # times likelier than any other, from which a minimum is not doubted
 CONTRADICTED = 2.0  # times the given noise
 MOST_MISFITS = 0.2  # of those that show the target
 FEWEST_SPARE = 3  # measured numbers beyond the unknowns, without which nothing is judged
@@ -84,8 +86,10 @@ def solve_task(
     does not have.
     """
     read = features(task, data)
-    fit = fit_mount((read.view,), looked(task, data, read), settings.noise())
-    require_radius(fit)
+    near, doubt = looked(task, data, read)
+    fit = fit_mount((read.view,), near, settings.noise())
+    fit = replace(fit, doubt=fit.doubt or doubt)
+    require_radius(fit, (read.view,))
     require_seen(fit)
     if method == "classic":
         return _classic(task, read, fit, data, settings)
@@ -186,8 +190,8 @@ def judge(
     )
     if refused is not None:
         return refused
-    if fit.creeping:
-        return Verdict(Code.POSES_NOT_INFORMATIVE, fit.creeping)
+    if fit.doubt:
+        return Verdict(Code.POSES_NOT_INFORMATIVE, fit.doubt)
     figures = f"a point in the field of view is expected to be off by {error_m * 1e3:.3f} mm rms"
     if error_m > settings.limit_m:
         words = (
@@ -246,14 +250,14 @@ def features(task: Task, data: HandEyeData) -> Read:
         raise
 
 
-def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
-    """A state near the solution.
+def looked(task: Task, data: HandEyeData, read: Read) -> tuple[MountState, str]:
+    """A state near the solution, and why another may be the right one, if so.
 
     Raises `ResidualError` when the data do not fit: with the mistake that explains it, where one
     does; `RobocalError` when too little is seen, or the poses leave a direction open.
     """
     try:
-        near = look(task, read.view)
+        near, doubt = look(task, read.view)
     except RobocalError as error:
         _name_mistake(task, data, read, np.inf, error)
         raise
@@ -266,7 +270,7 @@ def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
             f"{off} or do not show the target where it must be, and no common mistake explains it: "
             "has the target moved, are poses and profiles of the same run, is it the right target?"
         )
-    return near
+    return near, doubt
 
 
 def _shown(view: TargetView, data: HandEyeData) -> bool:
@@ -275,23 +279,43 @@ def _shown(view: TargetView, data: HandEyeData) -> bool:
     return len(np.unique(view.sightings.shot)) > SHOWN * usable
 
 
-def look(task: Task, view: TargetView) -> MountState:
+def look(task: Task, view: TargetView) -> tuple[MountState, str]:
     """The state nearest to the sightings to which a start leads, before the noise is known.
+
+    Why another one may be right, too; empty where none is. The sum of squares judges, each not
+    larger than that of the largest error that a robot may have: a median hides what half of few
+    sightings say against a false minimum.
 
     Raises `TooFewSamplesError` or `RankDeficientError` when none leads anywhere.
     """
-    states: list[MountState] = []
+    states: list[tuple[float, MountState]] = []
     failure: RobocalError | None = None
     for start in task.starts(view):
         try:
-            states.append(first_look((view,), start))
+            state = first_look((view,), start)
         except RobocalError as error:
             failure = failure or error
             if isinstance(error, RankDeficientError):
                 break  # it lies in the poses, not in the start
+            continue
+        far = np.minimum(distances((view,), state), LARGEST_POSE_M)
+        states.append((float(np.sum(far**2)), state))
     if not states:
         raise failure or RobocalError("no start was found")
-    return min(states, key=lambda state: misfit((view,), state))
+    states.sort(key=lambda pair: pair[0])
+    least, best = states[0]
+    numbers = view.model.components * len(view.sightings.names)
+    seen = in_plane(view.sightings.value)
+    for squares, state in states[1:]:
+        if squares > least * np.exp(2.0 * np.log(CERTAIN) / numbers):
+            break
+        off_m = apart(best.T_flange_sensor, state.T_flange_sensor, seen)
+        if off_m > LARGEST_POSE_M:
+            words = f"another place of the sensor, {off_m * 1e3:.0f} mm away, fits nearly as well "
+            rms = np.sqrt([squares / len(seen), least / len(seen)]) * 1e3
+            words += f"({rms[0]:.3f} mm rms, this one {rms[1]:.3f}): show the target from more "
+            return best, f"{words}poses that differ"
+    return best, ""
 
 
 def _name_mistake(
@@ -479,7 +503,7 @@ def solve_joint(
     views = tuple(read.view for read in reads)
     places = tuple(task.placed(view, X) for task, view in zip(tasks, views, strict=True))
     fit = fit_mount(views, MountState(X, places), settings.noise())
-    require_radius(fit)
+    require_radius(fit, views)
     require_seen(fit)
     result = _result_of(tasks, fit, reads, data, settings)
     if not checks:
@@ -495,7 +519,7 @@ def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read]
     for task, data in parts:
         reads.append(features(task, data))
         try:
-            starts.append((reads[-1].view, looked(task, data, reads[-1])))
+            starts.append((reads[-1].view, looked(task, data, reads[-1])[0]))
         except (TooFewSamplesError, RankDeficientError) as error:
             unseen.append(error)  # others may show more
     for view, near in starts:

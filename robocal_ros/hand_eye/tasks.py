@@ -14,10 +14,11 @@ from robocal_ros.estimation.edge import (
     fit_edge,
 )
 from robocal_ros.estimation.estimation import solve
-from robocal_ros.estimation.sphere import ArcRule, fit_arc
+from robocal_ros.estimation.sphere import ArcRule, LargeArcError, fit_arc
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     InputError,
+    ResidualError,
     RobocalError,
     TooFewSamplesError,
 )
@@ -43,10 +44,28 @@ Fit = TypeVar("Fit")
 
 FEWEST_SPHERES = 5  # profiles
 SUBSET = 6  # profiles whose sides are tried in all patterns
+TOO_LARGE = 0.1  # of the radius, by which an arc exceeds the sphere and is something else
 DRAWS = 24  # one of them holds no wrong pair, very likely, even with four among 15
 MIRROR = np.array([1.0, -1.0, 1.0])
 KEPT_SPHERES = 3  # starts of each draw, and in the end
-RADII = (0.8, 0.83, 0.86, 0.89, *np.arange(0.91, 1.1, 0.01), 1.12, 1.15, 1.2, 1.25)  # as told: 1
+RADII = (
+    0.5,
+    0.6,
+    0.7,
+    0.8,
+    0.83,
+    0.86,
+    0.89,
+    *np.arange(0.91, 1.1, 0.01),
+    1.12,
+    1.15,
+    1.2,
+    1.25,
+    1.4,
+    1.6,
+    1.8,
+    2.0,
+)  # as told: 1
 
 TURNS = 400  # rotations of the sensor that are tried
 DIRECTIONS = 60  # directions of an unknown line that are tried
@@ -193,12 +212,17 @@ class SphereTask(Task):
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Circles."""
-        rule = ArcRule(self.target.radius_m, towards=self.towards)
+        radius_m = self.target.radius_m
+        # An arc that is a little too large is kept: together they tell that the radius is wrong.
+        rule = ArcRule(radius_m, radius_tolerance_m=TOO_LARGE * radius_m, towards=self.towards)
         arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
         rejected = {name: str(error) for name, error in errors.items()}
         wrong = [error for error in errors.values() if isinstance(error, InputError)]
         if wrong and not arcs:
             raise wrong[-1]  # no profile's fault: the radius is in another unit
+        large = [error for error in errors.values() if isinstance(error, LargeArcError)]
+        if len(large) > 1:
+            raise ResidualError(f"in {len(large)} of {len(data.names)} profiles: {large[0]}")
         usable(arcs, rejected, self.fewest if T_flange_sensor is None else 1, "the sphere")
         points, names = {}, [data.names[i] for i in arcs]
         for (i, arc), name in zip(arcs.items(), names, strict=True):
@@ -208,7 +232,7 @@ class SphereTask(Task):
         value = np.array([[*arc.centre, arc.radius_m] for arc in arcs.values()])
         covariance = np.array([arc.covariance for arc in arcs.values()])
         sightings = sightings_of(data, arcs, names, value, covariance)
-        return Read(TargetView(SphereModel(self.target.radius_m), sightings), rejected, points)
+        return Read(TargetView(SphereModel(radius_m), sightings), rejected, points)
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Circles depend neither on poses nor on the radius."""

@@ -247,7 +247,7 @@ def test_a_badly_taught_origin_shows_in_tilted_shots(axis):
     target = stairs_target(taught, user_sigma_m=SHIFT_M, user_sigma_rad=1e-4)
     task, data = StepTask(target), data_of(shots)
     read = features(task, data)
-    fit = fit_mount((read.view,), looked(task, data, read))
+    fit = fit_mount((read.view,), looked(task, data, read)[0])
     off_m = (frames.invert(fit.state.places[0]) @ T_BASE_USER)[:3, 3]
     covariance = fit.covariance[6:9, 6:9]
     assert off_m @ np.linalg.solve(covariance, off_m) < 16.27  # chi-square of 3, once in 1000

@@ -96,7 +96,7 @@ class TestSphere:
             data = sphere_data(seed, cell=HandEyeCell(robot=PoseRobot(1e-4)))
             task = SphereTask(SPHERE)
             view = features(task, data).view
-            best = fit_mount((view,), look(task, view)).state
+            best = fit_mount((view,), look(task, view)[0]).state
             states = best, task.classic(view, best)
             off.append([np.linalg.norm((X.T_flange_sensor - TRUE)[:3, 3]) for X in states])
         best_m, classic_m = np.sqrt(np.mean(np.square(off), axis=0))
