@@ -26,6 +26,7 @@ PARTS = {
     "thermal": "thermal",
     "tool": "tool",
     "hand_eye": "hand_eye",
+    "hand_eye_real": "hand_eye_real",
     "hand_eye_camera": "hand_eye_camera",
     "hand_eye_tracker": "hand_eye_tracker",
     "speed": "times",
@@ -48,6 +49,7 @@ TOGETHER = (
     "thermal",
     "tool",
     "hand_eye",
+    "hand_eye_real",
     "hand_eye_camera",
     "hand_eye_tracker",
 )

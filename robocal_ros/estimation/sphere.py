@@ -384,14 +384,16 @@ def _form(circle: Array, points: Array, variance: Array) -> tuple[float, Array]:
     J, residual = linearised(circle, points)
     x = points[:, 0] - points[:, 0].mean()
     shape = np.polynomial.legendre.legvander(x / np.max(np.abs(x)), _FORM_DEGREE)
-    Q = np.linalg.qr(np.column_stack([J, shape[:, 3:]]))[0]
-    seen = (Q.T @ residual)[3:]
+    Q = np.linalg.qr(np.column_stack([J, shape[:, 3:]]))[0][:, 3:]
+    seen = Q.T @ residual
     noise = float(np.mean(variance))
     total, count = float(np.sum(seen**2)), len(seen)
     if total <= noise * chi2_quantile(_FORM_SEEN, count):
         return 0.0, np.zeros((3, 3))
-    size = total / count / len(points) * (2 * np.arange(_FORM_DEGREE + 1) + 1.0)
-    pull = np.linalg.pinv(J) @ shape
+    alike = 2 * np.arange(_FORM_DEGREE + 1) + 1.0  # degrees of one rms
+    size = alike * total / float(np.sum(alike * (Q.T @ shape) ** 2))
+    sigma = np.sqrt(variance)[:, None]
+    pull = np.linalg.pinv(J / sigma) @ (shape / sigma)
     return float(np.sqrt(total / len(points))), (pull * size) @ pull.T
 
 

@@ -339,6 +339,12 @@ def show_mount(console: "Console", document: Document) -> None:
     console.print(
         f"Samples from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
     )
+    every = document.get("spread")
+    if every is not None and every["n"] > len(residual["per_sample"]):
+        console.print(
+            f"With those left out, {every['n']} samples: rms {every['rms_mm']:.3f} mm, largest "
+            f"{every['max_mm']:.3f} mm"
+        )
     show_judged(console, document)
 
 

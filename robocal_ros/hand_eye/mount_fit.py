@@ -16,9 +16,10 @@ from robocal_ros.hand_eye.mount_problem import (
     SphereModel,
     TargetView,
     averaged_covariance,
+    in_plane,
     restricted_noise,
 )
-from robocal_ros.hand_eye.result import ARM_M, PoseNoise, at_origin, increment
+from robocal_ros.hand_eye.result import ARM_M, PoseNoise, apart, at_origin, increment
 
 Array = NDArray[np.float64]
 
@@ -274,7 +275,8 @@ def require_seen(fit: MountFit) -> None:
     problem = MountProblem(fit.views, calm, fit.state)
     J = problem.linearise(fit.state)[1].reshape(-1, len(problem.names))
     covariance = np.asarray(np.linalg.pinv(J.T @ J + problem.prior()))
-    reach_m = np.abs(np.concatenate([view.sightings.value[:, 1] for view in fit.views])).mean()
+    seen = np.concatenate([view.sightings.value[:, :2] for view in fit.views])
+    reach_m = np.linalg.norm(seen, axis=1).mean()
     words = open_directions(at_origin(covariance[:6, :6], problem.pivot), float(reach_m), T)
     if words:
         raise RankDeficientError(f"not determined: {joined(words)}", words)
@@ -381,7 +383,7 @@ def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: flo
 def swapped(fit: MountFit, view: TargetView, place: Array, shots: Sequence[str]) -> dict[str, str]:
     """Which rejected sightings of a view fit the pose of another rejected shot, with the reason.
 
-    ``shots``: the name of each.
+    ``shots``: the name of each. Repeats of one pose cannot be told apart: they are no swap.
     """
     lost = view.take(np.array([name in fit.rejected for name in view.sightings.names]))
     limit = FITS * float(np.sqrt(np.mean(distances(fit.views, fit.state) ** 2)))
@@ -392,6 +394,9 @@ def swapped(fit: MountFit, view: TargetView, place: Array, shots: Sequence[str])
         for other in np.unique(s.shot[s.shot != shot]):
             T = s.T_base_flange[[np.flatnonzero(s.shot == other)[0]]] @ fit.state.T_flange_sensor
             own = lost.take(rows)
+            mine = own.sightings.T_base_flange[0] @ fit.state.T_flange_sensor
+            if apart(mine, T[0], in_plane(own.sightings.value)) < limit:
+                continue
             far = own.model.distance(np.repeat(T, len(rows), axis=0), place, own.sightings.value)
             if np.median(far) < limit:
                 words = f"fits the pose of {shots[other]}, not its own: swapped?"

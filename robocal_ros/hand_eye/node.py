@@ -88,7 +88,7 @@ SETTINGS = (
     Setting(
         "robot_sigma_deg",
         0.0,
-        "And of its turn about each axis; 0: robot_sigma_mm over 1 m, of a camera from the data",
+        "And of its turn about each axis; 0: robot_sigma_mm over 3 m, of a camera from the data",
         unit="deg",
         low=0.0,
         high=1.0,

@@ -20,7 +20,9 @@ from robocal_ros.ground.errors import (
 from robocal_ros.ground.frames import Document
 from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.mount_fit import (
+    OPEN_M,
     MountFit,
+    describe_motion,
     distances,
     explain,
     first_look,
@@ -109,7 +111,9 @@ def _result_of(
     shots = len(data.names)
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
     rejected |= dict(fit.rejected)
+    every = summarise(distances(tuple(read.view for read in reads), fit.state))
     more: Document = {
+        "spread": errors_document(every),
         "robot_sigma_mm": fit.noise.sigma_m * 1e3,
         "working_distance_mm": float(field[0, 2]) * 1e3,
     }
@@ -195,8 +199,8 @@ def judge(
     figures = f"a point in the field of view is expected to be off by {error_m * 1e3:.3f} mm rms"
     if error_m > settings.limit_m:
         words = (
-            f"{figures} (allowed {settings.limit_m * 1e3:g} mm): tilt the flange more, show the "
-            "target at more distances, or measure more often; check-plan proposes poses"
+            f"{figures} (allowed {settings.limit_m * 1e3:g} mm), most by a {_weakest(fit)}; "
+            "measure more often; check-plan proposes poses"
         )
         return Verdict(Code.POSES_NOT_INFORMATIVE, words)
     rms = float(np.sqrt(np.mean(far_m**2)))
@@ -204,6 +208,18 @@ def judge(
     if fit.scale > CONTRADICTED:
         words += f", {fit.scale:.1f} times what the given noise explains"
     return Verdict(Code.ACCEPT, words)
+
+
+def _weakest(fit: MountFit) -> str:
+    """The direction that is known least, by how much, and the motion that would show it."""
+    seen = np.concatenate([view.sightings.value[:, :2] for view in fit.views])
+    T = np.concatenate([view.sightings.T_base_flange for view in fit.views])
+    size = np.repeat([1.0, max(float(np.ptp(seen, axis=0).max()), OPEN_M)], 3)  # of a turn
+    values, vectors = np.linalg.eigh(fit.covariance[:6, :6] * np.outer(size, size))
+    v, w = np.split(vectors[:, -1] / size, 2)
+    open_one = np.concatenate([v - np.cross(w, pivot_of(fit.views)), w])
+    what, _, remedy = describe_motion(open_one, T).partition(": ")
+    return f"{what}, known to {np.sqrt(values[-1]) * 1e3:.2f} mm there: {remedy}"
 
 
 def _too_few(fit: MountFit, settings: HandEyeSettings) -> Verdict | None:
@@ -370,8 +386,9 @@ class HeldOut:
 class Verification(HeldOut):
     """What other data say of a mount.
 
-    ``target``: what was found of the target with the mount held; ``rejected``: shots and features
-    that were not used, and why.
+    ``target``: what was found of the target with the mount held; ``rejected``: shots without a
+    feature, and features by which the target was not found, and why; the latter are among the
+    samples all the same.
     """
 
     target: Document
@@ -426,17 +443,18 @@ def verify(
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
     rejected = dict(read.rejected)
     view, state = _fit_place(read.view, start, settings.noise() or FIRST_NOISE, rejected)
-    far = distances((view,), state)
-    rms = float(np.sqrt(np.mean(far**2)))
-    words, code = f"{len(far)} samples are off by {rms * 1e3:.3f} mm rms", Code.ACCEPT
-    if len(rejected) > len(far):
+    fit = distances((view,), state)
+    rms = float(np.sqrt(np.mean(fit**2)))
+    words, code = f"{len(fit)} samples are off by {rms * 1e3:.3f} mm rms", Code.ACCEPT
+    far = distances((read.view,), state)
+    if len(rejected) > len(fit):
         code = Code.RESIDUAL_TOO_LARGE
         words = f"{words}, but {len(rejected)} do not fit at all"
     elif rms > settings.limit_m:
         code = Code.RESIDUAL_TOO_LARGE
         words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): the mount is not this one"
     return Verification(
-        samples=view.sightings.names,
+        samples=read.view.sightings.names,
         distance_m=far,
         rejected=rejected,
         target=task.found(state.places[0]),

@@ -213,8 +213,8 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("words", "reason"),
         [
-            ([], "--poses with --profiles, or --bag"),
-            (["--poses", "poses.csv"], "--poses with --profiles, or --bag"),
+            ([], "give the shots: --poses, or --bag"),
+            (["--poses", "poses.csv"], "poses.csv: no such table"),
             (["--bag", bag("sphere")], "name its robot with --robot"),
             (["--bag", bag("sphere"), *ROBOT, "--poses", "poses.csv"], "given twice"),
             (["--bag", "nothing.mcap", *ROBOT], "nothing.mcap"),

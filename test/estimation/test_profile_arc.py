@@ -17,6 +17,8 @@ from robocal_ros.ground.errors import InputError, ResidualError, TooFewSamplesEr
 
 R = 0.02
 
+FORM_M = 3e-5
+
 
 def circle(rng, r):
     return (rng.uniform(-0.012, 0.012), 0.195 + r + rng.uniform(-0.003, 0.003), r)
@@ -192,3 +194,25 @@ def test_much_noise_is_refused():
     points, _ = arc_profile(circle(rng, R), rng, noise=3e-4)
     with pytest.raises(ResidualError, match=r"scatter by 0\.[23]"):
         fit_arc(points, ArcRule(R))
+
+
+def test_a_smooth_form_has_its_share_of_the_covariance():
+    """Real profiles differ from a circle by more than they scatter, by a smooth function."""
+    rng = np.random.default_rng(21)
+    squares, forms = [], []
+    for _ in range(80):
+        truth = circle(rng, R)
+        points, _ = arc_profile(truth, rng, noise=6e-6, table=False)
+        x = np.linspace(-1.0, 1.0, len(points))
+        size = FORM_M * np.sqrt(2 * np.arange(7) + 1.0) / np.sqrt(7.0)
+        shape = np.polynomial.legendre.legval(x, size * rng.standard_normal(7))
+        normal = points - np.array(truth[:2])
+        points += shape[:, None] * normal / np.linalg.norm(normal, axis=1)[:, None]
+        fit = fit_arc(points, ArcRule(R, radius_tolerance_m=1e-3))
+        squares.append(error(fit, truth) @ np.linalg.solve(fit.covariance, error(fit, truth)))
+        forms.append(fit.form_m)
+    # How large the 7 degrees are is known from 4 of them: the median of 3 F(3, 4) is 2.8, and
+    # that of 80 runs scatters by 0.3.
+    assert 2.0 < float(np.median(squares)) < 4.0
+    seen = FORM_M * np.sqrt(4.0 / 7.0)
+    assert abs(float(np.sqrt(np.mean(np.square(forms)))) / seen - 1.0) < 0.25

@@ -95,7 +95,7 @@ def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):
 
 
 def test_a_plan_takes_the_noise_that_calibrate_takes(history):
-    """A shift that is given alone is a turn too, at an arm's length of 1 m."""
+    """A shift that is given alone is a turn too, at an arm's length of 3 m."""
     driver = driver_of(history)
     driver.sphere(1)
     poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(width_m=0.09)
@@ -104,7 +104,7 @@ def test_a_plan_takes_the_noise_that_calibrate_takes(history):
         config = HandEyeConfig(robot_sigma_m=2e-4, robot_sigma_rad=turn_rad)
         return judged_plan(driver.session.data, poses, [], TRUTH, sensor, config).working_error_m
 
-    assert error_m(None) == error_m(2e-4) > error_m(1e-9)
+    assert error_m(None) == error_m(2e-4 / 3.0) > error_m(1e-9)
 
 
 def test_other_units_are_named():

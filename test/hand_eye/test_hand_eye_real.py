@@ -1,0 +1,78 @@
+"""Real profiles of line lasers on FANUC robots, as others recorded them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import hand_eye_real as real
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import Code, ResidualError, TooFewSamplesError
+from robocal_ros.hand_eye.mount_fit import fit_mount
+from robocal_ros.hand_eye.result import HandEyeResult
+from robocal_ros.hand_eye.solve import look
+from robocal_ros.hand_eye.stairs import task_of
+from robocal_ros.hand_eye.targets import SphereTarget
+
+pytestmark = pytest.mark.data
+
+SHOP_MM = np.array([-6.493, -2027.8, 857.047])  # the shop's own report of leichi_cam0_sphere
+SHOP_SIGMA_MM = 0.8
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sets(data_dir: Path) -> Path:
+    folder = data_dir / "line_laser_fanuc"
+    if not folder.is_dir():
+        pytest.skip("no real profiles")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(sets: Path) -> dict[str, HandEyeResult]:
+    return {name: real.solved(real.task_for(name), real.read_set(name)) for name in real.SPREAD_MM}
+
+
+@pytest.mark.parametrize("name", real.SPREAD_MM)
+def test_every_shot_is_used_and_near_its_target(results, name):
+    result = results[name]
+    assert not result.rejected
+    assert result.more["spread"]["rms_mm"] <= real.SPREAD_MM[name]
+    assert result.verdict.code in (Code.ACCEPT, Code.POSES_NOT_INFORMATIVE)
+
+
+@pytest.mark.parametrize("name", real.SPREAD_MM)
+def test_what_is_left_out_is_off_as_predicted(name):
+    task, data = real.task_for(name), real.read_set(name)
+    view = task.read(data).view
+    found, predicted = real.left_out_m(fit_mount((view,), look(task, view)[0]))
+    assert 0.8 < found / predicted < 1.25
+
+
+def test_two_targets_tell_one_mount(results):
+    sphere, edge = results["experiments_sphere"], results["experiments_edge"]
+    off = (sphere.T_flange_sensor - edge.T_flange_sensor)[:2, 3]
+    assert np.all(np.abs(off) < 6e-4)
+
+
+def test_a_weak_answer_holds_what_the_shop_reports(results):
+    result = results["leichi_cam0_sphere"]
+    off_mm = result.T_flange_sensor[:3, 3] * 1e3 - SHOP_MM
+    turn = result.T_flange_sensor[:3, :3]
+    move = np.hstack([turn, -turn @ -frames.skew(result.pivot)])
+    sigma_mm = 1e3 * np.sqrt(np.diag(move @ result.covariance @ move.T))
+    assert np.linalg.norm(off_mm) < 3.5
+    assert np.all(np.abs(off_mm) < 3.5 * np.hypot(sigma_mm, SHOP_SIGMA_MM))
+
+
+def test_a_height_that_is_taken_for_a_distance_is_named():
+    data = real.read_set("experiments_sphere")
+    with pytest.raises(TooFewSamplesError, match=r"opens the wrong way.*set z_grows towards"):
+        real.solved(task_of(SphereTarget(real.RADIUS_M), None), data)
+
+
+@pytest.mark.parametrize("radius_mm", [25.0, 37.0, 39.0, 41.0, 42.0])
+def test_another_radius_is_refused_with_the_reason(radius_mm):
+    data = real.read_set("experiments_sphere")
+    with pytest.raises(ResidualError, match=r"which sphere is mounted"):
+        real.solved(real.task_for("experiments_sphere", radius_mm * 1e-3), data)
