@@ -135,7 +135,7 @@ class Recorder:
         follower, current = thermal.follower, tool.current
         cycles = 0 if follower is None else follower.state.cycles
         shown = {
-            "thermal": (thermal.in_force.revision, thermal.reference_id, cycles),
+            "thermal": (thermal.in_force.revision, thermal.current.reference_id, cycles),
             "tool": (current.head.revision, current.thermal.revision, current.healthy.revision),
         }
         made = {

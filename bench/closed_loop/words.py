@@ -14,7 +14,7 @@ from robocal_ros.tool.session import ToolSession
 
 def model_of(session: ThermalSession, now_ns: int) -> OfferedModel:
     """The model in force."""
-    arm, nominal = session.arm, session.nominal
+    arm, nominal = session.current.arm, session.nominal
     return OfferedModel(
         nominal.name,
         setting.SERIAL,

@@ -16,7 +16,7 @@ from robocal_ros.ground.samples import (
     stamp_ns,
 )
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome, digest, read_command
+from robocal_ros.session.events import Command, Outcome, SessionBase, digest, read_command
 
 EVENTS = "session_events"
 NOT_BITS = "not to the last bit"
@@ -37,24 +37,7 @@ class RecordedMessage(Protocol):
         """The message."""
 
 
-class Replayed(Protocol):
-    """What a session does with commands."""
-
-    @property
-    def newest_joints_ns(self) -> int:
-        """Time of the data: what a replay's history has in place of the wall clock."""
-
-    def take_plain(self, block: JointBlock, start: int) -> int:
-        """Take the readings from ``start`` on that decide nothing: how many these are."""
-
-    def submit(self, command: Command, clock_ns: int | None = None) -> None:
-        """Queue a command."""
-
-    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
-        """Carry out one command."""
-
-
-S = TypeVar("S", bound=Replayed)
+S = TypeVar("S", bound=SessionBase)
 
 
 @dataclass
@@ -189,7 +172,9 @@ class One:
     message: Any
 
 
-def one_by_one(session: Replayed, messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
+def one_by_one(
+    session: SessionBase, messages: Iterable[RecordedMessage]
+) -> Iterator[RecordedMessage]:
     """Samples that may decide something; joint readings that do not, the session takes at once.
 
     It has the rest of a block of them before the next sample is asked for.
@@ -249,7 +234,9 @@ def replay(
 
 
 def _submit_next(
-    session: Replayed, expected: Iterator[tuple[Command, Mapping[str, Any]]], ids: Mapping[int, int]
+    session: SessionBase,
+    expected: Iterator[tuple[Command, Mapping[str, Any]]],
+    ids: Mapping[int, int],
 ) -> Mapping[str, Any] | None:
     following = next(expected, None)
     if following is None:
@@ -263,7 +250,7 @@ def _submit_next(
 
 
 def _take(
-    session: Replayed,
+    session: SessionBase,
     report: ReplayReport,
     done: list[Outcome],
     recorded: Mapping[str, Any],

@@ -70,15 +70,14 @@ def seconds(stamp_ns: int | None) -> float:
 
 def commanded_document(
     report: ReplayReport,
-    session: SessionBase | ThermalSession,
+    session: SessionBase,
     recording: BagOverview,
     candidates: Document | None = None,
 ) -> Document:
     """What a replay tells, whatever it measures; ``candidates`` stand behind the topics."""
     topic = {kind: name for name, kind in recording.inputs.items()}
     ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
-    stream = session.desk.stream if isinstance(session, ThermalSession) else session.stream
-    damaged = recording.reader.info.lost
+    stream, damaged = session.stream, recording.reader.info.lost
     return {
         "robot": session.nominal.name,
         "model_hash": session.nominal.model_hash,
@@ -333,7 +332,8 @@ def _document(report: ReplayReport, session: ThermalSession, recording: BagOverv
             for o in report.outcomes
             if o.command.name == events.ACCEPT and o.done
         ],
-        "final_model": model_document(session.arm) | {"revision": session.in_force.revision},
+        "final_model": model_document(session.current.arm)
+        | {"revision": session.in_force.revision},
     }
     return _failure(report, made) | commanded_document(report, session, recording, candidates)
 

@@ -3,10 +3,10 @@
 import json
 import time
 import traceback
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -19,7 +19,6 @@ from robocal_ros.ground.files import StateFile
 from robocal_ros.ground.samples import JOINTS, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge, damage_notice, history_path, state_folder
-from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_file_hash
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
@@ -42,8 +41,8 @@ from robocal_ros.session.events import (
     REJECT,
     ROLLBACK,
     Command,
-    Ignored,
     Outcome,
+    SessionBase,
     arguments_text,
     outcome_text,
 )
@@ -237,40 +236,6 @@ class SessionEvents:
         return self._since >= EVENTS.depth // 2
 
 
-class Session(Protocol):
-    """What its node asks of a session.
-
-    ``received``, ``ignored``: samples by topic, and those that were not used.
-    """
-
-    received: Counter[str]
-    ignored: Ignored
-
-    @property
-    def in_force(self) -> Head:
-        """Head of the history as the session last saw it."""
-
-    @property
-    def fault(self) -> str:
-        """Why the history could not be read at the last look; empty when it could."""
-
-    def refuse(self, kind: str, error: RobocalError) -> None:
-        """Count a message of an input that cannot be used."""
-
-    def poll(self) -> list[Outcome]:
-        """Take over what another process decided in the history since the last look."""
-
-    @property
-    def waiting(self) -> int:
-        """Number of commands not yet carried out."""
-
-    def submit(self, command: Command, clock_ns: int | None = None) -> None:
-        """Queue a command."""
-
-    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
-        """Carry out one command: what was decided outside before it, and it."""
-
-
 class CommandQueue:
     """Between the callers of a node and its session.
 
@@ -284,7 +249,7 @@ class CommandQueue:
     ) -> None:
         self._node, self._show = node, show
         self._asked: deque[Future] = deque()
-        self.session: Session | None = None
+        self.session: SessionBase | None = None
         self._deadline = node.add_timer(timeout_s, lambda: self.step(force=True), steady=True)
         self._deadline.cancel()
 
@@ -328,7 +293,7 @@ class CommandQueue:
             self._asked.popleft().set_exception(error)
 
 
-SessionT = TypeVar("SessionT", bound=Session)
+SessionT = TypeVar("SessionT", bound=SessionBase)
 
 
 class SessionNode(HouseNode, Generic[SessionT]):

@@ -106,18 +106,11 @@ def carried_out(
         return Outcome(command, error.code, str(error))
 
 
-def reached(marks: Mapping[str, int], newest_ns: Mapping[str, int], jumps: int) -> bool:
-    """Whether samples have come as far as the marks of a recorded command."""
-    wanted = marks.get(JUMPS, 0)
-    topics = (topic for topic in marks if topic != JUMPS)
-    near = all(newest_ns.get(topic, -1) >= marks[topic] for topic in topics)
-    return jumps > wanted or (jumps == wanted and near)
-
-
-def joints_awaited_ns(marks: Mapping[str, int], newest_ns: Mapping[str, int]) -> int | None:
-    """Stamp of the joint reading with which the marks may be reached; None: not by one."""
-    wanted = marks.get(JOINTS, -1)
-    return wanted if newest_ns.get(JOINTS, -1) < wanted else None
+def reached(wanted: Mapping[str, int], marks: Mapping[str, int]) -> bool:
+    """Whether samples, which have come to ``marks``, are as far as a recorded command wants."""
+    jumps = marks[JUMPS] - wanted.get(JUMPS, 0)
+    near = all(marks.get(topic, -1) >= mark for topic, mark in wanted.items() if topic != JUMPS)
+    return jumps > 0 or (jumps == 0 and near)
 
 
 VERSION = 1
@@ -425,7 +418,7 @@ Handler = Callable[[Command, int], Outcome]
 
 
 class SessionBase:
-    """Base of the sessions that carry out a command as soon as it is given.
+    """Base of the sessions: commands are carried out in their turn, as soon as they are given.
 
     A subclass gives its handlers. A recorded command waits for its marks.
 
@@ -496,8 +489,7 @@ class SessionBase:
         """
         if self._watches_joints():
             return 0
-        marks = self._queue[0].marks if self._queue else None
-        awaited_ns = joints_awaited_ns(marks or {}, self.newest_ns)
+        awaited_ns = self._joints_awaited_ns()
         count = self.stream.extend(block, start, awaited_ns, GAP_NS)
         if count:
             self.received[JOINTS] += count
@@ -511,12 +503,15 @@ class SessionBase:
     def submit(self, command: Command, clock_ns: int | None = None) -> None:
         """Queue a command; ``step`` carries it out when its samples are complete.
 
-        A command without a stamp gets the newest stamp of the joints, where there is one, so that
-        a clock that is off does not matter.
+        A command without a stamp gets one, see `_stamp_ns`.
         """
         if command.stamp_ns is None:
-            command = replace(command, stamp_ns=self.newest_joints_ns or clock_ns or 0)
+            command = replace(command, stamp_ns=self._stamp_ns(clock_ns))
         self._queue.append(command)
+
+    def _stamp_ns(self, clock_ns: int | None) -> int:
+        """The newest stamp of the joints, where there is one: a clock that is off does no harm."""
+        return self.newest_joints_ns or clock_ns or 0
 
     @property
     def waiting(self) -> int:
@@ -525,15 +520,15 @@ class SessionBase:
 
     def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
         """Carry out one command: what was decided outside before it, and it."""
-        if not self._queue or not (force or self._ready(self._queue[0])):
+        if not self._queue or not (force or reached(self._wanted(self._queue[0]), self.marks)):
             return []
         command = self._queue.pop(0)
         outside = self.poll()
-        if command.marks is None:
-            command = replace(command, marks=self.marks)
-        decisions = dict.fromkeys((ACCEPT, REJECT, ROLLBACK), self._decide)
-        common = {**decisions, CONFIGURE: self._reconfigured}
-        outcome = carried_out({**self._handlers(), **common}, command, wall_ns)
+        command = self._completed(command)
+        handlers = {**self._handlers(), **dict.fromkeys((ACCEPT, REJECT, ROLLBACK), self._decide)}
+        if self._kind != THERMAL:  # whose own commands bring thermal models into force
+            handlers[CONFIGURE] = self._reconfigured
+        outcome = carried_out(handlers, command, wall_ns)
         outside += [outside_decision(d, self.marks) for d in self._followed.look(wall_ns)]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
 
@@ -541,8 +536,18 @@ class SessionBase:
         """Take over what another process decided in the history since the last look."""
         return [outside_decision(d, self.marks) for d in self._followed.look()]
 
-    def _ready(self, command: Command) -> bool:
-        return command.marks is None or reached(command.marks, self.newest_ns, self._jumps)
+    def _wanted(self, command: Command) -> Mapping[str, int]:
+        """Marks up to which samples must have come for a command."""
+        return command.marks or {}
+
+    def _joints_awaited_ns(self) -> int | None:
+        """Stamp of the joint reading with which a command may be ready; None: not by one."""
+        wanted_ns = self._wanted(self._queue[0]).get(JOINTS, -1) if self._queue else -1
+        return wanted_ns if self.newest_ns.get(JOINTS, -1) < wanted_ns else None
+
+    def _completed(self, command: Command) -> Command:
+        """The command as it is recorded: with the marks of its samples."""
+        return replace(command, marks=self.marks) if command.marks is None else command
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
         return decide(self._history, command, self.in_force.revision, wall_ns, self._kind)

@@ -518,7 +518,7 @@ class ThermalNode(SessionNode[ThermalSession]):
         head, follower = session.in_force, session.follower
         cycles = 0 if follower is None else follower.state.cycles
         sensor = history.head(SENSOR)
-        shown = (head.revision, session.reference_id, cycles, sensor.revision)
+        shown = (head.revision, session.current.reference_id, cycles, sensor.revision)
         if self._shown == shown and not self._outputs.events.need_configuration:
             return
         if self._shown[:1] != shown[:1]:
@@ -548,7 +548,7 @@ class ThermalNode(SessionNode[ThermalSession]):
             values["pending candidates"] = ", ".join(map(str, pending)) or "none"
         except RobocalError as error:
             health.worsen(ERROR, str(error))
-        values["cold reference"] = "captured" if session.reference_id else "none"
+        values["cold reference"] = "captured" if session.current.reference_id else "none"
         visited, poses = session.windows.progress()
         named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
         values["cycle"] = f"{named}{visited} of {poses} poses measured"

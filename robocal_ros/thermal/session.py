@@ -1,6 +1,6 @@
 """The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from typing import Any
@@ -31,20 +31,18 @@ from robocal_ros.ground.samples import (
     temperature_sample,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry, Head
+from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.events import (
-    CONFIGURE,
     NEWEST,
     OWN,
     Command,
+    Handler,
     Outcome,
-    decide,
-    joints_awaited_ns,
-    outside_decision,
-    reached,
-    require_robot,
+    SessionBase,
+    configured_with,
+    recorded_arguments,
     seeded,
 )
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel
@@ -76,7 +74,7 @@ LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cy
 NO_REFERENCE = "no cold reference: capture it before the first cycle"
 
 
-class ThermalSession:
+class ThermalSession(SessionBase):
     """Identifies the model of one arm from measurements at standstill.
 
     Without a cold reference, ``identify`` calibrates base, targets and model from all poses and
@@ -84,6 +82,7 @@ class ThermalSession:
 
     Attributes
     ----------
+    current : what is in force.
     temperatures : of the motors.
     cycle : the measuring cycle that is open.
     windows : which measurements belong to a cycle.
@@ -92,58 +91,29 @@ class ThermalSession:
     def __init__(
         self, nominal: SerialArm, history: CalibrationHistory, config: ThermalConfig, software: str
     ) -> None:
-        self.nominal, self.config = nominal, config
+        self.config = config
+        self.current = InForce(history, nominal)
+        super().__init__(nominal, history, THERMAL, self.current)
         self.desk = ObservationDesk(
             nominal.joint_names, config.standstill, config.measuring_frame or None
         )
         self.received, self.ignored = self.desk.received, self.desk.ignored
-        self._history = history
-        self._queue: list[Command] = []
-        self._current = InForce(history, nominal)
+        self.stream, self.newest_ns = self.desk.stream, self.desk.newest_ns
         self.temperatures = MotorTemperatures(nominal.joint_names)
         self.cycle = OpenCycle()
-        self.windows = Windows(self.desk, self.cycle, self._current, config)
-        self._following = Following(history, self._current, config)
-        self._proposer = Proposer(nominal, history, config, software, self._current)
+        self.windows = Windows(self.desk, self.cycle, self.current, config)
+        self._following = Following(history, self.current, config)
+        self._proposer = Proposer(nominal, history, config, software, self.current)
 
     @property
-    def in_force(self) -> Head:
-        """Head of the history as the session last saw it."""
-        return self._current.head
+    def marks(self) -> dict[str, int]:
+        """How far the samples have come: newest stamps, and jumps of the clock."""
+        return self.desk.marks
 
     @property
     def reference(self) -> ColdReference | None:
         """The cold reference, or None."""
-        return self._current.reference
-
-    @property
-    def reference_id(self) -> int | None:
-        """Calibration that is the cold reference, or None."""
-        return self._current.reference_id
-
-    @property
-    def fault(self) -> str:
-        """Why the history could not be read at the last look; empty when it could."""
-        return self._current.fault
-
-    @property
-    def newest_joints_ns(self) -> int:
-        """Stamp of the newest joint reading; 0 before any."""
-        return self.desk.newest_ns.get(JOINTS, 0)
-
-    def refuse(self, kind: str, error: RobocalError) -> None:
-        """Count a message of an input that cannot be used."""
-        self.ignored.add(kind, str(error))
-
-    @property
-    def arm(self) -> SerialArm:
-        """The arm with the model in force."""
-        return self._current.arm
-
-    @property
-    def reference_model(self) -> dict[str, Any] | None:
-        """The cold reference as it is kept, or None."""
-        return self._current.reference_model
+        return self.current.reference
 
     @property
     def follower(self) -> DriftFollower | None:
@@ -174,31 +144,14 @@ class ThermalSession:
             self.desk.add_measurement(sample)
 
     def take_plain(self, block: JointBlock, start: int) -> int:
-        """Take the joint readings from ``start`` on that decide nothing: how many these are.
+        """As `SessionBase.take_plain`."""
+        return self.desk.take_plain(block, start, self._joints_awaited_ns())
 
-        As `add` of each, many times faster. The reading after them is for `add`.
-        """
-        awaited_ns = None
-        if self._queue:
-            awaited_ns = joints_awaited_ns(self._wanted(self._queue[0]), self.desk.newest_ns)
-        return self.desk.take_plain(block, start, awaited_ns)
-
-    def submit(self, command: Command, clock_ns: int | None = None) -> None:
-        """Queue a command; ``advance`` carries it out when its samples are complete.
-
-        A command without a stamp gets ``clock_ns`` where that is on the samples' clock (within
-        a second after the newest of them), else the newest stamp known.
-        """
-        if command.stamp_ns is None:
-            newest = self.desk.clock_ns
-            near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
-            command = replace(command, stamp_ns=clock_ns if near else newest)
-        self._queue.append(command)
-
-    @property
-    def waiting(self) -> int:
-        """Number of commands not yet carried out."""
-        return len(self._queue)
+    def _stamp_ns(self, clock_ns: int | None) -> int:
+        """The clock where it is on the samples' (within a second after their newest), else that."""
+        newest = self.desk.clock_ns
+        near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
+        return clock_ns if near and clock_ns is not None else newest
 
     def advance(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
         """Carry out the commands whose samples are complete.
@@ -212,7 +165,6 @@ class ThermalSession:
         return outcomes
 
     def _wanted(self, command: Command) -> Mapping[str, int]:
-        """Marks up to which samples must have come for a command."""
         if command.marks is not None:
             return command.marks
         marks = {JUMPS: self.desk.jumps}
@@ -220,41 +172,24 @@ class ThermalSession:
             marks[JOINTS] = (command.stamp_ns or 0) + int(self.config.lateness_s * 1e9)
         return marks
 
-    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
-        """Carry out one command, as ``advance``: what was decided outside before it, and it.
-
-        For the record the command gets a cycle's name, the marks of its samples, and the stamp of
-        the first of them.
-        """
-        desk = self.desk
-        if not self._queue:
-            return []
-        if not force and not reached(self._wanted(self._queue[0]), desk.newest_ns, desk.jumps):
-            return []
-        command = self._queue.pop(0)
+    def _completed(self, command: Command) -> Command:
+        """The command with a cycle's name, the marks of its samples, the stamp of their first."""
         arguments, begins = dict(command.arguments), command.name == events.BEGIN_CYCLE
         if (begins or command.name in events.CYCLE) and not arguments.get("cycle_id"):
             by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
             arguments["cycle_id"] = by_time if begins else self.cycle.id or by_time
-            command = replace(command, arguments=arguments)
-        outside = self.poll()
-        if command.marks is None:
-            if command.name in events.MEASURED:
-                arguments.setdefault("from_ns", self.windows.from_ns(command))
-            command = replace(command, marks=desk.marks, arguments=arguments)
-        handlers: dict[str, Callable[[Command, int], Outcome]] = {
+        if command.marks is None and command.name in events.MEASURED:
+            arguments.setdefault("from_ns", self.windows.from_ns(command))
+        return super()._completed(replace(command, arguments=arguments))
+
+    def _handlers(self) -> Mapping[str, Handler]:
+        return {
             events.CALIBRATE_SENSOR: self._calibrate_sensor,
             events.CAPTURE_REFERENCE: self._capture_reference,
             events.IDENTIFY: self._identify,
             events.BEGIN_CYCLE: self._begin_cycle,
             events.END_CYCLE: self._end_cycle,
-            events.ACCEPT: self._decide,
-            events.REJECT: self._decide,
-            events.ROLLBACK: self._decide,
         }
-        outcome = events.carried_out(handlers, command, wall_ns)
-        outside += [outside_decision(d, desk.marks) for d in self._current.look(wall_ns)]
-        return [*outside, replace(outcome, revision=self.in_force.revision)]
 
     def _calibrate_sensor(self, command: Command, wall_ns: int) -> Outcome:
         """Place the sensor; the samples stay, for the cold reference."""
@@ -335,13 +270,6 @@ class ThermalSession:
         idle = not self._queue and self.reference is not None
         return self.windows.overdue() if idle else None
 
-    def _decide(self, command: Command, wall_ns: int) -> Outcome:
-        return decide(self._history, command, self.in_force.revision, wall_ns)
-
-    def poll(self) -> list[Outcome]:
-        """Take over what another process decided in the history since the last look."""
-        return [outside_decision(decision, self.desk.marks) for decision in self._current.look()]
-
     def accuracy(self, stamp_ns: int) -> Accuracy:
         """How far the tool may be off at a stamp with the model in force.
 
@@ -361,7 +289,7 @@ class ThermalSession:
 
     def _judged(self, follower: DriftFollower, stamp_ns: int) -> Accuracy:
         config, time_s = self.config, follower.time_s(stamp_ns)
-        forecast = follower.forecast(self._current.arm)
+        forecast = follower.forecast(self.current.arm)
         error = forecast.at(time_s)
         age_s = time_s - follower.state.tracker.time_s
         left_s = config.expires_after_s - age_s
@@ -414,13 +342,9 @@ def session_as_recorded(
     InputError
         The configuration cannot be read.
     """
-    require_robot(nominal, configured)
-    arguments = configured.arguments
-    try:
-        in_force = {THERMAL: arguments["model"], REFERENCE: arguments["reference"]}
-        tracker = arguments[OWN["thermal"]]
-    except KeyError as error:
-        raise InputError(f"the recorded configuration lacks {error}") from error
+    arguments = recorded_arguments(nominal, configured, ("model", "reference", OWN["thermal"]))
+    in_force = {THERMAL: arguments["model"], REFERENCE: arguments["reference"]}
+    tracker = arguments[OWN["thermal"]]
     config = config_of(arguments)
     state = None if tracker is None else FollowerState.of_document(tracker)
     fresh = seeded(history, nominal, in_force, software)
@@ -436,16 +360,12 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
     Recorded at the start and after each change of what is in force: a recording that begins
     later has it too. ``topics``: name of each input's topic.
     """
-    arguments = {
-        "robot": session.nominal.name,
-        "model_hash": session.nominal.model_hash,
-        "topics": dict(topics or {}),
-        "config": asdict(session.config),
+    in_force = {
         "model": session.in_force.model,
-        "reference": session.reference_model,
+        "reference": session.current.reference_model,
         OWN["thermal"]: None if session.follower is None else session.follower.state.document(),
     }
-    return Command(CONFIGURE, arguments, session.newest_joints_ns, session.desk.marks)
+    return configured_with(session, topics or {}, asdict(session.config), in_force)
 
 
 def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:

@@ -47,7 +47,7 @@ class Loop:
         reference = self.session.reference
         if not self.corrected or reference is None:
             return q
-        return JointCorrection.between(reference.cell.arm, self.session.arm).correct(q).q
+        return JointCorrection.between(reference.cell.arm, self.session.current.arm).correct(q).q
 
     def cycle(self, command: str, after_h: float = 0.0) -> Outcome:
         q = self.commanded(self.taught)
@@ -97,7 +97,7 @@ def predicted_m(found: Outcome) -> float:
 
 def drift_of(session: ThermalSession, arm: SerialArm) -> np.ndarray:
     assert session.reference is not None
-    return arm.parameters.read(session.arm.mdh - session.reference.cell.arm.mdh)
+    return arm.parameters.read(session.current.arm.mdh - session.reference.cell.arm.mdh)
 
 
 def test_the_model_is_the_same_with_the_correction_on_and_off(tmp_path):
@@ -120,7 +120,7 @@ def test_the_model_is_the_same_with_the_correction_on_and_off(tmp_path):
     turned = np.abs(found[True].commanded(q) - q).max()
     assert 1e-5 < turned < np.radians(0.3)  # it was on
     check = postures(found[True].nominal, 40, seed=9)
-    moved = {c: (loop.session.arm.fk(check) @ BALL)[:, :3] for c, loop in found.items()}
+    moved = {c: (loop.session.current.arm.fk(check) @ BALL)[:, :3] for c, loop in found.items()}
     apart = np.linalg.norm(moved[True] - moved[False], axis=1)
     assert np.sqrt(np.mean(apart**2)) < 2e-6 / NOISE_M * predicted_m(outcome)
     assert drift_of(found[True].session, found[True].nominal) == pytest.approx(

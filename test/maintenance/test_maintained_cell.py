@@ -108,7 +108,7 @@ def waiting(measured, tmp_path):
 
 def true_error_m(cell: MaintainedCell) -> np.ndarray:
     """(m,) distance of the true tip from where model and tool in force have it."""
-    in_force, tool = cell.thermal.arm, cell.session.current.tool.T_flange_tool
+    in_force, tool = cell.thermal.current.arm, cell.session.current.tool.T_flange_tool
     q = cell.maintenance.config.poses
     believed = in_force.fk(q) @ np.append(tool[:3, 3], 1.0)
     true = cell.true.fk(q) @ np.append(cell.tool.T_flange_tool[:3, 3], 1.0)

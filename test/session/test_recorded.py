@@ -30,7 +30,7 @@ from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
+from robocal_ros.session.events import Command, Outcome, reached
 from robocal_ros.thermal import session as thermal_session
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.observations import ObservationDesk
@@ -182,16 +182,15 @@ class Desk:
         self.queue.append(command)
 
     def take_plain(self, block: JointBlock, start: int) -> int:
-        marks = self.queue[0].marks if self.queue else None
-        return self.desk.take_plain(
-            block, start, joints_awaited_ns(marks or {}, self.desk.newest_ns)
-        )
+        marks = (self.queue[0].marks if self.queue else None) or {}
+        wanted_ns, newest_ns = marks.get(JOINTS, -1), self.desk.newest_ns.get(JOINTS, -1)
+        return self.desk.take_plain(block, start, wanted_ns if newest_ns < wanted_ns else None)
 
     def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
         if not self.queue:
             return []
         marks, desk = self.queue[0].marks or {}, self.desk
-        if not force and not reached(marks, desk.newest_ns, desk.jumps):
+        if not force and not reached(marks, desk.marks):
             return []
         command = self.queue.pop(0)
         found = desk.window(-1, command.stamp_ns or 0, marks | {MEASURED_POINT: 2**62})

@@ -129,7 +129,7 @@ def test_temperatures_tell_the_drift_between_cycles(learned):
     arm = session.reference.cell.arm
     before = follower.state
     with follower.looking_ahead(session.temperatures.between(follower.read_ns, now_ns)):
-        told, _ = follower.forecast(session.arm).drift_at(follower.time_s(now_ns))
+        told, _ = follower.forecast(session.current.arm).drift_at(follower.time_s(now_ns))
     assert follower.state is before
     true = arm.parameters.read(warmed(learned.cold, 15.0).mdh - learned.cold.mdh)
     held = arm.parameters.read(warmed(learned.cold, 9.0).mdh - learned.cold.mdh)
@@ -153,7 +153,7 @@ def test_a_restart_keeps_the_temperatures_course(learned):
 def test_silent_temperatures_cost_certainty_and_not_the_cycle(learned):
     """An hour without a reading: the cycle counts, and less is known than with readings."""
     follower = learned.session.follower
-    forecast = follower.forecast(learned.session.arm)
+    forecast = follower.forecast(learned.session.current.arm)
     _, before = forecast.drift_at(follower.time_s(learned.shift.now_ns))
     learned.temperatures = False
     try:

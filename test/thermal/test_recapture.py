@@ -66,7 +66,7 @@ class Robot:
     def off_m(self, kelvin: float) -> float:
         """Rms distance over the workspace of the model in force's drift from the true one."""
         true = self._ball(warmed(self.cold, kelvin)) - self._ball(self.cold)
-        found = self._ball(self.session.arm) - self._ball(self.nominal)
+        found = self._ball(self.session.current.arm) - self._ball(self.nominal)
         return float(np.sqrt(np.mean(np.sum((found - true) ** 2, axis=1))))
 
     def _ball(self, arm):
@@ -116,7 +116,7 @@ def test_a_warm_robot_keeps_its_drift_when_the_sensor_was_knocked(robot):
     captured = robot.capture(KELVIN, 0.1, rounds=3)
     assert captured.done, captured.message
     assert "as warm as the model in force" in captured.message
-    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.session.arm.mdh)
+    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.session.current.arm.mdh)
     found = robot.visit(events.IDENTIFY, KELVIN, 0.5)
     assert found.status is Code.NO_SIGNIFICANT_GAIN, found.message
     assert robot.off_m(KELVIN) < robot.known_m
@@ -150,11 +150,11 @@ def test_a_drift_within_the_noise_hinders_no_capture(robot):
 
 
 def test_a_robot_that_is_cooling_is_no_reference(robot):
-    before = robot.session.reference_id
+    before = robot.session.current.reference_id
     refused = robot.capture(0.35 * KELVIN, 1.0, rounds=3)
     assert refused.status is Code.CONFLICT, refused.message
     assert "neither cold nor as warm as the model in force" in refused.message
-    assert robot.session.reference_id == before
+    assert robot.session.current.reference_id == before
 
 
 def test_the_bound_does_not_creep_over_five_mornings(robot):
@@ -190,4 +190,4 @@ def test_a_replay_decides_the_same(robot, tmp_path, kelvin, after_h):
     again.submit(captured.command)
     (outcome,) = again.advance(wall_ns=1, force=True)
     assert outcome.message == captured.message
-    assert again.reference_model == robot.session.reference_model
+    assert again.current.reference_model == robot.session.current.reference_model

@@ -86,7 +86,7 @@ def test_a_warm_robot_is_found_warm(nominal, visits, tmp_path):
     assert session.in_force.revision == 0  # solving changes nothing
     (accepted,) = run(session, [], [Command(events.ACCEPT, {"id": identified.calibration_id})])
     assert (accepted.status, accepted.revision) == (Code.ACCEPT, 1)
-    assert not np.array_equal(session.arm.mdh, nominal.mdh)
+    assert not np.array_equal(session.current.arm.mdh, nominal.mdh)
 
 
 @pytest.fixture(scope="module")
