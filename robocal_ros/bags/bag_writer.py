@@ -70,10 +70,7 @@ class BagWriter:
         message.
     compression, chunk_bytes : of the chunks; larger ones are smaller on the disk.
 
-    Raises
-    ------
-    InputError
-        When the file cannot be made.
+    Raises `InputError` when the file cannot be made.
     """
 
     def __init__(
@@ -143,12 +140,8 @@ class BagWriter:
             fields (those left out are zero or empty), or its CDR as bytes.
         publish_time_ns : the log time when it is not given.
 
-        Raises
-        ------
-        InputError
-            When the type is not known.
-        ValueError
-            When a mapping has a field that the type has not.
+        Raises `InputError` when the type is not known; `ValueError` when a mapping has a field that
+        the type has not.
         """
         channel = self._channel(topic, full_name(msgtype))
         data = message
@@ -189,10 +182,7 @@ _NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 def hold_open(folder: Path) -> TextIO:
     """Say that this process writes a recording, as long as the file is open.
 
-    Raises
-    ------
-    OSError
-        When it cannot be said, or another process writes it.
+    Raises `OSError` when it cannot be said, or another process writes it.
     """
     file = (folder / OPEN).open("w", encoding="utf-8")
     try:
@@ -250,10 +240,7 @@ class BagRecording:
     latched : topics that are published latched; may grow.
     file_bytes : size of a file.
 
-    Raises
-    ------
-    StorageError
-        When it cannot be written; what was written before stays readable.
+    Raises `StorageError` when it cannot be written; what was written before stays readable.
     """
 
     def __init__(self, folder: Path, *, latched: Collection[str], file_bytes: int) -> None:
@@ -282,12 +269,7 @@ class BagRecording:
     def write(self, topic: str, msgtype: str, cdr: bytes, log_time_ns: int) -> None:
         """Append a serialized message.
 
-        Raises
-        ------
-        StorageError
-            When it cannot be written.
-        InputError
-            When the type is not known.
+        Raises `StorageError` when it cannot be written; `InputError` when the type is not known.
         """
         try:
             if self._writer is not None and self._writer.size_bytes >= self._file_bytes:
@@ -482,10 +464,7 @@ class FreedSpace:
 def new_folder(parent: Path, maker: Maker, wall_ns: int | None = None) -> Path:
     """Make the marked folder of a recording that begins now: named by UTC, nobody else's.
 
-    Raises
-    ------
-    StorageError
-        When it cannot be made.
+    Raises `StorageError` when it cannot be made.
     """
     wall_ns = time.time_ns() if wall_ns is None else wall_ns
     stamp = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
@@ -535,10 +514,7 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
     cannot be deleted or measured does not hold up the others. Where deleting all of them did not
     free enough, none is deleted for that.
 
-    Raises
-    ------
-    OSError
-        When the folder or its disk cannot be looked at.
+    Raises `OSError` when the folder or its disk cannot be looked at.
     """
     if not parent.is_dir():
         return FreedSpace((), {}, 0)
@@ -578,10 +554,7 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
 def keep(folder: Path, why: str) -> None:
     """Mark a recording: it is never deleted.
 
-    Raises
-    ------
-    InputError
-        When it cannot be marked.
+    Raises `InputError` when it cannot be marked.
     """
     if not folder.is_dir():
         raise InputError("no such recording", file=str(folder))

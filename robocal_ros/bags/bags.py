@@ -89,11 +89,8 @@ class BagReader:
     path : str or Path
         An ``.mcap`` file, or a folder of ``ros2 bag record`` with one or more of them.
 
-    Raises
-    ------
-    InputError
-        When it is not such a file or folder, or broke off before any message; the message says what
-        to do.
+    Raises `InputError` when it is not such a file or folder, or broke off before any message; the
+    message says what to do.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -159,10 +156,7 @@ class BagReader:
         ``JointBlock`` with the log time of its first; those that are odd come as messages.
         A damaged chunk is left out; afterwards ``info`` tells of it.
 
-        Raises
-        ------
-        InputError
-            When a message cannot be decoded, or every chunk is damaged.
+        Raises `InputError` when a message cannot be decoded, or every chunk is damaged.
         """
         wanted = [
             {
@@ -295,10 +289,7 @@ def read_bag(
 def bag_info(path: str | Path) -> BagInfo:
     """Topics, counts and times of a bag.
 
-    Raises
-    ------
-    InputError
-        When it cannot be read.
+    Raises `InputError` when it cannot be read.
     """
     with BagReader(path) as bag:
         return bag.info
@@ -327,10 +318,7 @@ def write_data_set(
     document : of the data set, with its ``samples`` in SI.
     topic : ``profile``, ``target_pose`` or ``image``; ``frame``: the sensor's.
 
-    Raises
-    ------
-    InputError
-        When the file is there already, or cannot be written.
+    Raises `InputError` when the file is there already, or cannot be written.
     """
     if path.exists():
         raise InputError("is there already: name another file", file=str(path))
@@ -388,12 +376,8 @@ def _shot(topic: str, header: Document, values: Sequence[Sequence[float]]) -> Do
 def read_data_set(path: Path, arm: SerialArm) -> Document:
     """Read what `write_data_set` wrote: the same numbers to the last bit.
 
-    Raises
-    ------
-    InputError
-        When it is no such file, or a part of it is missing.
-    WrongRobotError
-        It was made with another nominal model.
+    Raises `InputError` when it is no such file, or a part of it is missing; `WrongRobotError`: it
+    was made with another nominal model.
     """
     with BagReader(path) as reader:
         found = list(reader.messages([DATA_SET, JOINTS, *_TYPE]))

@@ -63,10 +63,7 @@ def full_name(msgtype: str) -> str:
 def register_schema(store: Typestore, msgtype: str, encoding: str, text: str, file: str) -> None:
     """Teach ``store`` the type that a bag defines, or the known one where it defines none.
 
-    Raises
-    ------
-    InputError
-        When the definition cannot be read and the type is not a standard one.
+    Raises `InputError` when the definition cannot be read and the type is not a standard one.
     """
     if msgtype in store.types:
         return
@@ -117,10 +114,7 @@ def _learn_installed(store: Typestore, msgtype: str) -> None:
 def definition(msgtype: str) -> str:
     """Text of a known type with all that it is made of, as recorders store it.
 
-    Raises
-    ------
-    InputError
-        When the type is not known here.
+    Raises `InputError` when the type is not known here.
     """
     store = ros_types()
     _learn_installed(store, msgtype)
@@ -138,10 +132,7 @@ def encode(msgtype: str, value: Any) -> memoryview:
 
     Fields that a mapping leaves out are zero or empty, as in ROS.
 
-    Raises
-    ------
-    ValueError
-        When a mapping has a field that the type has not.
+    Raises `ValueError` when a mapping has a field that the type has not.
     """
     store = ros_types()
     message = value if isinstance(value, store.types[msgtype]) else _build(store, msgtype, value)
@@ -233,10 +224,7 @@ def graph_name(topic: str) -> str:
 def message_class(msgtype: str) -> type:
     """The Python class of ``package/msg/Type``.
 
-    Raises
-    ------
-    InputError
-        When it is not installed.
+    Raises `InputError` when it is not installed.
     """
     package, _, name = msgtype.replace("/msg/", "/").partition("/")
     try:
@@ -342,10 +330,7 @@ class McapFile:
 def open_file(path: Path) -> McapFile:
     """Find out what a file holds.
 
-    Raises
-    ------
-    InputError
-        When it is missing, empty or not an MCAP file.
+    Raises `InputError` when it is missing, empty or not an MCAP file.
     """
     try:
         with path.open("rb") as stream:

@@ -60,10 +60,7 @@ def topic_kind(topic: str) -> str:
 def first_configuration(messages: Iterable[RecordedMessage]) -> Command | None:
     """The first configuration among the events: whose they are, and the names of the inputs.
 
-    Raises
-    ------
-    InputError
-        When it cannot be read.
+    Raises `InputError` when it cannot be read.
     """
     for recorded in messages:
         if (event := recorded.message).command == events.CONFIGURE:
@@ -83,10 +80,7 @@ def read_events(
     in the bag only because the topic is latched; its samples are not. It is left out, and the
     configuration is the one that it led to.
 
-    Raises
-    ------
-    InputError
-        When an event cannot be read.
+    Raises `InputError` when an event cannot be read.
     """
     configured: Command | None = None
     model: Any = None
@@ -130,10 +124,7 @@ def input_topics(topics: Iterable[str], configured: Command | None = None) -> di
     The configuration names them; without it the last part of a name decides. Joint states that
     a correction node has un-corrected are never an input.
 
-    Raises
-    ------
-    InputError
-        When two topics could be the same input.
+    Raises `InputError` when two topics could be the same input.
     """
     recorded = {} if configured is None else dict(configured.arguments.get("topics", {}))
     if recorded:

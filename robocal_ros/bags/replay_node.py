@@ -118,10 +118,7 @@ class ReplayTopics:
     def require(self, names: Collection[str]) -> None:
         """Refuse names that are not played: their subscribers would be waited for in vain.
 
-        Raises
-        ------
-        InputError
-            A name is not the played name of any topic.
+        Raises `InputError`: a name is not the played name of any topic.
         """
         played = {p.publisher.topic_name for p in self.played.values()}
         unknown = [name for name in names if self._node.resolve_topic_name(name) not in played]
@@ -186,10 +183,7 @@ def chosen_topics(
     ``wanted`` empty means all but the clock, `LEFT_OUT` and what is `withheld` under the name that
     it is played by. ``remap`` has entries ``recorded:=played``.
 
-    Raises
-    ------
-    InputError
-        A wanted or remapped topic is not in the bag, or an entry is no remapping.
+    Raises `InputError`: a wanted or remapped topic is not in the bag, or an entry is no remapping.
     """
     names = dict(_pair(entry) for entry in remap)
     missing = [topic for topic in (*wanted, *names) if topic not in recorded]

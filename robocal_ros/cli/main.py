@@ -194,10 +194,7 @@ def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
 def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":
     """Read a robot file; what it leaves open is added to ``warnings``.
 
-    Raises
-    ------
-    InputError
-        When there is no such robot, or its file is not as docs/files.md says.
+    Raises `InputError` when there is no such robot, or its file is not as docs/files.md says.
     """
     from robocal_ros.kinematics.robots import load_description
 

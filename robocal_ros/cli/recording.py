@@ -65,10 +65,7 @@ class BagOverview:
     def require_inputs(self) -> None:
         """Refuse to obey commands whose samples are not here.
 
-        Raises
-        ------
-        InputError
-            When the bag lacks an input that the session had.
+        Raises `InputError` when the bag lacks an input that the session had.
         """
         lacking = needed_inputs(self.configured, self.commands) - set(self.inputs.values())
         if not lacking:
@@ -99,10 +96,7 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
 
     ``given``: input (or ``session_events``) to topic, where the user named it.
 
-    Raises
-    ------
-    InputError
-        When a topic is missing or ambiguous, or an event cannot be read.
+    Raises `InputError` when a topic is missing or ambiguous, or an event cannot be read.
     """
     info = reader.info
     for kind, topic in given.items():
@@ -166,12 +160,8 @@ def _first_joint_stamp(reader: BagReader, inputs: Mapping[str, str]) -> int:
 def find_robot(name: str | None, warnings: list[str], configured: Command | None) -> SerialArm:
     """The arm that the user named, else the shipped one that the bag was recorded with.
 
-    Raises
-    ------
-    InputError
-        Nothing says which robot it is, or its file is not as docs/files.md says.
-    WrongRobotError
-        It is none of the shipped robots.
+    Raises `InputError`: nothing says which robot it is, or its file is not as docs/files.md says;
+    `WrongRobotError`: it is none of the shipped robots.
     """
     if name is not None:
         return describe_robot(name, warnings).arm
@@ -294,10 +284,7 @@ class BagTruth:
     def state_topic(self, namespace: str) -> str | None:
         """Topic of the states that are told in a namespace, by a node or not; None without any.
 
-        Raises
-        ------
-        InputError
-            When there are several, and nothing says which is meant.
+        Raises `InputError` when there are several, and nothing says which is meant.
         """
         places = {topic: topic.removesuffix(STATE) for topic in self.states}
         found = [topic for topic, place in places.items() if place == namespace]

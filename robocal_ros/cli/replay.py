@@ -118,10 +118,7 @@ def replay_commanded(
 
     ``as_recorded`` makes the session; ``take`` gives it a message of an input.
 
-    Raises
-    ------
-    InputError, WrongRobotError
-        The bag lacks what a replay needs.
+    Raises `InputError` or `WrongRobotError`: the bag lacks what a replay needs.
     """
     if recording.configured is None:
         raise InputError("the bag holds no configuration of the node")
@@ -212,10 +209,7 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
 
     ``watch`` reads a recording's samples; it may show how far it is.
 
-    Raises
-    ------
-    InputError, WrongRobotError
-        The bag cannot be read, or lacks what a replay needs.
+    Raises `InputError` or `WrongRobotError`: the bag cannot be read, or lacks what a replay needs.
     """
     given = bool(request.auto or request.cold or request.warm)  # in place of recorded commands
     with ExitStack() as opened:

@@ -90,10 +90,7 @@ def validated(jobs: "Sequence[Job]", workers: int, scheduler: str | None) -> "It
     scheduler : address of a running Dask cluster, which is used instead; it must see the bags by
         the same paths, and have this software.
 
-    Raises
-    ------
-    InputError
-        When Dask is not there, or the cluster does not answer or has no worker.
+    Raises `InputError` when Dask is not there, or the cluster does not answer or has no worker.
     """
     if scheduler is not None:
         with _cluster(scheduler) as client:

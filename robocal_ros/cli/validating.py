@@ -162,10 +162,7 @@ def _recorded_decision(command: Command, outcome: Mapping[str, Any]) -> Document
 def require_finite(found: Any, path: str, field: str = "") -> None:
     """See that a bag's document has finite numbers alone, for JSON knows no others.
 
-    Raises
-    ------
-    InputError
-        With the bag and the number's place in the document.
+    Raises `InputError` with the bag and the number's place in the document.
     """
     if isinstance(found, float) and not math.isfinite(found):
         raise InputError(f"{field} is {found}, which is no finite number", file=path)
@@ -577,10 +574,7 @@ def shift_errors(cycles: Sequence[ReplayedCycle]) -> ShiftErrors | None:
 def cell_courses(reader: BagReader, truth: BagTruth) -> list[CellCourse]:
     """The course of the true error of each cell that a bag tells of.
 
-    Raises
-    ------
-    InputError
-        When it cannot be read.
+    Raises `InputError` when it cannot be read.
     """
     if not truth.states:
         return []

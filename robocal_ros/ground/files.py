@@ -40,10 +40,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def read_bytes(path: Path, what: str) -> bytes:
     """Content of a file.
 
-    Raises
-    ------
-    InputError
-        When the file is missing or unreadable.
+    Raises `InputError` when the file is missing or unreadable.
     """
     try:
         return path.read_bytes()
@@ -57,10 +54,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 def read_text(path: Path, what: str) -> str:
     """Text of a UTF-8 file, without a byte order mark.
 
-    Raises
-    ------
-    InputError
-        When the file is missing, unreadable, empty or not UTF-8.
+    Raises `InputError` when the file is missing, unreadable, empty or not UTF-8.
     """
     data = read_bytes(path, what)
     try:
@@ -83,10 +77,7 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
 
     ``durable``: on the disk when this returns; not even a power cut loses it.
 
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
+    Raises `InputError` when the file cannot be written.
     """
     draft = draft_beside(path)
     try:
@@ -125,10 +116,7 @@ def sync_folder(folder: Path) -> None:
 def made_folder_beside(history: Path, name: str) -> Path:
     """Folder of further files of a history's robot, ``<serial>/<name>`` beside it; made if need be.
 
-    Raises
-    ------
-    StorageError
-        When it cannot be made.
+    Raises `StorageError` when it cannot be made.
     """
     folder = history.with_suffix("") / name
     try:
@@ -168,10 +156,7 @@ STATE = "state.json"
 class StateFile:
     """One JSON document, ``<serial>/<name>/state.json`` beside a history; empty at first.
 
-    Raises
-    ------
-    StorageError
-        When it, or its folder, cannot be made.
+    Raises `StorageError` when it, or its folder, cannot be made.
     """
 
     def __init__(self, history: Path, name: str) -> None:
@@ -202,12 +187,7 @@ class StateFile:
     def load(self) -> Mapping[str, Any] | None:
         """The document; None before the first.
 
-        Raises
-        ------
-        StateLostError
-            When it was there once.
-        StorageError
-            When it cannot be read.
+        Raises `StateLostError` when it was there once; `StorageError` when it cannot be read.
         """
         if not self.path.exists():
             raise StateLostError(f"{self.path} is gone: what it told is forgotten")
@@ -223,10 +203,8 @@ class StateFile:
     def save(self, document: Mapping[str, Any]) -> None:
         """Put a document in its place.
 
-        Raises
-        ------
-        StorageError
-            When it cannot be written, or a number is not finite; the one before is still there.
+        Raises `StorageError` when it cannot be written, or a number is not finite; the one before
+        is still there.
         """
         try:
             write_text(self.path, json.dumps(document, allow_nan=False), durable=True)
@@ -252,12 +230,7 @@ class SoleUser:
     name : the part, as the executable is called.
     timeout_s : longest wait for one that is just ending.
 
-    Raises
-    ------
-    ConflictError
-        Another process holds it.
-    StorageError
-        The file cannot be made.
+    Raises `ConflictError`: another process holds it; `StorageError`: the file cannot be made.
     """
 
     def __init__(self, history: Path, name: str, serial: str, timeout_s: float) -> None:

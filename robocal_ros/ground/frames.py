@@ -29,10 +29,7 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 def transform_from_quat(xyz: ArrayLike, quat_xyzw: ArrayLike) -> Array:
     """Assemble (..., 4, 4) from positions (..., 3), m, and quaternions (..., 4).
 
-    Raises
-    ------
-    ValueError
-        For a quaternion of length 0; all others are normalised.
+    Raises `ValueError` for a quaternion of length 0; all others are normalised.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     length = np.linalg.norm(quat, axis=-1, keepdims=True)

@@ -41,10 +41,7 @@ class JointSample:
     def order(self, names: tuple[str, ...]) -> NDArray[np.int64]:
         """Places (n,) of these joints among the sample's.
 
-        Raises
-        ------
-        InputError
-            Naming the joints that are not there.
+        Raises `InputError`, naming the joints that are not there.
         """
         missing = [name for name in names if name not in self.names]
         if missing:
@@ -189,11 +186,8 @@ def stamp_ns(stamp: Any) -> int:
 def joint_sample(message: Any) -> JointSample:
     """Build a sample from a ``sensor_msgs/JointState``; a sample is one already.
 
-    Raises
-    ------
-    InputError
-        When names and positions differ in number, a name is doubled or a value is not finite,
-        or the readings are not the controller's own.
+    Raises `InputError` when names and positions differ in number, a name is doubled or a value is
+    not finite, or the readings are not the controller's own.
     """
     if isinstance(message, JointSample):
         return message
@@ -239,10 +233,7 @@ def point_sample(
 def temperature_sample(message: Any) -> TemperatureSample:
     """Build a sample from a ``sensor_msgs/Temperature`` whose frame_id names the joint.
 
-    Raises
-    ------
-    InputError
-        When the temperature is not finite, or the stamp is missing.
+    Raises `InputError` when the temperature is not finite, or the stamp is missing.
     """
     celsius = _finite(np.array([message.temperature], dtype=np.float64), "motor temperature")
     at_ns = stamp_ns(message.header.stamp)
@@ -254,10 +245,8 @@ def temperature_sample(message: Any) -> TemperatureSample:
 def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PointSample:
     """Build a sample from a ``geometry_msgs/PoseStamped`` (frame_id ``frame[/target]``).
 
-    Raises
-    ------
-    InputError
-        When a value is not finite or the quaternion is not of unit length (tolerance 1e-3).
+    Raises `InputError` when a value is not finite or the quaternion is not of unit length
+    (tolerance 1e-3).
     """
     from robocal_ros.ground.frames import transform_from_quat
 
@@ -289,10 +278,8 @@ MOST_POINTS = 5_000_000
 def cloud_points(message: Any) -> Array:
     """Points (n, 3), m, of the fields x, y, z; missing points stay not-a-number.
 
-    Raises
-    ------
-    InputError
-        When a field is missing or the data do not have the size that the message tells.
+    Raises `InputError` when a field is missing or the data do not have the size that the message
+    tells.
     """
     fields = {field.name: field for field in message.fields}
     missing = [name for name in "xyz" if name not in fields]
@@ -340,10 +327,8 @@ MOST_PIXELS = 100_000_000
 def image_array(message: Any) -> Image:
     """Grey image (h, w), a copy; colours are weighted as ITU-R BT.601 does.
 
-    Raises
-    ------
-    InputError
-        When it is of another encoding, or the data do not have the size that the message tells.
+    Raises `InputError` when it is of another encoding, or the data do not have the size that the
+    message tells.
     """
     encoding = str(message.encoding)
     if encoding not in CHANNELS:
@@ -457,10 +442,7 @@ class JointStream:
         clock. So is the beginning. A leap ahead is a pause; a leap back starts the stream anew.
         Pauses longer than ``gap_ns`` are counted.
 
-        Raises
-        ------
-        InputError
-            When a joint is missing, or the stamp is not after the newest one.
+        Raises `InputError` when a joint is missing, or the stamp is not after the newest one.
         """
         order = self._order.get(sample.names)
         if order is None:
@@ -540,10 +522,7 @@ class JointStream:
     def standstill(self, stamp_ns: int, rule: StandstillRule) -> Reading | None:
         """Joints at an instant at which the robot stands still; None while readings are to come.
 
-        Raises
-        ------
-        NotStillError
-            When the robot moved, or readings are missing around the instant.
+        Raises `NotStillError` when the robot moved, or readings are missing around the instant.
         """
         first_ns = stamp_ns - int(rule.before_s * 1e9)
         last_ns = stamp_ns + int(rule.after_s * 1e9)

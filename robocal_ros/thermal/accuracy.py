@@ -54,12 +54,8 @@ def learn_drift(
     Each cycle is identified with the default prior; ``process.learned_prior`` weighs what the
     cycles show against it. What no cycle can show keeps its default.
 
-    Raises
-    ------
-    InputError
-        When a cycle does not belong to its cold visit.
-    TooFewSamplesError
-        With fewer than ten cycles.
+    Raises `InputError` when a cycle does not belong to its cold visit; `TooFewSamplesError` with
+    fewer than ten cycles.
     """
     total = sum(len(cycles) for _, cycles in histories)
     if total < FEWEST_CYCLES:
@@ -130,10 +126,8 @@ def visit_noise(shifts: Sequence[EarlierShift]) -> float:
     From second differences over three cycles in a row, in which a drift all but cancels (Gasser,
     Sroka and Jennen-Steinmetz 1986), without points far beyond the median: outliers.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer than ten cycles that visit the same poses as the cold visit.
+    Raises `TooFewSamplesError` with fewer than ten cycles that visit the same poses as the cold
+    visit.
     """
     found = [np.empty(0)]
     for shift in shifts:
@@ -166,12 +160,8 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     The covariance is ``learn_drift``'s; its size, and the time of approach, are those with which
     each shift is most likely under what the others teach (one shift alone judges itself).
 
-    Raises
-    ------
-    InputError
-        When a cycle does not belong to its cold visit.
-    TooFewSamplesError
-        With fewer than ten cycles.
+    Raises `InputError` when a cycle does not belong to its cold visit; `TooFewSamplesError` with
+    fewer than ten cycles.
     """
     sigma_m = visit_noise(shifts)
 
@@ -204,12 +194,8 @@ def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     The gains pass from shift to shift with their covariance, as the tracker updates them. Their
     expected size (lengths, angles) and the process are those that make the shifts most likely.
 
-    Raises
-    ------
-    InputError
-        When a shift has no temperatures, or a cycle does not belong to its cold visit.
-    TooFewSamplesError
-        With fewer than ten cycles.
+    Raises `InputError` when a shift has no temperatures, or a cycle does not belong to its cold
+    visit; `TooFewSamplesError` with fewer than ten cycles.
     """
     if any(shift.temperature is None for shift in shifts):
         raise InputError("a shift without motor temperatures teaches no gains: leave it out")
@@ -384,12 +370,8 @@ def write_prior(path: Path, document: Document) -> None:
 def read_prior(path: Path, arm: SerialArm) -> Array:
     """Covariance (k, k), SI, of the expected drift of ``arm``'s free parameters.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when it is not as docs/thermal.md says.
-    WrongRobotError
-        When it was learned for another nominal model.
+    Raises `InputError`, naming file and key, when it is not as docs/thermal.md says;
+    `WrongRobotError` when it was learned for another nominal model.
     """
     file, top = str(path), read_made(path, arm, KEYS, "prior file", "learn it")
     if top.values.get("parameters") != list(arm.parameters.names):

@@ -115,12 +115,9 @@ def calibrate_sensor(
     sigma, from the linear start; ``classic`` solves the pose differences for nine free elements
     of R and p with an orthogonality penalty, then t as the mean over the poses.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the poses cannot place them; the message names the missing motion.
-    InputError, ResidualError
-        When the data miss the arm by a mistake that can be named, or R comes out reflected.
+    Raises `TooFewSamplesError` or `RankDeficientError` when the poses cannot place them; the
+    message names the missing motion; `InputError` or `ResidualError` when the data miss the arm by
+    a mistake that can be named, or R comes out reflected.
     """
     if len(data) < FEWEST_POSES:
         raise TooFewSamplesError(
@@ -225,12 +222,8 @@ def write_sensor(path: Path, document: Document) -> None:
 def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
     """Read a sensor file for ``arm``.
 
-    Raises
-    ------
-    InputError
-        Naming file and key, when it is not as docs/thermal.md says.
-    WrongRobotError
-        When it was made for another nominal model.
+    Raises `InputError`, naming file and key, when it is not as docs/thermal.md says;
+    `WrongRobotError` when it was made for another nominal model.
     """
     top = read_made(path, arm, KEYS, "sensor file", "calibrate the sensor")
     pose = top.below("T_sensor_base")
@@ -344,10 +337,8 @@ def candidate_poses(
     ``cell.T_frame_base`` is T_sensor_base. The stem, from the flange to the sphere, stays behind
     the sphere as the sensor sees it.
 
-    Raises
-    ------
-    LimitError
-        When hardly any pose within the joint limits brings the target into the field.
+    Raises `LimitError` when hardly any pose within the joint limits brings the target into the
+    field.
     """
     found: list[Array] = []
     have = 0
@@ -468,10 +459,7 @@ class Design:
 def choose(design: Design, count: int) -> tuple[int, ...]:
     """Candidates that leave the smallest error: exchanged from several starts, one of them greedy.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer candidates than poses wanted.
+    Raises `TooFewSamplesError` with fewer candidates than poses wanted.
     """
     if len(design.rows) < count:
         raise TooFewSamplesError(f"{len(design.rows)} candidates for {count} poses: give more")
@@ -508,10 +496,7 @@ def _best(design: Design, chosen: list[int]) -> int:
 def plan_poses(design: Design, candidates: Array, count: int, rng: np.random.Generator) -> PosePlan:
     """Choose poses, and put them in the order of the shortest way.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer candidates than poses wanted.
+    Raises `TooFewSamplesError` with fewer candidates than poses wanted.
     """
     chosen = choose(design, count)
     draws = [
@@ -587,10 +572,8 @@ def plan_cycle(
     working : (w, n) poses where the tool must be right; None: all over the joint limits.
     own : (o, n) measuring poses to compare with, or None.
 
-    Raises
-    ------
-    LimitError, TooFewSamplesError
-        When the sphere cannot be brought into the field often enough.
+    Raises `LimitError` or `TooFewSamplesError` when the sphere cannot be brought into the field
+    often enough.
     """
     tool = frames.transform(np.eye(3), sphere_in_flange)[None]
     cell = CellModel(arm, T_sensor_base, ("sphere",), tool)

@@ -283,12 +283,9 @@ def _show_learn_prior(console: "Console", document: Document) -> None:
 def identify_fixed_files(arm: SerialArm, args: argparse.Namespace) -> Document:
     """Identify each cycle of the warm table; the document is the last one's.
 
-    Raises
-    ------
-    InputError, WrongRobotError
-        When a file cannot be read, or does not belong to this robot or to the cold visit.
-    TooFewSamplesError, RankDeficientError
-        When the data cannot answer.
+    Raises `InputError` or `WrongRobotError` when a file cannot be read, or does not belong to this
+    robot or to the cold visit; `TooFewSamplesError` or `RankDeficientError` when the data cannot
+    answer.
     """
     chosen = tuple(name.strip() for name in (args.parameters or "").split(",") if name.strip())
     sigma_m = args.sigma_mm * 1e-3

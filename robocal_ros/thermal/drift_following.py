@@ -130,10 +130,7 @@ class FollowerState:
     def of_document(cls, document: Mapping[str, Any]) -> "FollowerState":
         """Read it back.
 
-        Raises
-        ------
-        InputError
-            When it is no such document.
+        Raises `InputError` when it is no such document.
         """
         try:
             arrays = {
@@ -212,10 +209,7 @@ class InForce(HistoryFollower):
     def commissioned(self) -> SerialArm:
         """The arm without any drift: what is in force while none is, else what the reference keeps.
 
-        Raises
-        ------
-        ConflictError
-            When a drift is in force and no cold reference.
+        Raises `ConflictError` when a drift is in force and no cold reference.
         """
         if not self.drifted:
             return self.arm
@@ -253,10 +247,7 @@ class DriftFollower:
     ) -> TrackedCycle:
         """Take a cycle, or refuse it as moved.
 
-        Raises
-        ------
-        RobocalError
-            When it cannot answer; then nothing has changed.
+        Raises `RobocalError` when it cannot answer; then nothing has changed.
         """
         stamp_ns, state = cycle.middle_ns, self.state
         found = track_cycle(
@@ -426,10 +417,7 @@ class Following:
     def follower(self) -> DriftFollower | None:
         """None without a reference.
 
-        Raises
-        ------
-        StorageError
-            When the cycles kept so far cannot be read.
+        Raises `StorageError` when the cycles kept so far cannot be read.
         """
         current = self._current
         if current.reference is None:

@@ -200,10 +200,7 @@ def hand_eye_start(arm: SerialArm, data: Measurements) -> MeasuringRobot:
 
     ``R_i (R_X p_i + t_X) - c = -t_i`` is linear in R_X (nine numbers), t_X and the centres.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the poses cannot give them.
+    Raises `TooFewSamplesError` or `RankDeficientError` when the poses cannot give them.
     """
     spheres, T = data.targets, arm.fk(data.q)
     index, m = data.target_index(spheres), len(data)
@@ -302,10 +299,7 @@ def identify_flange_sensor(
     The parameters have building tolerances as prior, scaled to what the data show
     (`fitted_prior`).
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the data cannot answer.
+    Raises `TooFewSamplesError` or `RankDeficientError` when the data cannot answer.
     """
     start = hand_eye_start(arm, data)
     sigma = np.ones(len(data)) if data.sigma is None else data.sigma
@@ -369,10 +363,7 @@ def identify_and_judge_flange_sensor(
 
     Without ``check`` a ``share`` of the poses of the sessions is held out.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the data cannot answer.
+    Raises `TooFewSamplesError` or `RankDeficientError` when the data cannot answer.
     """
     train = in_sessions(sessions)
     if check is None:

@@ -112,12 +112,8 @@ def subset_drift(
     chosen : columns that may drift; the others are held.
     names : (k,) of all parameters.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer equations than chosen parameters.
-    RankDeficientError
-        When the poses do not tell the chosen parameters apart.
+    Raises `TooFewSamplesError` with fewer equations than chosen parameters; `RankDeficientError`
+    when the poses do not tell the chosen parameters apart.
     """
     columns = np.array(chosen, dtype=np.int64)
     A = rows[:, columns]
@@ -258,12 +254,8 @@ def identify_cycle(
     sigma_m : standard deviation of one coordinate of one visit, of the cold ones and of warm
         ones without a sigma of their own.
 
-    Raises
-    ------
-    InputError
-        When a sample has no cold counterpart.
-    TooFewSamplesError
-        With fewer than two poses.
+    Raises `InputError` when a sample has no cold counterpart; `TooFewSamplesError` with fewer than
+    two poses.
     """
     warm = spots.average(warm, sigma_m)
     if len(warm) < FEWEST_POSES:
@@ -301,10 +293,7 @@ def identify_cycle(
 def require_parameters(arm: SerialArm, names: Sequence[str]) -> None:
     """Refuse names that are not free parameters of ``arm``.
 
-    Raises
-    ------
-    InputError
-        Naming the first of them, and those that there are.
+    Raises `InputError`, naming the first of them, and those that there are.
     """
     unknown = [name for name in names if name not in arm.parameters.names]
     if unknown:
@@ -318,12 +307,8 @@ def identify_subset(
 ) -> CycleDrift:
     """Identify some parameters by least squares and hold the others (thesis eq. 3-8 to 3-10).
 
-    Raises
-    ------
-    InputError
-        When a name is unknown, or a sample has no cold counterpart.
-    TooFewSamplesError, RankDeficientError
-        When the poses cannot answer.
+    Raises `InputError` when a name is unknown, or a sample has no cold counterpart;
+    `TooFewSamplesError` or `RankDeficientError` when the poses cannot answer.
     """
     warm = spots.average(warm, sigma_m)
     spot, arm = spots.match(warm), spots.cell.arm

@@ -389,12 +389,8 @@ class Windows:
     def of(self, command: Command) -> tuple[Measurements, Array]:
         """Targets on the flange, and centres (n, 3) of a sphere fixed in the cell.
 
-        Raises
-        ------
-        TooFewSamplesError
-            When nothing was measured.
-        InputError
-            When a cycle holds no pose of the cold reference.
+        Raises `TooFewSamplesError` when nothing was measured; `InputError` when a cycle holds no
+        pose of the cold reference.
         """
         desk, reference = self._desk, self._current.reference
         desk.drop_far_ahead()
@@ -464,10 +460,7 @@ class MotorTemperatures:
     def add(self, sample: TemperatureSample) -> None:
         """Take a joint's temperature.
 
-        Raises
-        ------
-        InputError
-            When the robot has no such joint.
+        Raises `InputError` when the robot has no such joint.
         """
         if sample.joint not in self._place:
             raise InputError(

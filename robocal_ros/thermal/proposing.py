@@ -116,10 +116,7 @@ class Proposer:
     def method(self, command: Command) -> Method:
         """Tell the estimator that a command names, else the configured one.
 
-        Raises
-        ------
-        InputError
-            When there is no such estimator.
+        Raises `InputError` when there is no such estimator.
         """
         named = str(command.arguments.get("method") or self._config.method)
         for method in METHODS:
@@ -140,10 +137,7 @@ class Proposer:
 
         ``follower``: of the drift since the cold reference in force; None without one.
 
-        Raises
-        ------
-        RobocalError
-            When they cannot answer, or the history refuses.
+        Raises `RobocalError` when they cannot answer, or the history refuses.
         """
         current, reference = self._current, self._current.reference
         if reference is None or follower is None:
@@ -223,10 +217,7 @@ class Proposer:
         The model in force stays: where it holds a drift that a cold robot has not, the forecast
         says so until a cycle is accepted.
 
-        Raises
-        ------
-        RobocalError
-            When they cannot be one, or the history refuses.
+        Raises `RobocalError` when they cannot be one, or the history refuses.
         """
         visit, which_arm = self._visit(data)
         reference = replace(visit, fixed=beside.fixed, temperature=beside.temperature)
@@ -307,10 +298,7 @@ class Proposer:
     ) -> Outcome:
         """Place the sensor of a frame, and bring it into force where the verdict accepts.
 
-        Raises
-        ------
-        RobocalError
-            When the measurements cannot place them, or the history refuses.
+        Raises `RobocalError` when the measurements cannot place them, or the history refuses.
         """
         named = str(command.arguments.get("method") or SENSOR_METHODS[0])
         method = next((m for m in SENSOR_METHODS if m == named), None)

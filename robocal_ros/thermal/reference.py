@@ -104,10 +104,7 @@ class ColdSpots:
     def match(self, warm: Measurements) -> Index:
         """The spot (m,) that each warm measurement visits again: all joints within 0.5 deg.
 
-        Raises
-        ------
-        InputError
-            When a measurement has no cold counterpart.
+        Raises `InputError` when a measurement has no cold counterpart.
         """
         target = warm.target_index(self.cell.targets)
         away = np.max(np.abs(warm.q[:, None] - self.q), axis=2)
@@ -127,10 +124,7 @@ class ColdSpots:
 
         ``sigma_m``: of one visit, where the measurements have none of their own.
 
-        Raises
-        ------
-        InputError
-            When a measurement has no cold counterpart.
+        Raises `InputError` when a measurement has no cold counterpart.
         """
         _, place, count = np.unique(self.match(warm), return_inverse=True, return_counts=True)
         mean = np.zeros((len(count), len(warm)))
@@ -208,12 +202,9 @@ def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
     Samples that do not fit the others do not place them, and are named in ``rejected``; a warm
     visit of such a pose will not fit either.
 
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the visit cannot place them.
-    InputError, ResidualError
-        When the visit misses the arm by a mistake that can be named, or by more than 5 mm rms.
+    Raises `TooFewSamplesError` or `RankDeficientError` when the visit cannot place them;
+    `InputError` or `ResidualError` when the visit misses the arm by a mistake that can be named, or
+    by more than 5 mm rms.
     """
     require_match(arm, data, base=True, tool=True)
     placed = identify(arm, data, fit=("base", "tool"), method="lsq")
@@ -324,10 +315,7 @@ class Visits:
 def require_cold_counterparts(cold: Visits, warm: Visits, file: str | None = None) -> None:
     """Refuse warm visits of a pose that was not visited cold, or at other joints.
 
-    Raises
-    ------
-    InputError
-        Naming the sample, ``file``, and what differs.
+    Raises `InputError`, naming the sample, ``file``, and what differs.
     """
     known = {pose: cold.data.q[i] for i, pose in enumerate(cold.pose)}
     for i, pose in enumerate(warm.pose):
@@ -353,10 +341,7 @@ def require_cold_counterparts(cold: Visits, warm: Visits, file: str | None = Non
 def read_visits(path: str | Path, arm: SerialArm) -> Visits:
     """Read a table of visits of named poses: as ``read_measurements``, with a column ``pose``.
 
-    Raises
-    ------
-    InputError
-        As ``read_measurements``, and when the column ``pose`` is missing.
+    Raises `InputError` as ``read_measurements``, and when the column ``pose`` is missing.
     """
     table, layout = read_table(Path(path), arm)
     if "pose" not in layout.place:
@@ -508,10 +493,7 @@ def measured_errors(
     averaged; the noise of both visits is in it. ``left_out``: names of averaged visits that no
     model can fit. ``sigma_m``: of a coordinate of one visit.
 
-    Raises
-    ------
-    InputError
-        When a measurement has no cold counterpart.
+    Raises `InputError` when a measurement has no cold counterpart.
     """
     spots, cold = reference.spots, reference.cell.arm
     data = spots.average(warm, sigma_m)

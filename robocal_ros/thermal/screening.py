@@ -53,12 +53,8 @@ class DriftHistory:
 
         A cycle without one of the poses is left out. Visits of a spot in one cycle are averaged.
 
-        Raises
-        ------
-        InputError
-            When a sample has no cold counterpart, or serves both ends.
-        TooFewSamplesError
-            With fewer than 21 complete cycles.
+        Raises `InputError` when a sample has no cold counterpart, or serves both ends;
+        `TooFewSamplesError` with fewer than 21 complete cycles.
         """
         seen = [_by_spot(spots, cycle) for cycle in cycles]
         told = [_by_spot(spots, cycle) for cycle in checks]
@@ -86,10 +82,7 @@ class DriftHistory:
     def residual(self, chosen: Sequence[int]) -> Array:
         """What is left (t, 3c) at the check points with some parameters (columns) identified.
 
-        Raises
-        ------
-        TooFewSamplesError, RankDeficientError
-            When the spots do not determine them.
+        Raises `TooFewSamplesError` or `RankDeficientError` when the spots do not determine them.
         """
         if not len(chosen):
             return self.check
@@ -161,10 +154,7 @@ def stationarity(series: Array) -> Stationarity:
     chi-square with as many degrees of freedom as there are lags. Either finds a white series
     drifting in about 5 % of cases (the count, being whole, in a little less).
 
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer than 21 times.
+    Raises `TooFewSamplesError` with fewer than 21 times.
     """
     from scipy.special import gammaincc
 
@@ -292,12 +282,8 @@ def screen(
     ----------
     wanted : how many parameters to stop at.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With fewer equations than parameters, or too few cycles to test their series.
-    ValueError
-        When the wanted number is not between 1 and the number of parameters.
+    Raises `TooFewSamplesError` with fewer equations than parameters, or too few cycles to test
+    their series; `ValueError` when the wanted number is not between 1 and the number of parameters.
     """
     if not 1 <= wanted <= len(history.names):
         raise ValueError(f"wanted must be 1 to {len(history.names)}, not {wanted}")
@@ -428,12 +414,8 @@ def best_subset(history: DriftHistory, size: int) -> BestSubset:
     With the same parameters in all t cycles, C_p = RSS / (t s^2) - 3m + 2p; s^2 is what all
     parameters together leave, per degree of freedom. Only the spots' displacements are used.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When no equations are left over that could show the noise.
-    ValueError
-        When the size is not between 1 and the number that the poses determine.
+    Raises `TooFewSamplesError` when no equations are left over that could show the noise;
+    `ValueError` when the size is not between 1 and the number that the poses determine.
     """
     Y, A = history.displacement, history.rows
     branches = tuple(_determined(A, tuple(range(A.shape[1])), ()))

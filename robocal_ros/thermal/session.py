@@ -335,12 +335,8 @@ def session_as_recorded(
 ) -> ThermalSession:
     """Make a session with the recorded settings; an empty history gets what was in force.
 
-    Raises
-    ------
-    WrongRobotError
-        The recording was made with another nominal model.
-    InputError
-        The configuration cannot be read.
+    Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
+    configuration cannot be read.
     """
     arguments = recorded_arguments(nominal, configured, ("model", "reference", OWN["thermal"]))
     in_force = {THERMAL: arguments["model"], REFERENCE: arguments["reference"]}
@@ -371,10 +367,7 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
 def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
     """Read the settings back from a configuration record.
 
-    Raises
-    ------
-    InputError
-        When the record has other settings than this version knows.
+    Raises `InputError` when the record has other settings than this version knows.
     """
     try:
         values = dict(arguments["config"])
@@ -410,10 +403,7 @@ def automatic_commands(
     Poses that recur from cycle to cycle: the first visit is the cold reference, each later one
     a warm cycle. Otherwise everything is one calibration.
 
-    Raises
-    ------
-    InputError
-        When nothing was observed.
+    Raises `InputError` when nothing was observed.
     """
     if not observations:
         raise InputError("no measurement at standstill in this recording")

@@ -48,10 +48,7 @@ class DriftProcess:
     setup_sigma_m, setup_approach_s : standard deviation of the steady state of each of the
         set-up's six coordinates, and how fast they approach it.
 
-    Raises
-    ------
-    InputError
-        When the steady state is forgotten before it is approached.
+    Raises `InputError` when the steady state is forgotten before it is approached.
     """
 
     covariance: Array
@@ -114,10 +111,8 @@ class Heat:
     def read(self, temperature: Array, time_s: float) -> "Heat":
         """After a reading (n,), the course since the last one taken as straight.
 
-        Raises
-        ------
-        InputError
-            When it is not one finite temperature for each joint, or older than the last.
+        Raises `InputError` when it is not one finite temperature for each joint, or older than the
+        last.
         """
         given = np.asarray(temperature, dtype=np.float64)
         if given.shape != self.motor.shape or not np.all(np.isfinite(given)):
@@ -285,10 +280,8 @@ class DriftTracker:
     def read_temperatures(self, temperature: Array, time_s: float) -> None:
         """Take motor temperatures (n,) above those at the cold visit, K; in order of time.
 
-        Raises
-        ------
-        InputError
-            When they are not one finite number per joint, come out of order, or have no gains.
+        Raises `InputError` when they are not one finite number per joint, come out of order, or
+        have no gains.
         """
         if self.heat is None:
             raise InputError("this tracker has no gains for motor temperatures: learn them first")
@@ -297,10 +290,7 @@ class DriftTracker:
     def at(self, time_s: float) -> DriftState:
         """The state at a later time, without new measurements.
 
-        Raises
-        ------
-        StaleError
-            When the time lies before the last cycle.
+        Raises `StaleError` when the time lies before the last cycle.
         """
         state, k = self.state, self.count
         step = time_s - state.time_s
@@ -385,12 +375,8 @@ class DriftTracker:
 
         ``cycle.sigma`` (m,), where given, is each coordinate's noise.
 
-        Raises
-        ------
-        InputError
-            When a sample has no cold counterpart.
-        StaleError
-            When the cycle is older than the last one.
+        Raises `InputError` when a sample has no cold counterpart; `StaleError` when the cycle is
+        older than the last one.
         """
         if doubt_s is not None and not (early := self._examine(cycle, doubt_s)[0]).applied:
             return early
@@ -481,14 +467,8 @@ def track_cycle(
     fixed in the cell (``fixed``) moved, leaves the tracker as it was, and is refused as
     SENSOR_OR_ROBOT_MOVED with what it may be. ``doubt_s``: see `DriftTracker.take`.
 
-    Raises
-    ------
-    InputError
-        When a sample has no cold counterpart.
-    TooFewSamplesError
-        With fewer than two poses.
-    StaleError
-        When the cycle is older than the last one.
+    Raises `InputError` when a sample has no cold counterpart; `TooFewSamplesError` with fewer than
+    two poses; `StaleError` when the cycle is older than the last one.
     """
     spots = tracker.spots
     warm = spots.average(warm, tracker.sigma_m)
