@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bench.cell_samples import Sample
 from bench.closed_loop import setting
 from bench.closed_loop.carrying import Carrier
-from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
+from bench.closed_loop.words import model_of, told_by, tool_of
 from robocal_ros import __version__
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import JointCommand
@@ -270,5 +270,5 @@ class Suite:
         return self.maintenance.accuracy(self._clock.now_s, self._clock.now_ns)
 
     def _tell_drift(self) -> None:
-        drift = drift_of(self.thermal, self._clock.now_ns)
+        drift = self.thermal.accuracy(self._clock.now_ns)
         self.maintenance.drift(drift, self._clock.now_s)

@@ -5,7 +5,6 @@ import numpy as np
 from bench.closed_loop import setting
 from robocal_ros.correction.interface import OfferedModel, OfferedTool, ToldCorrection
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.session import ThermalSession
@@ -58,12 +57,6 @@ def tool_answer(outcome: Outcome) -> DriverAnswer:
         deviation_mm=float(document["change"]["tip_mm"]),
         sigma_mm=float(np.max(document["sigma_mm"])),
     )
-
-
-def drift_of(session: ThermalSession, now_ns: int) -> Drift:
-    """What the thermal session tells the maintenance of the robot's accuracy."""
-    found = session.accuracy(now_ns)
-    return Drift(found.level, found.reason, found.error, found.due_in_s)
 
 
 def told_by(session: CorrectionSession) -> ToldCorrection:

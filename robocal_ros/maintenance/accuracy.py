@@ -311,27 +311,9 @@ class Memory:
         )
 
 
-@dataclass(frozen=True)
-class Drift:
-    """What the thermal node says of itself; ``error`` None where it is not known."""
-
-    level: AccuracyLevel
-    reason: str
-    error: ToolError | None
-    due_in_s: float
-
-
-@dataclass(frozen=True)
-class _Finding:
-    level: AccuracyLevel
-    words: str
-    error: ToolError | None
-    due_in_s: float
-
-
 def accuracy_of(
     config: MaintenanceConfig,
-    drift: Drift | None,
+    drift: Accuracy | None,
     uncorrected: str,
     memory: Memory,
     tool: Head,
@@ -349,14 +331,13 @@ def accuracy_of(
     parts = []
     if len(config.poses) and drift is None:
         silent = "drift: the thermal node is silent"
-        parts.append(_Finding(AccuracyLevel.FAULT, silent, None, 0.0))
+        parts.append(Accuracy(AccuracyLevel.FAULT, silent, None, 0.0))
     elif len(config.poses) and drift is not None:
-        reason = f"drift: {drift.reason}"
-        parts.append(_Finding(drift.level, reason, drift.error, drift.due_in_s))
+        parts.append(replace(drift, reason=f"drift: {drift.reason}"))
     if config.T_base_laser is not None:
         parts.append(_tool(config, memory.tool, tool, thermal_id, wall_ns))
     if parts and uncorrected:  # what is known of model and tool is not what the line makes
-        parts.append(_Finding(AccuracyLevel.DEGRADED, f"correction: {uncorrected}", None, np.inf))
+        parts.append(Accuracy(AccuracyLevel.DEGRADED, f"correction: {uncorrected}", None, np.inf))
     errors = [part.error for part in parts if part.error is not None]
     known = both_errors(*errors) if len(errors) == 2 else errors[0] if errors else None
     error = known if len(errors) == len(parts) else None
@@ -366,7 +347,7 @@ def accuracy_of(
         return Accuracy(AccuracyLevel.FAULT, "neither measuring poses nor a laser are configured")
     due_in_s = min(part.due_in_s for part in parts)
     worst = max(part.level for part in parts)
-    words = "; ".join(part.words for part in parts if part.level >= worst)
+    words = "; ".join(part.reason for part in parts if part.level >= worst)
     if known is not None:
         bound = f"95 % of tool errors below {known.bound_m * 1e3:.2f} mm"
         bound += f", of {config.tolerance_m * 1e3:.2f} mm allowed"
@@ -379,40 +360,40 @@ def accuracy_of(
 
 def _tool(
     config: MaintenanceConfig, record: ToolRecord, tool: Head, thermal_id: int, wall_ns: int
-) -> _Finding:
+) -> Accuracy:
     age_s = (wall_ns - record.wall_ns) / NS
     due_in_s = config.tool_due_s - age_s
     if not record.wall_ns:
-        return _Finding(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
+        return Accuracy(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
     if age_s < 0.0:  # the clock was set back: nobody knows how old it is
-        return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
+        return Accuracy(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
     same = record.revision == tool.revision
     error = _tool_error(record, tool) if same else None
     if age_s > config.tool_expires_s:
-        return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
+        return Accuracy(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
     if record.answer == "failed":
-        return _Finding(AccuracyLevel.DEGRADED, f"tool: {record.words}", None, 0.0)
+        return Accuracy(AccuracyLevel.DEGRADED, f"tool: {record.words}", None, 0.0)
     if record.candidate and record.candidate == tool.calibration_id:
         words = f"tool: {when}, measured and accepted; a check has not passed yet"
-        return _Finding(AccuracyLevel.DUE, words, None, min(due_in_s, 0.0))
+        return Accuracy(AccuracyLevel.DUE, words, None, min(due_in_s, 0.0))
     if record.answer == "recalibrate":  # until a check passes, whatever else came into force since
         todo = "measure and accept it" if same else "another one is in force since: check it"
         words = f"tool: {record.words}: {todo}"
-        return _Finding(AccuracyLevel.DEGRADED, words, error, min(due_in_s, 0.0))
+        return Accuracy(AccuracyLevel.DEGRADED, words, error, min(due_in_s, 0.0))
     if not same:
         words = "tool: another one is in force than was checked: check it"
-        return _Finding(AccuracyLevel.DUE, words, None, 0.0)
+        return Accuracy(AccuracyLevel.DUE, words, None, 0.0)
     if record.thermal_id != thermal_id:
         # A newer model knows the drift since the check. An older one was left for a reason, which
         # may be in the tool.
         words = "tool: another thermal model is in force than it was checked with: check it"
         known = error if thermal_id > record.thermal_id else None
-        return _Finding(AccuracyLevel.DUE, words, known, 0.0)
+        return Accuracy(AccuracyLevel.DUE, words, known, 0.0)
     if record.answer == "cannot tell" or due_in_s <= 0.0:
         words = f"tool: {when}, {record.words}"
-        return _Finding(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))
-    return _Finding(AccuracyLevel.OK, f"tool: {when}, {record.words}", error, due_in_s)
+        return Accuracy(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))
+    return Accuracy(AccuracyLevel.OK, f"tool: {when}, {record.words}", error, due_in_s)
 
 
 def _tool_error(record: ToolRecord, tool: Head) -> ToolError:
@@ -429,12 +410,12 @@ class NodeReports:
     def __init__(self, config: MaintenanceConfig) -> None:
         self._config = config
         # what was told, and when
-        self.told_drift: tuple[Drift, float] | None = None
+        self.told_drift: tuple[Accuracy, float] | None = None
         self.told_correction: tuple[ToldCorrection, float] | None = None
         self._in_force: tuple[int, int] | None = None
         self._since_s = -np.inf  # from when on that is in force, as far as it was looked at
 
-    def drift(self, now_s: float) -> Drift | None:
+    def drift(self, now_s: float) -> Accuracy | None:
         """None while the thermal node is silent."""
         drift = self.told_drift
         return drift[0] if drift is not None and now_s - drift[1] <= self._config.silent_s else None

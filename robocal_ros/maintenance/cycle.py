@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.history_records import THERMAL, TOOL
-from robocal_ros.maintenance.accuracy import CycleResult, Drift, Memory, ToolRecord
+from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
 from robocal_ros.maintenance.mover import HOME, FaultError
 from robocal_ros.maintenance.robot_interface import (
@@ -20,7 +20,7 @@ from robocal_ros.maintenance.robot_interface import (
     SilentError,
 )
 from robocal_ros.session.events import LEAVE, ROLLBACK, Command, Outcome
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
 from robocal_ros.tool.session import FULL, QUICK
@@ -468,7 +468,7 @@ class CycleRun:
         decider: Decider,
         memory: Memory,
         decided: Callable[[Outcome], None],
-        drift: Callable[[], Drift | None],
+        drift: Callable[[], Accuracy | None],
     ) -> None:
         self.result = result
         self._cell, self._decider, self._decided, self._drift = cell, decider, decided, drift

@@ -26,7 +26,6 @@ from robocal_ros.maintenance import (
     Status,
     Times,
 )
-from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.motion.driver import CONTROLLER, MOTION, driving_config, require_limits
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import MM, joint_poses, joints_of
@@ -325,7 +324,7 @@ def require_robot(topic: str, message: Any, robot: str, serial: str) -> None:
         )
 
 
-def drift_of_message(message: Any) -> Drift:
+def drift_of_message(message: Any) -> Accuracy:
     """Read a ``robocal_msgs/AccuracyState`` of the thermal node.
 
     Raises `InputError` when its state is unknown, or a figure cannot be.
@@ -339,7 +338,7 @@ def drift_of_message(message: Any) -> Drift:
         raise InputError(f"rms {rms_mm:g} mm, bound {bound_mm:g} mm, due in {due_in_s:g} s")
     known = rms_mm >= 0.0 and bound_mm >= 0.0
     found = ToolError(rms_mm * MM, bound_mm * MM) if known else None
-    return Drift(level, message.reason, found, due_in_s)
+    return Accuracy(level, message.reason, found, due_in_s)
 
 
 def correction_of_message(message: Any) -> ToldCorrection:

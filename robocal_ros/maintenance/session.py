@@ -23,7 +23,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import (
     CycleResult,
     DocumentStore,
-    Drift,
     MaintenanceConfig,
     Memory,
     NodeReports,
@@ -309,7 +308,7 @@ class MaintenanceSession:
         self._cell.measured.append(stamp_s)
         del self._cell.measured[:-1000]
 
-    def drift(self, drift: Drift, now_s: float) -> None:
+    def drift(self, drift: Accuracy, now_s: float) -> None:
         """What the thermal part believes of the accuracy."""
         self._reports.told_drift = drift, now_s
 

@@ -492,11 +492,16 @@ def twin(ask: Ask, name: str, arguments: Mapping[str, Any]) -> Callable[..., Any
         except RobocalError as error:  # deactivated meanwhile
             response.message = trigger_text(0, error.code, str(error))
             return response
-        response.success = outcome.done
-        response.message = trigger_text(outcome.calibration_id, outcome.status, outcome.message)
-        return response
+        return trigger_answer(response, outcome)
 
     return trigger
+
+
+def trigger_answer(response: Any, outcome: Outcome) -> Any:
+    """Put an outcome into the response of a Trigger; its message is `trigger_text`."""
+    response.success = outcome.done
+    response.message = trigger_text(outcome.calibration_id, outcome.status, outcome.message)
+    return response
 
 
 def answer(response: Any, outcome: Outcome) -> Any:

@@ -42,7 +42,7 @@ from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.conversions import MM, joint_poses, transform_message
-from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.parameters import (
     ORIGIN,
     STANDSTILL,
@@ -283,7 +283,7 @@ class ThermalServices:
             add(Trigger, f"~/{name}_trigger", twin(ask, name, {}))
         DecisionServices(add, ask, history, THERMAL)
         add(CalibrateSensor, "~/calibrate_sensor", self._calibrate_sensor)
-        add(Trigger, "~/calibrate_sensor_trigger", self._calibrate_twin)
+        add(Trigger, "~/calibrate_sensor_trigger", twin(ask, CALIBRATE_SENSOR, {}))
         add(PlanPoses, "~/plan_poses", self._plan_poses)
 
     async def _capture_reference(self, request: Any, response: Any) -> Any:
@@ -334,12 +334,6 @@ class ThermalServices:
         response.rejected = list(outcome.document["rejected"])
         if outcome.document["left_out"] is not None:
             response.left_out_rms_mm = outcome.document["left_out"]["rms_mm"]
-        return response
-
-    async def _calibrate_twin(self, request: Any, response: Any) -> Any:
-        outcome = await self._ask(Command(CALIBRATE_SENSOR, {}))
-        response.success = outcome.done
-        response.message = trigger_text(outcome.calibration_id, outcome.status, outcome.message)
         return response
 
     def _plan_poses(self, request: Any, response: Any) -> Any:

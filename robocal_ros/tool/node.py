@@ -1,27 +1,32 @@
-"""Parameters of the tool node."""
+"""The tool node: parameters, services and the action, each call a command to the session."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
-from robocal_msgs.msg import BeamEvent, ToolFrame
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.msg import BeamEvent, ToolFrame, ToolStep
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, Silence
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import TOOL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
-from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
 from robocal_ros.ros.parameters import Setting, advanced, given_pose, length, pose_settings
-from robocal_ros.ros.session_node import STATE_DIR, SessionNode
+from robocal_ros.ros.session_node import STATE_DIR, DecisionServices, SessionNode, trigger_answer
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.driving import load_measuring
@@ -29,8 +34,11 @@ from robocal_ros.tool.edges import EDGES, InputRule
 from robocal_ros.tool.judging import CheckRule, ToolLimits
 from robocal_ros.tool.laser_frame import LaserFrame, read_laser_for
 from robocal_ros.tool.run import MeasuringMotion, PlannedStep, ToolConfig, TraitLimits, rows_of
-from robocal_ros.tool.services import MOTION_SETTINGS, Runner, TcfMotion, TcfOutputs, TcfServices
+from robocal_ros.tool.services import ANSWERS, MODES, MOTION_SETTINGS, TcfMotion, TcfOutputs
 from robocal_ros.tool.session import (
+    FULL,
+    QUICK,
+    REFERENCE,
     WITNESS,
     WITNESS_REFERENCE,
     ToolSession,
@@ -234,12 +242,127 @@ def session_config(
     )
 
 
+class TcfServices:
+    """``~/measure`` as action, the same as Triggers, and the decisions."""
+
+    def __init__(self, node: "TcfNode", ask: Any, history: CalibrationHistory) -> None:
+        self._node = node
+        self._goal: ServerGoalHandle | None = None
+        add = node.add_service
+        add(Trigger, "~/measure_trigger", self._starter(FULL))
+        add(Trigger, "~/quick_check_trigger", self._starter(QUICK))
+        add(Trigger, "~/measure_reference_trigger", self._starter(REFERENCE))
+        add(Trigger, "~/cancel_trigger", self._cancel_twin)
+        add(Trigger, "~/result_trigger", self._result)
+        DecisionServices(add, ask, history, TOOL)
+        self._server = ActionServer(
+            node,
+            MeasureTool,
+            "~/measure",
+            self._execute,
+            cancel_callback=self._cancel,
+            callback_group=node.async_group,
+        )
+
+    def close(self) -> None:
+        """Take the action down."""
+        self._server.destroy()
+
+    def feedback(self, step: ToolStep, state: str) -> None:
+        """Tell a waiting caller what goes on."""
+        if self._goal is not None and self._goal.is_active:
+            self._goal.publish_feedback(MeasureTool.Feedback(step=step, state=state))
+
+    async def _execute(self, goal: ServerGoalHandle) -> Any:
+        request = goal.request
+        try:
+            if not self._node.is_active:
+                return self._end(goal, Code.CONFLICT, f"the node is {self._node.state}")
+            if request.mode not in MODES:
+                words = f"mode {request.mode} is none of {', '.join(MODES.values())}"
+                return self._end(goal, Code.BAD_INPUT, words)
+            if request.only_in_gap and (why := self._node.deaf()):
+                return self._end(goal, Code.CONFLICT, f"{self._node.get_name()}: {why}")
+            outcome = await self._node.begin(MODES[request.mode], request.cycle_id, "action")
+            if outcome.done and not outcome.repeated:
+                self._goal = goal
+                self.feedback(self._node.step, outcome.message)
+                outcome = await self._node.run_end
+        except RobocalError as error:
+            return self._end(goal, error.code, str(error))
+        finally:
+            if self._goal is goal:
+                self._goal = None
+        return self._end(goal, outcome.status, outcome.message, outcome)
+
+    def _end(
+        self, goal: ServerGoalHandle, code: Code, message: str, outcome: Outcome | None = None
+    ) -> Any:
+        document = None if outcome is None else outcome.document
+        result = MeasureTool.Result(success=document is not None, message=message, status=int(code))
+        result.left_plan = outcome is not None and outcome.left_plan
+        if outcome is not None and document is not None:
+            result.candidate_id = outcome.calibration_id
+            change = document.get("change", {})
+            sigma = document["sigma_mm"]
+            result.answer = ANSWERS.get(document.get("answer", ""), MeasureTool.Result.NONE)
+            result.deviation_mm = float(change.get("tip_mm", 0.0))
+            result.deviation_deg = float(change.get("axis_deg", 0.0))
+            result.sigma_mm = float(np.max(sigma))
+            if outcome.calibration_id:
+                result.tool = self._node.frame(outcome)
+        if goal.is_cancel_requested:
+            goal.canceled()
+        elif result.success:
+            goal.succeed()
+        else:
+            goal.abort()
+        return result
+
+    async def _cancel(self, goal: ServerGoalHandle) -> CancelResponse:
+        if goal is not self._goal:
+            return CancelResponse.REJECT
+        await self._node.break_off(Code.CONFLICT, "cancelled by the caller")
+        return CancelResponse.ACCEPT
+
+    def _starter(self, mode: str) -> Callable[[Any, Any], Any]:
+        async def start(request: Any, response: Any) -> Any:
+            try:
+                outcome = await self._node.begin(mode, "", "trigger")
+            except RobocalError as error:
+                response.message = trigger_text(0, error.code, str(error))
+                return response
+            return trigger_answer(response, outcome)
+
+        return start
+
+    async def _cancel_twin(self, request: Any, response: Any) -> Any:
+        response.success = self._node.run_is_open
+        outcome = await self._node.break_off(Code.CONFLICT, "cancelled by a Trigger")
+        response.message = trigger_text(0, outcome.status, outcome.message)
+        return response
+
+    def _result(self, request: Any, response: Any) -> Any:
+        outcome = self._node.last
+        if outcome is None:
+            code, words = Code.CONFLICT, "no run has ended yet"
+            if self._node.run_is_open:  # no code that ends a run, for a PLC that asks until then
+                code, words = Code.NONE, f"run {self._node.step.run} is open"
+            response.message = trigger_text(0, code, words)
+            return response
+        return trigger_answer(response, outcome)
+
+
 WATCH_S = 0.02
 INPUTS = {JOINTS: (JointState, endpoints.STREAM), EDGES: (BeamEvent, endpoints.RELIABLE)}
 
 
 class TcfNode(SessionNode[ToolSession]):
-    """Drives a `ToolSession` with live messages and calls."""
+    """Drives a `ToolSession` with live messages and calls.
+
+    ``last``: outcome of the last run, None before any; ``run_end``: becomes that of the open run;
+    ``step``: that is awaited.
+    """
 
     NAME = "tcf_node"
     SETTINGS = (*SETTINGS, *MOTION_SETTINGS)
@@ -269,17 +392,7 @@ class TcfNode(SessionNode[ToolSession]):
             robot_file_hash(settings["robot"]),
             frames,
         )
-        runner = Runner(
-            begin=self._begin,
-            ended=lambda: self._run_end,
-            cancel=lambda reason: self._break_off(Code.CONFLICT, reason),
-            last=lambda: self._last,
-            frame=self._frame,
-            step=lambda: self._step,
-            is_open=lambda: self._session is not None and self._session.run is not None,
-            deaf=lambda: "" if self._motion is None else self._motion.deaf(),
-        )
-        self._calls = TcfServices(self, runner, self._desk.ask, history)
+        self._calls = TcfServices(self, self._desk.ask, history)
         if settings["motion"] == TRAJECTORY:
             robot = self._nominal, self._serial_in_use
             self._motion = TcfMotion(self, settings, self._desk.ask, *robot)
@@ -292,8 +405,8 @@ class TcfNode(SessionNode[ToolSession]):
     def activate(self) -> None:
         """Begin a session; it knows nothing of what was measured before."""
         super().activate()
-        self._last: Outcome | None = None
-        self._run_end: Future = Future()
+        self.last: Outcome | None = None
+        self.run_end: Future = Future()
         self._shown: tuple[int, int, int] | None = None
         self._silence = Silence()
         if self._motion is not None and self._session is not None:
@@ -306,8 +419,8 @@ class TcfNode(SessionNode[ToolSession]):
         if self._motion is not None:
             self._motion.deactivate()
         super().deactivate()
-        if not self._run_end.done():
-            self._run_end.set_exception(NotActiveError("deactivated: the run is broken off"))
+        if not self.run_end.done():
+            self.run_end.set_exception(NotActiveError("deactivated: the run is broken off"))
 
     def cleanup(self) -> None:
         """Take the action down and close the history."""
@@ -333,7 +446,8 @@ class TcfNode(SessionNode[ToolSession]):
         elif session.waiting:
             self._desk.step()
 
-    def _begin(self, mode: str, cycle_id: str, by: str) -> Any:
+    def begin(self, mode: str, cycle_id: str, by: str) -> Any:
+        """Begin a run; the outcome of the call."""
         session = self._session
         known = session is not None and session.answered(mode, cycle_id)
         if self._motion is not None and not known:
@@ -343,8 +457,18 @@ class TcfNode(SessionNode[ToolSession]):
             self._motion.require_ready()
         return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
 
-    def _break_off(self, code: Code, reason: str) -> Any:
+    def break_off(self, code: Code, reason: str) -> Any:
+        """Break the open run off; the outcome of the call."""
         return self._desk.ask(Command(BREAK_OFF, {"code": int(code), "reason": reason}))
+
+    @property
+    def run_is_open(self) -> bool:
+        """Whether a run has begun and not ended."""
+        return self._session is not None and self._session.run is not None
+
+    def deaf(self) -> str:
+        """Why the node would drive on in a closed gap; empty: it would not."""
+        return "" if self._motion is None else self._motion.deaf()
 
     def _watch(self) -> None:
         session = self._session
@@ -353,7 +477,7 @@ class TcfNode(SessionNode[ToolSession]):
         silent_s = self._silence.look(time.monotonic())
         if session.run is not None and silent_s > self.settings["joint_silence_s"]:
             words = f"joint states are silent for {silent_s:.2f} s: check the robot's driver"
-            self._break_off(Code.TOO_FEW_SAMPLES, words)
+            self.break_off(Code.TOO_FEW_SAMPLES, words)
 
     def show(self, outcome: Outcome) -> None:
         """Publish what came of a command; it is logged already."""
@@ -365,14 +489,14 @@ class TcfNode(SessionNode[ToolSession]):
                 self.show_in_force()
             self._outputs.events.tell(outcome.command, outcome)
             if name == MEASURE_TOOL and outcome.done:
-                self._run_end, self._last = Future(), None
+                self.run_end, self.last = Future(), None
             if name in (MEASURE_TOOL, TOOL_STEP, BREAK_OFF):
                 self._show_step(f"{name}: {outcome.status.name} {outcome.message}")
             self.show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{name} was done but not published: {error}")
-        if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None and not self._last:
-            self._last = outcome
+        if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None and not self.last:
+            self.last = outcome
             if self._motion is not None:
                 self._motion.run_ended(outcome)
             try:
@@ -382,8 +506,8 @@ class TcfNode(SessionNode[ToolSession]):
                 self._outputs.quality(outcome)
             except RobocalError as error:  # the caller is answered all the same
                 self.get_logger().error(f"the run has ended but was not published: {error}")
-            if not self._run_end.done():
-                self._run_end.set_result(outcome)
+            if not self.run_end.done():
+                self.run_end.set_result(outcome)
 
     def _show_step(self, words: str = "") -> None:
         session = self._session
@@ -391,11 +515,12 @@ class TcfNode(SessionNode[ToolSession]):
             return
         step: PlannedStep | None = session.awaited
         number = 0 if session.run is None else session.run.number
-        self._step = self._outputs.step(step, number, session.newest_joints_ns)
+        self.step = self._outputs.step(step, number, session.newest_joints_ns)
         if self._calls is not None:
-            self._calls.feedback(self._step, words)
+            self._calls.feedback(self.step, words)
 
-    def _frame(self, outcome: Outcome) -> ToolFrame:
+    def frame(self, outcome: Outcome) -> ToolFrame:
+        """The measured tool of an outcome."""
         if self._history is None:
             return ToolFrame()
         model = self._history.model(outcome.calibration_id)
@@ -428,7 +553,7 @@ class TcfNode(SessionNode[ToolSession]):
                 health.worsen(ERROR, self._motion.fault)
             if trouble := self._motion.trouble():
                 health.worsen(WARN, trouble)
-        values["last run"] = "none" if self._last is None else self._last.message
+        values["last run"] = "none" if self.last is None else self.last.message
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
 

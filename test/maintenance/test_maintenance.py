@@ -32,11 +32,10 @@ from maintenance_cell import (
 from robocal_ros.ground.errors import Code, InputError, StorageError
 from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import robot_interface as ask
-from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.mover import Mover
 from robocal_ros.motion.plan import SHORTEST_STOP_S, JointPlan
 from robocal_ros.session.events import LEAVE
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 
 SMALL = ToolError(1e-4, 1.5e-4)
 
@@ -283,7 +282,7 @@ def test_a_pose_takes_its_worst_case_and_no_more(history):
 
 
 def accuracy(cell: Cell, level=AccuracyLevel.OK, error=SMALL):
-    cell.session.drift(Drift(level, "95 % below", error, 600.0), cell.now_s)
+    cell.session.drift(Accuracy(level, "95 % below", error, 600.0), cell.now_s)
     return cell.session.accuracy(cell.now_s, cell.wall_ns)
 
 
@@ -302,7 +301,7 @@ def test_the_line_reads_one_state(cell):
     silent = cell.session.accuracy(cell.now_s, cell.wall_ns)
     assert (silent.level, silent.error) == (AccuracyLevel.FAULT, None)
     later_ns = cell.wall_ns + 3 * 3600 * 10**9
-    cell.session.drift(Drift(AccuracyLevel.OK, "", ToolError(1e-5, 2e-5), 600.0), cell.now_s)
+    cell.session.drift(Accuracy(AccuracyLevel.OK, "", ToolError(1e-5, 2e-5), 600.0), cell.now_s)
     assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.DUE
     later_ns += 6 * 3600 * 10**9
     assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.EXPIRED

@@ -12,7 +12,6 @@ from shift import BALL, NOISE_M, T_SENSOR_BASE, warmed
 from tool_driver import TAUGHT
 
 from bench.closed_loop.carrying import Carrier
-from bench.closed_loop.words import drift_of
 from robocal_ros.ground.samples import JointSample, PointSample
 from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession
 from robocal_ros.motion.cell import DrivingConfig, joint_way
@@ -162,7 +161,7 @@ class MaintainedCell(Robot):
 
     def _tell_drift(self) -> None:
         self.told_s = self.now_s
-        self.maintenance.drift(drift_of(self.thermal, self.wall_ns), self.now_s)
+        self.maintenance.drift(self.thermal.accuracy(self.wall_ns), self.now_s)
 
     def accuracy(self) -> Any:
         """What the line reads."""

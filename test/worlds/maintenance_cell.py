@@ -18,12 +18,11 @@ from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, MaintenanceState, Times
 from robocal_ros.maintenance import robot_interface as ask
-from robocal_ros.maintenance.accuracy import Drift
 from robocal_ros.maintenance.mover import STATION, Ways
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.run import made_with
 
@@ -35,7 +34,7 @@ LATE_S = 0.04  # after a pause, until the beat that waited is delivered
 WALL_NS = 1_700_000_000_000_000_000
 LONG_S = 120.0  # a gap in which all fits
 OK, REFUSED, SILENT, SLOW = "ok", "refused", "silent", "slow"
-KNOWN = Drift(AccuracyLevel.OK, "95 % below", ToolError(1e-5, 2e-5), 600.0)
+KNOWN = Accuracy(AccuracyLevel.OK, "95 % below", ToolError(1e-5, 2e-5), 600.0)
 
 CELL = noisy_cell()
 ARM = CELL.arm
@@ -135,7 +134,7 @@ class Cell:
     )
     check: DriverAnswer = field(default_factory=lambda: passed())
     full: Callable[["Cell"], DriverAnswer] = field(default=lambda cell: same_tool())
-    drift: Drift | None = None  # told by the thermal node
+    drift: Accuracy | None = None  # told by the thermal node
     silent: bool = False  # joint states
     measures_every: int = 5  # ticks
     planning_s: float = 0.0  # to make and send the next motion
