@@ -271,15 +271,6 @@ def test_an_acceptance_by_trigger_that_comes_twice_is_made_once(plc, graph):
     assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait")
 
 
-def test_the_last_acceptance_is_taken_back_once(plc, graph):
-    (first,) = candidates(graph, 1)
-    assert plc.call(Decide, "accept", id=first).revision == 1
-    (second,) = candidates(graph, 1, based_on=1)
-    assert plc.call(Decide, "accept", id=second).revision == 2
-    assert plc.trigger("rollback").startswith(f"{first} ACCEPT revision 3")
-    assert plc.trigger("rollback").startswith("0 ACCEPT")  # an answer was lost: no step further
-
-
 def test_a_history_that_another_process_holds_delays_nobody(plc, graph):
     (number,) = candidates(graph, 1)
     plc.call(Decide, "accept", id=0)  # discovered

@@ -1,6 +1,5 @@
 """tcf_node over DDS: a simulated robot drives what the node announces."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from tool_driver import TAUGHT, TRUTH
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.samples import JointSample
 from robocal_ros.ros import endpoints
 
 FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
@@ -172,98 +170,11 @@ def test_nothing_of_an_old_run_is_told_while_a_new_one_is_open(graph: Any, tmp_p
     assert (told.success, told.message) == (False, "0 NONE run 2 is open")
 
 
-def test_a_tool_too_thick_for_the_circle_is_refused(graph: Any, cell: LiveCell) -> None:
-    """It reaches further than the circle: its shadows run into one another."""
-    cell.program.tool = RoundTool.cylinder(TRUTH, 0.013)
-    thick = cell.measure()
-    assert thick.status == Code.BEAM_EDGES_WRONG
-    assert "never broken" in thick.message or "too thick" in thick.message
-
-
-def test_an_axis_nearly_in_the_beam_plane_is_refused(graph: Any, cell: LiveCell) -> None:
-    """A program that does not turn the flange as announced, by 50 degrees about the crossing."""
-    drive, laser = cell.program.drive, cell.cell.laser.T_base_laser
-    lean = laser @ frames.transform(frames.exp_rotation([np.radians(50.0), 0, 0]), np.zeros(3))
-    lean = lean @ frames.invert(laser)
-    cell.program.drive = lambda step: drive(replace(step, T_base_flange=lean @ step.T_base_flange))
-    result = cell.measure()
-    assert result.status == Code.RANK_DEFICIENT
-    assert "turn the flange until the tool stands upright" in result.message
-
-
-def test_joint_readings_too_far_apart_are_refused(graph: Any, cell: LiveCell) -> None:
-    """Readings 64 ms apart do not tell where the flange was at an edge between them."""
-    cell.rest(0.5)
-    play, kept = cell.play, [0]
-
-    def sparse(samples: list) -> None:
-        chosen = []
-        for sample in samples:
-            if isinstance(sample, JointSample) and sample.stamp_ns < kept[0] + 60_000_000:
-                continue
-            if isinstance(sample, JointSample):
-                kept[0] = sample.stamp_ns
-            chosen.append(sample)
-        play(chosen)
-
-    cell.play = sparse
-    result = cell.measure()
-    assert result.status == Code.BAD_INPUT
-    assert "raise the rate of joint_states" in result.message
-
-
 def test_the_answer_of_a_cycle_is_given_again(graph: Any, cell: LiveCell) -> None:
     first = cell.measure(FULL, "gap-1")
     again = cell.measure(FULL, "gap-1")
     assert (first.candidate_id, first.message) == (again.candidate_id, again.message)
     assert again.success
-
-
-def dead(step: Any, edges: list) -> list:
-    return [e for e in edges if e.beam != "y"]
-
-
-def lost(step: Any, edges: list) -> list:
-    return edges[:-1]
-
-
-def ninth(step: Any, edges: list) -> list:
-    e = edges[3]
-    return [*edges, replace(e, blocked=not e.blocked, time_s=e.time_s + 0.02)]
-
-
-def chatter(step: Any, edges: list) -> list:
-    e = edges[3]
-    return edges + [
-        replace(e, blocked=e.blocked ^ (i % 2 == 0), time_s=e.time_s + 1e-4 * (i + 1))
-        for i in range(9)
-    ]
-
-
-def swapped(step: Any, edges: list) -> list:
-    """Break and restore of one passage in the wrong order."""
-    own = [e for e in edges if e.beam == "x"]
-    return [replace(e, blocked=not e.blocked) if e in own[:2] else e for e in edges]
-
-
-WRONG = {
-    dead: "beam y was never broken",
-    lost: "has 3 edges",
-    ninth: "twice",
-    chatter: "chatters",
-    swapped: "twice",
-}
-
-
-def test_wrong_edges_end_the_run_in_their_words(graph: Any, cell: LiveCell) -> None:
-    for edit, words in WRONG.items():
-        cell.program.edit = edit
-        result = cell.measure()
-        assert result.status == Code.BEAM_EDGES_WRONG
-        assert words in result.message
-        assert not result.success
-    cell.program.edit = lambda step, edges: edges
-    assert cell.measure().success
 
 
 def test_joint_states_that_stop_end_the_run(graph: Any, cell: LiveCell) -> None:
@@ -273,16 +184,6 @@ def test_joint_states_that_stop_end_the_run(graph: Any, cell: LiveCell) -> None:
     result = ended.result().result
     assert result.status == Code.TOO_FEW_SAMPLES
     assert "joint states are silent" in result.message
-
-
-def test_edges_of_another_station_are_not_used(graph: Any, tmp_path: Any) -> None:
-    cell = LiveCell(graph, tmp_path, TRUTH, step_timeout_s=2.0)
-    cell.station = "south"
-    result = cell.measure()
-    assert result.status == Code.BEAM_EDGES_WRONG
-    assert "edge of station 'south', the laser frame is of 'north'" in result.message
-    ignored = [key for key in cell.node.health().values if "station 'south'" in key]
-    assert len(ignored) == 1
 
 
 def test_a_laser_of_another_robot_is_refused(graph: Any, tmp_path: Any) -> None:

@@ -182,9 +182,16 @@ def chatter(step, edges):
     return [*edges, *more]
 
 
+def swapped(step, edges):
+    """Break and restore of one passage in the wrong order."""
+    own = [e for e in edges if e.beam == "x"]
+    return [replace(e, blocked=not e.blocked) if e in own[:2] else e for e in edges]
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
+        (swapped, "twice"),
         (lost("x", 1), "an edge between was lost"),
         (lost("y", -1), "edges"),
         (dead("x"), "beam x was never broken"),
