@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from campaign import ROBOT, postures, true_arm
+from campaign import ROBOT
 from command import conforms, environment, robocal, robocal_json
 from recordings import (
     BETWEEN_S,
@@ -23,12 +23,11 @@ from recordings import (
     plain_bag,
     recorded_bag,
     shift,
-    visit,
     write_samples,
 )
 
 from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.bags.bags import BagWriter, read_bag
+from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cli.main import main
 from robocal_ros.ground.samples import JointSample
 
@@ -114,20 +113,6 @@ class TestRecordedSession:
         assert "ACCEPT" in done.stdout
         assert done.stderr == ""
 
-    def test_a_changed_sample_is_noticed(self, live, visits, folder: Path, replay) -> None:
-        """One measurement of the first warm cycle differs by a micrometre from what was live."""
-        path = folder / "changed.mcap"
-        with BagWriter(path) as bag:
-            for recorded in read_bag(live[0]):
-                message = recorded.message
-                stamp = recorded.log_time_ns
-                if recorded.topic == POINT and stamp > START_NS + BETWEEN_S * NS:
-                    message.point.x += 1e-6 if stamp < START_NS + (BETWEEN_S + 1) * NS else 0.0
-                bag.write(recorded.topic, recorded.msgtype, message, stamp)
-        status, document = replay(path)
-        assert status == 0
-        assert any(words.startswith("identify") for words in document["differs"])
-
     def test_other_robot_is_refused(self, live, replay) -> None:
         status, document = replay(live[0], "--robot", "ur10")
         assert status == 2
@@ -135,30 +120,6 @@ class TestRecordedSession:
         assert "UR10" in document["error"]["message"]
         status, document = replay(live[0], "--robot", ROBOT)
         assert (status, document["differs"]) == (0, [])
-
-    def test_a_recording_that_begins_late_starts_from_what_was_in_force(
-        self, live, folder: Path, replay
-    ) -> None:
-        """Only what came after the acceptance, and the latched configuration of that time."""
-        late_ns = START_NS + 2 * BETWEEN_S * NS + NS // 7
-        path = folder / "late.mcap"
-        _, whole = replay(live[0])
-        early = [
-            recorded
-            for recorded in read_bag(live[0])
-            if recorded.topic == EVENTS and recorded.log_time_ns < late_ns
-        ]
-        assert early[-1].message.command == "configure"
-        with BagWriter(path) as bag:
-            bag.write(EVENTS, early[-1].msgtype, early[-1].message, late_ns)
-            for recorded in read_bag(live[0]):
-                if (stamp := recorded.log_time_ns) >= late_ns:
-                    bag.write(recorded.topic, recorded.msgtype, recorded.message, stamp)
-        status, document = replay(path)
-        assert status == 0
-        assert document["differs"] == []
-        (candidate,) = document["candidates"]
-        assert candidate == whole["candidates"][1]
 
     def test_kept_history(self, live, folder: Path, replay) -> None:
         state = folder / "kept"
@@ -222,16 +183,6 @@ class TestWithoutEvents:
         assert first["verdict"]["code"] == "ACCEPT"
         assert first["nominal"]["held_out"]["rms_mm"] > 0.4
         assert first["calibrated"]["held_out"]["rms_mm"] < 0.2
-
-    def test_poses_that_do_not_recur_are_one_calibration(self, tmp_path: Path, replay) -> None:
-        arm = true_arm()
-        q = postures(arm, 60, 5)
-        path = plain_bag(tmp_path / "once.mcap", [list(visit(arm, q, START_NS, 3))])
-        status, document = replay(path, "--robot", ROBOT, "--auto")
-        assert status == 0
-        (candidate,) = document["candidates"]
-        assert candidate["verdict"]["accept"]
-        assert candidate["calibrated"]["held_out"]["n"] == 30
 
 
 class TestTopics:
@@ -354,40 +305,6 @@ class TestDamage:
         (words,) = document["warnings"]
         assert f"{path}: a damaged chunk is left out" in words
 
-    @pytest.mark.parametrize(
-        ("content", "words"),
-        [(b"", "empty"), (b"not a bag at all, but text", "not an MCAP"), (None, "no such bag")],
-    )
-    def test_no_bag(self, folder: Path, replay, content: bytes | None, words: str) -> None:
-        path = folder / "no.mcap"
-        path.unlink(missing_ok=True)
-        if content is not None:
-            path.write_bytes(content)
-        status, document = replay(path, "--auto", "--robot", ROBOT)
-        assert status == 2
-        assert words in document["error"]["message"]
-        assert document["error"]["file"] == str(path)
-
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            ('{"version": 99, "arguments": {}, "marks": {}}', "version 99"),
-            ("{}", "cannot be read"),
-            ("no json", "cannot be read"),
-        ],
-    )
-    def test_events_of_an_unknown_form(
-        self, folder: Path, visits, replay, arguments: str, words: str
-    ) -> None:
-        path = folder / "events.mcap"
-        with BagWriter(path) as bag:
-            event = {"stamp": ros_time(START_NS), "command": "identify", "arguments": arguments}
-            bag.write(EVENTS, TYPES[EVENTS], event, START_NS)
-            write_samples(bag, visits[0])
-        status, document = replay(path, "--robot", ROBOT)
-        assert status == 2
-        assert words in document["error"]["message"]
-
     def test_decisions_of_a_maintenance(self, folder: Path, visits, replay) -> None:
         path = folder / "maintained.mcap"
         arguments = json.dumps({"version": 1, "arguments": {"cycle_id": "c1"}, "marks": {}})
@@ -431,10 +348,6 @@ class TestUsage:
         status, document = replay(plain, "--robot", ROBOT, *options)
         assert status == 2
         assert words in document["error"]["message"]
-
-    def test_the_whole_command(self, plain: Path) -> None:
-        document = robocal_json("replay.json", "replay", plain, "--robot", ROBOT, "--auto")
-        assert len(document["candidates"]) >= 2
 
 
 def test_memory_does_not_grow_with_the_recording(folder: Path, visits) -> None:
