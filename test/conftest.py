@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, settings
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "test" / "worlds"))  # what tests share: cells, robots, recordings
 from measured_cell import cell, known_set_up, make_cell_fixture  # noqa: E402, F401
+from shift import arm, nominal  # noqa: E402, F401
 
 from robocal_ros.history.calibrations import CalibrationHistory  # noqa: E402
 

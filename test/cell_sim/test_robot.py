@@ -21,11 +21,6 @@ SHIFT_DUTY = np.array([0.5, 1.0, 1.0, 0.8, 0.6, 0.6])
 
 
 @pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
-
-
-@pytest.fixture(scope="module")
 def robot(arm) -> TrueRobot:
     return kr150.true_robot(arm, np.random.default_rng(7))
 

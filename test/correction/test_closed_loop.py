@@ -6,15 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm
-from shift import BALL, NOISE_M, Shift, built, postures, warmed
+from shift import BALL, NOISE_M, DriftingRobot, postures, warmed
 
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.ground.errors import Code
-from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.session import ThermalSession
 
@@ -23,20 +21,15 @@ FAR = 0.3  # singular value; nearer to a singularity joints turn by degrees to m
 CONFIG = ThermalConfig(sigma_m=NOISE_M)
 
 
-class Loop:
+class Loop(DriftingRobot):
     """A robot whose taught poses are corrected, where wanted, with the model in force.
 
     The taught world is that of the cold robot, which the cold reference knows.
     """
 
     def __init__(self, folder: Path, *, corrected: bool) -> None:
-        self.nominal = load_robot("kr150_r3100")
-        self.history = CalibrationHistory.open(
-            "s1", model_hash=self.nominal.model_hash, state_dir=folder
-        )
-        self.session = ThermalSession(self.nominal, self.history, CONFIG, "test")
-        self.shift = Shift(self.nominal.joint_names)
-        self.cold, many = built(self.nominal), postures(self.nominal, 10 * POSES)
+        super().__init__(folder, CONFIG)
+        many = postures(self.nominal, 10 * POSES)
         smallest = np.linalg.svd(self.nominal.jacobian(many), compute_uv=False)[:, -1]
         self.taught = many[smallest > FAR][:POSES]
         self.corrected = corrected
@@ -51,15 +44,12 @@ class Loop:
 
     def cycle(self, command: str, after_h: float = 0.0) -> Outcome:
         q = self.commanded(self.taught)
-        for sample in self.shift.visit(self.warm, q, after_h):
-            self.session.add(sample)
-        self.session.submit(Command(command))
-        return self.session.advance(wall_ns=1, force=True)[-1]
+        self.feed(self.shift.visit(self.warm, q, after_h))
+        return self.ask(command)
 
     def accept(self, found: Outcome) -> None:
         if found.status is Code.ACCEPT:
-            self.session.submit(Command(events.ACCEPT, {"id": found.calibration_id}))
-            assert self.session.advance(wall_ns=1)[-1].done
+            assert self.ask(events.ACCEPT, id=found.calibration_id).done
 
     def error_m(self, q: np.ndarray) -> float:
         """Rms distance of the ball, after correction, from where the cold robot had it."""

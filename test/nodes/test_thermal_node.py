@@ -32,7 +32,6 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge
 from robocal_ros.history.history_records import CalibrationState, Head, Proposal
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
@@ -43,11 +42,6 @@ from robocal_ros.thermal.session import ThermalSession, config_of, take_message
 
 POSES = 8
 NS = 1_000_000_000
-
-
-@pytest.fixture(scope="module")
-def nominal() -> Any:
-    return load_robot("kr150_r3100")
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,6 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Proposal
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import (
     CONFIGURE,
@@ -73,11 +72,6 @@ def recorded(sample: Any) -> Recorded:
     frame_id = f"{sample.frame}/{sample.target}"
     message = point_message(sample.stamp_ns, frame_id, *sample.position_m.tolist())
     return Recorded("/cell/measured_point", message)
-
-
-@pytest.fixture(scope="module")
-def nominal():
-    return load_robot("kr150_r3100")
 
 
 @pytest.fixture(scope="module")

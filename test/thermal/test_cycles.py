@@ -1,61 +1,30 @@
 """Measuring cycles of the session: bracketed, timed out, broken off, repeated, and what follows."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from shift import Shift, built, fixed_points, knocked, of_kind, postures, warmed
+from shift import DriftingRobot, fixed_points, knocked, of_kind, postures, warmed
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JOINTS, JointSample, PointSample
-from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.drift_following import CHECKPOINT_EVERY, ThermalConfig
-from robocal_ros.thermal.session import ThermalSession
 
 NS = 1_000_000_000
 POSES = 8
 CONFIG = ThermalConfig(sigma_m=2e-5, cycle_timeout_s=60.0)
 
 
-@pytest.fixture(scope="module")
-def nominal():
-    return load_robot("kr150_r3100")
-
-
-class Cell:
-    """A robot with its session; time runs on in one shift."""
-
-    def __init__(self, nominal, folder: Path, config: ThermalConfig = CONFIG) -> None:
-        self.nominal, self.folder, self.config = nominal, folder, config
-        self.shift = Shift(nominal.joint_names)
-        self.cold, self.q = built(nominal), postures(nominal, POSES)
-        self.session = self.start()
-
-    def start(self) -> ThermalSession:
-        """A node that starts: it knows the history alone."""
-        history = CalibrationHistory.open(
-            "s1", model_hash=self.nominal.model_hash, state_dir=self.folder
-        )
-        self.session = ThermalSession(self.nominal, history, self.config, "test")
-        return self.session
-
-    def feed(self, samples: Iterable[JointSample | PointSample]) -> None:
-        for sample in samples:
-            self.session.add(sample)
+class Cell(DriftingRobot):
+    def __init__(self, folder: Path, config: ThermalConfig = CONFIG) -> None:
+        super().__init__(folder, config, POSES)
 
     def visit(self, kelvin: float = 0.0, poses: slice = slice(None), after_h: float = 0.0) -> None:
         self.feed(self.shift.visit(warmed(self.cold, kelvin), self.q[poses], after_h))
-
-    def ask(self, name: str, **arguments) -> Outcome:
-        self.session.submit(Command(name, arguments))
-        return self.session.advance(wall_ns=self.shift.now_ns, force=True)[-1]
 
     def capture(self) -> None:
         self.visit()
@@ -70,8 +39,8 @@ class Cell:
 
 
 @pytest.fixture
-def cell(nominal, tmp_path) -> Cell:
-    made = Cell(nominal, tmp_path)
+def cell(tmp_path) -> Cell:
+    made = Cell(tmp_path)
     made.capture()
     return made
 
@@ -132,8 +101,8 @@ def test_a_new_cycle_breaks_off_the_open_one(cell):
     assert found.document["cycle_id"] == "c2"
 
 
-def test_a_cycle_needs_a_cold_reference(nominal, tmp_path):
-    cell = Cell(nominal, tmp_path)
+def test_a_cycle_needs_a_cold_reference(tmp_path):
+    cell = Cell(tmp_path)
     for name in (events.BEGIN_CYCLE, events.END_CYCLE):
         refused = cell.ask(name, cycle_id="c1")
         assert refused.status is Code.CONFLICT
@@ -213,13 +182,13 @@ def test_a_visit_counts_once_however_often_it_is_measured(cell):
     cell.feed(often)
     found = cell.ask(events.END_CYCLE)
     assert found.samples == POSES
-    inputs = cell.session._history.inputs(found.calibration_id)
+    inputs = cell.history.inputs(found.calibration_id)
     assert inputs["sigma"] == pytest.approx(np.full(POSES, CONFIG.sigma_m))
 
 
-def test_a_restart_goes_on_from_the_same_state(nominal, tmp_path):
+def test_a_restart_goes_on_from_the_same_state(tmp_path):
     """Cycles with restarts in between, beyond a kept state: the same bits as without."""
-    cells = [Cell(nominal, tmp_path / name) for name in ("steady", "restarted")]
+    cells = [Cell(tmp_path / name) for name in ("steady", "restarted")]
     for cell in cells:
         cell.capture()
     for number in range(CHECKPOINT_EVERY + 3):
@@ -239,7 +208,7 @@ def test_what_could_not_be_kept_was_not_taken(cell):
     """The disk is full, then it is not: the cycle counts once."""
     cell.visit(15.0, after_h=2.0)
     before = cell.session.follower.state
-    path = cell.session._history.path
+    path = cell.history.path
     path.rename(path.with_suffix(".away"))
     refused = cell.ask(events.END_CYCLE, cycle_id="c1")
     assert refused.status is Code.STORAGE_FAILED
@@ -277,8 +246,8 @@ def test_a_knocked_sensor_freezes_the_model(cell):
 
 
 @pytest.mark.parametrize("what", ["sensor", "sphere"])
-def test_a_fixed_sphere_decides(nominal, tmp_path, what):
-    cell = Cell(nominal, tmp_path)
+def test_a_fixed_sphere_decides(tmp_path, what):
+    cell = Cell(tmp_path)
     cell.feed(fixed_points(list(cell.shift.visit(cell.cold, cell.q)), moved=False))
     assert cell.ask(events.CAPTURE_REFERENCE).samples == POSES
     warm = list(cell.shift.visit(warmed(cell.cold, 15.0), cell.q, after_h=2.0))
@@ -303,15 +272,15 @@ def test_accuracy_ages(cell):
     assert levels[2] is AccuracyLevel.EXPIRED
 
 
-def test_without_a_reference_nothing_is_known(nominal, tmp_path):
-    found = Cell(nominal, tmp_path).session.accuracy(5)
+def test_without_a_reference_nothing_is_known(tmp_path):
+    found = Cell(tmp_path).session.accuracy(5)
     assert found.level is AccuracyLevel.EXPIRED
     assert found.error is None
     assert "no cold reference" in found.reason
 
 
-def test_a_tight_tolerance_is_missed(nominal, tmp_path):
-    cell = Cell(nominal, tmp_path, replace(CONFIG, tolerance_m=1e-7))
+def test_a_tight_tolerance_is_missed(tmp_path):
+    cell = Cell(tmp_path, replace(CONFIG, tolerance_m=1e-7))
     cell.capture()
     found = cell.session.accuracy(cell.shift.now_ns)
     assert found.level is AccuracyLevel.DEGRADED
@@ -381,7 +350,7 @@ def test_a_fixed_sphere_alone_keeps_no_cycle_open(cell):
 def test_a_time_out_on_a_full_disk_keeps_the_cycle(cell):
     cell.visit(15.0, after_h=2.0)
     cell.idle(61.0)
-    path = cell.session._history.path
+    path = cell.history.path
     path.rename(path.with_suffix(".away"))
     cell.session.submit(cell.session.overdue())
     assert cell.session.advance(wall_ns=1, force=True)[-1].status is Code.STORAGE_FAILED

@@ -8,7 +8,6 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
 from robocal_ros.ground.errors import Code, RankDeficientError, TooFewSamplesError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import (
     drift_prior,
     identify_cycle,
@@ -16,11 +15,6 @@ from robocal_ros.thermal.identification import (
     judge_cycle,
 )
 from robocal_ros.thermal.reference import ColdSpots
-
-
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 def draw(arm: SerialArm, rng: np.random.Generator) -> np.ndarray:

@@ -4,13 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shift import NOISE_M, NS, Shift, built, postures, warmed
+from shift import NOISE_M, NS, DriftingRobot, warmed
 
 from robocal_ros.ground.samples import TemperatureSample
-from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.accuracy import earlier_shifts, expected_drift
 from robocal_ros.thermal.drift_following import FollowerState, ThermalConfig
 from robocal_ros.thermal.identification import drift_prior
@@ -25,22 +23,16 @@ def config(prior: str) -> ThermalConfig:
     return ThermalConfig(prior="learned" if prior == "learned" else "default", sigma_m=NOISE_M)
 
 
-class Robot:
-    """A robot whose links follow its motors at once; shift after shift in one history."""
+class Robot(DriftingRobot):
+    """Its links follow its motors at once; shift after shift in one history."""
 
     def __init__(self, folder: Path, *, prior: str = "default", temperatures: bool = False) -> None:
-        self.nominal = load_robot("kr150_r3100")
-        self.folder, self.temperatures = folder, temperatures
-        self.shift = Shift(self.nominal.joint_names)
-        self.cold, self.q = built(self.nominal), postures(self.nominal, POSES)
-        self.start(prior)
+        self.temperatures = temperatures
+        super().__init__(folder, config(prior), POSES)
 
-    def start(self, prior: str = "default") -> ThermalSession:
-        self.history = CalibrationHistory.open(
-            "s1", model_hash=self.nominal.model_hash, state_dir=self.folder
-        )
-        self.session = ThermalSession(self.nominal, self.history, config(prior), "test")
-        return self.session
+    def start(self, prior: str | None = None) -> ThermalSession:
+        self.config = config(prior) if prior else self.config
+        return super().start()
 
     def warmth(self, kelvin: float) -> None:
         """All motors are read."""
@@ -52,10 +44,8 @@ class Robot:
     def visit(self, command: str, kelvin: float, after_h: float) -> Outcome:
         self.shift.now_ns += round(after_h * 3600 * NS)
         self.warmth(kelvin)
-        for sample in self.shift.visit(warmed(self.cold, kelvin), self.q):
-            self.session.add(sample)
-        self.session.submit(Command(command))
-        return self.session.advance(wall_ns=1, force=True)[-1]
+        self.feed(self.shift.visit(warmed(self.cold, kelvin), self.q))
+        return self.ask(command)
 
     def work(self, highest_k: float) -> list[Outcome]:
         """A night's rest, a cold reference, and a shift that warms up."""

@@ -9,7 +9,6 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.flange_sensor import (
     FlangeSensorProblem,
     MeasuringRobot,
@@ -22,11 +21,6 @@ from robocal_ros.thermal.flange_sensor import (
 SIGMA = 3e-5
 T_FLANGE_SENSOR = frames.transform(frames.exp_rotation([0.1, -0.4, 0.8]), [0.08, -0.05, 0.22])
 CENTRES = {"a": np.array([1.6, 0.2, 0.6]), "b": np.array([1.2, -0.8, 0.9])}
-
-
-@pytest.fixture(scope="module")
-def nominal() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 def robot(nominal: SerialArm, seed: int) -> SerialArm:

@@ -52,11 +52,6 @@ def test_a_learned_prior_does_better_than_the_default():
 PERIOD_S, CYCLES = 300.0, 40
 
 
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
-
-
 def gains_of(arm: SerialArm, rng: np.random.Generator) -> np.ndarray:
     """Change (k,) of each parameter per kelvin of its joint."""
     return 0.05 * np.sqrt(np.diag(drift_prior(arm))) * rng.standard_normal(len(arm.parameters))

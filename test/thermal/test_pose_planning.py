@@ -11,7 +11,6 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError, TooFewSamplesError
 from robocal_ros.identification.solve import CellModel
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.cell_setup import (
     Design,
     SensorField,
@@ -24,11 +23,6 @@ from robocal_ros.thermal.identification import drift_prior, identify_cycle
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
 
 FIELD = SensorField()
-
-
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 @pytest.fixture(scope="module")

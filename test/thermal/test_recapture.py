@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from maintenance_cell import config_of
-from shift import BALL, KNOCK, NOISE_M, Shift, built, knocked, postures, warmed
+from shift import BALL, KNOCK, NOISE_M, DriftingRobot, knocked, postures, warmed
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import Outcome
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.drift_following import ThermalConfig
-from robocal_ros.thermal.session import ThermalSession, configuration, session_as_recorded
+from robocal_ros.thermal.session import configuration, session_as_recorded
 
 POSES, KELVIN, NIGHT_H = 8, 15.0, 12.0
 STILL = np.eye(4)
@@ -23,20 +23,14 @@ TAUGHT = np.eye(4)
 TAUGHT[:3, 3] = BALL[:3]
 
 
-class Robot:
-    """Visits the same poses, at any warmth; ``T_sensor``: how the sensor was moved by now."""
+class Robot(DriftingRobot):
+    """``T_sensor``: how the sensor was moved by now."""
 
     def __init__(self, folder: Path) -> None:
-        self.nominal = load_robot("kr150_r3100")
-        self.history = CalibrationHistory.open(
-            "s1", model_hash=self.nominal.model_hash, state_dir=folder
-        )
-        self.cold, self.q = built(self.nominal), postures(self.nominal, POSES)
-        self.check = postures(self.nominal, 40, seed=9)
+        self.check = postures(load_robot("kr150_r3100"), 40, seed=9)
         work = {"work_poses": tuple(map(tuple, self.check.tolist())), "tip_m": tuple(BALL[:3])}
-        config = ThermalConfig(sigma_m=NOISE_M, **work)
-        self.session = ThermalSession(self.nominal, self.history, config, "test")
-        self.shift, self.T_sensor = Shift(self.nominal.joint_names), STILL
+        super().__init__(folder, ThermalConfig(sigma_m=NOISE_M, **work), POSES)
+        self.T_sensor = STILL
         self.known_m = 0.0  # how well the model in force is known
         bounds = config_of(home=self.q[0], poses=self.q[1:], T_flange_tool=TAUGHT)
         self.decider = Decider(self.nominal, self.history, bounds)
@@ -45,13 +39,8 @@ class Robot:
         q = np.tile(self.q if q is None else q, (rounds, 1))
         samples = self.shift.visit(warmed(self.cold, kelvin), q, after_h)
         self.visited = knocked(samples, self.T_sensor)
-        for sample in self.visited:
-            self.session.add(sample)
+        self.feed(self.visited)
         return self.ask(command)
-
-    def ask(self, command: str, **arguments) -> Outcome:
-        self.session.submit(Command(command, arguments))
-        return self.session.advance(wall_ns=1, force=True)[-1]
 
     def work(self, kelvin: float = KELVIN, after_h: float = 2.0) -> Outcome:
         """A cycle of the warm robot whose model is accepted."""

@@ -8,16 +8,10 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.cell_setup import calibrate_sensor, place_sensor
 
 SIGMA = 2e-5
 T_SENSOR_BASE, BALL = kr150.T_SENSOR_BASE, kr150.BALL
-
-
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 def poses(count: int, seed: int = 0) -> np.ndarray:

@@ -17,7 +17,6 @@ from robocal_ros.ground.samples import (
     JointSample,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.thermal.drift_following import ThermalConfig
@@ -25,11 +24,6 @@ from robocal_ros.thermal.session import ThermalSession, take_message
 
 NS = 1_000_000_000
 POSES = 8
-
-
-@pytest.fixture(scope="module")
-def nominal() -> Any:
-    return load_robot("kr150_r3100")
 
 
 @pytest.fixture(scope="module")

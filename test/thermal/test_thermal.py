@@ -10,7 +10,6 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, ResidualError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import (
     CycleDrift,
     drift_prior,
@@ -23,11 +22,6 @@ from robocal_ros.thermal.reference import ColdReference, capture_reference
 SIGMA_M = 2e-5
 BALL = np.array([0.10, 0.05, 0.20, 1.0])
 T_SENSOR_BASE = frames.transform(frames.exp_rotation([0.3, -0.2, 1.0]), [2.0, 1.0, -0.5])
-
-
-@pytest.fixture(scope="module")
-def nominal() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 @pytest.fixture(scope="module")

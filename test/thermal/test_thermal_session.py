@@ -21,7 +21,6 @@ from robocal_ros.ground.samples import (
     StandstillRule,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import NEWEST, ONLY, Command, Outcome, digest
 from robocal_ros.thermal.drift_following import ThermalConfig
@@ -30,11 +29,6 @@ from robocal_ros.thermal.session import ThermalSession
 NS = 1_000_000_000
 POSES = 8
 CONFIG = ThermalConfig(standstill=StandstillRule(), sigma_m=2e-5)
-
-
-@pytest.fixture(scope="module")
-def nominal():
-    return load_robot("kr150_r3100")
 
 
 @pytest.fixture(scope="module")

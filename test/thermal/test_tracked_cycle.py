@@ -10,7 +10,6 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import (
     FixedSphere,
     drift_prior,
@@ -22,11 +21,6 @@ from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, TrackedCycl
 
 PERIOD_S = 300.0
 POSES = 6
-
-
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 def settled(arm: SerialArm, seed: int, poses: int = POSES) -> DriftTracker:

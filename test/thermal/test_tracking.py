@@ -11,18 +11,11 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, StaleError
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import ColdSpots
 from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, Heat, HeatGains, joints_of
 
 PERIOD_S = 300.0
-
-
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 def sample_path(process: DriftProcess, count: int, rng: np.random.Generator) -> np.ndarray:

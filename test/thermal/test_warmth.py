@@ -8,17 +8,11 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import DriftShare, capture_reference, drift_share
 
 POSES, ROUNDS, TRIALS = 10, 3, 100
 KNOCK = frames.transform(frames.exp_rotation([0.0, 0.02, 0.01]), [6e-3, 0.0, -3e-3])
-
-
-@pytest.fixture(scope="module")
-def arm() -> SerialArm:
-    return load_robot("kr150_r3100")
 
 
 def shares(arm: SerialArm, truth: float, T_knock: np.ndarray) -> list[DriftShare]:

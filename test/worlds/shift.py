@@ -1,13 +1,23 @@
-"""A small simulated shift: a robot moves from pose to pose, a ball on it is measured at rest."""
+"""A small simulated shift: a robot moves from pose to pose, a ball on it is measured at rest.
+
+And the thermal session of such a robot.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import REFERENCE_SPHERE, JointSample, PointSample
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.session import ThermalSession
 
 NS = 1_000_000_000
 PERIOD_NS = 10_000_000
@@ -17,6 +27,17 @@ BALL = np.array([0.10, 0.05, 0.20, 1.0])
 T_SENSOR_BASE = frames.transform(frames.exp_rotation([0.3, -0.2, 1.0]), [2.0, 1.0, -0.5])
 
 Sample = JointSample | PointSample
+
+
+@pytest.fixture(scope="session")
+def nominal() -> SerialArm:
+    """The type of the robots here."""
+    return load_robot("kr150_r3100")
+
+
+@pytest.fixture(scope="session")
+def arm(nominal: SerialArm) -> SerialArm:
+    return nominal
 
 
 def postures(arm: SerialArm, count: int, seed: int = 3) -> np.ndarray:
@@ -111,3 +132,32 @@ def fixed_points(samples: Sequence[Sample], moved: bool) -> list[Sample]:
             at = centre + 2e-5 * rng.normal(size=3)
             found.append(PointSample(sample.stamp_ns, sample.frame, "floor", at, REFERENCE_SPHERE))
     return knocked(found) if moved else found
+
+
+class DriftingRobot:
+    """A robot that visits the same poses at any warmth, and its session; time runs on in a shift.
+
+    A session that starts anew knows the history alone.
+    """
+
+    def __init__(self, folder: Path, config: ThermalConfig | None = None, poses: int = 8) -> None:
+        self.nominal, self.folder = load_robot("kr150_r3100"), folder
+        self.config = config or ThermalConfig(sigma_m=NOISE_M)
+        self.shift = Shift(self.nominal.joint_names)
+        self.cold, self.q = built(self.nominal), postures(self.nominal, poses)
+        self.start()
+
+    def start(self) -> ThermalSession:
+        self.history = CalibrationHistory.open(
+            "s1", model_hash=self.nominal.model_hash, state_dir=self.folder
+        )
+        self.session = ThermalSession(self.nominal, self.history, self.config, "test")
+        return self.session
+
+    def feed(self, samples: Iterable[Sample]) -> None:
+        for sample in samples:
+            self.session.add(sample)
+
+    def ask(self, name: str, **arguments: object) -> Outcome:
+        self.session.submit(Command(name, arguments))
+        return self.session.advance(wall_ns=self.shift.now_ns, force=True)[-1]
