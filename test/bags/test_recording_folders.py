@@ -57,19 +57,6 @@ def test_the_oldest_go_first_but_for_those_that_are_kept(tmp_path: Path) -> None
     assert left == [folders[0], folders[4]]  # the newest stays
 
 
-def test_a_checkout_beside_the_recordings_stays(tmp_path: Path) -> None:
-    """It has the name of a recording, and is older than all of them."""
-    checkout = tmp_path / "robocal_ros"
-    (checkout / ".git").mkdir(parents=True)
-    (checkout / "setup.py").write_text("work of years\n")
-    os.utime(checkout, (0, 0))
-    old, _ = made(tmp_path, 100), made(tmp_path, 200)
-    room = make_room(tmp_path, MINE, 0, 0)
-    assert room.deleted == (old,)
-    assert (checkout / "setup.py").read_text() == "work of years\n"
-    assert "no recorder made it" in room.left["robocal_ros"]
-
-
 def test_links_files_copies_and_other_recorders_are_left_alone_and_hold_nothing_up(
     tmp_path: Path,
 ) -> None:

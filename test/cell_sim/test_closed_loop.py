@@ -259,36 +259,29 @@ def test_the_plan_is_struck_between_two_gaps():
         assert min(one for one in since if one >= 0.0) > plan.gap_s
 
 
-def test_right_after_the_next_gap_is_one_gap():
-    assert gaps_to_recover(until_gap(6), STRUCK_S, TOLERANCE_M) == 1
-    assert gaps_to_recover(until_gap(7), STRUCK_S, TOLERANCE_M) == 2
+RELAPSED = shift(lambda t, cycle: BENT if t > STRUCK_S and cycle != 6 and cycle < 9 else GOOD)
+REFUSING = shift(lambda t, cycle: None if cycle == 8 else BENT if STRUCK_S < t < 1800.0 else GOOD)
+STRUCK_AGAIN = shift(
+    lambda t, cycle: BENT if STRUCK_S < t < 1700.0 or t > 3000.0 else GOOD,
+    replace(PLAN, incidents=(*PLAN.incidents, Incident(3000.0, "sensor_knocked", 1.0))),
+)
 
 
-def test_what_is_not_hurt_needs_no_gap():
-    assert gaps_to_recover(always(GOOD), STRUCK_S, TOLERANCE_M) == 0
-
-
-def test_a_good_pass_between_bad_ones_is_no_recovery():
-    relapsed = shift(lambda t, cycle: BENT if t > STRUCK_S and cycle != 6 and cycle < 9 else GOOD)
-    assert gaps_to_recover(relapsed, STRUCK_S, TOLERANCE_M) == 4
-
-
-@pytest.mark.parametrize("size_m", [BENT, None])
-def test_never_right_again_are_all_gaps(size_m):
-    assert gaps_to_recover(until_gap(99, size_m), STRUCK_S, TOLERANCE_M) == PLAN.cycles
-
-
-def test_a_refused_pass_is_no_recovery():
-    refusing = shift(
-        lambda t, cycle: None if cycle == 8 else BENT if STRUCK_S < t < 1800.0 else GOOD
-    )
-    assert gaps_to_recover(refusing, STRUCK_S, TOLERANCE_M) == 4
-
-
-def test_the_next_incident_is_not_the_first_ones():
-    plan = replace(PLAN, incidents=(*PLAN.incidents, Incident(3000.0, "sensor_knocked", 1.0)))
-    record = shift(lambda t, cycle: BENT if STRUCK_S < t < 1700.0 or t > 3000.0 else GOOD, plan)
-    assert gaps_to_recover(record, STRUCK_S, TOLERANCE_M) == 1
+@pytest.mark.parametrize(
+    ("record", "gaps"),
+    [
+        pytest.param(until_gap(6), 1, id="right after the next gap"),
+        pytest.param(until_gap(7), 2, id="a gap later"),
+        pytest.param(always(GOOD), 0, id="what is not hurt needs none"),
+        pytest.param(RELAPSED, 4, id="a good pass between bad ones is no recovery"),
+        pytest.param(until_gap(99), PLAN.cycles, id="never right again"),
+        pytest.param(until_gap(99, None), PLAN.cycles, id="refused for ever"),
+        pytest.param(REFUSING, 4, id="a refused pass is no recovery"),
+        pytest.param(STRUCK_AGAIN, 1, id="the next incident is not the first one's"),
+    ],
+)
+def test_gaps_until_it_is_right_again(record, gaps):
+    assert gaps_to_recover(record, STRUCK_S, TOLERANCE_M) == gaps
 
 
 # ---- share below 0.1 mm --------------------------------------------------------------------------

@@ -256,21 +256,6 @@ def test_a_decision_that_comes_twice_is_made_once(plc, graph):
     assert names == ["accept", "accept", "rollback", "rollback", "reject", "reject"]  # one refused
 
 
-def test_an_acceptance_by_trigger_that_comes_twice_is_made_once(plc, graph):
-    (first,) = candidates(graph, 1)
-    assert plc.trigger("accept") == f"{first} ACCEPT revision 1: calibration {first} in force"
-    for _ in range(2):
-        assert plc.trigger("accept") == f"{first} ACCEPT calibration {first} is in force already"
-    assert [event.command for event in plc.events] == ["accept"]
-    (second,) = candidates(graph, 1, based_on=1)
-    assert plc.call(Decide, "accept", id=second, by="plc").revision == 2
-    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait")  # not its own
-    (third,) = candidates(graph, 1, based_on=2)
-    assert plc.trigger("accept").startswith(f"{third} ACCEPT revision 3")
-    assert plc.trigger("rollback").startswith(f"{second} ACCEPT revision 4")
-    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait")
-
-
 def test_a_history_that_another_process_holds_delays_nobody(plc, graph):
     (number,) = candidates(graph, 1)
     plc.call(Decide, "accept", id=0)  # discovered

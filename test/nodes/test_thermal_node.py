@@ -10,21 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cell import DEEP, KEEP_ALL, Cell, message_of
+from cell import DEEP, Cell, message_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped
-from history_content import content
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
-from robocal_msgs.msg import AccuracyState, CorrectionStatus, KinematicModel, SessionEvent
+from robocal_msgs.msg import AccuracyState, CorrectionStatus, KinematicModel
 from robocal_msgs.srv import Decide, ListCalibrations
 from sensor_msgs.msg import JointState
 from shift import Shift, built, postures, warmed
 
-from robocal_ros import __version__
-from robocal_ros.bags.bags import BagReader, BagWriter
-from robocal_ros.bags.replay import input_topics, read_events, replay
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.node import HandEyeNode
@@ -36,12 +32,10 @@ from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.endpoints import Health
-from robocal_ros.ros.session_node import EVENTS, history_notice
+from robocal_ros.ros.session_node import history_notice
 from robocal_ros.thermal.node import ThermalNode
-from robocal_ros.thermal.session import ThermalSession, config_of, take_message
 
 POSES = 8
-NS = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -324,81 +318,6 @@ def require_old_or_new(graph: Any, serial: str, before: Head, chosen: int) -> No
         assert (after.revision, after.calibration_id) == (before.revision + 1, chosen)
         assert after.model == model
         assert state is CalibrationState.IN_FORCE
-
-
-COMMANDS = 9
-CHANGES = 7  # of what is in force or of the tracker, with the start
-
-
-def test_live_equals_replay_bit_for_bit(graph, visits, nominal, tmp_path):
-    """What the node made of its topics, and what the sessions make of a recording of them."""
-    path = tmp_path / "live.mcap"
-    with BagWriter(path) as bag:
-        recorder = Recorder(graph, bag)
-        cell = Cell(graph, serial="live", target="cube")
-        found = candidate(cell, visits)
-        cell.call("accept", id=found, by="me", reason="fine")
-        cell.play(visits[2])
-        assert cell.call("identify", method="lsq").status == Code.RANK_DEFICIENT
-        second = cell.call("identify", cycle_id="two").candidate_id
-        cell.call("reject", id=second, by="me", reason="no")
-        cell.play(visits[1])  # the clock jumps back here
-        cell.call("identify", cycle_id="three", samples=6)
-        cell.call("rollback", id=0, by="me", reason="back")
-        assert cell.call("rollback", id=0).status == Code.CONFLICT
-        sent = sum(len(visits[i]) for i in (0, 1, 2, 1)) + COMMANDS + CHANGES
-        graph.spin_until(lambda: recorder.count == sent, "all is recorded")
-    assert cell.process.stop() == 0
-    topics = {"/joint_states": "joint_states", "/measured_point": "measured_point"}
-    with BagReader(path) as bag:
-        configured, commands = read_events(bag.messages(["/thermal_node/session_events"]))
-        assert configured is not None
-        assert input_topics(bag.info.topics, configured).items() >= topics.items()
-        assert len(commands) == COMMANDS
-        again = CalibrationHistory.open(
-            "again", model_hash=nominal.model_hash, state_dir=tmp_path / "again"
-        )
-        session = ThermalSession(nominal, again, config_of(configured.arguments), __version__)
-        report = replay(
-            session,
-            bag.messages(list(topics)),
-            commands,
-            input_topics(bag.info.topics, configured),
-            take_message,
-        )
-    assert report.differs == []
-    assert len(report.outcomes) == COMMANDS
-    with CalibrationHistory.open("live", state_dir=graph.state) as live:
-        assert content(again) == content(live)
-        assert again.head() == live.head()
-        done = robocal(graph, "replay", str(path), "--state", str(tmp_path / "cli"), "--json")
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["differs"] == []
-        with CalibrationHistory.open("live", state_dir=tmp_path / "cli") as printed:
-            assert content(printed) == content(live)
-
-
-class Recorder:
-    """Writes what comes on the node's topics into a bag, in the order in which it comes."""
-
-    def __init__(self, graph: Any, bag: BagWriter) -> None:
-        self._bag = bag
-        self.count = 0
-        for kind, topic, profile in (
-            (JointState, "/joint_states", KEEP_ALL),
-            (PointStamped, "/measured_point", KEEP_ALL),
-            (SessionEvent, "/thermal_node/session_events", EVENTS),
-        ):
-            graph.probe.create_subscription(kind, topic, self._writer(kind, topic), profile)
-
-    def _writer(self, kind: type, topic: str) -> Any:
-        msgtype = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-
-        def write(message: Any) -> None:
-            self.count += 1
-            self._bag.write(topic, msgtype, message, self.count)
-
-        return write
 
 
 def test_uncorrected_joint_states_are_refused(graph, visits):
