@@ -14,7 +14,6 @@ from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -33,6 +32,7 @@ from robocal_ros.bags.mcap_files import (
 )
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.files import draft_beside, read_text
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import cloud_points, joint_sample
 from robocal_ros.kinematics import SerialArm
 
@@ -295,8 +295,6 @@ def bag_info(path: str | Path) -> BagInfo:
         return bag.info
 
 
-Array = NDArray[np.float64]
-Document = dict[str, Any]
 DATA_SET, JOINTS, PROFILE, POSE = "data_set", "joint_states", "profile", "target_pose"
 IMAGE = "image"
 _TYPE = {

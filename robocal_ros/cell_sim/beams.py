@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.cell_sim.robot import Draws, Stream
 from robocal_ros.ground import frames
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.edges import BEAMS, BeamEdge
 
-Array = NDArray[np.float64]
 Poses = Callable[[Array], Array]
 
 GRID_S = 2e-3  # no shadow is shorter

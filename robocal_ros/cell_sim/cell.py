@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.beams import (
@@ -82,13 +82,11 @@ from robocal_ros.cell_sim.trajectory_controller import (
 )
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.screening import THRESHOLD_M
 from robocal_ros.tool.edges import BeamEdge
 from robocal_ros.tool.run import PlannedStep
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 NEAR = float(np.radians(8.0))  # corrections are smaller, working poses further apart
 

@@ -20,9 +20,8 @@ from robocal_ros.cell_sim.trajectory_controller import (
 )
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.tool.edges import BeamEdge
-
-Array = NDArray[np.float64]
 
 Fault = Literal[
     "none",

@@ -33,6 +33,7 @@ from robocal_ros.cell_sim.trajectory_controller import (
 )
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD, stamp_ns
 from robocal_ros.hand_eye.data import PROFILE
 from robocal_ros.ros import endpoints
@@ -41,8 +42,6 @@ from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 from robocal_ros.thermal.screening import THRESHOLD_M
 from robocal_ros.tool.edges import StepKind
 from robocal_ros.tool.run import PlannedStep
-
-Array = NDArray[np.float64]
 
 KINDS: Mapping[int, StepKind] = {ToolStep.CIRCLE: "circle", ToolStep.PLUNGE: "plunge"}
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from robocal_msgs.msg import ToolStep
 from trajectory_msgs.msg import JointTrajectory
 
@@ -33,6 +32,7 @@ from robocal_ros.cell_sim.trajectory_controller import LAG_S, ControllerOptions
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.files import write_text
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.ros import endpoints
@@ -40,8 +40,6 @@ from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import WARN, Health
 from robocal_ros.ros.parameters import Setting
 from robocal_ros.tool.run import PlannedStep
-
-Array = NDArray[np.float64]
 
 MM, MS = 1e-3, 1e-3
 PIN_M = 0.15  # tip of the straight tool along the flange's z, where the robot file has no tool

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.cell_sim.faults import BALL_KNOCK, Faults
 from robocal_ros.cell_sim.robot import Draws, Effects, Stream
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.cell_setup import SensorField
-
-Array = NDArray[np.float64]
 
 AWAY_M = 1e-9  # a ray does not meet the surface on which it begins
 TABLE_M = 2.0
@@ -538,8 +537,6 @@ class ProfileShot:
     told_s: float
     points: Array
 
-
-Index = NDArray[np.int64]
 
 TICK_S = 8e-3  # the cell works in whole ticks, so that it does not matter when it is asked
 FEWEST = 4  # ticks: a shorter stop, as where a plunge turns, is no rest

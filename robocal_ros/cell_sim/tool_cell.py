@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.edges import BEAMS
 from robocal_ros.tool.run import PlannedStep
-
-Array = NDArray[np.float64]
 
 
 def _moved(T_base_flange: Array, shift: Array) -> Array:

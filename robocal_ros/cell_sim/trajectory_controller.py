@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array, Index
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Index = NDArray[np.int64]
 
 WITH_SPEED, WITH_BOTH, WITHOUT_SPEED = 1, 3, 2  # what both ends of a stretch have beside positions
 AT_REST = 1.2e-7  # greatest speed of a last point, rad/s (prismatic: m/s): float's epsilon

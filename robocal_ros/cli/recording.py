@@ -25,6 +25,7 @@ from robocal_ros.bags.replay import (
 )
 from robocal_ros.cli.main import describe_robot
 from robocal_ros.ground.errors import InputError, WrongRobotError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
 from robocal_ros.hand_eye.data import SHOTS
 from robocal_ros.kinematics import SerialArm
@@ -181,7 +182,6 @@ def find_robot(name: str | None, warnings: list[str], configured: Command | None
     )
 
 
-Array = NDArray[np.float64]
 Transforms = list[tuple[int, Array]]
 CHECK_POINTS, TOOL, HAND_EYE = "/truth/check_points", "/truth/tool", "/truth/hand_eye"
 TRANSFORMS = {TOOL: "T_flange_tool", HAND_EYE: "T_flange_sensor"}

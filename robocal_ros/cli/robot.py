@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, warn
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text
-from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.universal_robots import (
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-Array = NDArray[np.float64]
 _VALUE = re.compile(r"\s*([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", re.IGNORECASE)
 _TO_SI = {"deg": 3.141592653589793 / 180.0, "rad": 1.0, "mm": 1e-3, "m": 1.0}
 _MOST_DEG = 1e6

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.bags.bags import BagMessage, BagReader
 from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
@@ -37,6 +36,7 @@ from robocal_ros.cli.recording import (
 from robocal_ros.cli.replay import ReplayRequest, replay_bag, seconds
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Action, Entry
@@ -56,7 +56,6 @@ from robocal_ros.thermal.reference import (
 )
 from robocal_ros.thermal.session import ThermalSession
 
-Array = NDArray[np.float64]
 Truth = Sequence[tuple[int, Array]]  # stamps, ns, and transforms (4, 4) from then on
 
 HOUR_NS = 3.6e12

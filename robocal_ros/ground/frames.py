@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Document = dict[str, Any]
 
 GIMBAL_LOCK = 1e-8  # cosine of the pitch below which roll and yaw are one
 
@@ -163,9 +165,6 @@ def urdf_joint(parent: str, child: str, xyz: str, rpy: str) -> str:
         f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
         "</joint>"
     )
-
-
-Document = dict[str, Any]
 
 
 def transform_document(T: Array) -> Document:

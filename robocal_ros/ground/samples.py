@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError
-
-Array = NDArray[np.float64]
+from robocal_ros.ground.frames import Array
 
 DEFAULT_TARGET = "tool"
 CORRECTED = "robocal_corrected"  # frame_id of commands that carry a joint correction

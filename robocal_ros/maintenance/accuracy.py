@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.correction.interface import ToldCorrection, uncorrected
 from robocal_ros.ground.errors import Code, InputError, StateLostError, StorageError
+from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import Head
 from robocal_ros.motion.cell import DrivingConfig
 from robocal_ros.thermal.accuracy import (
@@ -23,7 +24,6 @@ from robocal_ros.thermal.accuracy import (
     offset_error,
 )
 
-Array = NDArray[np.float64]
 NS, MM = 1_000_000_000, 1e-3
 REMEMBERED = 200  # ended cycles
 VERSION = 2  # of the document; one without a version is the first, which knew no runs and stamps

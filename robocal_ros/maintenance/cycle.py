@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
@@ -24,8 +24,6 @@ from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
 from robocal_ros.tool.session import FULL, QUICK
-
-Array = NDArray[np.float64]
 
 NS = 1_000_000_000
 NODE = "thermal node"

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.motion.cell import MotionCell, ToolBody, along, departure, joint_way, raised_way
@@ -24,8 +24,6 @@ from robocal_ros.tool.driving import least_s
 # Home and the measuring poses are a ring: home is 0, the poses are 1 to k in their order, and a
 # straight joint line leads from each to the next, from the last one home. Nothing else is driven.
 
-
-Array = NDArray[np.float64]
 
 HOME = 0
 Line = tuple[int, int]  # between two neighbours of the ring, or (i, i): at one

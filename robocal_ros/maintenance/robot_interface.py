@@ -9,9 +9,9 @@ from itertools import count
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, ConflictError, LimitError
+from robocal_ros.ground.frames import Array
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.maintenance.mover import HOME, STATION, FaultError, Mover, Route, Ways
 from robocal_ros.motion.plan import JointPlan
@@ -265,8 +265,6 @@ class Disarming:
 
 
 DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot
-
-Array = NDArray[np.float64]
 
 
 class CellInterface(Asking):

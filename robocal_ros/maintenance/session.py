@@ -12,11 +12,9 @@ from enum import IntEnum
 from pathlib import Path
 from traceback import extract_tb
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robocal_ros.correction.interface import ToldCorrection
 from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.kinematics import SerialArm
@@ -239,8 +237,6 @@ class Status:
     closed: str = ""  # why the gap counts as closed; empty while it is open
     trouble: str = ""  # why nobody knows what waits; empty: the pending ids are true
 
-
-Array = NDArray[np.float64]
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
 MOST_ID = 100  # characters of a cycle's name

@@ -5,10 +5,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import follow, inverse, require_within_limits
 from robocal_ros.motion.plan import (
@@ -21,8 +22,6 @@ from robocal_ros.motion.plan import (
     stop,
     stop_time,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

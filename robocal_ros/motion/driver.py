@@ -33,6 +33,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import DrivingConfig, Housing
@@ -42,8 +43,6 @@ from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.parameters import Setting, advanced, length
-
-Array = NDArray[np.float64]
 
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by

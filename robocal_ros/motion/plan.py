@@ -6,13 +6,12 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
 
 REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
 LEAD_S = 0.05

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError, LimitError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Silence
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import DrivingConfig, MotionCell
@@ -53,8 +53,6 @@ class SpeedScaling:
                 return factor
         return None
 
-
-Array = NDArray[np.float64]
 
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 LEAST, OLDEST_S = 5, 0.2  # of them, if not too old: one wild reading is outvoted

@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, MultipleLocator
 from numpy.typing import NDArray
 
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.report.validation import NO_FAULT, TOLERANCE_MM, ShiftErrors
-
-Array = NDArray[np.float64]
 
 BEFORE, AFTER, OLDEST = "#c2603a", "#0f6f86", "#7fb6c3"
 INK, FAINT, GRID = "#22303a", "#6d7b85", "#e6eaed"
@@ -226,8 +225,6 @@ def draw_rounds(path: Path, document: dict[str, Any]) -> None:
         axes.set_title(f"Directions within {document['threshold_mm']:g} mm at check poses")
         figure.savefig(path, dpi=130)
 
-
-Document = dict[str, Any]
 
 GOAL = 0.95  # of all directions
 MOST_TIMES = 2000  # drawn of a course

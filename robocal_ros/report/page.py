@@ -5,8 +5,9 @@ from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
+from robocal_ros.ground.frames import Document
 from robocal_ros.report.figures import Drawn
-from robocal_ros.report.validation import TOLERANCE_MM, Document, summary_rows
+from robocal_ros.report.validation import TOLERANCE_MM, summary_rows
 
 CSS = """
 :root { --ink: #22303a; --faint: #6d7b85; --line: #e1e6ea; --accent: #0f6f86; --warm: #c2603a; }

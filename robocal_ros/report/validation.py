@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import summarise
-
-Array = NDArray[np.float64]
-Document = dict[str, Any]
+from robocal_ros.ground.frames import Array, Document
 
 TOLERANCE_MM = 0.1
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, CalibrationState, Entry
@@ -24,10 +24,6 @@ from robocal_ros.kinematics.robots import Fields, read_made, write_made
 from robocal_ros.thermal.identification import drift_prior, identify_cycle, learned_prior
 from robocal_ros.thermal.reference import ColdSpots, reference_of
 from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, HeatGains
-
-Array = NDArray[np.float64]
-Document = dict[str, Any]
-
 
 FEWEST_CYCLES = 10
 

@@ -29,18 +29,13 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.judged import require_match
 from robocal_ros.identification.solve import CellModel, identify, linear_start, random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_made, write_made
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Document = dict[str, Any]
-
 
 SensorMethod = Literal["ml", "classic"]
 FEWEST_POSES = 5

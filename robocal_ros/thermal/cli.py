@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.cli.identify import show_identification
 from robocal_ros.cli.main import (
@@ -60,8 +59,6 @@ from robocal_ros.thermal.screening import DriftHistory, best_subset, screen, sha
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-Array = NDArray[np.float64]
 
 
 def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground.errors import Code, ConflictError, InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements, StandstillRule
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry
@@ -28,8 +29,6 @@ from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work,
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
 from robocal_ros.thermal.tracking import DriftProcess, DriftState, Heat, TrackedCycle, track_cycle
-
-Array = NDArray[np.float64]
 
 Prior = Literal["default", "learned"]
 METHODS: tuple[Method, ...] = ("map", "lsq")

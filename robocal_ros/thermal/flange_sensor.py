@@ -9,10 +9,8 @@ joint is seen only together with the sensor's mounting.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation import estimation
 from robocal_ros.estimation.assessment import (
@@ -29,16 +27,11 @@ from robocal_ros.estimation.assessment import (
 from robocal_ros.estimation.estimation import describe
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.solve import default_prior, fitted_prior, random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import parameters_document
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Document = dict[str, Any]
-
 
 _HAND_EYE = (
     "sensor_x_mm",

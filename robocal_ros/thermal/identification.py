@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +20,13 @@ from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.estimation.estimation import Observability, describe, observability
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import Array, Document, Index
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.judged import cell_document
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import parameters_document
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots, visit_variance
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Document = dict[str, Any]
-
 
 EXPANSION_PER_K = 12e-6  # steel and cast iron; aluminium links drift up to twice as much
 PLAUSIBLE_WARMING_K = 20.0

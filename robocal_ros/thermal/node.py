@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
-from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel
 from robocal_msgs.srv import (
@@ -23,6 +22,7 @@ from robocal_ros import __version__
 from robocal_ros.estimation.sphere import SphereRule
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, LimitError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import (
     DEFAULT_TARGET,
     JOINTS,
@@ -78,8 +78,6 @@ from robocal_ros.thermal.drift_following import METHODS, PRIORS, SPHERE_RADIUS_M
 from robocal_ros.thermal.identification import require_parameters
 from robocal_ros.thermal.proposing import SENSOR
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
-
-Array = NDArray[np.float64]
 
 ACCURACY_S = 1.0
 MOST_POSES = 20  # a plan holds the node up for two seconds then

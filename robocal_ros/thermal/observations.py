@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -31,8 +31,6 @@ from robocal_ros.ground.samples import (
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Ignored
 from robocal_ros.thermal.drift_following import InForce, ThermalConfig
-
-Array = NDArray[np.float64]
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
 MOST_KEPT = 20000  # observations that no command has used

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, summarise
 from robocal_ros.ground.errors import Code, ConflictError, InputError, TooFewSamplesError
+from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Proposal
@@ -46,9 +47,6 @@ from robocal_ros.thermal.reference import (
     drift_size_m,
     reference_document,
 )
-
-Array = NDArray[np.float64]
-Document = dict[str, Any]
 
 SENSOR = "sensor"
 SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")

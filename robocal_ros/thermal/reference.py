@@ -13,16 +13,12 @@ from robocal_ros.estimation.assessment import FEWEST_GROUPS, LARGEST_RMS_M, pose
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, ResidualError
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document, Index
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.judged import require_match
 from robocal_ros.identification.solve import CellModel, identify, make_layout
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import measurements_of, read_table
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 
 SAME_VISIT_RAD = float(np.radians(0.5))
 FEWEST_TO_JUDGE = 3  # visits of a spot, so that the others outvote a wrong one

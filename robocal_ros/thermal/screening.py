@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.thermal.identification import entangled, open_directions, subset_drift
 from robocal_ros.thermal.reference import ColdSpots
-
-Array = NDArray[np.float64]
-
 
 THRESHOLD_M = 1e-4
 FEWEST_KNOWN = 21  # as many as the test of stationarity needs

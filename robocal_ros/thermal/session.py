@@ -6,10 +6,10 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StorageError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
@@ -64,8 +64,6 @@ from robocal_ros.thermal.observations import (
 )
 from robocal_ros.thermal.proposing import Proposer
 from robocal_ros.thermal.reference import SAME_VISIT_RAD, ColdReference
-
-Array = NDArray[np.float64]
 
 SAME_CLOCK_NS = 1_000_000_000
 REMEMBERED = 200  # calibrations back to which a cycle's id is known

@@ -9,6 +9,7 @@ from robocal_ros.estimation.assessment import Judgement, Verdict
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.estimation.estimation import describe, observability
 from robocal_ros.ground.errors import Code, InputError, StaleError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.identification import (
@@ -23,9 +24,6 @@ from robocal_ros.thermal.identification import (
     step_words,
 )
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
-
-Array = NDArray[np.float64]
-
 
 SETUP_APPROACH_S = 1800.0
 APPROACH_S = 3600.0  # a link follows what heats it

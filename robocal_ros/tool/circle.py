@@ -18,11 +18,11 @@ from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError
+from robocal_ros.ground.frames import Array
 from robocal_ros.tool.crossed_model import LARGEST_MISFIT_M, BeamStep, RobotNoise
 from robocal_ros.tool.edges import BEAMS, FEWEST_EDGES, BeamEdge, BeamError, edges_of
 from robocal_ros.tool.laser_frame import FlangePath, LaserFrame, axis_from_centres, retaught
 
-Array = NDArray[np.float64]
 CircleMethod = Literal["best", "classic"]
 
 THICKEST = 0.7  # tool's radius on the circle's

@@ -24,6 +24,7 @@ from robocal_ros.ground.errors import (
     RankDeficientError,
     ResidualError,
 )
+from robocal_ros.ground.frames import Array
 from robocal_ros.tool.edges import BEAMS, FEWEST_EDGES, BeamEdge, BeamError, StepKind, edges_of
 from robocal_ros.tool.laser_frame import (
     FlangePath,
@@ -34,7 +35,6 @@ from robocal_ros.tool.laser_frame import (
     retaught,
 )
 
-Array = NDArray[np.float64]
 Row = tuple[int, int, int, BeamEdge]  # beam, step, circle (-1 in a plunge) and edge
 
 TOOL_NAMES = ("tip_x", "tip_y", "tip_z", "tilt_x", "tilt_y")

@@ -9,10 +9,11 @@ from enum import Enum
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, LimitError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import (
     ROUNDING,
@@ -69,9 +70,6 @@ def station_cell(run: ToolRun, config: DrivingConfig) -> MotionCell:
     seen = run.plan.T_flange_tool if run.seen is None else run.seen
     body = ToolBody(seen, config.tool_length_m, config.tool_radius_m, config.flange_radius_m)
     return MotionCell(run.arm, body, run.plan.laser.T_base_laser, config.housing, config.limits)
-
-
-Array = NDArray[np.float64]
 
 
 def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:

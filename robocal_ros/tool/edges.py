@@ -11,12 +11,11 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 
-Array = NDArray[np.float64]
 Beam = Literal["x", "y"]
 BEAMS: tuple[Beam, Beam] = ("x", "y")
 MOST_BOUNCES = 5  # edges of one burst; more is no contact that settles

@@ -3,16 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
-from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
+from robocal_ros.ground.frames import Array, Document, fixed, urdf_joint, urdf_origin
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields
 from robocal_ros.kinematics.tables import (
@@ -42,7 +41,6 @@ from robocal_ros.tool.judging import (
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, first_rotation
 from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height, TouchFit
 
-Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 1e-3
 
 
@@ -309,7 +307,6 @@ def named_steps(
     return steps
 
 
-Document = dict[str, Any]
 COVARIANCE_UNITS = ("m", "m", "m", "rad", "rad")
 
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.tool.crossed_model import (
     BeamStep,
     Held,
@@ -25,7 +25,6 @@ from robocal_ros.tool.crossed_model import (
 )
 from robocal_ros.tool.laser_frame import FlangePath, LaserFrame, minimal_rotation
 
-Array = NDArray[np.float64]
 Cause = Literal["tool", "station", "doubt"]
 FITS = 0.95  # a bend's shift and tilt agree below this quantile of their noise
 MISSES = 0.99  # and no more above this one: one true bend in a hundred
@@ -156,7 +155,6 @@ def bend_or_station(change: Array, covariance: Array, rule: BendRule, small_m: f
     return Witness(cause, f"{what}: {why}", tip, tilt, sigma, lever_m)
 
 
-Document = dict[str, Any]
 HEALTHY_M, HEALTHY_RAD = 3e-3, float(np.radians(1.5))  # of a measured healthy tool from the taught
 UNCHANGED = 0.95  # a difference below this quantile of its noise is none
 

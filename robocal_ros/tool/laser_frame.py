@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
@@ -21,11 +21,11 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, require_made_for, write_made
 from robocal_ros.tool.edges import BEAMS
 
-Array = NDArray[np.float64]
 POINTS = ("A", "B", "C", "D")
 SMALLEST_BASE_M = 2e-3  # between two points of a beam
 SMALLEST_ANGLE_RAD = float(np.radians(30.0))
@@ -159,7 +159,6 @@ def calibrate_laser(
     return replace(laser, reach=np.asarray(reach))
 
 
-Document = dict[str, Any]
 REQUIRED = ("station", "points_mm", "sigma_mm", "reach_mm", "robot", "model_hash")
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.crossed_model import (
     BeamStep,
@@ -36,7 +37,6 @@ from robocal_ros.tool.laser_frame import (
     upright_pose,
 )
 
-Array = NDArray[np.float64]
 Mode = Literal["full", "quick"]
 STEPS: Mapping[Mode, tuple[str, ...]] = {
     "full": ("low", "high", "upright", "plunge_1", "plunge_2"),

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Quaternion, TransformStamped
-from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import CalibrationQuality, MaintenanceStatus, ToolFrame, ToolStep
@@ -56,7 +55,6 @@ ANSWERS = {
 }
 
 
-Array = NDArray[np.float64]
 KINDS = {"circle": ToolStep.CIRCLE, "plunge": ToolStep.PLUNGE}
 
 

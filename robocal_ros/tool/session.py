@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head, Proposal
@@ -66,8 +66,6 @@ from robocal_ros.tool.run import (
     ToolRun,
     made_with,
 )
-
-Array = NDArray[np.float64]
 
 
 class ToolInForce(HistoryFollower):
@@ -136,7 +134,6 @@ class ToolInForce(HistoryFollower):
         return None if model is None or model["made_with"] != self._made_with else model
 
 
-Document = dict[str, Any]
 FULL, QUICK, REFERENCE = "full", "quick", "reference"
 WITNESS, WITNESS_REFERENCE = "witness", "witness reference"  # of the mandrel
 MODES = (FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.descent import Problem
@@ -23,9 +23,9 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
+from robocal_ros.ground.frames import Array
 from robocal_ros.tool.laser_frame import minimal_rotation
 
-Array = NDArray[np.float64]
 EulerConvention = Literal["zxz", "zyx", "zyz"]
 FEWEST_TOUCHES = 4
 SHORTEST_MOVE_M = 1e-2
