@@ -9,7 +9,6 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.qos import QoSProfile
 from robocal_msgs.action import RunMaintenance
 from robocal_msgs.msg import AccuracyState, MaintenanceResult, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
@@ -37,13 +36,11 @@ from robocal_ros.ros.endpoints import (
 )
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S
 from robocal_ros.ros.parameters import Setting, advanced, given_pose, length, pose_settings
-from robocal_ros.ros.session_node import STATE_DIR, TWIN, SessionEvents
+from robocal_ros.ros.session_node import STATE_DIR, TWIN, AddOutput, SessionEvents
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.tool.laser_frame import read_laser_for
 from robocal_ros.tool.services import ANSWERS
-
-AddOutput = Callable[[type, str, QoSProfile], Any]
 
 
 def result_message(result: CycleResult | None) -> MaintenanceResult:

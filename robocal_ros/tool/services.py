@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Quaternion, TransformStamped
-from rclpy.qos import QoSProfile
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import CalibrationQuality, MaintenanceStatus, ToolFrame, ToolStep
 from std_srvs.srv import SetBool
@@ -33,7 +32,7 @@ from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, tran
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.ros.parameters import Setting, length
-from robocal_ros.ros.session_node import SessionEvents
+from robocal_ros.ros.session_node import AddOutput, SessionEvents
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver
 from robocal_ros.tool.edges import RESTORE
@@ -123,9 +122,6 @@ class ToolMessages:
             covariance=flat.tolist(),
             state=state,
         )
-
-
-AddOutput = Callable[[type, str, QoSProfile], Any]
 
 
 class TcfOutputs:
