@@ -26,7 +26,7 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, StorageEr
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, trigger_text
-from robocal_ros.ros.parameters import Setting, advanced
+from robocal_ros.ros.parameters import Setting, advanced, number
 
 DEPTH = 1000
 DIAGNOSTICS = "/diagnostics"
@@ -187,11 +187,11 @@ SETTINGS = (
     Setting("topics", list(TOPICS), "What is recorded; relative names are in the namespace"),
     Setting("folder", "", "Where recordings are kept; empty: recordings/ in the state folder"),
     Setting("hours", 8.0, "A recording is no longer than this", unit="h", low=1e-3, high=168.0),
-    Setting("keep_mb", 20000.0, "All its recordings together", unit="MB", low=1.0, high=1e7),
-    Setting("free_mb", 500.0, "So much of the disk stays free", unit="MB", low=0.0, high=1e7),
+    number("keep_mb", 20000.0, "All its recordings together", 1.0, 1e7),
+    number("free_mb", 500.0, "So much of the disk stays free", 0.0, 1e7),
     *advanced(
-        Setting("file_mb", 50.0, "A file is this large", unit="MB", low=0.1, high=10000.0),
-        Setting("flush_s", 1.0, "A crash loses no more than this", unit="s", low=0.1, high=60.0),
+        number("file_mb", 50.0, "A file is this large", 0.1, 10000.0),
+        number("flush_s", 1.0, "A crash loses no more than this", 0.1, 60.0),
     ),
 )
 

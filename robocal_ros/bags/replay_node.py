@@ -23,7 +23,7 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.endpoints import ERROR, LOG_EVERY_S, WARN, Health
-from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.parameters import Setting, number
 
 DEPTH = 1000
 LATCHED_DEPTH = 100
@@ -225,26 +225,21 @@ NO_BAG = "no bag"
 GIVE_BAG = "no bag: set the parameter 'bag' to an MCAP file or a recording's folder"
 SETTINGS = (
     Setting("bag", "", "MCAP file, or folder of a recording; empty: nothing to play yet"),
-    Setting(
-        "rate",
-        1.0,
-        "Speed of the recorded time; 0: as fast as it is acknowledged",
-        low=0.0,
-        high=1000.0,
+    number(
+        "rate", 1.0, "Speed of the recorded time; 0: as fast as it is acknowledged", 0.0, 1000.0
     ),
     Setting("topics", [""], "What to play; empty: all that moves nothing"),
     Setting("remap", [""], "Entries recorded:=played"),
     Setting("latched", ["/tf_static"], "Played topics whose last messages are kept for latecomers"),
     Setting("wait_for_subscribers", [""], "Played topics that must have a subscriber first"),
-    Setting("start_delay_s", 0.0, "Pause before the first message", unit="s", low=0.0, high=600.0),
+    number("start_delay_s", 0.0, "Pause before the first message", 0.0, 600.0),
     Setting("start_paused", False, "Wait for ~/play"),
-    Setting(
+    number(
         "acknowledge_timeout_s",
         5.0,
         "Longest wait for a subscriber's acknowledgement before it is reported",
-        unit="s",
-        low=0.1,
-        high=600.0,
+        0.1,
+        600.0,
     ),
     Setting("exit_at_end", False, "End the process: status 0, or 3 when anything was lost"),
 )

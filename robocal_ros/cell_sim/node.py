@@ -38,7 +38,7 @@ from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import WARN, Health
-from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.parameters import Setting, number
 from robocal_ros.tool.run import PlannedStep
 
 MM, MS = 1e-3, 1e-3
@@ -52,14 +52,6 @@ KR150 = "kr150_r3100"
 
 def _numbers(count: int) -> Callable[[Any], str | None]:
     return lambda values: None if len(values) == count else f"not {count} numbers"
-
-
-def _mm(name: str, default: float, what: str, high: float, low: float = 0.0) -> Setting:
-    return Setting(name, default, what, unit="mm", low=low, high=high)
-
-
-def _ms(name: str, default: float, what: str, high: float) -> Setting:
-    return Setting(name, default, what, unit="ms", low=0.0, high=high)
 
 
 SETTINGS = (
@@ -76,15 +68,14 @@ SETTINGS = (
         "Robot type (config/robots) or path of a robot file; its tool is the straight one, 150 mm "
         "along the flange's z where it has none",
     ),
-    Setting(
+    number(
         "q_start_deg",
         [2.3, -124.4, -70.9, 107.7, -91.1, 91.8],
         "Where the robot stands first, tool above the station (sliding joint: mm)",
-        unit="deg",
-        low=-1e5,
-        high=1e5,
+        -1e5,
+        1e5,
     ),
-    Setting("rate_hz", 125.0, "Rate of joint_states", unit="Hz", low=1.0, high=1000.0),
+    number("rate_hz", 125.0, "Rate of joint_states", 1.0, 1000.0),
     Setting(
         "velocities",
         False,
@@ -97,14 +88,7 @@ SETTINGS = (
         "Drives refuse a command that is more than 5 % faster than their greatest speed; nobody "
         "behind a real controller does by default",
     ),
-    Setting(
-        "lag_ms",
-        1e3 * LAG_S,
-        "By so much the drives are behind their command",
-        unit="ms",
-        low=0.0,
-        high=200.0,
-    ),
+    number("lag_ms", 1e3 * LAG_S, "By so much the drives are behind their command", 0.0, 200.0),
     *(
         Setting(name, getattr(ControllerOptions(), name), f"Of the controller: {what}")
         for name, what in (
@@ -121,10 +105,16 @@ SETTINGS = (
             ("goal_time", "how long a goal may be out of that, s; 0: for ever"),
         )
     ),
-    _mm("arm_error_mm", 0.0, "Scatter of the true arm's lengths; angles err as much at 1 m", 5.0),
-    _mm("repeatability_mm", 0.03, "Scatter of a motion in each axis", 2.0),
-    _mm("edge_noise_mm", 0.01, "Further scatter at each edge", 2.0),
-    Setting("ripple", 0.02, "Relative ripple of the program's speed", low=0.0, high=0.5),
+    number(
+        "arm_error_mm",
+        0.0,
+        "Scatter of the true arm's lengths; angles err as much at 1 m",
+        0.0,
+        5.0,
+    ),
+    number("repeatability_mm", 0.03, "Scatter of a motion in each axis", 0.0, 2.0),
+    number("edge_noise_mm", 0.01, "Further scatter at each edge", 0.0, 2.0),
+    number("ripple", 0.02, "Relative ripple of the program's speed", 0.0, 0.5),
     Setting(
         "warm_h",
         0.0,
@@ -133,38 +123,36 @@ SETTINGS = (
         low=0.0,
         high=100.0,
     ),
-    Setting("warm_up", 1.0, "Heat of the kr150, over the usual", low=0.0, high=10.0, live=True),
-    Setting(
+    number("warm_up", 1.0, "Heat of the kr150, over the usual", 0.0, 10.0, live=True),
+    number(
         "cloud_points",
         2000,
         "Of a sphere's cloud of the kr150; 0: its centre is told instead",
-        low=0,
-        high=100_000,
+        0,
+        100_000,
     ),
     Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
     Setting("profile", False, "A line laser on the flange of the kr150"),
     Setting("profile_frame", "profile_sensor", "Frame of the line laser"),
     Setting("station", "station", "Name of the beam station: frame_id of its edges"),
-    Setting(
+    number(
         "laser_xyz_mm",
         [799.4, -126.3, 194.5],
         "True crossing of the beams in base",
-        unit="mm",
-        low=-1e5,
-        high=1e5,
+        -1e5,
+        1e5,
         check=_numbers(3),
     ),
-    Setting(
+    number(
         "laser_rotation_deg",
         [1.2, -2.3, 0.6],
         "True rotation vector of the laser frame in base",
-        unit="deg",
-        low=-180.0,
-        high=180.0,
+        -180.0,
+        180.0,
         check=_numbers(3),
     ),
-    Setting("beam_angle_deg", 92.2, "True angle of the beams", unit="deg", low=40.0, high=140.0),
-    _mm("beam_gap_mm", 0.058, "By so much the y-beam passes above the x-beam", 2.0, -2.0),
+    number("beam_angle_deg", 92.2, "True angle of the beams", 40.0, 140.0),
+    number("beam_gap_mm", 0.058, "By so much the y-beam passes above the x-beam", -2.0, 2.0),
     Setting(
         "laser_csv",
         "",
@@ -172,44 +160,42 @@ SETTINGS = (
         "empty: none",
     ),
     Setting("tool", "cylinder", "Shape of the tool", choices=TOOLS),
-    _mm("tool_radius_mm", 2.5, "Of cylinder, cone's tip, or torch's wire", 20.0, 0.1),
-    Setting(
+    number("tool_radius_mm", 2.5, "Of cylinder, cone's tip, or torch's wire", 0.1, 20.0),
+    number(
         "tool_bend_mm",
         [0.0, 0.0, 0.0],
         "Shift of the true tip from the straight tool's, flange axes",
-        unit="mm",
-        low=-50.0,
-        high=50.0,
+        -50.0,
+        50.0,
         check=_numbers(3),
         live=True,
     ),
-    Setting(
+    number(
         "tool_tilt_deg",
         [0.0, 0.0],
         "Tilt of the true tool about the flange's x and y",
-        unit="deg",
-        low=-45.0,
-        high=45.0,
+        -45.0,
+        45.0,
         check=_numbers(2),
         live=True,
     ),
-    _ms("input_latency_ms", 4.0, "Constant delay of an edge's stamp", 1000.0),
-    _ms("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 10.0),
-    _ms("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 100.0),
-    _ms("input_bounce_ms", 0.0, "For how long a contact may bounce", 20.0),
+    number("input_latency_ms", 4.0, "Constant delay of an edge's stamp", 0.0, 1000.0),
+    number("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 0.0, 10.0),
+    number("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 0.0, 100.0),
+    number("input_bounce_ms", 0.0, "For how long a contact may bounce", 0.0, 20.0),
     Setting("run_program", False, "Drive each step that is announced on next_step"),
     Setting("flange_frame", "tool0", "Parent frame of ~/truth"),
     Setting("tool_frame", "true_tool", "Child frame of ~/truth"),
     Setting("fault", "none", "What goes wrong", choices=(*FAULTS, *CONTROLLER_FAULTS), live=True),
-    Setting(
+    number(
         "fault_size",
         0.0,
         "Its size, in the unit that belongs to it; 0: the usual one",
-        low=-1e4,
-        high=1e4,
+        -1e4,
+        1e4,
         live=True,
     ),
-    Setting("seed", 1, "Of everything that is random", low=0, high=2**31 - 1),
+    number("seed", 1, "Of everything that is random", 0, 2**31 - 1),
 )
 
 

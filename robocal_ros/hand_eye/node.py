@@ -43,7 +43,7 @@ from robocal_ros.ros.parameters import (
     STANDSTILL,
     Setting,
     advanced,
-    length,
+    number,
     pose_settings,
     standstill_rule,
 )
@@ -82,7 +82,7 @@ SETTINGS = (
     ),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
-    length(
+    number(
         "robot_sigma_mm", 0.0, "Error of a reported pose in each axis; 0: from the data", 0.0, 10.0
     ),
     Setting(
@@ -93,7 +93,7 @@ SETTINGS = (
         low=0.0,
         high=1.0,
     ),
-    length("limit_mm", 1.0, "Largest expected error at the working distance", 1e-3, 100.0),
+    number("limit_mm", 1.0, "Largest expected error at the working distance", 1e-3, 100.0),
     *pose_settings(
         "rough",
         "About where the sensor sits on the flange, for check_plan before any calibration",
@@ -108,7 +108,7 @@ SETTINGS = (
         high=20000.0,
         check=_range_fault,
     ),
-    length("sensor_noise_mm", 0.037, "Noise of a point along the beam; for check_plan", 1e-4, 10.0),
+    number("sensor_noise_mm", 0.037, "Noise of a point along the beam; for check_plan", 1e-4, 10.0),
     *advanced(
         *STANDSTILL,
         Setting(

@@ -35,7 +35,7 @@ from robocal_ros.ros.endpoints import (
     trigger_text,
 )
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S
-from robocal_ros.ros.parameters import Setting, advanced, given_pose, length, pose_settings
+from robocal_ros.ros.parameters import Setting, advanced, given_pose, number, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR, TWIN, AddOutput, SessionEvents
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
@@ -361,10 +361,6 @@ def correction_of_message(message: Any) -> ToldCorrection:
 SHORTEST_SILENCE_S = 2.0
 
 
-def _time(name: str, default: float, what: str, high: float, low: float = 0.01) -> Setting:
-    return Setting(name, default, what, unit="s", low=low, high=high)
-
-
 def _silence_fault(silent_s: float) -> str | None:
     told = 0.0 < silent_s < SHORTEST_SILENCE_S
     return f"0, or {SHORTEST_SILENCE_S:g} s at least: it is told each second" if told else None
@@ -379,13 +375,12 @@ SETTINGS = (
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",
         "Its orientation: z from flange to tip",
     ),
-    Setting(
+    number(
         "home_deg",
         [0.0],
         "Taught home pose, a number for each joint (sliding joint: mm)",
-        unit="deg",
-        low=-1e5,
-        high=1e5,
+        -1e5,
+        1e5,
     ),
     Setting(
         "measuring_poses_deg",
@@ -398,93 +393,88 @@ SETTINGS = (
         "",
         "Laser file of the station, as tcf_node's; empty: no tool measurement",
     ),
-    Setting(
-        "travel_speed_mm_s",
-        250.0,
-        "Largest speed of the tip between the taught poses",
-        unit="mm/s",
-        low=1.0,
-        high=5000.0,
+    number(
+        "travel_speed_mm_s", 250.0, "Largest speed of the tip between the taught poses", 1.0, 5000.0
     ),
-    Setting(
+    number(
         "home_near_deg",
         0.5,
         "The robot is at home with all joints so near (sliding joint: mm)",
-        unit="deg",
-        low=0.01,
-        high=5.0,
+        0.01,
+        5.0,
     ),
     *MOTION,
     *CONTROLLER,
-    _time("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 86400.0),
-    _time(
+    number("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 0.01, 86400.0),
+    number(
         "gap_stale_s",
         0.5,
         "gap_open may pause for so long, and so old may the beat be that it echoes",
-        0.5,
         SHORTEST_STALE_S,
+        0.5,
     ),
     GAP_BOOL,
-    Setting("measurements", 1, "So many measurements make a pose measured", low=1, high=1000),
-    _time("check_s", 15.0, "A quick check takes at the most", 600.0, 1.0),
-    _time("full_s", 30.0, "A full tool measurement takes at the most", 3600.0, 1.0),
-    _time(
+    number("measurements", 1, "So many measurements make a pose measured", 1, 1000),
+    number("check_s", 15.0, "A quick check takes at the most", 1.0, 600.0),
+    number("full_s", 30.0, "A full tool measurement takes at the most", 1.0, 3600.0),
+    number(
         "resume_within_s",
         600.0,
         "An unfinished thermal cycle goes on when its last pose is no older; a minute shorter than "
         "thermal_node's cycle_timeout_s",
+        0.01,
         86400.0,
     ),
-    _time("check_every_s", 0.0, "A quick check is due so often; 0: in each gap", 1e7, 0.0),
-    _time(
+    number("check_every_s", 0.0, "A quick check is due so often; 0: in each gap", 0.0, 1e7),
+    number(
         "full_every_s",
         0.0,
         "A full tool measurement is due so often, when time allows; 0: only when needed",
-        1e7,
         0.0,
+        1e7,
     ),
-    _time("tool_due_s", 7200.0, "Age of a tool check at which accuracy_state is DUE", 1e7),
-    _time("tool_expires_s", 28800.0, "Age at which it is EXPIRED", 1e7),
-    Setting(
+    number("tool_due_s", 7200.0, "Age of a tool check at which accuracy_state is DUE", 0.01, 1e7),
+    number("tool_expires_s", 28800.0, "Age at which it is EXPIRED", 0.01, 1e7),
+    number(
         "correction_silent_s",
         5.0,
         "joint_correction_node's status may pause for so long; 0: there is none, the robot's "
         "controller takes model and tool itself",
-        unit="s",
-        low=0.0,
-        high=600.0,
+        0.0,
+        600.0,
         check=_silence_fault,
     ),
-    length("tolerance_mm", 0.3, "Error of the tool that the process allows", 0.001, 100.0),
+    number("tolerance_mm", 0.3, "Error of the tool that the process allows", 0.001, 100.0),
     Setting("auto_accept", False, "Accept inside the bounds without a person"),
-    length(
+    number(
         "accept_thermal_mm",
         1.0,
         "Largest shift of the tip since commissioning at home and measuring poses",
         0.001,
         100.0,
     ),
-    length("accept_tool_mm", 1.0, "Largest distance of the tip from the taught one", 0.001, 100.0),
-    Setting(
-        "accept_tool_deg",
-        1.5,
-        "Largest tilt of the axis from the taught one",
-        unit="deg",
-        low=0.001,
-        high=90.0,
-    ),
+    number("accept_tool_mm", 1.0, "Largest distance of the tip from the taught one", 0.001, 100.0),
+    number("accept_tool_deg", 1.5, "Largest tilt of the axis from the taught one", 0.001, 90.0),
     *advanced(
-        _time(
-            "rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 10.0, 0.1
+        number(
+            "rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 0.1, 10.0
         ),
-        _time("reserve_s", 1.0, "Kept free before the end of a gap", 60.0),
-        _time("settle_s", 0.3, "A measurement counts so long after the robot stands", 10.0),
-        _time("stay_s", 0.2, "The robot stays so long after the last measurement of a pose", 10.0),
-        _time("measure_s", 3.0, "The longest time at a pose", 600.0),
-        _time("answer_s", 1.0, "Another node answers within", 60.0, 0.1),
-        _time("solve_s", 6.0, "thermal_node ends a cycle within", 600.0, 0.1),
-        _time("tool_home_s", 10.0, "Kept free for the way home from the beams", 600.0, 0.1),
-        _time("thermal_silent_s", 5.0, "thermal_node's accuracy may pause for so long", 600.0, 1.0),
+        number("reserve_s", 1.0, "Kept free before the end of a gap", 0.01, 60.0),
+        number("settle_s", 0.3, "A measurement counts so long after the robot stands", 0.01, 10.0),
+        number(
+            "stay_s",
+            0.2,
+            "The robot stays so long after the last measurement of a pose",
+            0.01,
+            10.0,
+        ),
+        number("measure_s", 3.0, "The longest time at a pose", 0.01, 600.0),
+        number("answer_s", 1.0, "Another node answers within", 0.1, 60.0),
+        number("solve_s", 6.0, "thermal_node ends a cycle within", 0.1, 600.0),
+        number("tool_home_s", 10.0, "Kept free for the way home from the beams", 0.1, 600.0),
+        number(
+            "thermal_silent_s", 5.0, "thermal_node's accuracy may pause for so long", 1.0, 600.0
+        ),
     ),
 )
 

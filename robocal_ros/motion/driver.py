@@ -42,7 +42,7 @@ from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport, RobotWatch, S
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
-from robocal_ros.ros.parameters import Setting, advanced, length
+from robocal_ros.ros.parameters import Setting, advanced, number
 
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
@@ -196,57 +196,49 @@ def joint_trajectory(
 GOAL_TIME_S = 12  # the nodes wait less for a robot that does not come to rest where a motion ends
 
 
-def _of_joints(name: str, default: float, what: str, unit: str) -> Setting:
+def _of_joints(name: str, default: float, what: str) -> Setting:
     words = f"{what}; one for all joints or one for each"
-    return Setting(name, [default], words, unit, 1e-3, 1e4)
+    return number(name, [default], words, 1e-3, 1e4)
 
 
 MOTION = (
-    _of_joints("joint_velocity_deg_s", 57.0, "Largest velocity", "deg/s"),
-    _of_joints("joint_acceleration_deg_s2", 286.0, "Largest acceleration", "deg/s^2"),
-    _of_joints("stop_deceleration_deg_s2", 573.0, "Deceleration of a stop", "deg/s^2"),
-    Setting("tcp_speed_mm_s", 50.0, "Largest speed of the tip", "mm/s", 1.0, 250.0),
-    Setting(
+    _of_joints("joint_velocity_deg_s", 57.0, "Largest velocity"),
+    _of_joints("joint_acceleration_deg_s2", 286.0, "Largest acceleration"),
+    _of_joints("stop_deceleration_deg_s2", 573.0, "Deceleration of a stop"),
+    number("tcp_speed_mm_s", 50.0, "Largest speed of the tip", 1.0, 250.0),
+    number(
         "tcp_acceleration_mm_s2",
         1200.0,
         "Largest acceleration of the tip on its path",
-        unit="mm/s^2",
-        low=1.0,
-        high=10000.0,
+        1.0,
+        10000.0,
     ),
-    length("opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3),
-    length("housing_top_mm", 30.0, "Height of the housing above the beams", 0.0, 1e3),
-    length("housing_depth_mm", 120.0, "Depth of the opening below the beams", 1.0, 1e3),
-    length("housing_reach_mm", 0.0, "Radius of the housing; 0: it never ends", 0.0, 1e4),
-    length("retract_mm", 50.0, "Height of the tip above the beams on its way", 1.0, 2e3),
-    length("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
-    length("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
-    length("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
-    length("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
-    Setting(
+    number("opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3),
+    number("housing_top_mm", 30.0, "Height of the housing above the beams", 0.0, 1e3),
+    number("housing_depth_mm", 120.0, "Depth of the opening below the beams", 1.0, 1e3),
+    number("housing_reach_mm", 0.0, "Radius of the housing; 0: it never ends", 0.0, 1e4),
+    number("retract_mm", 50.0, "Height of the tip above the beams on its way", 1.0, 2e3),
+    number("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
+    number("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
+    number("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
+    number("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
+    number(
         "deviation_deg",
         0.5,
         "A joint so far from its plan stops the robot; the tip, see deviation_mm",
-        unit="deg",
-        low=0.01,
-        high=10.0,
+        0.01,
+        10.0,
     ),
     *advanced(
-        Setting(
+        number(
             "motion_silence_s",
             0.1,
             "Joint states may pause for so long while the robot moves",
-            unit="s",
-            low=0.02,
-            high=0.5,
+            0.02,
+            0.5,
         ),
-        Setting(
-            "motion_late_s",
-            0.15,
-            "The robot lags at most so far behind its trajectory",
-            "s",
-            0.01,
-            1.0,
+        number(
+            "motion_late_s", 0.15, "The robot lags at most so far behind its trajectory", 0.01, 1.0
         ),
     ),
 )

@@ -133,9 +133,16 @@ def _typed(value: object, like: Value) -> Value | None:
     return value if type(value) is type(like) else None
 
 
-def length(name: str, default: float, what: str, low: float, high: float) -> Setting:
-    """A length in mm."""
-    return Setting(name, default, what, "mm", low, high)
+UNITS = {
+    "deg_s2": "deg/s^2", "mm_s2": "mm/s^2", "deg_s": "deg/s", "mm_s": "mm/s", "deg": "deg",
+    "mm": "mm", "ms": "ms", "hz": "Hz", "mb": "MB", "s": "s",
+}  # fmt: skip
+
+
+def number(name: str, default: Value, what: str, low: float, high: float, **more: Any) -> Setting:
+    """A number, or a list of them, within bounds; the end of its name says its unit."""
+    unit = next((unit for end, unit in UNITS.items() if name.endswith(f"_{end}")), "")
+    return Setting(name, default, what, unit, low, high, **more)
 
 
 def advanced(*settings: Setting) -> tuple[Setting, ...]:
@@ -253,30 +260,23 @@ def given_pose(settings: Mapping[str, Any], name: str) -> NDArray[np.float64] | 
 
 
 STANDSTILL = (
-    Setting(
+    number(
         "standstill_before_s",
         0.3,
         "The robot stands still so long before a measurement's stamp",
-        unit="s",
-        low=0.0,
-        high=10.0,
+        0.0,
+        10.0,
     ),
-    Setting("standstill_after_s", 0.1, "It stands still so long after the stamp", "s", 0.0, 10.0),
-    Setting(
-        "standstill_tolerance_deg",
-        0.02,
-        "Largest range of a joint that stands still",
-        unit="deg",
-        low=1e-4,
-        high=5.0,
+    number("standstill_after_s", 0.1, "It stands still so long after the stamp", 0.0, 10.0),
+    number(
+        "standstill_tolerance_deg", 0.02, "Largest range of a joint that stands still", 1e-4, 5.0
     ),
-    Setting(
+    number(
         "joint_gap_s",
         0.25,
         "Longest pause between two joint readings about a measurement",
-        unit="s",
-        low=1e-3,
-        high=10.0,
+        1e-3,
+        10.0,
     ),
 )
 

@@ -49,6 +49,7 @@ from robocal_ros.ros.parameters import (
     Setting,
     advanced,
     count_fault,
+    number,
     standstill_rule,
 )
 from robocal_ros.ros.session_node import (
@@ -111,46 +112,41 @@ SETTINGS = (
         [""],
         "What lsq solves of a drift (a1_mm, beta2_deg, ...); empty: all, which takes many poses",
     ),
-    Setting(
+    number(
         "sigma_mm",
         0.03,
         "Standard deviation of one measured coordinate, sensor and repeatability",
-        unit="mm",
-        low=1e-4,
-        high=10.0,
+        1e-4,
+        10.0,
     ),
-    Setting(
+    number(
         "sphere_radius_mm",
         SPHERE_RADIUS_M * 1e3,
         "Certified radius of the sphere in sphere_cloud",
-        unit="mm",
-        low=1.0,
-        high=200.0,
+        1.0,
+        200.0,
     ),
-    Setting(
+    number(
         "sensor_field_mm",
         [570.0, 430.0, 700.0, 550.0, 850.0],
         "Where the sensor measures: width, height, at what distance; nearest and farthest distance",
-        unit="mm",
-        low=1.0,
-        high=20000.0,
+        1.0,
+        20000.0,
         check=_field_fault,
     ),
-    Setting(
+    number(
         "tolerance_mm",
         0.3,
         "Tool error that the process allows; accuracy is judged by it",
-        unit="mm",
-        low=1e-3,
-        high=100.0,
+        1e-3,
+        100.0,
     ),
-    Setting(
+    number(
         "expires_after_s",
         28800.0,
         "A measurement older than this says nothing any more",
-        unit="s",
-        low=60.0,
-        high=7 * 86400.0,
+        60.0,
+        7 * 86400.0,
     ),
     Setting(
         "work_poses_deg",
@@ -158,65 +154,59 @@ SETTINGS = (
         "Working poses at which accuracy is judged, each a text of numbers, one for each joint "
         "(sliding joint: mm); none: throughout the joint limits",
     ),
-    Setting(
+    number(
         "tip_mm",
         ORIGIN,
         "The tool's tip on the flange, which accuracy is about; at its default: the target",
-        unit="mm",
-        low=-5000.0,
-        high=5000.0,
+        -5000.0,
+        5000.0,
         check=count_fault(3),
     ),
     *advanced(
-        Setting(
+        number(
             "sphere_tolerance_mm",
             0.1,
             "How far the radius of the points of a cloud may be off",
-            unit="mm",
-            low=1e-3,
-            high=5.0,
+            1e-3,
+            5.0,
         ),
-        Setting(
+        number(
             "sphere_noise_mm",
             0.2,
             "Largest scatter of a cloud's points about the sphere",
-            unit="mm",
-            low=1e-3,
-            high=5.0,
+            1e-3,
+            5.0,
         ),
-        Setting(
+        number(
             "hold_out",
             0.5,
             "Share of the poses kept to judge a calibration without a reference",
-            low=0.1,
-            high=0.9,
+            0.1,
+            0.9,
         ),
-        Setting("seed", 0, "Which poses are held out", low=0, high=2**31 - 1),
+        number("seed", 0, "Which poses are held out", 0, 2**31 - 1),
         *STANDSTILL,
-        Setting(
+        number(
             "cycle_timeout_s",
             660.0,
             "A cycle ends when nothing was measured for so long; a minute longer than "
             "maintenance_node's resume_within_s",
-            unit="s",
-            low=1.0,
-            high=7200.0,
+            1.0,
+            7200.0,
         ),
-        Setting(
+        number(
             "lateness_s",
             0.2,
             "Commands on measurements wait for joint readings so much newer than the call",
-            unit="s",
-            low=0.0,
-            high=5.0,
+            0.0,
+            5.0,
         ),
-        Setting(
+        number(
             "command_timeout_s",
             1.0,
             "Such commands wait at most so long (wall clock), then use what is there",
-            unit="s",
-            low=0.05,
-            high=30.0,
+            0.05,
+            30.0,
         ),
     ),
 )

@@ -25,7 +25,7 @@ from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
-from robocal_ros.ros.parameters import Setting, advanced, given_pose, length, pose_settings
+from robocal_ros.ros.parameters import Setting, advanced, given_pose, number, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR, DecisionServices, SessionNode, trigger_answer
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
@@ -47,10 +47,6 @@ from robocal_ros.tool.session import (
 )
 
 PROGRAM, TRAJECTORY = "program", "trajectory"
-
-
-def _speed(name: str, default: float, what: str, high: float) -> Setting:
-    return Setting(name, default, what, unit="mm/s", low=0.1, high=high)
 
 
 SETTINGS = (
@@ -77,58 +73,31 @@ SETTINGS = (
         "Who moves: the robot's program, or this node",
         choices=(PROGRAM, TRAJECTORY),
     ),
-    Setting(
-        "input_period_ms",
-        0.0,
-        "How often the input is read; 0: by interrupt",
-        unit="ms",
-        low=0.0,
-        high=100.0,
-    ),
-    Setting("input_jitter_ms", 0.02, "Scatter of an edge's stamp", unit="ms", low=1e-4, high=10.0),
-    Setting(
-        "debounce_ms",
-        0.5,
-        "Edges nearer than this are one contact",
-        unit="ms",
-        low=0.0,
-        high=20.0,
-    ),
-    length("repeatability_mm", 0.03, "Scatter of a motion in each axis", 0.0, 2.0),
-    length("edge_noise_mm", 0.01, "Further scatter of the robot at each edge", 0.0, 2.0),
-    length(
+    number("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 0.0, 100.0),
+    number("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 1e-4, 10.0),
+    number("debounce_ms", 0.5, "Edges nearer than this are one contact", 0.0, 20.0),
+    number("repeatability_mm", 0.03, "Scatter of a motion in each axis", 0.0, 2.0),
+    number("edge_noise_mm", 0.01, "Further scatter of the robot at each edge", 0.0, 2.0),
+    number(
         "circle_radius_mm", 12.0, "Radius of the circles; wider than the largest bend", 2.0, 100.0
     ),
-    _speed("circle_speed_mm_s", 50.0, "Speed on the circles", 250.0),
-    length("circle_height_mm", 50.0, "Between both circles that give the axis", 5.0, 300.0),
-    length(
+    number("circle_speed_mm_s", 50.0, "Speed on the circles", 0.1, 250.0),
+    number("circle_height_mm", 50.0, "Between both circles that give the axis", 5.0, 300.0),
+    number(
         "above_tip_mm",
         5.0,
         "Height above the tip at which the lower circles are driven",
         0.5,
         100.0,
     ),
-    length("plunge_depth_mm", 7.0, "Depth of a plunge, half of it below the beams", 1.0, 50.0),
-    _speed("plunge_speed_mm_s", 10.0, "Speed of a plunge", 50.0),
-    Setting(
-        "spin_deg",
-        0.0,
-        "Turn of the flange about the laser's z",
-        unit="deg",
-        low=-360.0,
-        high=360.0,
-    ),
-    Setting(
-        "taper",
-        0.0,
-        "Growth of the tool's radius per length above the tip",
-        low=-2.0,
-        high=2.0,
-    ),
-    length("quick_limit_mm", 0.2, "Deviation of the tip that a quick check passes", 0.01, 10.0),
-    length("lever_mm", 150.0, "From where a bent tool bends to its tip", 1.0, 2000.0),
-    length("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
-    length(
+    number("plunge_depth_mm", 7.0, "Depth of a plunge, half of it below the beams", 1.0, 50.0),
+    number("plunge_speed_mm_s", 10.0, "Speed of a plunge", 0.1, 50.0),
+    number("spin_deg", 0.0, "Turn of the flange about the laser's z", -360.0, 360.0),
+    number("taper", 0.0, "Growth of the tool's radius per length above the tip", -2.0, 2.0),
+    number("quick_limit_mm", 0.2, "Deviation of the tip that a quick check passes", 0.01, 10.0),
+    number("lever_mm", 150.0, "From where a bent tool bends to its tip", 1.0, 2000.0),
+    number("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
+    number(
         "change_limit_mm",
         10.0,
         "Largest change of the tip from the taught one; no more than joint_correction_node's "
@@ -136,52 +105,40 @@ SETTINGS = (
         0.1,
         100.0,
     ),
-    Setting(
+    number(
         "tilt_limit_deg",
         4.0,
         "Largest change of the axis; no more than its tool_tcp_deg",
-        unit="deg",
-        low=0.1,
-        high=45.0,
+        0.1,
+        45.0,
     ),
     *advanced(
-        length(
+        number(
             "trait_radius_mm",
             0.05,
             "Change of the tool's radius that is no fault yet; 0: any",
             0.0,
             5.0,
         ),
-        Setting(
+        number(
             "trait_latency_ms",
             5.0,
             "Change of the edges' delay that is no fault yet; 0: any",
-            unit="ms",
-            low=0.0,
-            high=1000.0,
+            0.0,
+            1000.0,
         ),
-        Setting(
-            "trait_lost",
-            0.05,
-            "Share of the joint readings that may be lost; 0: any",
-            low=0.0,
-            high=1.0,
+        number(
+            "trait_lost", 0.05, "Share of the joint readings that may be lost; 0: any", 0.0, 1.0
         ),
-        Setting(
-            "step_timeout_s",
-            30.0,
-            "A run ends when a step has no edge for so long",
-            unit="s",
-            low=1.0,
-            high=3600.0,
+        number(
+            "step_timeout_s", 30.0, "A run ends when a step has no edge for so long", 1.0, 3600.0
         ),
-        Setting(
+        number(
             "joint_silence_s",
             0.5,
             "A run ends when joint states are silent for so long",
-            unit="s",
-            low=0.02,
-            high=10.0,
+            0.02,
+            10.0,
         ),
     ),
 )

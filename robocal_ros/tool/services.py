@@ -31,7 +31,7 @@ from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, transform_message
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
-from robocal_ros.ros.parameters import Setting, length
+from robocal_ros.ros.parameters import number
 from robocal_ros.ros.session_node import AddOutput, SessionEvents
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver
@@ -212,15 +212,14 @@ CELL = "accuracy_state", STATUS, "joint_correction_node/status"
 MOTION_SETTINGS = (
     *MOTION,
     *CONTROLLER,
-    length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
-    Setting(
+    number("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
+    number(
         "gap_stale_s",
         0.5,
         "Nothing moves unless gap_open is true, and neither it nor the beat that it echoes older; "
         "0: it is not listened to, and maintenance_node does not measure with it",
-        unit="s",
-        low=0.0,
-        high=0.5,
+        0.0,
+        0.5,
         check=lambda stale_s: (
             f"0, or {SHORTEST_STALE_S:g} s at least" if 0.0 < stale_s < SHORTEST_STALE_S else None
         ),
