@@ -562,3 +562,50 @@ def test_rates_of_a_settled_swing_are_those_of_its_positions() -> None:
     assert np.abs(out.velocity[5:-1] - by_steps).max() < 1e-5
     bends = np.gradient(out.velocity, t, axis=0)[8:-1]
     assert np.abs(out.acceleration[8:-1] - bends).max() < 1e-4
+
+
+def anew(robot: Robot, *, restart: bool) -> tuple[Robot, Watch, np.ndarray]:
+    """A program that begins where the robot stands, with the same node or with another one."""
+    if restart:
+        robot, before = Robot(rested=False, **WIDE), robot
+        robot.now, robot.at = before.now, before.at
+    robot.rest()
+    robot.session.acknowledge(robot.now)
+    robot.session.enable(True)
+    taught = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
+    return robot, Watch(robot, 0.8 * DT), taught.copy()
+
+
+WANDERS = {"turn": 0.012, "late": 0.01, "model": 0.006, "tool": 0.006, "on": 0.006, "off": 0.004}
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_program_that_wanders_through_anything(seed: int) -> None:
+    """Each joint on its own, up to nine tenths of its speed, in time or not, over restarts."""
+    rng = np.random.default_rng(seed)
+    fastest, change = 0.9 * LIMITS["velocity_limits"], 0.9 * LIMITS["acceleration_limits"] * DT
+    robot, watch, q = anew(Robot(**WIDE), restart=False)
+    v, wanted, tells_speed = np.zeros(6), np.zeros(6), bool(rng.random() < 0.5)
+    for revision in range(1, 801):
+        dt = rng.uniform(0.8, 1.2) * DT
+        what = rng.choice([*WANDERS, ""], p=[*WANDERS.values(), 1.0 - sum(WANDERS.values())])
+        if what == "turn":
+            wanted = rng.uniform(-1.0, 1.0, 6) * fastest * rng.choice([0.0, 0.3, 1.0])
+        elif what == "late":
+            dt = rng.uniform(0.01, 0.3)
+        elif what:
+            happen(robot, watch, str(what), int(rng.integers(1, 5)), revision, q)
+        near = (q < NOMINAL.lower + 1.0) | (q > NOMINAL.upper - 1.0)
+        wanted = np.where(near, np.where(q < HOME, 0.3, -0.3), wanted)
+        v = v + np.clip(wanted - v, -change, change)
+        q = q + v * min(dt, 3.0 * DT)
+        try:
+            robot.stream(q, dt, **({"velocity": v.copy()} if tells_speed else {}))
+        except RefusedError:
+            slow_down(robot, watch)
+            robot, watch, q = anew(robot, restart=bool(rng.random() < 0.3))
+            v, wanted = np.zeros(6), np.zeros(6)
+            continue
+        watch.out(NAMES, robot.at)
+        watch.offset(NAMES, robot.session.output.taught, robot.at)
