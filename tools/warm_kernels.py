@@ -3,6 +3,8 @@
 Numba keeps the machine code beside the source, so that no node pays for it at its start.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from robocal_ros.correction.session import load_kernels
@@ -13,6 +15,7 @@ from robocal_ros.hand_eye.camera_fit import fit_pairs
 from robocal_ros.identification import identify
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse
+from robocal_ros.kinematics.joint_functions import JointFunctions
 
 POSES = 30
 
@@ -47,6 +50,9 @@ def main() -> None:
     arm.jacobian(q)
     arm.parameter_jacobian(q)
     T = arm.fk(q)
+    functions = JointFunctions(np.zeros(6), np.ones(6), np.zeros((6, 4)), np.zeros(6))
+    turning = replace(arm, functions=functions)
+    turning.jacobian(turning.read(q))
     here = np.array([0.1, -1.2, 1.0, 0.4, 1.2, 0.3])
     inverse(arm, arm.fk(here)[None], here)
     names = tuple(str(i) for i in range(POSES))

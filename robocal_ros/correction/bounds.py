@@ -17,6 +17,7 @@ from robocal_ros.correction.joint_correction import (
     StagedCorrection,
     StagedResult,
     pack_model,
+    same_models,
 )
 from robocal_ros.correction.limiter import (
     FIGURES,
@@ -34,6 +35,7 @@ from robocal_ros.correction.limiter import (
 from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import payload_note
 
 # What floating point adds to a value that lies on its bound.
 ROUNDING = 1e-9
@@ -316,9 +318,9 @@ class DesiredOffset:
     def want(self, actual: SerialArm, on: bool) -> None:
         """Correct for an arm with its tool from the next command on, or for nothing."""
         packed = pack_model(actual)
-        if not np.allclose(packed, self._actual, rtol=0.0, atol=SAME_MODEL):
+        if not same_models(packed, self._actual, SAME_MODEL):
             self._actual = packed
-            same = np.allclose(packed, self._reference, rtol=0.0, atol=SAME_MODEL)
+            same = same_models(packed, self._reference, SAME_MODEL)
             self.known = None
             if not same:
                 self.known = correction_between(self._reference, packed, self._arm, self._config)
@@ -414,6 +416,7 @@ class CorrectionGate:
         self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
         self.waiting: OfferedModel | None = None  # refused, and to be taken over if looked at again
         self.stale = ""  # why the model is too old to be used
+        self.payload = ""  # what it may cost that the arm carries another load than the model's
         self.tools = ToolGate(reference.T_flange_tool, config)
 
     @property
@@ -444,10 +447,8 @@ class CorrectionGate:
         self.waiting = None
         if self._model is not None and not again:
             known = self._model
-            same = np.array_equal(model.mdh, known.mdh) and np.array_equal(
-                model.T_base_root, known.T_base_root
-            )
-            if same and model.revision == known.revision:
+            one, other = (pack_model(self._arm_of(m)) for m in (model, known))
+            if same_models(one, other, 0.0) and model.revision == known.revision:
                 self._model = model
                 return
             if not _later(model, self._model):
@@ -461,6 +462,7 @@ class CorrectionGate:
         if len(places):
             self._require_small(model, arm, places)
         self._model, self.revision = model, model.revision
+        self.payload = payload_note(arm, model.load)
         self.survey = survey(self._reference, arm, self._config.thermal)
 
     def watch_age(self, now_ns: int) -> bool:
@@ -506,13 +508,16 @@ class CorrectionGate:
 
     def _arm_of(self, model: OfferedModel) -> SerialArm:
         """The offered arm; the nominal one says that no drift is known: then the reference."""
-        nominal = self._nominal
+        nominal, reference = (
+            replace(arm, T_base_root=model.T_base_root).with_model(
+                model.mdh, model.functions, model.load
+            )
+            for arm in (self._nominal, self._reference)
+        )
         # The root travels as a quaternion: equal up to rounding.
-        if np.array_equal(model.mdh, nominal.mdh) and np.allclose(
-            model.T_base_root, nominal.T_base_root, rtol=0.0, atol=1e-12
-        ):
+        if same_models(pack_model(nominal), pack_model(self._nominal), SAME_MODEL):
             return self._reference
-        return replace(self._reference, mdh=model.mdh, T_base_root=model.T_base_root)
+        return reference
 
     def _require_small(self, model: OfferedModel, arm: SerialArm, places: Array) -> None:
         bound = self._config.thermal

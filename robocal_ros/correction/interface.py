@@ -15,6 +15,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.history.history_records import Head
+from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 
 if TYPE_CHECKING:  # who hears a status needs no compiled code
     from robocal_ros.correction.bounds import Policy, Survey
@@ -48,6 +49,7 @@ class Reason(StrEnum):
     OLD_REVISION = "older than the revision in use"
     TOOL_BOUND = "the tool's change exceeds its bound"
     BAD_TOOL = "the tool's frame is not usable"
+    BAD_FUNCTIONS = "the model's joint functions or load are not usable"
     OTHER_COMMANDER = "somebody else commands the robot"
     LEASED = "the robot is leased for a measurement"
     STOPPED = "stopped"
@@ -128,6 +130,8 @@ class OfferedModel:
     T_base_root: Array = field(default_factory=lambda: np.eye(4))
     stamp_ns: int = 0
     robot_file_hash: str = ""
+    functions: JointFunctions | None = None
+    load: ArmLoad | None = None  # with which it was identified
 
 
 @dataclass(frozen=True)
@@ -261,6 +265,7 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
     if not np.all(np.isfinite(mdh)):
         raise RefusedError(Reason.NOT_FINITE, f"model of {message.robot}")
     root = message.base_root
+    functions, load = _layer(message, len(names))
     return OfferedModel(
         robot=message.robot,
         serial=message.serial,
@@ -272,7 +277,32 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
         T_base_root=_pose(root.translation, root.rotation, Reason.NOT_FINITE),
         stamp_ns=stamp_ns(message.header.stamp),
         robot_file_hash=message.robot_file_hash,
+        functions=functions,
+        load=load,
     )
+
+
+def _layer(message: Any, n: int) -> tuple[JointFunctions | None, ArmLoad | None]:
+    """Joint functions and load of a ``robocal_msgs/KinematicModel``, None where it holds none."""
+    functions, load = None, None
+    try:
+        if len(message.function_step) or len(message.compliance):
+            table = np.array(message.function_coefficients, dtype=np.float64).reshape(n, -1)
+            of_joints = message.function_first, message.function_step
+            functions = JointFunctions(*of_joints, table, message.compliance)
+        if len(message.link_mass):
+            centre, pull = (
+                np.array([v.x, v.y, v.z]) for v in (message.payload_centre, message.gravity)
+            )
+            centres = np.array(message.link_centre, dtype=np.float64).reshape(n, 3)
+            load = ArmLoad(message.link_mass, centres, message.payload_mass, centre, pull)
+            if len(load.mass) != n:
+                raise ValueError(f"masses of {len(load.mass)} links, {n} joints")
+        if functions is not None and load is None and np.any(functions.compliance):
+            raise ValueError("compliances without masses of the links")
+    except ValueError as error:
+        raise RefusedError(Reason.BAD_FUNCTIONS, f"model of {message.robot}: {error}") from error
+    return functions, load
 
 
 def offered_tool(message: Any, accepted_state: int) -> OfferedTool:
@@ -341,6 +371,7 @@ class CorrectionStatus:
     tool_revision: int | None  # of the tool taken over
     waiting_tool: int | None  # revision of one that waits for standstill or the next trajectory
     stale: str  # why the model is not corrected with any more; empty when it is not stale
+    payload: str  # what it may cost that the arm carries another load than the model's; else empty
     tcp_shift_m: float  # error at the tool that the drift would have made
     largest_shift: float  # largest offset that was asked for, rad (prismatic: m)
     remaining_m: float  # error that was left at the tool

@@ -4,7 +4,9 @@ Given taught joints q, the corrected joints q' satisfy
 
     T_actual(q') T_flange_tool_actual = T_reference(q) T_flange_tool_reference          (1)
 
-by Newton steps with the geometric Jacobian at the tool.
+by Newton steps with the geometric Jacobian at the tool. Where joints have functions of their own,
+or wind under load (`kinematics.joint_functions`), q and q' here are what rigid arms would read;
+what the joints do besides is put on before and taken off behind, joint by joint.
 
 Near a singularity the exact q' leaves every bound. There the weak directions alone are given up,
 and of the tool's turn before its position. With e the twist that is left at the tool (lengths in
@@ -64,13 +66,31 @@ SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two jo
 
 
 def pack_model(arm: SerialArm) -> Array:
-    """Numbers (n + 2, 9) of an arm with its base and its ``T_flange_tool``, for the kernels."""
-    packed = np.zeros((arm.n + 2, 9))
-    packed[: arm.n] = arm.links
+    """Numbers (n + 2, 9 + w) of an arm with its base and its ``T_flange_tool``, for the kernels.
+
+    w columns hold its joint functions; 0 where it has none.
+    """
+    width = 0 if arm.functions is None else arm.layer.shape[1]
+    packed = np.zeros((arm.n + 2, 9 + width))
+    packed[: arm.n, :9] = arm.links
+    if width:
+        packed[: arm.n + 1, 9:] = arm.layer
     for row, T in ((arm.n, arm.T_base_root), (arm.n + 1, arm.T_flange_tool)):
         packed[row, :4] = frames.quat_xyzw(T)
         packed[row, 4:7] = T[:3, 3]
     return packed
+
+
+def stack_models(*packed: Array) -> Array:
+    """Packed models in one array; those with fewer coefficients, or none, get zeros."""
+    width = max(model.shape[1] for model in packed)
+    return np.stack([np.pad(model, ((0, 0), (0, width - model.shape[1]))) for model in packed])
+
+
+def same_models(a: Array, b: Array, within: float) -> bool:
+    """Whether packed models are the same to so much."""
+    one, other = stack_models(a, b)
+    return np.allclose(one, other, rtol=0.0, atol=within)
 
 
 def plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
@@ -106,7 +126,7 @@ class JointCorrection:
 
     Parameters
     ----------
-    models : (2, n + 2, 9) packed reference and actual model (see `pack_model`, `between`).
+    models : (2, n + 2, 9 + w) packed reference and actual model (see `pack_model`, `stack_models`).
     largest : largest shift of a joint, rad (prismatic: m), for all or (n,) for each; the turning
         joints' least one is b of equation 3.
     free_axis : the tool may turn about its z; the turn is used to move the joints least.
@@ -123,14 +143,15 @@ class JointCorrection:
         self.models = plain(models)
         self.free_axis, self.slope = free_axis, slope
         self.n = self.models.shape[1] - 2
-        if self.models.shape != (2, self.n + 2, 9):
-            raise ValueError(f"models have shape {self.models.shape}, expected (2, n + 2, 9)")
+        width = self.models.shape[2] - 9
+        if len(self.models) != 2 or width < 0:
+            raise ValueError(f"models have shape {self.models.shape}, expected (2, n + 2, 9 + w)")
         self.largest = plain(largest, (self.n,)).copy()
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
         turning = self.models[1, : self.n, 8] < 0.5
         least = float(np.min(self.largest[turning] if np.any(turning) else self.largest))
-        self.work = np.zeros(work_size(self.n))
+        self.work = np.zeros(work_size(self.n, width))
         solution.prepare(
             self.models, self.largest, 1.0 / slope, SHARED / least**2, free_axis, self.work
         )
@@ -147,7 +168,7 @@ class JointCorrection:
         """Correction from one arm to another, each with its base and its ``T_flange_tool``."""
         if reference.n != actual.n or np.any(reference.prismatic != actual.prismatic):
             raise ValueError(f"{reference.name} and {actual.name} have different joints")
-        models = np.stack([pack_model(reference), pack_model(actual)])
+        models = stack_models(pack_model(reference), pack_model(actual))
         return cls(models, largest, free_axis, slope)
 
     def correct(self, q: ArrayLike) -> CorrectionResult:
@@ -240,7 +261,7 @@ class StagedCorrection:
 
     Parameters
     ----------
-    reference, actual : packed models (n + 2, 9), see `pack_model`. The taught tool is the
+    reference, actual : packed models (n + 2, 9 + w), see `pack_model`. The taught tool is the
         reference's.
     arm_largest, tool_largest : (n,) largest joint shift of each stage, rad (prismatic: m).
     free_axis : the tool may turn about its z, in both stages.
@@ -254,6 +275,7 @@ class StagedCorrection:
         tool_largest: Array,
         free_axis: bool = False,
     ) -> None:
+        reference, actual = stack_models(reference, actual)
         bare = actual.copy()
         bare[-1] = reference[-1]
         self.n, self._free = len(reference) - 2, free_axis
@@ -355,7 +377,8 @@ class StagedCorrection:
         """Velocities and accelerations (m, n) of the corrected joints; without some, those alone.
 
         ``result`` is that of `correct` at ``q``. By the chain rule where all of the correction of
-        six joints is made; with a weak direction, a free axis, or other numbers of joints, by
+        six joints is made; with a weak direction, a free axis, joint functions or other numbers of
+        joints, by
         central differences along the path, which the two continuous derivatives of the
         correction allow everywhere.
         """

@@ -250,6 +250,7 @@ class CorrectionReport:
         waits = status.waiting_revision
         of_model = {
             status.stale: True,
+            status.payload: True,
             f"model revision {status.revision}: {status.survey}": status.survey.beyond,
             f"model revision {waits} was refused, ~/take_over looks at it again": waits is not None,
             "enabled, but neither a model nor a tool was taken over": (

@@ -474,6 +474,7 @@ class CorrectionSession:
             tool_revision=None if tools.in_use is None else tools.in_use.revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
             stale=self._gate.stale,
+            payload=self._gate.payload,
             tcp_shift_m=float(desired.figures[SHIFT]),
             largest_shift=float(desired.figures[LARGEST]),
             remaining_m=float(desired.figures[REMAINING]),

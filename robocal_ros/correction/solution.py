@@ -14,7 +14,14 @@ from robocal_ros.correction import damping, six_axis
 from robocal_ros.correction.six_axis import CONSTANTS, LANES, ROWS, N
 from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
-from robocal_ros.kinematics.kernels import turns_size, walk
+from robocal_ros.kinematics.kernels import (
+    SCRATCH,
+    TURNED,
+    read_joints,
+    turn_joints,
+    turns_size,
+    walk,
+)
 
 Array = NDArray[np.float64]
 
@@ -73,13 +80,19 @@ class Workspace(NamedTuple):
     came: Array
     goes: Array
     late: Array
+    taught_layer: Array  # (n + 1, w) joint functions of both models; w is 0 where neither has some
+    layer: Array
+    scratch: Array  # (n, SCRATCH) of `turn_joints`
+    turned: Array  # (n,) what rigid arms would read
+    back: Array
 
 
-def work_size(n: int) -> int:
-    """How many scratch numbers a solution for n joints needs."""
+def work_size(n: int, w: int) -> int:
+    """How many scratch numbers a solution needs: n joints, w columns of their functions."""
     many = CONSTANTS + LANES * (N + ROWS + 1)
     small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 9 + 6 * TWISTS + SETTINGS
-    return 18 * n + 18 * n + n + small + many
+    layers = (2 * (n + 1) * w + n * (SCRATCH + 2)) if w else 0
+    return 18 * n + 18 * n + n + small + many + layers
 
 
 @lean
@@ -98,11 +111,17 @@ def room_in(work: Array, n: int) -> Workspace:
     constants, at = work[at : at + CONSTANTS], at + CONSTANTS
     came, at = work[at : at + LANES * N], at + LANES * N
     goes, at = work[at : at + LANES * ROWS], at + LANES * ROWS
+    late, at = work[at : at + LANES], at + LANES
+    layered = n if work.shape[0] > at else 0
+    w = (work.shape[0] - at - layered * (SCRATCH + 2)) // (2 * (n + 1))
+    layers, at = work[at : at + 2 * (n + 1) * w].reshape(2, n + 1, w), at + 2 * (n + 1) * w
+    scratch = work[at : at + layered * SCRATCH].reshape(layered, SCRATCH)
+    both = work[at + layered * SCRATCH :].reshape(2, layered)
     return Workspace(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
         turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
         twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
-        constants, came, goes, work[at : at + LANES],
+        constants, came, goes, late, layers[0], layers[1], scratch, both[0], both[1],
     )  # fmt: skip
 
 
@@ -110,11 +129,18 @@ def room_in(work: Array, n: int) -> Workspace:
 def prepare(
     models: Array, largest: Array, steepness: float, per_error: float, free: bool, work: Array
 ) -> None:
-    """Put models (2, n + 2, 9), reference and actual, and the damping's settings into ``work``."""
+    """Put models (2, n + 2, 9 + w), reference and actual, and the damping's settings into ``work``.
+
+    The last w columns are the joint functions' layers.
+    """
     n = models.shape[1] - 2
     room = room_in(work, n)
-    newton.copy(models[0, :n], room.taught_links)
-    newton.copy(models[1, :n], room.links)
+    for i in range(n):
+        for c in range(9):
+            room.taught_links[i, c], room.links[i, c] = models[0, i, c], models[1, i, c]
+    for i in range(n + 1):
+        for c in range(room.layer.shape[1]):
+            room.taught_layer[i, c], room.layer[i, c] = models[0, i, 9 + c], models[1, i, 9 + c]
     newton.pose(models[0, n], room.taught_root)
     newton.pose(models[0, n + 1], room.taught_tool)
     newton.pose(models[1, n], room.root)
@@ -305,6 +331,45 @@ def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Arr
 
 
 @lean
+def _correct_turned(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
+    """One point where joints turn otherwise than they read: rigid arms are solved in between.
+
+    What a rigid reference arm would read is corrected to what a rigid actual one would; a joint's
+    own function is corrected in each posture, no direction is weak to it. The report's shift is
+    that of the arms as they are.
+    """
+    n, e = q.shape[0], room.e
+    turn_joints(q, room.links, room.root, room.layer, room.scratch)
+    for i in range(n):
+        room.back[i], room.x[i] = room.scratch[i, TURNED], 0.0
+    turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
+    for i in range(n):
+        room.turned[i] = room.scratch[i, TURNED]
+    walk(room.turned, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
+    newton.at_tool(room.goal, room.taught_tool)
+    damping.swap_tool(room.goal, room.taught_tool, room.tool)
+    _residual_at(room.back, free, room)
+    shift, rotation = newton.length(e, 0), newton.length(e, 3)
+    _correct_one(room.turned, largest, free, room, out)
+    out[n + TCP_SHIFT], out[n + TCP_ROTATION] = shift, rotation
+    fine = out[n + CONVERGED] > 0.5
+    for i in range(n):
+        room.turned[i] = out[i]
+    if fine:
+        fine = read_joints(room.turned, room.links, room.root, room.layer, room.scratch, out[:n])
+    if not fine:
+        for i in range(n):
+            out[i] = q[i]
+        out[n + CONVERGED] = 0.0
+        out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = shift, rotation
+
+
+@lean
+def _is_turned(room: Workspace) -> bool:
+    return room.layer.shape[1] > 0
+
+
+@lean
 def _correct_weak(q: Array, largest: Array, room: Workspace, out: Array) -> None:
     """Those of the points (m, 6) of which ``out`` says that they are not solved."""
     count, n = 0, N
@@ -333,7 +398,10 @@ def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Arra
     for stage in range(works.shape[0]):
         room = room_in(works[stage], n)
         start = q if stage == 0 else out[stage - 1, :n]
-        _correct_one(start, largest[stage], free, room, out[stage])
+        if _is_turned(room):
+            _correct_turned(start, largest[stage], free, room, out[stage])
+        else:
+            _correct_one(start, largest[stage], free, room, out[stage])
 
 
 @lean
@@ -344,6 +412,10 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
     ``out`` (m, n + 7): joints, then the report.
     """
     room, first = room_in(work, q.shape[1]), 0
+    if _is_turned(room):
+        for i in range(q.shape[0]):
+            _correct_turned(q[i], largest, free, room, out[i])
+        return
     if room.settings[IS_STRAIGHT] > 0.5:
         while q.shape[0] - first >= LANES:
             for lane in range(LANES):
@@ -398,13 +470,18 @@ def rates_batch(
     """Joint rates (m, 6) at corrected joints: the tool moves as the reference tool does.
 
     J' qd' = J qd, and its derivative J' qdd' + (dJ'/dt) qd' = J qdd + (dJ/dt) qd, analytically.
-    Meaningful where no direction is weak; NaN where the pose is singular. ``first`` holds the
-    reference model, ``last`` the actual one: ``work`` of the first and of the last stage.
+    Meaningful where no direction is weak; NaN where the pose is singular, and for joint functions.
+    ``first`` holds the reference model, ``last`` the actual one: ``work`` of the first and of the
+    last stage.
     """
     taught, room = room_in(first, q.shape[1]), room_in(last, q.shape[1])
     n, J, L, v, a = q.shape[1], room.J, room.B, room.e, room.spare
     for m in range(q.shape[0]):
         velocity, acceleration = out_v[m], out_a[m]
+        if _is_turned(room):
+            for i in range(n):
+                velocity[i], acceleration[i] = np.nan, np.nan
+            continue
         _stand(q[m], taught.taught_links, taught.taught_root, taught.taught_tool, room)
         newton.bias(taught.taught_links, room.frames, room.here, qd[m], v, a)
         for i in range(n):
@@ -429,6 +506,8 @@ def velocity_by_chain(
     """The velocities (6,) of `rates_batch` for one point; whether they are finite."""
     n = q.shape[0]
     taught, room = room_in(first, n), room_in(last, n)
+    if _is_turned(room):
+        return False
     J, L, v = room.J, room.B, room.e
     _stand(q, taught.taught_links, taught.taught_root, taught.taught_tool, room)
     for r in range(6):

@@ -5,13 +5,15 @@ robot file and the start of a node do not need.
 """
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.ground.errors import LimitError
+from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.frames import Document
 from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 
@@ -386,13 +388,22 @@ def arm_of(model: Document, nominal: SerialArm) -> SerialArm:
     return nominal.with_model(np.array(model["mdh"]), *layer_of(model))
 
 
-def layer_of(model: Document) -> tuple[JointFunctions | None, ArmLoad | None]:
-    """Joint functions of a model document, and the load that it was identified with."""
+def layer_of(model: Mapping[str, Any]) -> tuple[JointFunctions | None, ArmLoad | None]:
+    """Joint functions of a model document, and the load that it was identified with.
+
+    Raises
+    ------
+    InputError
+        When they cannot be.
+    """
     functions, load = model.get("functions"), model.get("load")
-    return (
-        None if functions is None else JointFunctions(**functions),
-        None if load is None else ArmLoad(**load),
-    )
+    try:
+        return (
+            None if functions is None else JointFunctions(**functions),
+            None if load is None else ArmLoad(**load),
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the model cannot be read: {error}") from error
 
 
 _POSES = 2000  # over the joints' range, among which the largest shift is sought

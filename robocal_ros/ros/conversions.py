@@ -16,7 +16,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.history.history_records import Entry
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import COLUMNS
+from robocal_ros.kinematics.arm import COLUMNS, layer_of
 from robocal_ros.ros import endpoints
 
 if TYPE_CHECKING:
@@ -82,6 +82,21 @@ def kinematic_model(
     )
     for column, name in enumerate(COLUMNS):
         setattr(message, name, mdh[:, column].tolist())
+    functions, load = layer_of(model)  # which holds finite numbers only
+    if functions is not None:
+        message.function_first = functions.first.tolist()
+        message.function_step = functions.step.tolist()
+        message.function_coefficients = functions.coefficients.ravel().tolist()
+        message.compliance = functions.compliance.tolist()
+    if load is not None:
+        message.link_mass = load.mass.tolist()
+        message.link_centre = load.centre.ravel().tolist()
+        message.payload_mass = float(load.payload_mass)
+        for part, values in (
+            (message.payload_centre, load.payload_centre),
+            (message.gravity, load.gravity),
+        ):
+            part.x, part.y, part.z = values.tolist()
     return message
 
 

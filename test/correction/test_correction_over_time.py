@@ -26,6 +26,7 @@ from correction_robot import (
 )
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from joint_errors import with_joint_errors
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.bounds import CorrectionConfig
@@ -109,7 +110,7 @@ class Watch:
 EVENT = st.tuples(
     st.sampled_from(
         [
-            "on", "off", "model", "nominal", "tool", "nan", "beyond", "some", "stall",
+            "on", "off", "model", "full", "nominal", "tool", "nan", "beyond", "some", "stall",
             "pause", "backwards", "held", "nothing", "path", "late", "midway", "rejected",
             "acknowledged", "stopped",
         ]
@@ -125,6 +126,8 @@ def happen(robot: Robot, watch: Watch, what: str, seed: int, revision: int, q: n
         session.enable(what == "on")
     elif what == "model":
         session.offer_model(offer(drifted(0.4 * seed, seed), revision))
+    elif what == "full":
+        session.offer_model(offer(with_joint_errors(drifted(0.2 * seed, seed), seed), revision))
     elif what == "nominal":
         session.offer_model(offer(NOMINAL, revision))
     elif what == "tool":
@@ -223,6 +226,7 @@ def slow_down(robot: Robot, watch: Watch) -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.lists(EVENT, min_size=1, max_size=12), st.floats(0.0, 1.0), st.booleans())
 @example([("on", 0, 1), ("tool", 1, 1), ("pause", 0, 1), ("on", 0, 1)], 0.25, False)
+@example([("on", 0, 9), ("full", 2, 60), ("off", 0, 9), ("on", 0, 60), ("model", 1, 60)], 1.0, True)
 def test_streams_through_anything(
     events: list[tuple[str, int, int]], speed: float, whole: bool
 ) -> None:
@@ -275,13 +279,14 @@ def test_streams_through_anything(
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(EVENT, min_size=1, max_size=8), st.integers(2, 60), st.floats(0.8, 4.0))
+@example([("on", 0, 1), ("full", 2, 1), ("nominal", 3, 2), ("full", 4, 3)], 60, 0.8)
 def test_trajectories_through_anything(
     events: list[tuple[str, int, int]], m: int, duration: float
 ) -> None:
     """Each begins where the robot is by its un-corrected readings, at once or led in."""
     robot = Robot(**WIDE)
     for revision, (what, seed, count) in enumerate(events, start=1):
-        if what in ("on", "off", "model", "nominal", "tool"):
+        if what in ("on", "off", "model", "full", "nominal", "tool"):
             happen(robot, Watch(robot), what, seed, revision, HOME)
         begin = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
         first_s = 0.0 if count % 2 else 0.3

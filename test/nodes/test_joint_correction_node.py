@@ -21,6 +21,7 @@ from joint_correction_live import (
     tool_message,
     trajectory,
 )
+from joint_errors import with_joint_errors
 from rclpy.node import Node
 from robocal_msgs.msg import KinematicModel, ToolFrame
 from rosgraph_msgs.msg import Clock
@@ -34,10 +35,14 @@ from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import OK, WARN
 from robocal_ros.ros.graph import SourceGuard
 
+# What an arm's model holds: a drift, or joint functions and compliances besides.
+ACTUAL = {"drifted": drifted(), "full": with_joint_errors(drifted(), 1)}
 
-def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:
-    line = Line(graph)
-    actual = drifted()
+
+@pytest.mark.parametrize("model", ACTUAL)
+def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any, model: str) -> None:
+    line = Line(graph, thermal_tcp_mm=5.0)
+    actual = ACTUAL[model]
     line.take(model_message(actual), line.to_model, "kinematic_model")
     out = line.target(effort=array("d", np.full(6, 3.0)))
     assert list(out.position) == HOME.tolist()
@@ -58,11 +63,13 @@ def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> 
     assert list(line.settle().position) == HOME.tolist()
 
 
-def test_a_trajectory_keeps_its_times(graph: Any) -> None:
-    line = Line(graph, enable_on_start=True)
-    actual = drifted()
+@pytest.mark.parametrize("model", ACTUAL)
+def test_a_trajectory_keeps_its_times(graph: Any, model: str) -> None:
+    line = Line(graph, enable_on_start=True, thermal_tcp_mm=5.0)
+    actual = ACTUAL[model]
     line.take(model_message(actual), line.to_model, "kinematic_model")
     line.settle()
+    line.rest()  # the offset that came in stands
     times = np.array([0.0, 0.5, 1.25])
     message = trajectory(np.stack([HOME, HOME + 0.1, HOME]), times)
     line.to_path.publish(message)

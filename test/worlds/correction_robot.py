@@ -59,6 +59,8 @@ def offer(arm: SerialArm, revision: int = 1, **changes: Any) -> OfferedModel:
         accepted=True,
         joint_names=NAMES,
         mdh=arm.mdh,
+        functions=arm.functions,
+        load=arm.load,
     )
     return replace(model, **changes)
 
