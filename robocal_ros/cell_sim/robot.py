@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_functions import JointFunctions
 
 Array = NDArray[np.float64]
 
@@ -77,9 +78,9 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 class Effects:
     """Which parts of the truth are switched on.
 
-    The estimators model ``static`` and ``drift``, and know the size of ``noise``. They know
-    nothing of ``compliance``, ``eccentricity``, ``stem`` and ``sensor_warm_up``, and are to
-    recognise ``outliers``.
+    The estimators model ``static`` and ``drift``, and know the size of ``noise``. Those of the drift
+    know nothing of ``compliance``, ``eccentricity`` (with what else joints add), ``stem`` and
+    ``sensor_warm_up``, and are to recognise ``outliers``.
     """
 
     static: bool = True
@@ -132,6 +133,8 @@ class TrueRobot:
     body : masses and stiffness.
     eccentricity, phase : (n,) amplitude and phase of each encoder's once-per-turn error, rad.
     repeatability : standard deviation of the joint values at rest, rad.
+    functions : what gears and couplings add to each joint beside the encoder's error; its
+        compliances are not used, `body` has the stiffness.
     """
 
     nominal: SerialArm
@@ -143,6 +146,7 @@ class TrueRobot:
     phase: Array
     repeatability: float
     effects: Effects = field(default_factory=Effects)
+    functions: JointFunctions | None = None
 
     def mdh(self, warmth: Warmth) -> Array:
         """True parameters (n, 5) at these temperatures, without the joints' elastic deflection."""
@@ -164,6 +168,7 @@ class TrueRobot:
         joint = q.copy()
         if self.effects.eccentricity:
             joint += self.eccentricity * np.sin(q + self.phase)
+            joint += 0.0 if self.functions is None else self.functions.delta(q)
         if rng is not None and self.effects.noise:
             joint += self.repeatability * rng.standard_normal(q.shape)
         mdh = self.mdh(warmth)

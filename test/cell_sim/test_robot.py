@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from joint_errors import with_joint_errors
 
 from bench.measured_shifts import ShiftPlan, drifting_cell, poses, simulate
 from bench.thermal import SEEDS
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.kr150 import UNCORRECTED
-from robocal_ros.cell_sim.robot import Effects, TrueRobot, Warmth
+from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import SphereSensor
 from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.kinematics import SerialArm
@@ -59,6 +60,39 @@ def test_without_effects_it_is_the_nominal_arm(name):
     q = postures(arm, 200)
     flange = robot.flange(q, warm(3.0) if n == 6 else Warmth.cold(n), np.random.default_rng(0))
     np.testing.assert_allclose(flange, arm.fk(q), atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:.*limit")
+@pytest.mark.parametrize("name", ROBOTS)
+def test_joint_functions_and_stiffness_are_those_of_the_model(name):
+    """An arm with joint functions, compliances and a load, and the same robot by plain products."""
+    arm = with_joint_errors(load_robot(name), 4)
+    n, load = arm.n, arm.load
+    whole = load.mass[-1] + load.payload_mass  # the payload is the last link's
+    moment = load.mass[-1] * load.centre[-1] + load.payload_mass * load.payload_centre
+    robot = TrueRobot(
+        nominal=load_robot(name),
+        static_error=np.zeros((n, 5)),
+        motor_gain=np.zeros((n, 5, n)),
+        link_gain=np.zeros((n, 5, n)),
+        body=FlexibleBody(
+            mass=np.append(load.mass[:-1], whole),
+            centre=np.vstack([load.centre[:-1], moment / whole]),
+            stiffness=1.0 / arm.functions.compliance,
+            softening=0.0,
+        ),
+        eccentricity=np.zeros(n),
+        phase=np.zeros(n),
+        repeatability=0.0,
+        effects=replace(Effects.none(), eccentricity=True, compliance=True),
+        functions=arm.functions,
+    )
+    q = postures(arm, 200)
+    moved = np.linalg.norm((robot.flange(q, Warmth.cold(n)) - arm.fk(q))[:, :3, 3], axis=1)
+    sag = np.linalg.norm((arm.fk(q) - robot.nominal.fk(q))[:, :3, 3], axis=1)
+    # the truth's load is that of the bent arm, a thousandth (1 mrad) of it another one, and pulls
+    # with 9.81 m/s² for 9.80665
+    assert np.max(moved) < 2e-3 * np.max(sag)
 
 
 def test_static_errors_are_those_of_the_model(arm, robot):
