@@ -78,8 +78,8 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 class Effects:
     """Which parts of the truth are switched on.
 
-    The estimators model ``static`` and ``drift``, and know the size of ``noise``. Those of the drift
-    know nothing of ``compliance``, ``eccentricity`` (with what else joints add), ``stem`` and
+    The estimators model ``static`` and ``drift``, and know the size of ``noise``. Those of a
+    drift know nothing of ``compliance``, ``eccentricity`` (with what else joints add), ``stem`` and
     ``sensor_warm_up``, and are to recognise ``outliers``.
     """
 

@@ -455,6 +455,10 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "position accuracy and repeatability (AP, RP) of single poses as ISO 9283, 7.2, "
         "defines them; no whole test",
     ),
+    "joint-functions": CliCommand(
+        "cli.robot:joint_functions",
+        "what each joint of a robot file turns besides what is read, as a table",
+    ),
     "import-ur": CliCommand(
         "cli.robot:import_ur",
         "turn the factory calibration of a Universal Robots arm into a robot file",

@@ -1,4 +1,4 @@
-"""Commands about one robot: ``robocal fk`` and ``import-ur``."""
+"""Commands about one robot: ``robocal fk``, ``joint-functions`` and ``import-ur``."""
 
 import argparse
 import re
@@ -11,7 +11,7 @@ import numpy as np
 
 from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, warn
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.files import quoted, read_text
+from robocal_ros.ground.files import quoted, read_text, write_text
 from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import save_robot
@@ -126,6 +126,76 @@ def _show_fk(console: "Console", document: Document) -> None:
             lengths = [f"{value:z.3f}" for value in pose["xyz_mm"]]
             table.add_row(name, *lengths, *(f"{value:z.6f}" for value in pose["quat_xyzw"]))
     console.print(table)
+
+
+_ROWS_PER_KNOT = 4  # of a table: a cubic is drawn well by them
+
+
+def add_joint_functions(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``joint-functions``."""
+    parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
+    parser.add_argument("--output", type=Path, metavar="T.csv", help="table to write")
+
+
+def run_joint_functions(args: argparse.Namespace) -> CliResult:
+    """Do ``joint-functions``. Raises `RobocalError` for what a user can mend."""
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    functions = arm.functions
+    if functions is None:
+        raise InputError(f"{arm.name} has no joint functions: identify them", file=args.robot)
+    knots = functions.coefficients.shape[1] + 4
+    steps = np.arange(_ROWS_PER_KNOT * knots + 1)[:, None] / _ROWS_PER_KNOT
+    q = functions.first + functions.step * steps
+    delta, slope = functions.delta(q), functions.slope(q)
+    joints, rows = [], ["joint,q,q_unit,delta,delta_unit,slope"]
+    for i, name in enumerate(arm.joint_names):
+        unit, small = ("mm", "um") if arm.prismatic[i] else ("deg", "urad")
+        shown, micro = q[:, i] / _TO_SI[unit], 1e6 * delta[:, i]
+        used = np.flatnonzero(delta[:, i])
+        rows += [
+            f"{name},{shown[k]:.6f},{unit},{micro[k]:.4f},{small},{slope[k, i]:.8f}" for k in used
+        ]
+        joints.append(
+            {
+                "name": name,
+                "unit": unit,
+                "from": float(shown[used[0]]) if len(used) else None,
+                "to": float(shown[used[-1]]) if len(used) else None,
+                "rms_micro": float(np.sqrt(np.mean(micro[used] ** 2))) if len(used) else 0.0,
+                "largest_micro": float(np.max(np.abs(micro))),
+                "compliance_micro": float(1e6 * functions.compliance[i]),
+            }
+        )
+    if args.output is not None:
+        write_text(args.output, "\n".join(rows) + "\n")
+    document: Document = {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "joints": joints,
+        "output": None if args.output is None else str(args.output),
+        "warnings": warnings,
+    }
+    warn(warnings)
+    return CliResult(document, partial(_show_joint_functions, document=document))
+
+
+def _show_joint_functions(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{document['robot']}: what joints turn besides what is read")
+    table.add_column("joint")
+    for heading in ("from", "to", "rms µrad", "largest µrad", "compliance µrad/(N m)"):
+        table.add_column(heading, justify="right")
+    for joint in document["joints"]:
+        ends = (joint["from"], joint["to"])
+        span = ["" if end is None else f"{end:.1f} {joint['unit']}" for end in ends]
+        numbers = [joint["rms_micro"], joint["largest_micro"]]
+        compliance = f"{joint['compliance_micro']:.4f}"
+        table.add_row(joint["name"], *span, *(f"{value:.1f}" for value in numbers), compliance)
+    console.print(table)
+    if document["output"] is not None:
+        console.print(f"Written: {document['output']}")
 
 
 _POSES = 1000

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command import conforms
+from joint_errors import with_joint_errors
 
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
@@ -157,3 +158,24 @@ def test_the_factory_calibration_of_a_ur5e(
     assert status == 2
     assert document["error"]["file"] == str(calibration)
     assert not (tmp_path / "none.yaml").exists()
+
+
+def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arm, path = with_joint_errors(load_robot("ur10"), 2), tmp_path / "full.yaml"
+    save_robot(arm, path)
+    command = ["joint-functions", "--robot", str(path), "--output", str(tmp_path / "t.csv")]
+    status, document = answer(command, capsys)
+    assert status == 0
+    rows = [line.split(",") for line in (tmp_path / "t.csv").read_text().splitlines()[1:]]
+    elbow = np.array([[row[1], row[3], row[5]] for row in rows if row[0] == "elbow_joint"], float)
+    q = np.zeros((len(elbow), 6))
+    q[:, 2] = np.radians(elbow[:, 0])
+    # the table is rounded to 1e-6 deg, 1e-4 urad and 1e-8
+    np.testing.assert_allclose(elbow[:, 1], 1e6 * arm.functions.delta(q)[:, 2], atol=1e-3)
+    np.testing.assert_allclose(elbow[:, 2], arm.functions.slope(q)[:, 2], atol=2e-8)
+    told = document["joints"][2]
+    assert told["largest_micro"] == pytest.approx(np.max(np.abs(elbow[:, 1])), abs=1e-3)
+    np.testing.assert_allclose((told["from"], told["to"]), elbow[[0, -1], 0], atol=1e-6)
+    assert told["compliance_micro"] == pytest.approx(1e6 * arm.functions.compliance[2])
+    assert main(command) == 0
+    assert "what joints turn besides what is read" in capsys.readouterr().out

@@ -10,6 +10,7 @@ from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
 from hand_eye_bag import hand_eye_bag
 from hand_eye_tables import TRUE, hand_eye_tables
+from joint_errors import with_joint_errors
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
 from tool_tables import tool_tables
@@ -18,7 +19,7 @@ from tracker_files import SCAN, tracker_files
 from bench.laser_tracker import prp_cell
 from robocal_ros.cli.main import COMMANDS
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.kinematics.robots import load_description
+from robocal_ros.kinematics.robots import load_description, load_robot, save_robot
 
 UR_NOMINAL = """[DH]
 a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
@@ -257,6 +258,12 @@ CASES = {
         ["iso9283", "--data", "edges.csv"],
         (2, "BAD_INPUT"),
     ),
+    "joint-functions": (
+        "joint-functions.json",
+        ["joint-functions", "--robot", "full.yaml", "--output", "functions.csv"],
+        ["joint-functions", "--robot", ROBOT],
+        (2, "BAD_INPUT"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -269,6 +276,7 @@ CASES = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("commands")
+    save_robot(with_joint_errors(load_robot(ROBOT), 1), folder / "full.yaml")
     table(folder / "data.csv", measured(60))
     table(folder / "few.csv", measured(3))
     visits = shift()
