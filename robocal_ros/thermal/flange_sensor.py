@@ -183,7 +183,7 @@ def _point_jacobian(arm: SerialArm, q: Array, p_flange: Array) -> Array:
     none, each = np.full(m, -1, dtype=np.int64), np.arange(m, dtype=np.int64)
     slots = arm.parameters.slots(arm.n)
     kernels.parameter_batch(
-        np.ascontiguousarray(q), arm.links, arm.T_base_root, tools, each, slots, -1, none, T, J
+        arm.turned(q), arm.links, arm.T_base_root, tools, each, slots, -1, none, T, J
     )
     return J
 

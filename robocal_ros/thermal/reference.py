@@ -18,6 +18,7 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.judged import require_match
 from robocal_ros.identification.solve import CellModel, identify, make_layout
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of, model_document
 from robocal_ros.kinematics.tables import measurements_of, read_table
 
 SAME_VISIT_RAD = float(np.radians(0.5))
@@ -225,14 +226,14 @@ def holds_drift(model: Document | None) -> bool:
 
 def commissioned_of(reference: Document, nominal: SerialArm) -> SerialArm:
     """The arm without any drift, also where the reference was captured with the robot warm."""
-    return nominal.with_mdh(np.array(reference.get(COMMISSIONED, reference["mdh"])))
+    return arm_of(reference | {"mdh": reference.get(COMMISSIONED, reference["mdh"])}, nominal)
 
 
 def reference_document(reference: ColdReference) -> Document:
     """A cold reference in full precision, SI; ``reference_of`` reads it back to the last bit."""
     cell, data = reference.cell, reference.data
-    return {
-        "mdh": cell.arm.mdh.tolist(),
+    model = model_document(cell.arm)
+    return {key: model[key] for key in ("mdh", "functions", "load") if key in model} | {
         "T_frame_base": cell.T_frame_base.tolist(),
         "targets": list(cell.targets),
         "T_flange_target": cell.T_flange_target.tolist(),
@@ -249,7 +250,7 @@ def reference_document(reference: ColdReference) -> Document:
 def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
     """Read a cold reference back from its document."""
     cell = CellModel(
-        nominal.with_mdh(document["mdh"]),
+        arm_of(document, nominal),
         np.array(document["T_frame_base"]),
         tuple(document["targets"]),
         np.array(document["T_flange_target"]),

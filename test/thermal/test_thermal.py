@@ -1,14 +1,17 @@
 """Drift identification against a simulated truth: recovery, honesty, and what it cannot see."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from joint_errors import with_joint_errors
 
 from robocal_ros.estimation.assessment import Judgement
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, ResidualError
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.identification import (
     CycleDrift,
@@ -17,7 +20,14 @@ from robocal_ros.thermal.identification import (
     judge_cycle,
     learned_prior,
 )
-from robocal_ros.thermal.reference import ColdReference, capture_reference
+from robocal_ros.thermal.reference import (
+    COMMISSIONED,
+    ColdReference,
+    capture_reference,
+    commissioned_of,
+    reference_document,
+    reference_of,
+)
 
 SIGMA_M = 2e-5
 BALL = np.array([0.10, 0.05, 0.20, 1.0])
@@ -64,6 +74,18 @@ def drift_error(found: SerialArm, reference: SerialArm, warm: SerialArm, cold: S
     """Error (m, 3) of the ball's identified displacement, base axes."""
     moved = (warm.fk(q) - cold.fk(q)) @ BALL
     return ((found.fk(q) - reference.fk(q)) @ BALL - moved)[:, :3]
+
+
+def test_a_reference_keeps_the_joint_functions_of_its_arm(nominal, cold):
+    arm, rng = with_joint_errors(cold, 1), np.random.default_rng(0)
+    q = postures(arm, 20, rng)
+    cell = CellModel(arm, T_SENSOR_BASE, ("ball",), frames.transform(np.eye(3), BALL[:3])[None])
+    reference = ColdReference(cell, visit(arm, q, rng))
+    document = json.loads(json.dumps(reference_document(reference)))
+    back = reference_of(document, nominal).cell.arm
+    np.testing.assert_array_equal(back.fk(q), arm.fk(q))
+    commissioned = commissioned_of(document | {COMMISSIONED: nominal.mdh.tolist()}, nominal)
+    np.testing.assert_array_equal(commissioned.fk(q), arm.with_mdh(nominal.mdh).fk(q))
 
 
 def test_expected_error_is_the_achieved_one(nominal, cold):
