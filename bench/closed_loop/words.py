@@ -24,6 +24,8 @@ def model_of(session: ThermalSession, now_ns: int) -> OfferedModel:
         arm.mdh,
         arm.T_base_root,
         now_ns,
+        functions=arm.functions,
+        load=arm.load,
     )
 
 
