@@ -10,9 +10,9 @@ Both come before the geometric chain: `SerialArm.turned` gives what a rigid arm 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from robocal_ros.ground.frames import Array
 
 STANDARD_GRAVITY = 9.80665  # m/s², of the 3rd CGPM, 1901
 # A slope from which on two readings could mean the same angle of the joint, with room to spare.

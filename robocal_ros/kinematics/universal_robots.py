@@ -9,12 +9,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics.arm import ALPHA, NEARLY_PARALLEL, THETA, A, D, SerialArm
-
-Array = NDArray[np.float64]
 
 JOINT_NAMES = (
     "shoulder_pan_joint",
