@@ -179,7 +179,14 @@ class JointCorrection:
         joints = np.asarray(q, dtype=np.float64)
         points = plain(joints.reshape(-1, self.n))
         out = np.empty((len(points), self.n + solution.REPORT))
-        solution.correct_batch(points, self.largest, self.free_axis, self.work, out)
+        given = self.largest, self.free_axis, self.work, out
+        if self.models.shape[2] > 9:
+            turned = np.empty_like(points)
+            solution.turn_batch(points, self.work, turned)
+            solution.correct_batch(turned, *given)
+            solution.read_batch(points, turned, self.free_axis, self.work, out)
+        else:
+            solution.correct_batch(points, *given)
         lead = joints.shape[:-1]
         corrected, report = plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
         return CorrectionResult(

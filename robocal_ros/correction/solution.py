@@ -330,43 +330,66 @@ def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Arr
     _correct(q, largest, free, room, out)
 
 
-@lean
-def _correct_turned(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
-    """One point where joints turn otherwise than they read: rigid arms are solved in between.
-
-    What a rigid reference arm would read is corrected to what a rigid actual one would; a joint's
-    own function is corrected in each posture, no direction is weak to it. The report's shift is
-    that of the arms as they are.
-    """
-    n, e = q.shape[0], room.e
-    turn_joints(q, room.links, room.root, room.layer, room.scratch)
-    for i in range(n):
-        room.back[i], room.x[i] = room.scratch[i, TURNED], 0.0
-    turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
-    for i in range(n):
-        room.turned[i] = room.scratch[i, TURNED]
-    walk(room.turned, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
-    newton.at_tool(room.goal, room.taught_tool)
-    damping.swap_tool(room.goal, room.taught_tool, room.tool)
-    _residual_at(room.back, free, room)
-    shift, rotation = newton.length(e, 0), newton.length(e, 3)
-    _correct_one(room.turned, largest, free, room, out)
-    out[n + TCP_SHIFT], out[n + TCP_ROTATION] = shift, rotation
-    fine = out[n + CONVERGED] > 0.5
-    for i in range(n):
-        room.turned[i] = out[i]
-    if fine:
-        fine = read_joints(room.turned, room.links, room.root, room.layer, room.scratch, out[:n])
-    if not fine:
-        for i in range(n):
-            out[i] = q[i]
-        out[n + CONVERGED] = 0.0
-        out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = shift, rotation
+# Where joints turn otherwise than they read, what a rigid reference arm would read is corrected to
+# what a rigid actual one would, and that is read off the joints: of a joint's own function nothing
+# is given up, whatever direction is weak.
 
 
 @lean
 def _is_turned(room: Workspace) -> bool:
     return room.layer.shape[1] > 0
+
+
+@lean
+def _turn(q: Array, room: Workspace, turned: Array) -> None:
+    """What a rigid reference arm would read at ``q`` (n,)."""
+    turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
+    for i in range(q.shape[0]):
+        turned[i] = room.scratch[i, TURNED]
+
+
+@lean
+def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> None:
+    """Make joints of what a rigid arm would read, in ``out``, and its shift that of the true arms.
+
+    ``turned`` (n,) is what `_turn` makes of ``q``.
+    """
+    n, e, back = q.shape[0], room.e, room.back
+    walk(turned, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
+    newton.at_tool(room.goal, room.taught_tool)
+    damping.swap_tool(room.goal, room.taught_tool, room.tool)
+    turn_joints(q, room.links, room.root, room.layer, room.scratch)
+    for i in range(n):
+        back[i], room.x[i] = room.scratch[i, TURNED], 0.0
+    _residual_at(back, free, room)
+    out[n + TCP_SHIFT], out[n + TCP_ROTATION] = newton.length(e, 0), newton.length(e, 3)
+    fine = out[n + CONVERGED] > 0.5
+    for i in range(n):
+        back[i] = out[i]
+    if fine:
+        fine = read_joints(back, room.links, room.root, room.layer, room.scratch, out[:n])
+    if not fine:
+        for i in range(n):
+            out[i] = q[i]
+        out[n + CONVERGED] = 0.0
+        out[n + POSITION_ERROR] = out[n + TCP_SHIFT]
+        out[n + ROTATION_ERROR] = out[n + TCP_ROTATION]
+
+
+@lean
+def turn_batch(q: Array, work: Array, turned: Array) -> None:
+    """What a rigid reference arm would read (m, n) at ``q`` (m, n): what `correct_batch` takes."""
+    room = room_in(work, q.shape[1])
+    for k in range(q.shape[0]):
+        _turn(q[k], room, turned[k])
+
+
+@lean
+def read_batch(q: Array, turned: Array, free: bool, work: Array, out: Array) -> None:
+    """Joints of what `correct_batch` made of ``turned`` (m, n), in ``out``."""
+    room = room_in(work, q.shape[1])
+    for k in range(q.shape[0]):
+        _read(q[k], turned[k], free, room, out[k])
 
 
 @lean
@@ -399,23 +422,21 @@ def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Arra
         room = room_in(works[stage], n)
         start = q if stage == 0 else out[stage - 1, :n]
         if _is_turned(room):
-            _correct_turned(start, largest[stage], free, room, out[stage])
+            _turn(start, room, room.turned)
+            _correct_one(room.turned, largest[stage], free, room, out[stage])
+            _read(start, room.turned, free, room, out[stage])
         else:
             _correct_one(start, largest[stage], free, room, out[stage])
 
 
 @lean
 def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
-    """Joints that put the actual tool where the reference tool is at ``q`` (m, n).
+    """Joints that put the actual tool where the reference tool is at ``q`` (m, n), of rigid arms.
 
     ``largest`` (n,) bounds the joint shift; ``free``: the turn about the tool's z is free.
     ``out`` (m, n + 7): joints, then the report.
     """
     room, first = room_in(work, q.shape[1]), 0
-    if _is_turned(room):
-        for i in range(q.shape[0]):
-            _correct_turned(q[i], largest, free, room, out[i])
-        return
     if room.settings[IS_STRAIGHT] > 0.5:
         while q.shape[0] - first >= LANES:
             for lane in range(LANES):
