@@ -63,8 +63,7 @@ def test_a_long_gap_takes_everything_in_its_order(cell):
 
 def test_a_bent_tool_is_measured_in_full(cell):
     cell.check = bent()
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     assert [r.mode for r in cell.log if isinstance(r, ask.Measure)] == ["quick", "full"]
     over(cell)
 
@@ -74,8 +73,7 @@ def test_no_gap_is_overrun(cell, gap_s):
     """What does not fit is left, whatever the length."""
     cell.check = bent()
     cell.services["measure"] = SLOW
-    cell.run("c1", gap_s)
-    result = cell.finish()
+    result = cell.ran("c1", gap_s)
     assert cell.now_s <= cell.ends_s
     assert result.code is Code.ACCEPT, result.message
     assert result.complete == (not result.left)
@@ -83,15 +81,13 @@ def test_no_gap_is_overrun(cell, gap_s):
 
 
 def test_what_did_not_fit_is_resumed_in_the_next_gap(cell):
-    cell.run("c1", 15.0)
-    first = cell.finish()
+    first = cell.ran("c1", 15.0)
     assert "thermal measurement" in first.left[0]
     visited = sum(isinstance(r, ask.Move) for r in cell.log) - 1
     assert 0 < visited < len(POSES)
     cell.pass_time(20.0)
     cell.log.clear()
-    cell.run("c2", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c2").complete
     assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c1"]
     thermal = kinds(cell)[: kinds(cell).index("EndCycle")]
     assert thermal.count("Move") == len(POSES) - visited + 1
@@ -100,12 +96,10 @@ def test_what_did_not_fit_is_resumed_in_the_next_gap(cell):
 def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
     cell = Cell(history, config_of(resume_within_s=5.0))
     cell.open_gap()
-    cell.run("c1", 15.0)
-    cell.finish()
+    cell.ran("c1", 15.0)
     cell.pass_time(6.0)
     cell.log.clear()
-    cell.run("c2", LONG_S)
-    words = cell.finish().message
+    words = cell.ran("c2").message
     assert re.search(r"cycle 'c1' with 1 of 3 .* \d+ s old \(resume_within_s = 5 s\)", words)
     assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c2"]
     assert kinds(cell)[: kinds(cell).index("EndCycle")].count("Move") == len(POSES) + 1
@@ -113,15 +107,13 @@ def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
 
 def test_a_full_measurement_that_did_not_fit_comes_next(cell):
     cell.check = bent()
-    cell.run("c1", 33.0)
-    assert cell.finish().left == ("tool measurement (full)",)
+    assert cell.ran("c1", 33.0).left == ("tool measurement (full)",)
     (left,) = (outcome for name, outcome in cell.events if name == LEAVE)
     assert left.command.arguments["what"] == "tool measurement (full)"
     worst_s = cell.session.worst_cases()["tool measurement (full)"]
     assert 0.0 < left.command.arguments["left_s"] < worst_s + TIMES.reserve_s
     cell.log.clear()
-    cell.run("c2", LONG_S)
-    cell.finish()
+    cell.ran("c2")
     assert [r.mode for r in cell.log if isinstance(r, ask.Measure)] == ["full"]
 
 
@@ -176,8 +168,7 @@ def test_after_a_fault_the_ways_begin_at_home_again(cell):
     cell.pass_time(0.5)
     cell.session.acknowledge("me")
     assert cell.session.status(cell.now_s).doing == ""
-    cell.run("c2", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c2").complete
     over(cell)
 
 
@@ -185,8 +176,7 @@ def test_after_a_fault_the_ways_begin_at_home_again(cell):
 @pytest.mark.parametrize("how", [REFUSED, SILENT])
 def test_nodes_that_fail_leave_the_robot_at_home(cell, service, how):
     cell.services[service] = how
-    cell.run("c1", LONG_S)
-    assert cell.finish().code is Code.ACCEPT
+    assert cell.ran("c1").code is Code.ACCEPT
     over(cell)
 
 
@@ -204,8 +194,7 @@ def test_a_defect_is_a_fault_and_no_cycle_is_left_without_a_code(cell, monkeypat
 
 
 def test_nothing_runs_twice_not_after_a_restart_either(cell):
-    cell.run("c1", LONG_S)
-    first = cell.finish()
+    first = cell.ran("c1")
     count = len(cell.log)
     assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
     cell.restart()
@@ -288,8 +277,7 @@ def accuracy(cell: Cell, level=AccuracyLevel.OK, error=SMALL):
 
 def test_the_line_reads_one_state(cell):
     assert accuracy(cell).level is AccuracyLevel.EXPIRED  # the tool was never checked
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     found = accuracy(cell)
     assert found.level is AccuracyLevel.OK, found.reason
     assert 1e-4 < found.error.rms_m < found.error.bound_m <= cell.config.tolerance_m
@@ -308,16 +296,14 @@ def test_the_line_reads_one_state(cell):
 
 
 def test_an_error_that_is_no_number_is_not_within_tolerance(cell):
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     assert accuracy(cell).level is AccuracyLevel.OK
     assert accuracy(cell, error=ToolError(1e-4, np.nan)).level is AccuracyLevel.DEGRADED
 
 
 def test_a_bent_tool_degrades(cell):
     cell.check = bent()
-    cell.run("c1", 33.0)
-    cell.finish()
+    cell.ran("c1", 33.0)
     assert accuracy(cell).level is AccuracyLevel.DEGRADED
 
 
@@ -355,8 +341,7 @@ def test_a_way_home_that_took_longer_than_was_set_counts_from_then_on(history):
 def test_without_a_station_only_the_drift_is_measured(history):
     cell = Cell(history, config_of(T_base_laser=None))
     cell.open_gap()
-    cell.run("c1", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c1").complete
     assert not {"Arm", "Disarm"} & set(kinds(cell))
     assert accuracy(cell).level is AccuracyLevel.OK
 
@@ -364,6 +349,5 @@ def test_without_a_station_only_the_drift_is_measured(history):
 def test_without_poses_only_the_tool_is_measured(history):
     cell = Cell(history, config_of(poses=np.zeros((0, CELL.arm.n))))
     cell.open_gap()
-    cell.run("c1", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c1").complete
     assert kinds(cell) == ["Disarm", "Disarm", "Arm", "Measure", "Disarm", "Move"]

@@ -90,8 +90,7 @@ def test_a_thermal_model_waits_while_the_drift_is_a_fault(history, said):
     cell.check = passed()
     cell.drift = said and replace(KNOWN, level=said)
     number = thermal_candidate(cell)
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert result.accepted == (() if said in UNSOUND else (number,)), result.message
     assert (f"thermal candidate {number} waits" in result.message) == (said in UNSOUND)
 
@@ -254,8 +253,7 @@ def corrected(history) -> Cell:
     cell = automatic(history, correction_silent_s=SILENT_S)
     line(cell)
     cell.full = straightened
-    cell.run("c1", LONG_S)
-    assert cell.finish().accepted
+    assert cell.ran("c1").accepted
     assert cell.history.head(TOOL).revision == 1
     return cell
 

@@ -36,8 +36,7 @@ SPOILT = {
 @pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
 def test_a_state_of_another_version_is_refused_by_its_name(history, spoil):
     cell = opened(history)
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     spoil(cell.shelf.document)
     with pytest.raises(StorageError, match=r"^shelf is not of this version.*move it away"):
         Cell(history, shelf=cell.shelf)
@@ -46,8 +45,7 @@ def test_a_state_of_another_version_is_refused_by_its_name(history, spoil):
 def test_a_cycle_of_before_a_restart_is_told_to_be_old(history):
     cell = opened(history)
     for name in ("c1", "c2"):
-        cell.run(name, LONG_S)
-        ended = cell.finish()
+        ended = cell.ran(name)
         assert cell.session.memory.words_of(ended) == ended.message
     assert (ended.run, ended.stamp_ns) == (2, cell.wall_ns)
     cell.restart()
@@ -59,8 +57,7 @@ def test_a_cycle_of_before_a_restart_is_told_to_be_old(history):
     assert words.startswith(old)
     assert words.endswith(f"nothing runs now; it ended so: {ended.message}")
     cell.open_gap()
-    cell.run("c3", LONG_S)
-    new = cell.finish()
+    new = cell.ran("c3")
     assert (new.run, cell.session.memory.words_of(new)) == (3, new.message)
 
 
@@ -85,14 +82,12 @@ def test_a_cycle_that_could_not_be_written_is_no_run(history):
     cell.shelf.takes = full
     assert cell.run("c1", LONG_S) is Code.STORAGE_FAILED
     cell.shelf.takes = lambda: None
-    cell.run("c2", LONG_S)
-    assert cell.finish().run == 1
+    assert cell.ran("c2").run == 1
 
 
 def test_a_state_of_the_first_version_is_read(history):
     cell = opened(history)
-    cell.run("c1", LONG_S)
-    message = cell.finish().message
+    message = cell.ran("c1").message
     kept = cell.shelf.document
     for name in ("version", "runs", "began_ns"):
         del kept[name]
@@ -103,8 +98,7 @@ def test_a_state_of_the_first_version_is_read(history):
     words = "cycle 'c1' is one of before this start of the node; nothing runs now; it ended so: "
     assert cell.session.memory.words_of(result) == words + message
     cell.open_gap()
-    cell.run("c2", LONG_S)
-    assert cell.finish().run == 1
+    assert cell.ran("c2").run == 1
 
 
 UNSURE = replace(bent(), code=Code.TOO_FEW_SAMPLES, answer="cannot tell")
@@ -160,8 +154,7 @@ UNKNOWN = set(Code) - {
 @pytest.mark.parametrize("how", [REFUSED, SILENT])
 def test_a_thermal_node_that_fails_leaves_the_measurement(cell, how):
     cell.services["thermal"] = how
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert (result.code, result.complete, result.left) == (
         Code.ACCEPT,
         False,
@@ -174,8 +167,7 @@ def test_a_thermal_node_that_fails_leaves_the_measurement(cell, how):
 @pytest.mark.parametrize("code", sorted(UNKNOWN), ids=lambda code: code.name)
 def test_a_verdict_that_does_not_tell_the_drift_leaves_it(cell, code):
     cell.thermal = DriverAnswer(code, "why")
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert (result.complete, result.left) == (False, ("thermal measurement",))
     assert result.thermal_code is code
 
@@ -190,42 +182,35 @@ def test_a_pose_that_was_not_measured_is_left_by_its_number(cell):
     assert (result.complete, result.left) == (False, ("thermal measurement at pose 2",))
     assert result.thermal_code is Code.NO_SIGNIFICANT_GAIN  # the others told enough
     cell.open_gap()
-    cell.run("c2", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c2").complete
 
 
 def test_a_pose_that_an_earlier_gap_missed_is_still_named(cell):
     cell.services["sensor"] = SILENT
-    cell.run("c1", 15.0)
-    assert "poses" in cell.finish().left[0]
+    assert "poses" in cell.ran("c1", 15.0).left[0]
     cell.services["sensor"] = "ok"
     cell.open_gap()
-    cell.run("c2", LONG_S)
-    assert cell.finish().left == ("thermal measurement at pose 1",)
+    assert cell.ran("c2").left == ("thermal measurement at pose 1",)
 
 
 def test_cold_poses_that_were_not_measured_are_named(cell):
     cell.thermal = replace(cell.thermal, missing=(2, 7))
-    cell.run("c1", LONG_S)
-    assert "without pose 2, 7 of the cold reference" in cell.finish().message
+    assert "without pose 2, 7 of the cold reference" in cell.ran("c1").message
 
 
 def test_poses_that_the_thermal_node_lost_are_left(cell):
     """Started anew between two gaps it opens the same cycle, without what was measured before."""
-    cell.run("c1", 15.0)
-    assert "poses" in cell.finish().left[0]
+    assert "poses" in cell.ran("c1", 15.0).left[0]
     first = kinds(cell).count("Move") - 1
     cell.open_gap()
     cell.thermal = replace(cell.thermal, visited=len(POSES) - first)
-    cell.run("c2", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c2")
     words = f"thermal measurement at 3 poses, of which the thermal node has {len(POSES) - first}"
     assert (result.complete, result.left) == (False, (words,))
     cell.open_gap()
     cell.thermal = replace(cell.thermal, visited=len(POSES))
     cell.log.clear()
-    cell.run("c3", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c3").complete
     assert [each.cycle_id for each in cell.log if isinstance(each, ask.BeginCycle)] == ["c3"]
 
 
@@ -235,8 +220,7 @@ def test_a_pose_that_was_taught_twice_is_one_to_the_thermal_node(history):
     cell = Cell(history, config=config)
     cell.open_gap()
     cell.thermal = replace(cell.thermal, visited=len(POSES))
-    cell.run("c1", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c1").complete
 
 
 @pytest.mark.parametrize("every", [1, 2])
@@ -248,7 +232,6 @@ def test_a_sensor_that_measures_often_does_not_hold_the_robot(history, every):
         cell = Cell(history, config=config, measures_every=ticks)
         cell.open_gap()
         begin_s = cell.now_s
-        cell.run("c1", LONG_S)
-        assert cell.finish().complete
+        assert cell.ran("c1").complete
         taken_s.append(cell.now_s - begin_s)
     assert taken_s[1] <= taken_s[0]

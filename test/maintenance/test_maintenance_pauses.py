@@ -68,8 +68,7 @@ def test_nor_does_one_between_two_measurements(history, pause_s):
     cell = automatic(history)
     cell.full = straightened
     cell.shelf.takes = lambda: cell.pause(pause_s)
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
     assert (len(result.accepted), result.tool_answer) == (1, "pass")
 

@@ -166,8 +166,7 @@ def test_a_robot_that_left_its_plan_in_a_tool_run_is_not_driven_on(cell, mode):
     """It may be held, or have hit something; only a person knows."""
     held = DriverAnswer(Code.LIMIT_EXCEEDED, "away from its plan", left_plan=True)
     cell.check, cell.full = (held if mode == "quick" else bent()), lambda _: held
-    cell.run("c1", LONG_S)
-    assert cell.finish().code is Code.LIMIT_EXCEEDED
+    assert cell.ran("c1").code is Code.LIMIT_EXCEEDED
     over(cell, fault=True)
     status = cell.session.status(cell.now_s)
     assert (cell.state, status.fault_code) == (MaintenanceState.FAULT, Code.LIMIT_EXCEEDED)
@@ -200,8 +199,7 @@ def test_a_robot_that_never_left_is_not_moved(cell):
     """A programme may stop a little beside the taught home."""
     cell.motion = AheadMotion(HOME + np.radians(0.1))
     cell.services["thermal"] = SILENT
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     asked = kinds(cell)
     assert asked.index("BeginCycle") < asked.index("Arm")
     assert "Move" not in asked[: asked.index("Arm")]

@@ -6,7 +6,6 @@ import maintenance_cell
 import pytest
 from maintenance_cell import (
     KNOWN,
-    LONG_S,
     Cell,
     bent,
     config_of,
@@ -16,7 +15,13 @@ from maintenance_cell import (
     thermal_proposed,
     wrong_tool,
 )
-from maintenance_tools import decide, level, measured_in_full, modes, until_measuring
+from maintenance_tools import (
+    a_check_passes,
+    decide,
+    level,
+    measured_in_full,
+    until_measuring,
+)
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.history_records import THERMAL, TOOL
@@ -32,16 +37,11 @@ OTHER_MODEL = "another thermal model is in force than it was checked with: check
 
 def test_a_check_in_the_future_is_none(cell, monkeypatch):
     """The computer's clock was set back by a day."""
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     assert level(cell) is AccuracyLevel.OK
     monkeypatch.setattr(maintenance_cell, "WALL_NS", maintenance_cell.WALL_NS - DAY_NS)
     assert level(cell) is AccuracyLevel.EXPIRED
-    cell.log.clear()
-    cell.run("c2", LONG_S)
-    cell.finish()
-    assert modes(cell) == ["quick"]
-    assert level(cell) is AccuracyLevel.OK
+    a_check_passes(cell, "c2")
 
 
 @pytest.mark.parametrize("told", [wrong_tool(), WITHOUT_WAY])
@@ -49,14 +49,12 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
 def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(
     cell, monkeypatch, mode, told
 ):
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     assert level(cell) is AccuracyLevel.OK
     cell.check, cell.full = (told if mode == "quick" else bent()), lambda _: told
     later_ns = round(cell.config.check_every_s * 1e9)
     monkeypatch.setattr(maintenance_cell, "WALL_NS", maintenance_cell.WALL_NS + later_ns)
-    cell.run("c2", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c2")
     assert (result.tool_code, result.complete) == (told.code, False)
     assert result.left == (f"tool measurement ({mode})",)
     assert level(cell) is AccuracyLevel.DEGRADED
@@ -64,26 +62,19 @@ def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(
     cell.restart()
     assert level(cell) is AccuracyLevel.DEGRADED
     cell.open_gap()
-    cell.log.clear()
-    cell.check = passed()
-    cell.run("c3", LONG_S)
-    assert cell.finish().complete
-    assert modes(cell) == ["quick"]
-    assert level(cell) is AccuracyLevel.OK
+    assert a_check_passes(cell, "c3").complete
 
 
 def test_a_first_check_that_fails_leaves_the_tool_unknown(cell):
     cell.check = wrong_tool()
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     assert level(cell) is AccuracyLevel.EXPIRED
     assert wrong_tool().message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
 
 
 def found_bent(cell: Cell) -> None:
     cell.check = bent()
-    cell.run("bent", TOO_SHORT_FOR_FULL_S)
-    cell.finish()
+    cell.ran("bent", TOO_SHORT_FOR_FULL_S)
     assert level(cell) is AccuracyLevel.DEGRADED
 
 
@@ -93,12 +84,7 @@ def test_a_bent_tool_stays_bent_when_another_one_comes_into_force(cell):
     found_bent(cell)
     assert cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns).done
     assert level(cell) is AccuracyLevel.DEGRADED
-    cell.check = passed()
-    cell.log.clear()
-    cell.run("c2", LONG_S)
-    cell.finish()
-    assert modes(cell) == ["quick"]
-    assert level(cell) is AccuracyLevel.OK
+    a_check_passes(cell, "c2")
 
 
 @pytest.mark.parametrize("rolled_back", [False, True])
@@ -130,8 +116,7 @@ def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
     assert level(cell) is AccuracyLevel.DUE
     cell.open_gap()
     cell.check = passed()
-    cell.run("c2", LONG_S)
-    assert cell.finish().tool_answer == "pass"
+    assert cell.ran("c2").tool_answer == "pass"
     assert level(cell) is AccuracyLevel.OK
 
 
@@ -158,8 +143,7 @@ def test_another_tool_than_the_measured_one_stays_degraded(cell):
 
 def test_a_measured_tool_whose_check_finds_it_bent_stays_degraded(cell):
     bent_measured_and_accepted(cell)
-    cell.run("c2", TOO_SHORT_FOR_FULL_S)
-    assert cell.finish().tool_answer == "recalibrate"
+    assert cell.ran("c2", TOO_SHORT_FOR_FULL_S).tool_answer == "recalibrate"
     assert level(cell) is AccuracyLevel.DEGRADED
 
 
@@ -173,8 +157,7 @@ def test_a_pass_is_not_credited_to_another_tool(cell):
     assert (result.tool_answer, result.complete) == ("", False)
     assert level(cell) is AccuracyLevel.EXPIRED  # never checked
     cell.log.clear()
-    cell.run("c2", LONG_S)
-    assert cell.finish().tool_answer == "pass"
+    assert cell.ran("c2").tool_answer == "pass"
     assert level(cell) is AccuracyLevel.OK
 
 
@@ -194,8 +177,7 @@ def checked(history) -> Cell:
     for kelvin in (10.0, 20.0):
         decide(cell, ACCEPT, thermal_proposed(history, kelvin))
     decide(cell, ACCEPT, proposed(history))
-    cell.run("c1", LONG_S)
-    assert cell.finish().tool_answer == "pass"
+    assert cell.ran("c1").tool_answer == "pass"
     assert level(cell) is AccuracyLevel.OK
     cell.log.clear()
     return cell
@@ -209,10 +191,7 @@ def is_due_until_checked(cell: Cell, *, error_known: bool) -> None:
     cell.restart()
     assert level(cell) is AccuracyLevel.DUE
     cell.open_gap()
-    cell.run("c2", LONG_S)
-    assert cell.finish().tool_answer == "pass"
-    assert modes(cell) == ["quick"]
-    assert level(cell) is AccuracyLevel.OK
+    a_check_passes(cell, "c2")
 
 
 @pytest.mark.parametrize("by", ["the PLC", "another process"])
@@ -245,31 +224,20 @@ def test_a_tool_of_another_thermal_model_that_comes_back_is_due(checked):
     history, tool = checked.history, checked.history.head(TOOL).calibration_id
     decide(checked, ACCEPT, thermal_proposed(history, 30.0))
     decide(checked, ACCEPT, proposed(history))
-    checked.run("c2", LONG_S)
-    assert checked.finish().tool_answer == "pass"
+    assert checked.ran("c2").tool_answer == "pass"
     assert level(checked) is AccuracyLevel.OK
     decide(checked, ROLLBACK, tool)
     assert level(checked) is AccuracyLevel.DUE
-    checked.log.clear()
-    checked.run("c3", LONG_S)
-    checked.finish()
-    assert modes(checked) == ["quick"]
-    assert level(checked) is AccuracyLevel.OK
+    a_check_passes(checked, "c3")
 
 
 def test_a_station_that_moved_degrades_until_a_check_passes(cell):
     words = "the beam station was knocked, or the tool slipped in its mount"
     cell.check = bent()
     cell.full = lambda _: DriverAnswer(Code.STATION_MOVED, words, 7, (), True, "", 0.8, 0.03)
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert (result.tool_found_code, result.tool_code) == (Code.STATION_MOVED, Code.STATION_MOVED)
     assert result.accepted == ()
     assert level(cell) is AccuracyLevel.DEGRADED
     assert words in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
-    cell.check = passed()
-    cell.log.clear()
-    cell.run("c2", LONG_S)
-    cell.finish()
-    assert modes(cell) == ["quick"]
-    assert level(cell) is AccuracyLevel.OK
+    a_check_passes(cell, "c2")

@@ -36,8 +36,7 @@ GONE_S = 6.0  # the tool node is looked for as long
 
 def test_a_tool_node_that_never_confirms_is_a_fault(cell):
     cell.services["disarm"] = SILENT
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert "does not confirm" in result.message
     with pytest.raises(ConflictError, match="not confirmed"):
         cell.session.acknowledge("me")
@@ -54,26 +53,22 @@ def test_a_tool_node_that_was_never_started_keeps_nothing_but_its_part(history):
     with pytest.raises(ConflictError, match="not there: start it"):  # it may yet be found
         cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns)
     cell.pass_time(GONE_S)
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert (result.code, result.thermal_code) == (Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
     assert (result.tool_code, result.left) == (Code.CONFLICT, ("tool measurement (quick)",))
     assert "tool: the tool node is not there: start it" in result.message
     assert not {"Arm", "Measure"} & set(kinds(cell))
     over(cell)
     cell.tool = ToolNode()
-    cell.run("c2", LONG_S)
-    assert cell.finish().tool_answer == "pass"
+    assert cell.ran("c2").tool_answer == "pass"
     over(cell)
 
 
 def test_a_tool_node_that_died_at_home_is_a_fault_that_can_be_acknowledged(cell):
-    cell.run("c1", LONG_S)
-    cell.finish()
+    cell.ran("c1")
     cell.tool_dies()
     count = kinds(cell).count("Move")
-    cell.run("c2", LONG_S)
-    assert "not there: start it" in cell.finish().message
+    assert "not there: start it" in cell.ran("c2").message
     assert kinds(cell).count("Move") == count
     with pytest.raises(ConflictError, match=r"not confirmed .* not there"):
         cell.session.acknowledge("me")
@@ -230,8 +225,7 @@ def test_a_tool_node_that_hears_is_left_to_stop_by_itself(cell, how):
     else:
         cell.session.cancel("by the PLC")
         cell.finish()
-    cell.run("c2", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c2").complete
     assert "Stop" not in kinds(cell)
 
 
@@ -316,8 +310,7 @@ def test_an_idle_cell_that_restarts_does_not_begin_before_a_disarm(cell):
 
 def test_what_an_operator_armed_is_disarmed_before_anything_moves(cell):
     cell.tool.armed = True
-    cell.run("c1", LONG_S)
-    assert cell.finish().complete
+    assert cell.ran("c1").complete
     assert kinds(cell)[:3] == ["Disarm", "BeginCycle", "Move"]
     over(cell)
 
@@ -325,8 +318,7 @@ def test_what_an_operator_armed_is_disarmed_before_anything_moves(cell):
 def test_a_cycle_moves_nothing_before_the_disarm_is_confirmed(cell):
     cell.tool.armed = True
     cell.services["disarm"] = SILENT
-    cell.run("c1", LONG_S)
-    result = cell.finish()
+    result = cell.ran("c1")
     assert "does not confirm" in result.message
     assert not {"Move", "BeginCycle", "Arm"} & set(kinds(cell))
     assert cell.state is MaintenanceState.FAULT

@@ -60,8 +60,7 @@ def broken_off(cell: Cell, how: str) -> None:
 @pytest.mark.parametrize("answer", [bent(), wrong_tool()])
 def test_what_a_check_found_outlives_a_run_that_breaks_off_on_the_way_home(history, how, answer):
     cell = opened(history)
-    cell.run("c0", LONG_S)
-    assert cell.finish().tool_answer == "pass"
+    assert cell.ran("c0").tool_answer == "pass"
     assert level(cell) is AccuracyLevel.OK
     cell.check = answer
     until_measuring(cell, "quick")
@@ -154,8 +153,7 @@ def test_of_a_tool_that_was_taken_back_no_error_is_predicted(history):
     assert cell.session.accuracy(cell.now_s, cell.wall_ns).error is None
     cell.log.clear()
     cell.check = passed()
-    cell.run("c2", LONG_S)
-    cell.finish()
+    cell.ran("c2")
     assert modes(cell) == ["quick"]
     assert level(cell) is AccuracyLevel.OK
     assert cell.session.accuracy(cell.now_s, cell.wall_ns).error is not None

@@ -196,6 +196,11 @@ class Cell:
             assert self.now_s < end_s, self.session.status(self.now_s)
         return self.session.status(self.now_s).last
 
+    def ran(self, cycle_id: str, gap_s: float = LONG_S) -> Any:
+        """A whole run; its result."""
+        self.run(cycle_id, gap_s)
+        return self.finish()
+
     @property
     def state(self) -> MaintenanceState:
         return self.session.state
