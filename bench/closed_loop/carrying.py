@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 from bench.closed_loop.words import tool_answer
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.maintenance import MaintenanceSession
 from robocal_ros.maintenance import robot_interface as ask
 from robocal_ros.maintenance.robot_interface import DriverAnswer
+from robocal_ros.maintenance.session import MaintenanceSession
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome

@@ -17,7 +17,7 @@ from robocal_ros.correction.interface import RefusedError, TrajectoryCommand
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.maintenance import CycleResult
+from robocal_ros.maintenance.accuracy import CycleResult
 from robocal_ros.maintenance.mover import STATION
 from robocal_ros.motion.cell import joint_way
 from robocal_ros.motion.plan import JointPlan

@@ -26,7 +26,7 @@ from robocal_ros.ground.samples import (
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description
-from robocal_ros.maintenance import MaintenanceSession
+from robocal_ros.maintenance.session import MaintenanceSession
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.session import events

@@ -8,16 +8,3 @@ deciding         accept, reject, roll back; what needs no person
 accuracy         settings, what outlives a restart, the accuracy of the cell
 services, node   parameters, services and messages; the node and its clients
 """
-
-from robocal_ros.maintenance.accuracy import AcceptBounds, CycleResult, MaintenanceConfig, Times
-from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState, Status
-
-__all__ = [
-    "AcceptBounds",
-    "CycleResult",
-    "MaintenanceConfig",
-    "MaintenanceSession",
-    "MaintenanceState",
-    "Status",
-    "Times",
-]

@@ -29,7 +29,6 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance import MaintenanceSession, MaintenanceState
 from robocal_ros.maintenance import robot_interface as asked
 from robocal_ros.maintenance.robot_interface import DriverAnswer, DriverRequest, Move
 from robocal_ros.maintenance.services import (
@@ -42,6 +41,7 @@ from robocal_ros.maintenance.services import (
     require_robot,
     session_config,
 )
+from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState
 from robocal_ros.motion.cell import load_motion
 from robocal_ros.motion.driver import (
     LeaseHolder,

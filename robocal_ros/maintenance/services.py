@@ -17,14 +17,8 @@ from std_srvs.srv import Trigger
 from robocal_ros.correction.interface import CorrectionState, ToldCorrection
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.maintenance import (
-    AcceptBounds,
-    CycleResult,
-    MaintenanceConfig,
-    MaintenanceSession,
-    Status,
-    Times,
-)
+from robocal_ros.maintenance.accuracy import AcceptBounds, CycleResult, MaintenanceConfig, Times
+from robocal_ros.maintenance.session import MaintenanceSession, Status
 from robocal_ros.motion.driver import CONTROLLER, MOTION, driving_config, require_limits
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import MM, joint_poses, joints_of

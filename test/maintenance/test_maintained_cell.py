@@ -17,7 +17,7 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalEr
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance import AcceptBounds
+from robocal_ros.maintenance.accuracy import AcceptBounds
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.drift_following import ThermalConfig

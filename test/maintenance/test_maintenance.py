@@ -30,9 +30,9 @@ from maintenance_cell import (
 )
 
 from robocal_ros.ground.errors import Code, InputError, StorageError
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import robot_interface as ask
 from robocal_ros.maintenance.mover import Mover
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.motion.plan import SHORTEST_STOP_S, JointPlan
 from robocal_ros.session.events import LEAVE
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError

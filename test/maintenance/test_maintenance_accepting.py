@@ -45,7 +45,7 @@ from robocal_ros.history.history_records import (
     Head,
     insert_decision,
 )
-from robocal_ros.maintenance import AcceptBounds
+from robocal_ros.maintenance.accuracy import AcceptBounds
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.motion.robot_watch import STALL_S
 from robocal_ros.session.events import ACCEPT, WITHHOLD, Command, Outcome, decide

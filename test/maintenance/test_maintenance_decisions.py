@@ -30,8 +30,8 @@ from maintenance_tools import (
 from robocal_ros.ground.errors import Code, ConflictError, StorageError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL, Action
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.deciding import HELD_S, Decider
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 

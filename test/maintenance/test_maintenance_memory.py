@@ -19,10 +19,10 @@ from maintenance_cell import (
 from maintenance_tools import automatic, measured_in_full, until_verified
 
 from robocal_ros.ground.errors import Code, StorageError
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance import robot_interface as ask
 from robocal_ros.maintenance.accuracy import VERSION
 from robocal_ros.maintenance.robot_interface import DriverAnswer
+from robocal_ros.maintenance.session import MaintenanceState
 
 SPOILT = {
     "a part is missing": lambda kept: kept.pop("tool"),

@@ -18,9 +18,8 @@ from maintenance_cell import (
 from maintenance_tools import automatic, straightened, until_sent
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.robot_interface import DEAF_S, Stop
-from robocal_ros.maintenance.session import UNSAVED_S
+from robocal_ros.maintenance.session import UNSAVED_S, MaintenanceState
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.motion.robot_watch import DRAIN_S
 from robocal_ros.tool.driving import SETTLED_S

@@ -40,8 +40,9 @@ from tool_driver import TAUGHT
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Action
-from robocal_ros.maintenance import AcceptBounds, MaintenanceState
+from robocal_ros.maintenance.accuracy import AcceptBounds
 from robocal_ros.maintenance.robot_interface import DEAF_S, DriverAnswer
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.tool.driving import SETTLED_S

@@ -25,9 +25,9 @@ from maintenance_cell import (
 )
 
 from robocal_ros.ground.errors import Code, RobocalError, StorageError
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.mover import Ways
 from robocal_ros.maintenance.robot_interface import CellInterface, DriverAnswer
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 

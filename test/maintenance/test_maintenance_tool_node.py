@@ -25,8 +25,8 @@ from maintenance_cell import (
 )
 
 from robocal_ros.ground.errors import Code, ConflictError
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.robot_interface import DEAF_S
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.motion.robot_watch import VELOCITY_S
 from robocal_ros.tool.driving import SETTLED_S

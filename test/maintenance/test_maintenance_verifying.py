@@ -29,7 +29,7 @@ from maintenance_tools import (
 from robocal_ros.ground.errors import Code, StorageError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import TOOL
-from robocal_ros.maintenance import MaintenanceState
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.session.events import ACCEPT, REJECT
 from robocal_ros.thermal.accuracy import AccuracyLevel
 

@@ -25,8 +25,8 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance import MaintenanceState
 from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode
+from robocal_ros.maintenance.session import MaintenanceState
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS
 

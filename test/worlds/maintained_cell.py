@@ -13,7 +13,8 @@ from tool_driver import TAUGHT
 
 from bench.closed_loop.carrying import Carrier
 from robocal_ros.ground.samples import JointSample, PointSample
-from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession
+from robocal_ros.maintenance.accuracy import MaintenanceConfig
+from robocal_ros.maintenance.session import MaintenanceSession
 from robocal_ros.motion.cell import DrivingConfig, joint_way
 from robocal_ros.session.events import CAPTURE_REFERENCE, Command, Outcome
 from robocal_ros.thermal.drift_following import ThermalConfig

@@ -16,10 +16,11 @@ from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, MaintenanceState, Times
 from robocal_ros.maintenance import robot_interface as ask
+from robocal_ros.maintenance.accuracy import MaintenanceConfig, Times
 from robocal_ros.maintenance.mover import STATION, Ways
 from robocal_ros.maintenance.robot_interface import DriverAnswer
+from robocal_ros.maintenance.session import MaintenanceSession, MaintenanceState
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError

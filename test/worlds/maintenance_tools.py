@@ -17,8 +17,8 @@ from maintenance_cell import (
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.history_records import TOOL
-from robocal_ros.maintenance import AcceptBounds
 from robocal_ros.maintenance import robot_interface as ask
+from robocal_ros.maintenance.accuracy import AcceptBounds
 from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
