@@ -27,7 +27,7 @@ from robocal_ros.hand_eye.tasks import HandEyeData, Task
 Array = NDArray[np.float64]
 
 RADIUS_M = 0.04
-HALVES = 50
+HALVES = 40
 SPREAD_MM = {  # goals, of all shots
     "experiments_sphere": 0.245,
     "leichi_cam0_sphere": 0.54,

@@ -77,7 +77,7 @@ from robocal_ros.hand_eye.planning import (
     planned_target,
 )
 from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise, hand_eye_document
-from robocal_ros.hand_eye.targets import TrackerTarget, read_tracker_target
+from robocal_ros.hand_eye.targets import FARTHEST_MM, TrackerTarget, read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
 from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise
 from robocal_ros.kinematics import SerialArm
@@ -388,8 +388,12 @@ def _show_tracker(console: "Console", document: Document) -> None:
 FORMATS = ("urdf", "xacro", "yaml", "static-transform")
 PARENTS = {"flange": "tool0", "base": "base"}
 SENSOR = {
-    "near": (190.0, "nearest distance that the sensor sees"),
-    "far": (210.0, "farthest"),
+    "near": (
+        190.0,
+        "z of the near end of what the sensor sees, in its own coordinates; above that "
+        "of the far end where z grows towards it",
+    ),
+    "far": (210.0, "z of the far end"),
     "width": (60.0, "of the field, half way"),
     "noise": (0.037, "of a point along the beam, one sigma"),
 }
@@ -457,7 +461,7 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
     for name, (value, words) in SENSOR.items():
         sensor.add_argument(
             f"--{name}-mm",
-            type=positive,
+            type=float if name in ("near", "far") else positive,
             default=value,
             metavar="L",
             help=f"{words}; default {value:g}",
@@ -469,8 +473,8 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
 def run_check_plan(args: argparse.Namespace) -> CliResult:
     """Do ``check-plan``. Raises `RobocalError` for what a user can mend."""
     settings = settings_of(args)
-    if args.near_mm >= args.far_mm:
-        raise InputError(f"--near-mm {args.near_mm:g} must be below --far-mm {args.far_mm:g}")
+    if not 0.0 < abs(args.near_mm - args.far_mm) < FARTHEST_MM:
+        raise InputError(f"--near-mm {args.near_mm:g} is --far-mm: the field has no depth")
     sensor = SensorRange(
         near_m=args.near_mm * 1e-3,
         far_m=args.far_mm * 1e-3,

@@ -62,7 +62,7 @@ INPUTS = {
 def _range_fault(values: list[float]) -> str | None:
     if len(values) != 3:
         return "three lengths are wanted"
-    return None if values[0] < values[1] else "the nearest distance must be below the farthest"
+    return None if values[0] != values[1] and values[2] > 0.0 else "the field has no extent"
 
 
 SETTINGS = (
@@ -102,9 +102,9 @@ SETTINGS = (
     Setting(
         "sensor_range_mm",
         [190.0, 210.0, 60.0],
-        "Nearest and farthest distance of the sensor, and its width; for check_plan",
+        "z of the near and the far end of the sensor's field, and its width; for check_plan",
         unit="mm",
-        low=1.0,
+        low=-20000.0,
         high=20000.0,
         check=_range_fault,
     ),

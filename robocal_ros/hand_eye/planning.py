@@ -68,7 +68,11 @@ ALONG_M = (-0.04, 0.0, 0.04)  # of an edge
 
 @dataclass(frozen=True)
 class SensorRange:
-    """What a line-laser sensor sees: distances and width (m), points, noise along the beam (m)."""
+    """What a line-laser sensor sees: width (m), points, noise along the beam (m).
+
+    ``near_m``, ``far_m``: z of the field's ends, in the sensor's own coordinates; where z grows
+    towards the sensor the first is the larger one.
+    """
 
     near_m: float = 0.19
     far_m: float = 0.21
@@ -80,6 +84,16 @@ class SensorRange:
     def middle_m(self) -> float:
         """The distance to work at."""
         return 0.5 * (self.near_m + self.far_m)
+
+    @property
+    def sense(self) -> float:
+        """1 where z grows away from the sensor, -1 where towards it."""
+        return 1.0 if self.far_m > self.near_m else -1.0
+
+    @property
+    def reach_m(self) -> float:
+        """Distance at which turns count."""
+        return max(abs(self.middle_m), 0.5 * self.width_m)
 
     @property
     def pivot(self) -> Array:
@@ -168,10 +182,10 @@ def _shown(
     information = J.T @ J + problem.prior()
     covariance = np.asarray(np.linalg.inv(information + VAGUE**-2 * np.eye(k)))
     size = np.ones(k)
-    size[3:6] = sensor.middle_m
+    size[3:6] = sensor.reach_m
     rank = int(np.sum(np.linalg.eigvalsh(covariance * np.outer(size, size)) < OPEN_M**2))
     at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
-    words = open_directions(at_sensor, sensor.middle_m, view.sightings.T_base_flange)
+    words = open_directions(at_sensor, sensor.reach_m, view.sightings.T_base_flange)
     return rank, information, None if words else covariance[:6, :6], words
 
 
@@ -242,9 +256,10 @@ def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tup
     """
     R, origin = T_base_sensor[:, :3, :3], T_base_sensor[:, :3, 3]
     off = OFF_EQUATOR * radius_m
-    depth_m = 0.5 * (sensor.far_m - sensor.near_m) + radius_m
+    depth_m = 0.5 * abs(sensor.far_m - sensor.near_m) + radius_m
     allowed = np.array([0.5 * sensor.width_m, radius_m - off, depth_m])
-    middle_m = sensor.middle_m + BEHIND * radius_m  # its surface is seen, not its centre
+    # Its surface is seen, not its centre.
+    middle_m = sensor.middle_m + sensor.sense * BEHIND * radius_m
     starts = np.array([[0.0, side * off, middle_m] for side in (-1.0, 1.0)])
     centres = (np.einsum("mij,sj->smi", R, starts) + origin).reshape(-1, 3)
     for _ in range(MOST_ROUNDS):
@@ -289,7 +304,8 @@ def _places(sensor: SensorRange, heights: tuple[float, ...], behind_m: float = 0
 
     ``behind_m``: how far the point that is placed lies behind the surface that is seen.
     """
-    far = np.linspace(sensor.near_m, sensor.far_m, 5)[[1, 3]] + behind_m
+    far = np.linspace(sensor.near_m, sensor.far_m, 5)[[1, 3]]
+    far = far + sensor.sense * behind_m
     aside = np.array(ASIDE) * sensor.width_m
     return np.array(list(product(aside, heights, far)))
 
@@ -307,9 +323,10 @@ def _expected(
 
 
 def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict[int, str]:
-    """Poses whose sighting (x, z to z + depth), m, lies out of the field of view."""
+    """Poses whose sighting (x, and z to ``depth`` behind it), m, lies out of the field of view."""
     found = {}
-    for i in np.flatnonzero((z < sensor.near_m - CUT * depth) | (z + depth > sensor.far_m)):
+    before, behind = sensor.sense * (z - sensor.near_m), sensor.sense * (sensor.far_m - z)
+    for i in np.flatnonzero((before < -CUT * depth) | (behind < depth)):
         found[int(i)] = f"the target is at {z[i] * 1e3:.0f} mm, the sensor sees "
         found[int(i)] += f"{sensor.near_m * 1e3:.0f} to {sensor.far_m * 1e3:.0f} mm"
     for i in np.flatnonzero(np.abs(x) > 0.5 * sensor.width_m):
@@ -348,7 +365,8 @@ class PlannedSphere:
         seen = model.see(T_base_flange @ T_flange_sensor, place)
         r = np.maximum(seen.value[:, 2], 0.1 * self.radius_m)
         slope = np.linspace(-STEEPEST_RAD, STEEPEST_RAD, 41)
-        J = np.column_stack([np.sin(slope), -np.cos(slope), np.ones(len(slope))])
+        normal = np.sin(slope), -self.sensor.sense * np.cos(slope)
+        J = np.column_stack([*normal, np.ones(len(slope))])
         step = self.sensor.width_m / self.sensor.points
         share = np.cos(slope) * (slope[1] - slope[0])  # columns are even along the laser line
         unit = np.linalg.inv((J * share[:, None]).T @ J)
@@ -359,7 +377,7 @@ class PlannedSphere:
     def unseen(self, view: TargetView) -> dict[int, str]:
         """Out of the field of view, or beside the sphere."""
         x, z, r = view.sightings.value.T
-        found = _out_of_range(x, z - r, NEEDED * r, self.sensor)
+        found = _out_of_range(x, z - self.sensor.sense * r, NEEDED * r, self.sensor)
         for i in np.flatnonzero(r < SMALLEST * self.radius_m):
             found.setdefault(int(i), "the laser plane passes beside the sphere")
         return found

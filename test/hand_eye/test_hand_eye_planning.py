@@ -242,3 +242,27 @@ def test_poses_that_look_alike_leave_both_sides_possible():
     assert np.allclose(np.abs(y), OFF_EQUATOR * RADIUS_M, atol=1e-6)
     assert y[0] < 0.0 < y[-1]
     assert np.allclose(sides[1], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", PLANNED)
+def test_a_field_counted_in_heights_about_its_middle_is_the_same_field(kind):
+    target, shown = PLANNED[kind]
+    more = {
+        "sphere": lambda: sphere_poses(12),
+        "line": lambda: (
+            edge_shots(CELL, T_BASE_USER, 15, np.random.default_rng(1)).true_T_base_flange
+        ),
+    }
+    poses = more.get(kind, shown)()
+    middle_m = SENSOR.middle_m
+    half_m = middle_m - SENSOR.near_m
+    heights = replace(SENSOR, near_m=half_m, far_m=-half_m)
+    turned = frames.transform(frames.exp_rotation([np.pi, 0.0, 0.0]), [0.0, 0.0, middle_m])
+    mount = CELL.T_flange_sensor
+    one = check_plan(target, poses, mount, SENSOR, NOISE, LIMIT_M)
+    same = replace(target, sensor=heights)
+    other = check_plan(same, poses, mount @ turned, heights, NOISE, LIMIT_M)
+    assert list(one.unseen) == list(other.unseen)
+    assert one.working_error_m == pytest.approx(other.working_error_m, rel=1e-6)
+    added_m = [plan.proposed_error_m or 0.0 for plan in (one, other)]
+    assert added_m[0] == pytest.approx(added_m[1], rel=1e-3)
