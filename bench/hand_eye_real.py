@@ -49,6 +49,16 @@ def read_set(name: str) -> HandEyeData:
     return HandEyeData(table.names, table.T_base_flange, read_profiles(folder() / name, table))
 
 
+def part_of(data: HandEyeData, rows: NDArray[np.int64]) -> HandEyeData:
+    """The shots at these rows."""
+    return replace(
+        data,
+        names=tuple(data.names[i] for i in rows),
+        T_base_flange=data.T_base_flange[rows],
+        profiles=[data.profiles[i] for i in rows],
+    )
+
+
 def task_for(name: str, radius_m: float = RADIUS_M) -> Task:
     """The target of a set; heights grow towards the sensor."""
     return task_of(SphereTarget(radius_m) if "sphere" in name else None, "edge", towards=True)
@@ -131,14 +141,8 @@ def _halves(task: Task, data: HandEyeData, whole: HandEyeResult) -> tuple[tuple[
     codes, far = [], 0
     for _ in range(HALVES):
         rows = np.sort(rng.permutation(count)[: count // 2])
-        part = replace(
-            data,
-            names=tuple(data.names[i] for i in rows),
-            T_base_flange=data.T_base_flange[rows],
-            profiles=[data.profiles[i] for i in rows],
-        )
         try:
-            half = solved(task, part)
+            half = solved(task, part_of(data, rows))
         except RobocalError:
             codes.append("refused")
             continue

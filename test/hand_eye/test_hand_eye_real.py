@@ -7,10 +7,10 @@ import pytest
 
 from bench import hand_eye_real as real
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, ResidualError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, ResidualError, RobocalError, TooFewSamplesError
 from robocal_ros.hand_eye.mount_fit import fit_mount
-from robocal_ros.hand_eye.result import HandEyeResult
-from robocal_ros.hand_eye.solve import look
+from robocal_ros.hand_eye.result import HandEyeResult, apart
+from robocal_ros.hand_eye.solve import field_of, look
 from robocal_ros.hand_eye.stairs import task_of
 from robocal_ros.hand_eye.targets import SphereTarget
 
@@ -76,3 +76,20 @@ def test_another_radius_is_refused_with_the_reason(radius_mm):
     data = real.read_set("experiments_sphere")
     with pytest.raises(ResidualError, match=r"which sphere is mounted"):
         real.solved(real.task_for("experiments_sphere", radius_mm * 1e-3), data)
+
+
+def test_no_half_of_a_set_ends_in_a_false_minimum(results):
+    """The nearest one is 70 mm away in the field; a half that tells too little is refused."""
+    data, whole = real.read_set("experiments_edge"), results["experiments_edge"]
+    rng, solved = np.random.default_rng(51), 0
+    for _ in range(16):
+        rows = np.sort(rng.permutation(len(data.names))[: len(data.names) // 2])
+        part = real.part_of(data, rows)
+        try:
+            half = real.solved(real.task_for("experiments_edge"), part)
+        except RobocalError:
+            continue
+        off_m = apart(half.T_flange_sensor, whole.T_flange_sensor, field_of(data))
+        assert off_m < 0.01 or not half.verdict.accept
+        solved += half.verdict.accept
+    assert solved >= 8

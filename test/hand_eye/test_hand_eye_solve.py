@@ -41,7 +41,7 @@ from robocal_ros.ground.errors import (
 from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.result import HandEyeSettings, point_covariance
 from robocal_ros.hand_eye.solve import features, held_out, look, solve_joint, solve_task, verify
-from robocal_ros.hand_eye.stairs import StepTask
+from robocal_ros.hand_eye.stairs import StepTask, task_of
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
 
@@ -306,6 +306,23 @@ class TestStepMistakes:
         found = solve_step(replace(shots, T_base_flange=T))
         assert {name.partition("/")[0] for name in found.rejected} == {"p2", "p4"}
         assert all("swapped" in words for words in found.rejected.values())
+
+
+@pytest.mark.parametrize("kind", ["sphere", "step", "line"])
+def test_a_sensor_that_counts_heights_is_found_in_its_own_coordinates(kind):
+    """z = 0.2 m less the distance: its frame is that of the simulated sensor, turned about x."""
+    rng = np.random.default_rng(41)
+    shots, target = {
+        "sphere": lambda: (sphere_shots(CELL, CENTRE, RADIUS_M, 15, rng), SPHERE),
+        "step": lambda: (step_shots(CELL, STAIRS, 8, rng), stairs_target()),
+        "line": lambda: (edge_shots(CELL, T_BASE_USER, 20, rng), None),
+    }[kind]()
+    heights = [np.column_stack([p[:, 0], 0.2 - p[:, 1]]) for p in shots.profiles]
+    data = data_of(replace(shots, profiles=heights))
+    result = solve_task(task_of(target, "edge", towards=True), data, "best", SETTINGS)
+    turned = frames.transform(frames.exp_rotation([np.pi, 0.0, 0.0]), [0.0, 0.0, 0.2])
+    assert result.verdict.accept
+    assert chi_square(result, TRUE @ turned) < FAR_OFF
 
 
 def _negated(T, axis):
