@@ -27,7 +27,7 @@ from robocal_ros.hand_eye.tasks import HandEyeData, Task
 Array = NDArray[np.float64]
 
 RADIUS_M = 0.04
-HALVES = 40
+HALVES = 20
 SPREAD_MM = {  # goals, of all shots
     "experiments_sphere": 0.245,
     "leichi_cam0_sphere": 0.54,
@@ -149,7 +149,7 @@ def _halves(task: Task, data: HandEyeData, whole: HandEyeResult) -> tuple[tuple[
         codes.append("accepted" if half.verdict.accept else "not informative")
         told = np.hypot(half.working_error_m or 0.0, whole.working_error_m or 0.0)
         off = apart(half.T_flange_sensor, whole.T_flange_sensor, field_of(data))
-        far += half.verdict.accept and off > 4.0 * told
+        far += int(half.verdict.accept and off > 4.0 * told)
     return tuple(codes.count(code) for code in ("accepted", "not informative", "refused")), far
 
 
