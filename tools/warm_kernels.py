@@ -12,7 +12,7 @@ from robocal_ros.ground import frames, mcap_records, serialized_joints
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import fit_pairs
-from robocal_ros.identification import identify
+from robocal_ros.identification import identify, row_kernels
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse
 from robocal_ros.kinematics.joint_functions import JointFunctions
@@ -60,6 +60,7 @@ def main() -> None:
     position = T[:, :3, 3] + 0.1 * T[:, :3, 2] + noise
     data = Measurements(q=q, position=position, target=("tool",) * POSES, sample=names)
     identify(arm, data).cell.residual(data)
+    row_kernels.load_kernels()
     fit_pairs(PosePairs(T, frames.invert(T), names))
     load_kernels(arm)
     for serialized in (mcap_records, serialized_joints):

@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from robocal_ros.estimation.assessment import (
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.frames import Document, log_rotation, transform_document
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
+from robocal_ros.identification.full_model import FullIdentification, identify_full
 from robocal_ros.identification.solve import (
     CellModel,
     Identification,
@@ -138,14 +140,26 @@ def _mistakes(arm: SerialArm, data: Measurements) -> Iterator[tuple[str, Measure
 # ---- identify on one part of the data, judge on another -----------------------------------------
 
 
+CURVE = 300  # points of a joint's function
 LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
+
+
+Model = Literal["full", "geometric"]
 
 
 @dataclass(frozen=True)
 class JudgedIdentification(Judgement):
-    """An identification with its judgement."""
+    """An identification with its judgement.
+
+    Attributes
+    ----------
+    measured : (n, 2) smallest and largest reading of each joint that it was made from.
+    check_outside : share of the check poses that have a joint outside of these.
+    """
 
     identification: Identification
+    measured: Array
+    check_outside: float
 
 
 def identify_and_judge(
@@ -155,6 +169,7 @@ def identify_and_judge(
     *,
     fit: Collection[Part] = ("base", "tool", "geometry"),
     method: Method = "map",
+    model: Model = "geometric",
     check_refit: Collection[Part] = (),
     in_force: SerialArm | None = None,
 ) -> JudgedIdentification:
@@ -162,6 +177,7 @@ def identify_and_judge(
 
     Parameters
     ----------
+    model : ``full``: with joint functions and compliances, where the evidence wants them.
     check_refit : ``base``, ``tool``: parts that are solved anew from the check data, for both
         models, because those come from another set-up; the geometry is held.
     in_force : arm with the parameters in force, default the nominal ``arm``; base and targets
@@ -169,7 +185,8 @@ def identify_and_judge(
     """
     if "geometry" in check_refit:
         raise InputError("the geometry is what is checked: refit only base and tool")
-    result = identify(arm, train, fit=fit, method=method)
+    solved = identify_full if model == "full" else identify
+    result = solved(arm, train, fit=fit, method=method)
     _require_orientations(result, train)
     set_up = frozenset(fit) - {"geometry"}
     plain = _check_error(_set_up(arm, train, set_up), check, check_refit)
@@ -179,7 +196,8 @@ def identify_and_judge(
     after = _check_error(result.cell, check, check_refit)
     predicted, total = _predicted(result, check, check_refit)
     doubt = still_joints(arm, train) and still_joints(arm, check)
-    sound = ~gross(before, after)
+    # a row counts unless it misses the model in force, too, as no robot does
+    sound = ~(gross(before, after) & gross(before, before))
     current, workspace_m = (
         summarise(before[sound]),
         result.workspace_rms(result.estimate.covariance),
@@ -194,8 +212,12 @@ def identify_and_judge(
     ):  # fmt: skip  # base and targets alone were fitted: the model cannot have changed
         why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
         verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
+    measured = np.column_stack([train.q.min(axis=0), train.q.max(axis=0)])
+    outside = np.any((check.q < measured[:, 0]) | (check.q > measured[:, 1]), axis=1)
     return JudgedIdentification(
         identification=result,
+        measured=measured,
+        check_outside=float(np.mean(outside)),
         nominal=summarise(plain[sound]),
         current=current,
         candidate=summarise(after[sound]),
@@ -296,6 +318,45 @@ def cell_document(cell: CellModel) -> Document:
     }
 
 
+def joints_document(judged: JudgedIdentification) -> list[Document]:
+    """Of each joint: from where to where it was measured, what its function and its load do."""
+    result, arm = judged.identification, judged.identification.cell.arm
+    found = []
+    for joint, name in enumerate(arm.joint_names):
+        unit, factor = ("mm", 1e3) if arm.prismatic[joint] else ("deg", float(np.degrees(1.0)))
+        function = None
+        if isinstance(result, FullIdentification) and result.terms.count[joint]:
+            function = _function_document(result, joint)
+        functions = arm.functions
+        found.append(
+            {
+                "name": name,
+                f"measured_{unit}": (judged.measured[joint] * factor).tolist(),
+                "function": function,
+                "compliance": 0.0 if functions is None else float(functions.compliance[joint]),
+            }
+        )
+    return found
+
+
+def _function_document(result: FullIdentification, joint: int) -> Document:
+    """Rms of a joint's function, and of its standard deviation, where it was measured."""
+    arm = result.cell.arm
+    assert arm.functions is not None
+    unit, micro, factor = ("deg", "urad", float(np.degrees(1.0)))
+    if arm.prismatic[joint]:
+        unit, micro, factor = "mm", "um", 1e3
+    lower, upper = result.measured[joint].tolist()
+    q = np.zeros((CURVE, arm.n))
+    q[:, joint] = np.linspace(lower, upper, CURVE)
+    value, sigma = arm.functions.delta(q)[:, joint], result.function_sigma(q)[:, joint]
+    return {
+        f"rms_{micro}": float(np.sqrt(np.mean(value**2))) * 1e6,
+        f"sigma_{micro}": float(np.sqrt(np.mean(sigma**2))) * 1e6,
+        f"length_{unit}": float(result.prior.length[joint]) * factor,
+    }
+
+
 def identification_document(judged: JudgedIdentification) -> Document:
     """The ``identify`` document: errors before and after, parameters, rank, verdict."""
     result = judged.identification
@@ -304,6 +365,9 @@ def identification_document(judged: JudgedIdentification) -> Document:
         "robot": result.nominal.name,
         "model_hash": result.nominal.model_hash,
         "method": result.method,
+        "model": "full" if isinstance(result, FullIdentification) else "geometric",
+        "joints": joints_document(judged),
+        "check_outside": judged.check_outside,
         **judged_errors_document(judged),
         "parameters": parameters_document(result.nominal, result.cell.arm, result.sigma()),
         **cell_document(result.cell),

@@ -49,7 +49,7 @@ class CellModel:
         from robocal_ros.kinematics import kernels
 
         T = np.empty((len(q), 4, 4))
-        kernels.fk_batch(np.ascontiguousarray(q), self.arm.links, self.T_frame_root, T)
+        kernels.fk_batch(self.arm.turned(q), self.arm.links, self.T_frame_root, T)
         return np.asarray(T @ self.T_flange_target[target])
 
     def residual(self, data: Measurements) -> Array:
@@ -92,7 +92,7 @@ class UnknownLayout:
         J = np.zeros((len(q), self.tool_size, len(self.names)))
         arm = state.arm
         kernels.parameter_batch(
-            q, arm.links, state.T_frame_root, state.T_flange_target, target,
+            arm.turned(q), arm.links, state.T_frame_root, state.T_flange_target, target,
             self.slots, self.base, self.tool, T, J,
         )  # fmt: skip
         return T, J
@@ -368,6 +368,7 @@ class Identification:
     unobservable : directions, in words, that the data leave to the prior or to ``held``.
     prior_covariance : (g, g), SI, of the model parameters before the data, or None.
     noise_m : standard deviation of a measured coordinate, as given or as found.
+    lever_m : length by which a turn in rad counted as a position error.
     """
 
     nominal: SerialArm
@@ -380,6 +381,7 @@ class Identification:
     unobservable: tuple[str, ...]
     rejected: tuple[str, ...]
     noise_m: float
+    lever_m: float
 
     def sigma(self) -> dict[str, float]:
         """Standard deviation, SI, of each unknown by name."""
@@ -619,4 +621,5 @@ def _report(
         unobservable=words,
         rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
         noise_m=estimate.scale * (1.0 if known is None else float(np.sqrt(np.mean(known**2)))),
+        lever_m=lever,
     )

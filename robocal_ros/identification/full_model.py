@@ -1,0 +1,463 @@
+"""The full model of an arm: geometry, joint functions and compliances, base and targets together.
+
+Begins with the geometric model (`solve.identify`); then all of it in one robust weighted least
+squares, whose prior the evidence chooses. Samples are judged with the functions in: what the
+geometry alone misses is no outlier, and what no function explains is not learned.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation.assessment import pose_groups
+from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.joint_functions import (
+    EVIDENCE_NEEDED,
+    FunctionPrior,
+    JointEvidence,
+    JointTerms,
+    Posterior,
+)
+from robocal_ros.identification.solve import (
+    CellModel,
+    CellProblem,
+    Identification,
+    Method,
+    Part,
+    UnknownLayout,
+    identify,
+)
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import THETA, D
+from robocal_ros.kinematics.joint_functions import JointFunctions
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry alone
+# The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:
+# these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
+GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
+_ROUNDS = 4  # of solving, and judging the samples anew
+
+
+@dataclass(frozen=True)
+class FullIdentification(Identification):
+    """An identification with joint functions and compliances.
+
+    Attributes
+    ----------
+    terms : which joints have them.
+    prior : length and amplitude (n,) that the evidence chose for each function.
+    gain : (n,) evidence for each joint's function, natural logarithm.
+    all_covariance : (k, k) of all unknowns, those of ``layout`` first.
+    measured : (n, 2) smallest and largest reading of each joint, rad (prismatic: m).
+    left_out_rms_m : rms error at measured poses, each left out in turn.
+    """
+
+    terms: JointTerms
+    prior: FunctionPrior
+    gain: Array
+    all_covariance: Array
+    measured: Array
+    left_out_rms_m: float
+
+    def predicted_variance(self, q: Array, target: Index, without: Collection[Part] = ()) -> Array:
+        """Covariance (m, 3, 3), m^2, of the predicted target positions.
+
+        Where a joint was not measured its function is zero, give or take the prior.
+        """
+        from robocal_ros.identification import row_kernels
+
+        rows = _rows(self.layout, self.cell, self.terms, np.ascontiguousarray(q), target)
+        J, by_turn = np.ascontiguousarray(rows.J[:, :3]), rows.by_turn[:, :3]
+        covariance, own = self.all_covariance, np.flatnonzero(self._columns(without))
+        if len(own):  # what is solved anew takes up what it can of every other error
+            k = self.terms.size
+            normal, unused = np.zeros((k, k)), np.zeros(k)
+            ones, none = np.ones(len(q)), np.zeros((len(q), 3))
+            row_kernels.normal_equations(J, rows.column, none, ones, normal, unused)
+            keep = np.eye(k)
+            keep[own] -= np.linalg.lstsq(normal[np.ix_(own, own)], normal[own], rcond=None)[0]
+            covariance = keep @ covariance @ keep.T
+        spread = np.empty((len(q), 3, 3))
+        row_kernels.spreads(J, rows.column, covariance, spread)
+        unknown = self.terms.share_outside(q) * self.prior.amplitude
+        beyond = by_turn * unknown[:, None]
+        return np.asarray(spread + beyond @ np.swapaxes(beyond, 1, 2))
+
+    def function_sigma(self, q: Array) -> Array:
+        """Standard deviation (m, n) of each joint's function at readings (m, n), rad."""
+        from robocal_ros.identification import row_kernels
+
+        n = q.shape[1]
+        sigma = np.empty(q.shape)
+        for joint in range(n):
+            by_turn = np.zeros((len(q), 1, n))
+            by_turn[:, 0, joint] = 1.0
+            J, column = self.terms.rows(q, by_turn, np.zeros(q.shape))
+            spread = np.empty((len(q), 1, 1))
+            row_kernels.spreads(J, column, self.all_covariance, spread)
+            sigma[:, joint] = spread[:, 0, 0]
+        outside = self.terms.share_outside(q) * self.prior.amplitude
+        return np.sqrt(np.maximum(sigma, 0.0) + outside**2)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Poses T (m, 4, 4) with the columns that they see, and their derivative by each turn."""
+
+    T: Array
+    J: Array
+    column: Index
+    by_turn: Array
+
+
+def gravity_torque(arm: SerialArm, q: Array) -> Array | None:
+    """Torque of gravity (m, n) about each axis, N m, in the controller's sense; None: no load.
+
+    It is what a compliance of one would turn.
+    """
+    if arm.load is None:
+        return None
+    n = arm.n
+    unit = JointFunctions(np.zeros(n), np.ones(n), np.zeros((n, 1)), np.ones(n))
+    return np.asarray(replace(arm, functions=unit).turned(q) - q)
+
+
+def _with_turns(layout: UnknownLayout, arm: SerialArm) -> tuple[UnknownLayout, Index]:
+    """The layout with a column for what each joint turns, where it has none; those columns."""
+    slots, names = layout.slots.copy(), layout.names
+    kinds = np.where(arm.prismatic, D, THETA)
+    for joint, kind in enumerate(kinds):
+        if slots[joint, kind] < 0:
+            slots[joint, kind] = len(names)
+            names = (*names, f"turn_{joint}")
+    return replace(layout, slots=slots, names=names), slots[range(arm.n), kinds]
+
+
+def _rows(
+    layout: UnknownLayout, cell: CellModel, terms: JointTerms, q: Array, target: Index
+) -> _Rows:
+    wide, turns = _with_turns(layout, cell.arm)
+    T, J = wide.jacobian(cell, q, target)
+    by_turn = J[:, :, turns] * cell.arm.sign
+    return _sparse(terms, cell.arm, q, T, J[:, :, : len(layout.names)], by_turn)
+
+
+def _sparse(
+    terms: JointTerms, arm: SerialArm, q: Array, T: Array, dense: Array, by_turn: Array
+) -> _Rows:
+    k = dense.shape[2]
+    J, column = terms.rows(q, by_turn, gravity_torque(arm, q))
+    own = np.broadcast_to(np.arange(k), (len(q), k))
+    return _Rows(
+        T, np.concatenate([dense, J], axis=2), np.concatenate([own, column], axis=1), by_turn
+    )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Where the rounds stand."""
+
+    cell: CellModel
+    terms: JointTerms
+    prior: FunctionPrior
+    posterior: Posterior | None = None
+
+
+class _FullProblem:
+    """All unknowns against the measurements; a wide ``CellProblem`` linearises the dense part."""
+
+    def __init__(self, start: Identification, data: Measurements, lever_m: float) -> None:
+        self.start, self.data = start, data
+        self.layout = start.layout
+        sigma = np.ones(len(data)) if data.sigma is None else data.sigma
+        wide, self.turns = _with_turns(start.layout, start.nominal)
+        self.problem = CellProblem(
+            wide, data, start.cell.targets, sigma, lever_m, start.nominal.mdh
+        )
+
+    def linearise(self, cell: CellModel, terms: JointTerms) -> tuple[Array, _Rows]:
+        residual, J = self.problem.linearise(cell)
+        by_turn = J[:, :, self.turns] * cell.arm.sign
+        dense = J[:, :, : len(self.layout.names)]
+        return residual, _sparse(terms, cell.arm, self.data.q, residual, dense, by_turn)
+
+    def values(self, cell: CellModel, terms: JointTerms) -> Array:
+        """All unknowns (k,), from the mean of their prior; of base and targets zeros."""
+        away = self.problem.deviation(cell)[: len(self.layout.names)]
+        return np.concatenate([away, terms.values(cell.arm.functions)])
+
+    def moved(self, cell: CellModel, terms: JointTerms, values: Array) -> CellModel:
+        """The cell model with these unknowns (k,)."""
+        step = values - self.values(cell, terms)
+        cell = self.layout.retract(cell, step[: terms.before])
+        arm = cell.arm
+        return replace(cell, arm=arm.with_model(arm.mdh, terms.functions(values), arm.load))
+
+    def evidence(self, at: _Solution, residual: Array, rows: _Rows, weight: Array) -> JointEvidence:
+        from robocal_ros.identification import row_kernels
+
+        k = at.terms.size
+        normal, pull = np.zeros((k, k)), np.zeros(k)
+        row_kernels.normal_equations(rows.J, rows.column, -residual, weight, normal, pull)
+        x = self.values(at.cell, at.terms)
+        squares = float(weight @ np.sum(residual**2, axis=1) + 2.0 * pull @ x + x @ normal @ x)
+        flat = np.zeros(k, dtype=np.bool_)
+        flat[: at.terms.before] = True
+        fixed: Array = np.zeros((0, 0))
+        if self.start.prior_covariance is not None:
+            fixed = np.asarray(np.linalg.cholesky(self.start.prior_covariance))
+            flat[: len(fixed)] = False
+        return JointEvidence(
+            terms=at.terms,
+            normal=normal,
+            pull=pull + normal @ x,
+            squares=squares,
+            count=3.0 * float(np.sum(weight)) * (1.0 + _turn_share(residual)),
+            flat=flat,
+            fixed=fixed,
+            noise_least=0.0 if self.data.sigma is None else 1.0,
+        )
+
+    @cached_property
+    def limit(self) -> float:
+        """Squared length of a residual, over its covariance, beyond which it is an outlier."""
+        components = self.problem.layout.tool_size if self.data.rotation is not None else 3
+        return chi2_quantile(1.0 - FALSE_REJECTION / len(self.data), components)
+
+    def robust_weight(self, residual: Array) -> Array:
+        """Huber's weights (m,), from the median of the positions' residuals."""
+        squared = np.sum(residual[:, :3] ** 2, axis=1)
+        scale = np.sqrt(float(np.median(squared)) / chi2_quantile(0.5, 3))
+        length = np.sqrt(np.sum(residual**2, axis=1))
+        bend = scale * np.sqrt(chi2_quantile(0.95, residual.shape[1]))
+        return np.asarray(np.minimum(1.0, bend / np.maximum(length, np.finfo(float).tiny)))
+
+    @cached_property
+    def pose(self) -> Index:
+        """Number (m,) of each sample's pose: visits of one pose share it."""
+        return pose_groups(self.data.q)
+
+    def visit_share(self, residual: Array, weight: Array) -> Array:
+        """What each visit (m,) of a pose tells, of one sample, when ``weight`` (m,) are in use.
+
+        What no model explains comes back at each visit: n residuals that correlate by rho tell as
+        much as n / (1 + (n - 1) rho) that do not.
+        """
+        used = weight[:, None] * residual[:, :3]
+        visits = np.bincount(self.pose, weight > 0.0)
+        total = np.stack([np.bincount(self.pose, axis) for axis in used.T], axis=1)
+        own, pairs = np.sum(used**2), np.sum(visits * (visits - 1.0))
+        rho = 0.0
+        if pairs and own:
+            shared = (np.sum(total**2) - own) / pairs
+            each = own / float(np.sum(weight > 0.0))
+            rho = float(np.clip(shared / each, 0.0, 1.0))
+        return np.asarray(1.0 / (1.0 + np.maximum(visits[self.pose] - 1.0, 0.0) * rho))
+
+    def left_out(
+        self, residual: Array, rows: _Rows, at: _Solution, weight: Array
+    ) -> tuple[Array, Array]:
+        """Residuals (m, c) of a fit without each sample's own pose, and their covariances.
+
+        By the fit with it, of Gaussian unknowns (`weight` zero: it was not in use).
+        """
+        from robocal_ros.identification import row_kernels
+
+        assert at.posterior is not None
+        m, c = residual.shape
+        spread = np.empty((m, c, c))
+        row_kernels.spreads(rows.J, rows.column, at.posterior.covariance, spread)
+        variance, unit = at.prior.noise**2, np.eye(c)
+        total = np.bincount(self.pose, weight)[self.pose]
+        pose_variance = (variance / np.where(total > 0.0, total, 1.0))[:, None, None] * unit
+        used = (weight > 0.0)[:, None, None]
+        loose = (1.0 + 1e-6) * pose_variance
+        gain = pose_variance @ np.linalg.inv(np.where(used, loose - spread, pose_variance))
+        error = (gain @ residual[..., None])[..., 0]
+        expected = np.where(used, gain @ pose_variance - pose_variance, spread) + variance * unit
+        return np.asarray(error), np.asarray(expected)
+
+    def geometric_left_out(self) -> float:
+        """The same of the geometric model: rms error, m, at poses left out one by one."""
+        start = self.start
+        none = np.zeros(start.nominal.n, dtype=np.bool_)
+        zeros = np.zeros(start.nominal.n)
+        terms = JointTerms(
+            len(self.layout.names), zeros, zeros + 1.0, zeros.astype(np.int64), none, zeros
+        )
+        residual, rows = self.linearise(start.cell, terms)
+        prior = FunctionPrior(zeros, zeros, start.estimate.scale)
+        posterior = Posterior(zeros, start.estimate.covariance, zeros, zeros, 0.0)
+        weight = np.where(start.estimate.rejected, 0.0, 1.0)
+        weight *= self.visit_share(residual, weight)
+        at = _Solution(start.cell, terms, prior, posterior)
+        return self.rms(self.left_out(residual, rows, at, weight)[0])
+
+    def rms(self, error: Array) -> float:
+        """Rms length, m, of position errors (m, c), by Huber's loss."""
+        weight = self.robust_weight(error)
+        return float(np.sqrt(weight @ np.sum(error[:, :3] ** 2, axis=1) / np.sum(weight)))
+
+    def inliers(self, error: Array, expected: Array) -> Mask:
+        """Samples (m,) that a fit without them predicts as well as it says; at least half."""
+        squared = _squared(error, expected)
+        return np.asarray(squared <= max(self.limit, float(np.median(squared))))
+
+
+def _squared(error: Array, expected: Array) -> Array:
+    """Squared length (m,) of errors (m, c) over their covariances (m, c, c)."""
+    whitened = np.linalg.solve(expected, error[..., None])[..., 0]
+    return np.asarray(np.sum(error * whitened, axis=1))
+
+
+def _turn_share(residual: Array) -> float:
+    """How much orientations scatter, in units of positions: they count by so much as numbers.
+
+    They are given less weight than their noise would allow (`solve._solve`), and so would tell a
+    noise that is too small.
+    """
+    if residual.shape[1] == 3:
+        return 0.0
+    squared = residual**2
+    turn, shift = (float(np.median(np.sum(squared[:, s], axis=1))) for s in (np.s_[3:], np.s_[:3]))
+    return min(1.0, turn / shift) if shift > 0.0 else 1.0
+
+
+def bare(arm: SerialArm) -> SerialArm:
+    """Return the arm without joint functions."""
+    return arm.with_model(arm.mdh, None, arm.load)
+
+
+def identify_full(
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    fit: Collection[Part] = ("base", "tool", "geometry"),
+    method: Method = "map",
+) -> Identification:
+    """Identify the full model; functions and compliances only where the evidence wants them.
+
+    Where it wants none, or the geometry is not in ``fit``, the answer is that of `identify`.
+    Functions that ``arm`` has are found anew. Compliances need the arm's ``load``.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        As `identify`.
+    """
+    if "geometry" not in fit:
+        return identify(arm, data, fit=fit, method=method)
+    start = identify(bare(arm), data, fit=fit, method=method)
+    torque = gravity_torque(arm, data.q)
+    q = np.ascontiguousarray(data.q)
+    data = replace(data, q=q)
+    problem = _FullProblem(start, data, start.lever_m)
+    before = len(start.layout.names)
+    if 3.0 * len(data) < FEWEST_NUMBERS * before:
+        return start
+    at = _Solution(
+        start.cell,
+        JointTerms.cover(q, torque, before, coarse=True),
+        FunctionPrior.typical(arm.n, start.estimate.scale),
+    )
+    for _ in range(_ROBUST_ROUNDS):
+        residual, rows = problem.linearise(at.cell, at.terms)
+        weight = problem.robust_weight(residual)
+        weight *= problem.visit_share(residual, weight)
+        at = _round(problem, at, residual, rows, weight)
+    keep = problem.inliers(*problem.left_out(*problem.linearise(at.cell, at.terms), at, weight))
+    functions, bends = _unwanted(at)
+    terms = JointTerms.cover(q, torque, before).without(functions, bends)
+    if terms.size == before:
+        return start
+    amplitude = np.where(functions, 0.0, at.prior.amplitude)
+    rigid = replace(at.cell, arm=bare(at.cell.arm))
+    at = _Solution(rigid, terms, replace(at.prior, amplitude=amplitude))
+    for _ in range(_ROUNDS):
+        residual, rows = problem.linearise(at.cell, at.terms)
+        weight = keep * problem.visit_share(residual, keep.astype(np.float64))
+        at = _round(problem, at, residual, rows, weight)
+        residual, rows = problem.linearise(at.cell, at.terms)
+        last, keep = keep, problem.inliers(*problem.left_out(residual, rows, at, weight))
+        if np.array_equal(last, keep):
+            break
+    full = _reported(problem, at, last, weight)
+    needed = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
+    return full if full.left_out_rms_m < needed * problem.geometric_left_out() else start
+
+
+def _round(
+    problem: _FullProblem, at: _Solution, residual: Array, rows: _Rows, weight: Array
+) -> _Solution:
+    evidence = problem.evidence(at, residual, rows, weight)
+    prior = evidence.maximise(at.prior)
+    posterior = evidence.posterior(prior)
+    cell = problem.moved(at.cell, at.terms, posterior.mean)
+    return _Solution(cell, at.terms, prior, posterior)
+
+
+def _unwanted(at: _Solution) -> tuple[Mask, Mask]:
+    """Joints (n,) whose function, and whose compliance, the evidence does not want.
+
+    No compliance is below zero. Functions must show together that there are any; then of each it
+    suffices that it is more likely there than not.
+    """
+    assert at.posterior is not None
+    posterior, terms = at.posterior, at.terms
+    gain = posterior.gain
+    shown = float(np.sum(gain[gain > 0.0])) >= EVIDENCE_NEEDED
+    bent = posterior.mean[terms.before : terms.before + len(posterior.bend_gain)]
+    stiff = np.ones(len(terms.count), dtype=np.bool_)
+    stiff[terms.bends] = (posterior.bend_gain < EVIDENCE_NEEDED) | (bent <= 0.0)
+    return (gain <= 0.0) | (not shown), stiff
+
+
+def _reported(
+    problem: _FullProblem, at: _Solution, keep: Mask, weight: Array
+) -> FullIdentification:
+    """Put together what is reported, with covariances that samples left out confirm.
+
+    Errors that no model explains are neither equal everywhere nor normal: where more than one in
+    twenty left-out samples lies beyond its bound of 95 %, all sigmas grow until it is one.
+    """
+    assert at.posterior is not None
+    start, data, k = problem.start, problem.data, at.terms.before
+    residual, rows = problem.linearise(at.cell, at.terms)
+    error, expected = problem.left_out(residual, rows, at, weight)
+    squared = np.maximum(_squared(error[:, :3], expected[:, :3, :3]), 0.0)
+    stretch = max(1.0, np.sqrt(float(np.quantile(squared, 0.95)) / chi2_quantile(0.95, 3)))
+    covariance, noise = stretch**2 * at.posterior.covariance, stretch * at.prior.noise
+    estimate = replace(
+        start.estimate,
+        state=at.cell,
+        covariance=covariance[:k, :k],
+        scale=noise,
+        freedom=at.posterior.left,
+        residual=residual,
+        rejected=~keep,
+    )
+    sigma = 1.0 if data.sigma is None else float(np.sqrt(np.mean(data.sigma**2)))
+    plain = {field.name: getattr(start, field.name) for field in fields(Identification)}
+    plain |= {
+        "estimate": estimate,
+        "cell": at.cell,
+        "rejected": tuple(data.sample[i] for i in np.flatnonzero(~keep)),
+        "noise_m": noise * sigma,
+    }
+    return FullIdentification(
+        **plain,
+        terms=at.terms,
+        prior=at.prior,
+        gain=at.posterior.gain,
+        all_covariance=covariance,
+        measured=np.column_stack([data.q.min(axis=0), data.q.max(axis=0)]),
+        left_out_rms_m=problem.rms(error),
+    )

@@ -1,0 +1,410 @@
+"""Joint functions and compliances from measurements: what is unknown, and what the evidence wants.
+
+Of each joint a smooth function of its own angle is a Gaussian process, with a Matérn 5/2 kernel
+of a length and an amplitude, on the coefficients of a cubic spline (`kinematics.joint_functions`).
+With the normal equations in hand, length and amplitude of every joint and the noise are those
+under which the data are most likely, all unknowns integrated out (evidence, type II maximum
+likelihood: MacKay, Bayesian interpolation, 1992; Rasmussen and Williams, Gaussian Processes for
+Machine Learning, 2006, chapter 5).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.kinematics.joint_functions import JointFunctions
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Gears and encoders go with tens of periods in a turn: a length of a few degrees. How far length
+# and amplitude may be from these, as factors (standard deviations of their logarithms), is wide
+# beside what some hundred poses tell. Of a joint that slides, m stands for rad.
+LENGTH_RAD, LENGTH_FACTOR = float(np.radians(3.5)), 0.5
+AMPLITUDE_RAD, AMPLITUDE_FACTOR = 250e-6, 1.0
+WINDING_RAD = 1e-3  # standard deviation of what the largest torque winds a joint, before the data
+EVIDENCE_NEEDED = 3.0  # of a term, natural logarithm: twenty to one
+
+# Of the knots, under a typical length: no more splines than poses, within these bounds.
+FINEST_STEP_RAD, COARSEST_STEP_RAD = float(np.radians(1.5)), float(np.radians(3.0))
+MOST_SPLINES = 1200
+MARGIN = 3  # splines beyond the measured angles, on which a function returns to zero
+_JITTER = 1e-8
+LEAST_NOISE_SHARE = 1e-2  # of the noise before: what functions leave at least
+FLAT, FLAT_SHARE = 0.1, 3e-6  # change of the log evidence that means nothing, also relative
+
+
+@dataclass(frozen=True)
+class JointTerms:
+    """Which joints have a function and a compliance, and their columns among the unknowns.
+
+    The k unknowns are ``before`` others (geometry, base, targets), the compliances of the joints
+    that bend, and the spline coefficients, joint by joint.
+
+    Attributes
+    ----------
+    first, step : (n,) first knot and spacing of the knots, rad (prismatic: m).
+    count : (n,) splines of each joint; 0: no function.
+    bends : (n,) whether its compliance is unknown.
+    torque_scale : (n,) largest gravity torque in the data, N m (prismatic: N).
+    """
+
+    before: int
+    first: Array
+    step: Array
+    count: Index
+    bends: Mask
+    torque_scale: Array
+
+    @classmethod
+    def cover(
+        cls, q: Array, torque: Array | None, before: int, coarse: bool = False
+    ) -> "JointTerms":
+        """All terms that readings (m, n) and, where it is known, gravity torque (m, n) can have.
+
+        ``coarse``: with half of the splines, to search with.
+        """
+        lower, span = q.min(axis=0), np.ptp(q, axis=0)
+        wanted = np.clip(float(span.sum()) / len(q), FINEST_STEP_RAD, COARSEST_STEP_RAD)
+        step = max(wanted, float(span.sum()) / MOST_SPLINES) * (2.0 if coarse else 1.0)
+        largest = np.zeros(q.shape[1]) if torque is None else np.max(np.abs(torque), axis=0)
+        return cls(
+            before=before,
+            first=lower - (MARGIN + 3) * step,
+            step=np.full(q.shape[1], step),
+            count=np.ceil(span / step).astype(np.int64) + 2 * MARGIN + 3,
+            bends=largest > 1e-3 * max(float(largest.max()), 1e-9),
+            torque_scale=np.maximum(largest, 1e-9),
+        )
+
+    def without(self, functions: Mask, bends: Mask) -> "JointTerms":
+        """Return the terms without some joints' functions (n,) and compliances (n,)."""
+        count = np.where(functions, 0, self.count)
+        return JointTerms(
+            self.before, self.first, self.step, count, self.bends & ~bends, self.torque_scale
+        )
+
+    @cached_property
+    def offset(self) -> Index:
+        """Column (n,) of each joint's first coefficient."""
+        start = self.before + int(np.sum(self.bends))
+        return start + np.concatenate([[0], np.cumsum(self.count)[:-1]])
+
+    @property
+    def size(self) -> int:
+        """Number k of all unknowns."""
+        return self.before + int(np.sum(self.bends)) + int(np.sum(self.count))
+
+    def block(self, joint: int) -> slice:
+        """Columns of a joint's coefficients."""
+        return slice(int(self.offset[joint]), int(self.offset[joint] + self.count[joint]))
+
+    def rows(self, q: Array, by_turn: Array, torque: Array | None) -> tuple[Array, Index]:
+        """Columns that poses see of these terms: Jacobian (m, c, h) and which unknown, (m, h).
+
+        ``by_turn`` (m, c, n): derivative by what each joint turns, in the controller's sense.
+        """
+        m, c, n = by_turn.shape
+        cell, weight = _splines((q - self.first) / self.step)
+        column = cell[..., None] + np.arange(4)
+        inside = (column >= 0) & (column < self.count[:, None])
+        column = np.where(inside, self.offset[:, None] + column, -1).reshape(m, 4 * n)
+        J = (by_turn[..., None] * weight[:, None]).reshape(m, c, 4 * n)
+        if not np.any(self.bends):
+            return J, column
+        assert torque is not None
+        by_load = (by_turn * torque[:, None])[:, :, self.bends]
+        own = np.broadcast_to(self.before + np.arange(by_load.shape[2]), (m, by_load.shape[2]))
+        return np.concatenate([by_load, J], axis=2), np.concatenate([own, column], axis=1)
+
+    def share_outside(self, q: Array) -> Array:
+        """Share (m, n) of the splines at readings (m, n) that no table has."""
+        cell, weight = _splines((q - self.first) / self.step)
+        column = cell[..., None] + np.arange(4)
+        inside = (column >= 0) & (column < self.count[:, None])
+        return np.where(self.count > 0, np.sum(weight * ~inside, axis=2), 0.0)
+
+    def functions(self, unknowns: Array) -> JointFunctions | None:
+        """Joint functions of a vector (k,) of all unknowns; None of no terms."""
+        if self.size == self.before:
+            return None
+        coefficients = np.zeros((len(self.count), max(1, int(self.count.max()))))
+        for joint, count in enumerate(self.count):
+            coefficients[joint, :count] = unknowns[self.block(joint)]
+        compliance = np.zeros(len(self.count))
+        bent = unknowns[self.before : self.before + int(np.sum(self.bends))]
+        compliance[self.bends] = np.maximum(bent, 0.0)
+        return JointFunctions(self.first, self.step, coefficients, compliance)
+
+    def values(self, functions: JointFunctions | None) -> Array:
+        """Return these terms' unknowns (k - before,) in joint functions."""
+        if functions is None:
+            return np.zeros(self.size - self.before)
+        parts = [functions.coefficients[i, :c] for i, c in enumerate(self.count)]
+        return np.concatenate([functions.compliance[self.bends], *parts])
+
+
+def _splines(u: Array) -> tuple[Index, Array]:
+    """First of the four splines at u, in knots, and their values (..., 4)."""
+    cell = np.floor(u)
+    s = u - cell
+    r = 1.0 - s
+    weights = (r**3, 4.0 - 3.0 * s * s * (1.0 + r), 4.0 - 3.0 * r * r * (1.0 + s), s**3)
+    return cell.astype(np.int64) - 3, np.stack(weights, axis=-1) / 6.0
+
+
+@dataclass(frozen=True)
+class FunctionPrior:
+    """Lengths and amplitudes (n,) of the joints' functions, rad, and the noise of a residual."""
+
+    length: Array
+    amplitude: Array
+    noise: float
+
+    @classmethod
+    def typical(cls, n: int, noise: float) -> "FunctionPrior":
+        """Where the search begins."""
+        return cls(np.full(n, LENGTH_RAD), np.full(n, AMPLITUDE_RAD), noise)
+
+
+def _correlation(count: int, step: float, length: float) -> tuple[Array, Array]:
+    """Matérn 5/2 correlation (count, count) of coefficients, and its derivative by log(length)."""
+    from scipy.linalg import toeplitz
+
+    d = np.sqrt(5.0) * step / length * np.arange(count)
+    decay = np.exp(-d)
+    return toeplitz((1.0 + d + d * d / 3.0) * decay), toeplitz(decay * d * d * (1.0 + d) / 3.0)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Mean (k,) and covariance (k, k) of all unknowns under a prior.
+
+    Attributes
+    ----------
+    gain : (n,) evidence for each joint's function, natural logarithm, and ``bend_gain`` (p,) for
+        each compliance: the density of its absence before over that after the data (Dickey 1971).
+    left : how many numbers the unknowns leave to tell the noise.
+    """
+
+    mean: Array
+    covariance: Array
+    gain: Array
+    bend_gain: Array
+    left: float
+
+
+@dataclass(frozen=True)
+class JointEvidence:
+    """How likely N residuals are, from their normal equations, as a function of the prior.
+
+    Attributes
+    ----------
+    normal, pull : J^T J (k, k) and J^T y (k,) of the linear model y = J x + noise.
+    squares, count : y^T y and N.
+    flat : (k,) unknowns without a prior.
+    fixed : Cholesky factor (f, f) of the prior covariance of the first unknowns that are not flat
+        and not of ``terms``.
+    noise_least : smallest noise allowed, where it is known.
+    """
+
+    terms: JointTerms
+    normal: Array
+    pull: Array
+    squares: float
+    count: float
+    flat: Mask
+    fixed: Array
+    noise_least: float
+
+    @cached_property
+    def _reduced(self) -> tuple[Array, Array, float, Array, Array]:
+        """Normal equations without the flat unknowns, which take their best values."""
+        flat, rest = np.flatnonzero(self.flat), np.flatnonzero(~self.flat)
+        cross = np.column_stack([self.normal[np.ix_(flat, rest)], self.pull[flat]])
+        own = self.normal[np.ix_(flat, flat)]
+        size = 1.0 / np.sqrt(np.maximum(np.diag(own), np.finfo(float).tiny))
+        by_rest = np.linalg.solve(own * np.outer(size, size), cross * size[:, None]) * size[:, None]
+        reduced = self.normal[np.ix_(rest, rest)] - cross[:, :-1].T @ by_rest[:, :-1]
+        pull = self.pull[rest] - cross[:, :-1].T @ by_rest[:, -1]
+        squares = self.squares - float(cross[:, -1] @ by_rest[:, -1])
+        covariance = np.linalg.inv(own * np.outer(size, size)) * np.outer(size, size)
+        return reduced, pull, squares, by_rest, covariance
+
+    @cached_property
+    def _blocks(self) -> list[tuple[int, slice]]:
+        """Each joint with a function, and its place among the unknowns that are not flat."""
+        place = np.cumsum(~self.flat) - 1
+        found = []
+        for joint in np.flatnonzero(self.terms.count):
+            start = int(place[self.terms.offset[joint]])
+            found.append((int(joint), slice(start, start + int(self.terms.count[joint]))))
+        return found
+
+    def _factors(self, prior: FunctionPrior) -> tuple[list[tuple[slice, Array]], list[Array]]:
+        """Cholesky factors of the prior covariance's blocks, and of the joints' functions slopes.
+
+        A slope is the derivative of the block by log(length), between the factor's inverses.
+        """
+        from scipy.linalg import lapack
+
+        f, bends = len(self.fixed), self.terms.bends
+        first = np.zeros((f + int(np.sum(bends)),) * 2)
+        first[:f, :f] = self.fixed
+        first[range(f, len(first)), range(f, len(first))] = (
+            WINDING_RAD / self.terms.torque_scale[bends]
+        )
+        factors, slopes = [(slice(0, len(first)), first)], []
+        for joint, block in self._blocks:
+            count = block.stop - block.start
+            K, slope = _correlation(count, float(self.terms.step[joint]), prior.length[joint])
+            own = np.linalg.cholesky(K + _JITTER * np.eye(count))
+            half, _ = lapack.dtrtrs(own, slope, lower=1)
+            slopes.append(lapack.dtrtrs(own, half.T, lower=1)[0])
+            factors.append((block, prior.amplitude[joint] * own))
+        return factors, slopes
+
+    def _whitened(self, prior: FunctionPrior) -> "_Whitened":
+        """Everything in units of the prior."""
+        from scipy.linalg import lapack
+
+        reduced, pull, *_ = self._reduced
+        factors, slopes = self._factors(prior)
+        half, B = np.empty_like(reduced), np.empty_like(reduced)
+        for block, L in factors:
+            half[:, block] = reduced[:, block] @ L
+        for block, L in factors:
+            B[block] = L.T @ half[block]
+        B /= prior.noise**2
+        B[np.diag_indices_from(B)] += 1.0
+        whitened = np.concatenate([L.T @ pull[block] for block, L in factors])
+        R, _ = lapack.dpotrf(B.T, lower=1, overwrite_a=1)  # B is symmetric
+        z, _ = lapack.dpotrs(R, whitened / prior.noise**2, lower=1)
+        determinant = 2.0 * float(np.sum(np.log(np.diag(R))))
+        inverse, _ = lapack.dpotri(R, lower=1, overwrite_c=1)
+        return _Whitened(factors, slopes, inverse, z, determinant, float(whitened @ z))
+
+    def _cost(self, prior: FunctionPrior) -> tuple[float, Array]:
+        """Minus the log evidence, and its derivatives by the logarithms that are searched.
+
+        Those of length and amplitude of each block, and of the noise.
+        """
+        at, variance = self._whitened(prior), prior.noise**2
+        told, z = self.count - float(np.sum(self.flat)), at.mean
+        loss = self._reduced[2] - at.explained
+        cost = 0.5 * (told * np.log(variance) + at.determinant + loss / variance)
+        by = []
+        for (_, block), slope in zip(self._blocks, at.slopes, strict=True):
+            gained = np.eye(block.stop - block.start) - at.own(block)
+            pulled = z[block]
+            by.append(0.5 * (float(np.sum(gained * slope)) - float(pulled @ slope @ pulled)))
+            by.append(float(np.trace(gained)) - float(pulled @ pulled))
+        by.append(told - at.taken - loss / variance + float(z @ z))
+        return cost, np.array(by)
+
+    def maximise(self, start: FunctionPrior) -> FunctionPrior:
+        """The prior under which the data are most likely."""
+        from scipy.optimize import minimize
+
+        joints = [joint for joint, _ in self._blocks]
+        centre = np.tile(np.log([LENGTH_RAD, AMPLITUDE_RAD]), len(joints))
+        width = np.tile([LENGTH_FACTOR, AMPLITUDE_FACTOR], len(joints))
+
+        # the curvature that each logarithm has where the data tell it: steps of like size
+        counts = self.terms.count[joints].astype(np.float64)
+        size = np.sqrt(np.append(np.stack([counts, 2.0 * counts], axis=1), 2.0 * self.count))
+
+        def prior_at(x: Array) -> FunctionPrior:
+            length, amplitude = start.length.copy(), start.amplitude.copy()
+            length[joints], amplitude[joints] = np.exp(x[:-1:2]), np.exp(x[1:-1:2])
+            return FunctionPrior(length, amplitude, float(np.exp(x[-1])))
+
+        def cost(scaled: Array) -> tuple[float, Array]:
+            x = scaled / size
+            value, slope = self._cost(prior_at(x))
+            away = (x[:-1] - centre) / width
+            slope[:-1] += away / width
+            return value + 0.5 * float(away @ away), slope / size
+
+        x = np.empty(2 * len(joints) + 1)
+        x[:-1:2], x[1:-1:2] = np.log(start.length[joints]), np.log(start.amplitude[joints])
+        x[-1] = np.log(start.noise)
+        lower, upper = np.full(len(x), np.log(1e-7)), np.full(len(x), np.log(5e-3))
+        lower[:-1:2], upper[:-1:2] = np.log(0.5 * self.terms.step[joints]), np.log(np.pi)
+        lower[-1] = np.log(max(self.noise_least, LEAST_NOISE_SHARE * start.noise))
+        upper[-1] = np.inf
+        flat = max(FLAT_SHARE, FLAT / max(abs(cost(x * size)[0]), 1.0))
+        found = minimize(
+            cost, x * size, jac=True, method="L-BFGS-B",
+            bounds=np.stack([lower * size, upper * size], axis=1),
+            options={"ftol": flat, "maxiter": 40},
+        )  # fmt: skip
+        return prior_at(found.x / size)
+
+    def posterior(self, prior: FunctionPrior) -> Posterior:
+        """What the data and the prior say of all unknowns."""
+        at = self._whitened(prior)
+        *_, by_rest, flat_covariance = self._reduced
+        flat, rest = np.flatnonzero(self.flat), np.flatnonzero(~self.flat)
+        inverse = np.tril(at.inverse) + np.tril(at.inverse, -1).T
+        mean, covariance = np.zeros(len(self.flat)), np.zeros((len(self.flat),) * 2)
+        mean[rest] = np.concatenate([L @ at.mean[block] for block, L in at.factors])
+        half, own = np.empty_like(inverse), np.empty_like(inverse)
+        for block, L in at.factors:
+            half[:, block] = inverse[:, block] @ L.T
+        for block, L in at.factors:
+            own[block] = L @ half[block]
+        mean[flat] = by_rest[:, -1] - by_rest[:, :-1] @ mean[rest]
+        cross = -by_rest[:, :-1] @ own
+        covariance[np.ix_(rest, rest)] = own
+        covariance[np.ix_(flat, rest)], covariance[np.ix_(rest, flat)] = cross, cross.T
+        covariance[np.ix_(flat, flat)] = (
+            prior.noise**2 * flat_covariance - cross @ by_rest[:, :-1].T
+        )
+        gain = np.full(len(self.terms.count), -np.inf)
+        for joint, block in self._blocks:
+            gain[joint] = _gain(inverse[block, block], at.mean[block])
+        f, b = len(self.fixed), int(np.sum(self.terms.bends))
+        alone = [slice(i, i + 1) for i in range(f, f + b)]
+        bends = np.array([_gain(inverse[i, i], at.mean[i]) for i in alone])
+        return Posterior(mean, covariance, gain, bends, self.count - len(flat) - at.taken)
+
+
+@dataclass(frozen=True)
+class _Whitened:
+    """A linear model in units of its prior: unknowns L^-1 x with L of blocks.
+
+    Attributes
+    ----------
+    factors, slopes : of ``JointEvidence._factors``.
+    inverse : (p, p) lower triangle of the inverse of B = I + L^T A L / s^2.
+    mean : (p,).
+    determinant : log det B.
+    explained : by how much the unknowns lessen the squares, prior included.
+    """
+
+    factors: list[tuple[slice, Array]]
+    slopes: list[Array]
+    inverse: Array
+    mean: Array
+    determinant: float
+    explained: float
+
+    def own(self, block: slice) -> Array:
+        """The inverse's part of a block."""
+        part = np.tril(self.inverse[block, block])
+        return np.asarray(part + np.tril(part, -1).T)
+
+    @property
+    def taken(self) -> float:
+        """How many numbers the unknowns take up."""
+        return len(self.mean) - float(np.trace(self.inverse))
+
+
+def _gain(covariance: Array, mean: Array) -> float:
+    """Evidence for unknowns whose prior was a unit normal, against their all being zero."""
+    _, determinant = np.linalg.slogdet(covariance)
+    return 0.5 * float(determinant + mean @ np.linalg.solve(covariance, mean))
