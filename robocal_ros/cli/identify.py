@@ -27,9 +27,10 @@ from robocal_ros.cli.main import (
 )
 from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
-from robocal_ros.ground.files import nearest, quoted
+from robocal_ros.ground.files import nearest, quoted, write_text
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
+from robocal_ros.identification.full_model import FullIdentification
 from robocal_ros.identification.judged import (
     CYCLES,
     explain_mismatch,
@@ -83,6 +84,8 @@ def show_identification(console: "Console", document: Document) -> None:
         soft_wrap=True,
     )
     console.print()
+    if "joints" in document:  # of a drift there are none
+        _show_joints(console, document)
     _show_parameters(console, document)
     _show_doubts(console, document)
     if document.get("output"):
@@ -106,6 +109,34 @@ def _errors(document: Document) -> "Table":
     predicted = document["calibrated"]["predicted"]["total_rms_mm"]
     table.add_row("  predicted by its covariance", "", f"{predicted:.3f}", "", "")
     return table
+
+
+def _show_joints(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
+    table = Table(title="Joints", title_justify="left", box=None)
+    table.add_column("joint")
+    for name in ("measured from", "to", "own function, rms", "its sigma", "compliance"):
+        table.add_column(name, justify="right")
+    for row in document["joints"]:
+        unit = "deg" if "measured_deg" in row else "mm"
+        micro = "urad" if unit == "deg" else "um"
+        function, bends = row["function"], row["compliance"]
+        shown = ["none", ""]
+        if function:
+            shown = [f"{function[f'{name}_{micro}']:.0f} {micro}" for name in ("rms", "sigma")]
+        load = f"{bends * 1e6:.2f} {micro}/{'N m' if unit == 'deg' else 'N'}" if bends else "none"
+        lower, upper = row[f"measured_{unit}"]
+        table.add_row(row["name"], f"{lower:.0f}", f"{upper:.0f} {unit}", *shown, load)
+    console.print(table)
+    if document["check_outside"]:
+        there = ", and its function is zero there" if document["model"] == "full" else ""
+        console.print(
+            f"Not covered: {document['check_outside']:.1%} of the check poses have a joint outside "
+            f"of where it was measured{there}.",
+            soft_wrap=True,
+        )
+    console.print()
 
 
 def _show_parameters(console: "Console", document: Document) -> None:
@@ -203,6 +234,19 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
         help="map (default): with building tolerances as prior; lsq: by the data alone",
     )
     parser.add_argument(
+        "--model",
+        choices=("full", "geometric"),
+        default="full",
+        help="full (default): geometry, a function of each joint's own angle, and compliances "
+        "where the robot file has a load, each only if the data want it; geometric: geometry alone",
+    )
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        metavar="DIR",
+        help="write joints.svg there: each joint's function with its band",
+    )
+    parser.add_argument(
         "--output",
         type=Path,
         metavar="FILE",
@@ -226,11 +270,13 @@ def run_identify(args: argparse.Namespace) -> CliResult:
             f"measurements, method {document['method']};\n"
             f"nominal model {robot.arm.model_hash} of {robot.path}.\n{headline(document)}."
         )
-        arm = robot.arm.with_mdh(judged.identification.cell.arm.mdh)
+        found = judged.identification.cell.arm
+        arm = robot.arm.with_model(found.mdh, found.functions, found.load)
         save_robot(arm, args.output, like=robot, comment=comment)
         document["output"] = str(args.output)
     elif args.output is not None:
         warnings.append(f"{args.output} is not written: the verdict is {verdict.code.name}")
+    document["figures"] = _figures(judged, args.figures)
     document["warnings"] = warnings
     warn(warnings)
     status = DONE
@@ -239,6 +285,19 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         tell(verdict.code.name, verdict.reason)
         status = NO_ANSWER
     return CliResult(document, partial(show_identification, document=document), status)
+
+
+def _figures(judged: JudgedIdentification, folder: Path | None) -> str | None:
+    """Write each joint's function with its band; the file, None where there are none."""
+    result = judged.identification
+    if folder is None or not isinstance(result, FullIdentification):
+        return None
+    from robocal_ros.report.figures import joint_functions_figure, svg
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "joints.svg"
+    write_text(path, svg(joint_functions_figure(result)))
+    return str(path)
 
 
 def _require_sense(args: argparse.Namespace) -> None:
@@ -281,7 +340,7 @@ def _identified(
     refit = args.check_refit
     try:
         judged = identify_and_judge(
-            arm, train, check, fit=args.fit, method=args.method, check_refit=refit
+            arm, train, check, fit=args.fit, method=args.method, model=args.model, check_refit=refit
         )
     except TooFewSamplesError as error:
         if file is not None:
@@ -305,6 +364,7 @@ def _identified(
         "check_file": file,
         "fit": list(args.fit),
         "check_refit": list(refit),
+        "model": args.model,
         "hold_out": part,
         "seed": draw,
         "train": len(train),
