@@ -2,6 +2,7 @@
 
 - ``ur10_campaigns.png``: real measurements (see ``ur10_campaigns``), mean error at poses that were
   held out;
+- ``ur10_joints.png``: what the joints of that robot turn besides what is read, of series A;
 - ``beam_circle.png``: one simulated circle through two crossed beams;
 - ``demo_shift.png``: the simulated shift of ``bags/demo_shift.mcap``, as ``robocal validate`` draws
   it.
@@ -22,7 +23,15 @@ from bench.circle_figure import circle_figure
 from bench.real_data import carried_over, own_half
 from bench.ur10_campaigns import SERIES
 from robocal_ros.cli.validating import Job, validate_bag
-from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE, png
+from robocal_ros.identification.full_model import FullIdentification
+from robocal_ros.report.figures import (
+    AFTER,
+    BEFORE,
+    FAINT,
+    STYLE,
+    joint_functions_figure,
+    png,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -103,6 +112,9 @@ def main() -> None:
     found = campaign_errors()
     print(json.dumps(found, indent=1))
     (IMAGES / "ur10_campaigns.png").write_bytes(png(campaign_figure(found)))
+    joints = own_half("A").identification
+    if isinstance(joints, FullIdentification):
+        (IMAGES / "ur10_joints.png").write_bytes(png(joint_functions_figure(joints)))
     (IMAGES / "beam_circle.png").write_bytes(png(circle_figure()))
     bag = ROOT / "bags" / "demo_shift.mcap"
     (drawn,) = validate_bag(Job(str(bag), bag.name, "kr150_r3100")).figures

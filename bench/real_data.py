@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
@@ -9,29 +10,37 @@ from bench.tables import Goal, Table
 from bench.ur10_campaigns import data_folder, halves, load_campaign
 from robocal_ros.estimation.assessment import ErrorSummary, summarise
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
+from robocal_ros.identification.judged import Model
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.universal_robots import factory_arm, nominal_arm, parse_settings
 
-LARGEST_MEAN_MM = {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365}
-LARGEST_LATER_MEAN_MM = {"B": 0.455, "C": 0.52, "D": 0.40}
+LARGEST_MEAN_MM = {
+    "geometric": {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365},
+    "full": {"A": 0.066, "B": 0.088, "C": 0.087, "D": 0.124},
+}
+LARGEST_LATER_MEAN_MM = {
+    "geometric": {"B": 0.455, "C": 0.52, "D": 0.40},
+    "full": {"B": 0.24, "C": 0.42, "D": 0.145},
+}
+MODELS: tuple[Model, Model] = ("geometric", "full")
 DRAWS = 10
 LARGEST_UR5E_MEAN_MM, LARGEST_UR5E_MAX_MM = 0.0445, 0.081
 WHEN = {"A": "July 2020, grid", "B": "Nov. 2020", "C": "Nov. 2020, random", "D": "March 2021"}
 
 
 @lru_cache
-def own_half(series: str) -> JudgedIdentification:
+def own_half(series: str, model: Model = "full") -> JudgedIdentification:
     """Identify from half of a campaign, judge on the other half."""
     train, check = halves(load_campaign(series))
-    return identify_and_judge(load_robot("ur10"), train, check)
+    return identify_and_judge(load_robot("ur10"), train, check, model=model)
 
 
 @lru_cache
-def carried_over(source: str, series: str) -> JudgedIdentification:
+def carried_over(source: str, series: str, model: Model = "full") -> JudgedIdentification:
     """The model of a campaign's training half on another: only base and tool refitted there."""
     train, _ = halves(load_campaign(source))
-    check = load_campaign(series)
-    return identify_and_judge(load_robot("ur10"), train, check, check_refit=("base", "tool"))
+    check, refit = load_campaign(series), ("base", "tool")
+    return identify_and_judge(load_robot("ur10"), train, check, model=model, check_refit=refit)
 
 
 @lru_cache
@@ -63,18 +72,21 @@ def campaigns_table() -> Table:
         "ur10_campaigns",
         "UR10 with laser tracker and T-Mac: errors of the T-Mac's origin at held-out poses, mm",
         ("campaign", "poses", "model", "mean", "goal", "rms", "95 %", "max", "predicted rms"),
-        "Half of each campaign's poses identify base, T-Mac and geometry, the other half judges; "
+        "Half of each campaign's poses identify base, T-Mac and model, the other half judges; "
         "visits of one pose stay on one side. Nominal: base and T-Mac fitted to the same half. "
-        "Predicted: from the covariance and the residual noise.",
+        "Full: with a function of each joint's angle and compliances. Predicted: from covariance "
+        "and noise.",
     )
     for series in "ABCD":
-        judged = own_half(series)
-        name = f"{series} ({WHEN[series]})"
-        nominal, after = _millimetres(judged.nominal), _millimetres(judged.candidate)
-        table.add(name, judged.nominal.n, "nominal", nominal[0], None, *nominal[1:], None)
-        goal = Goal(after[0], LARGEST_MEAN_MM[series])
-        predicted = judged.predicted_total_rms_m * 1e3
-        table.add("", judged.candidate.n, "calibrated", after[0], goal, *after[1:], predicted)
+        nominal = own_half(series).nominal
+        mean, *others = _millimetres(nominal)
+        table.add(f"{series} ({WHEN[series]})", nominal.n, "nominal", mean, None, *others, None)
+        for model in MODELS:
+            judged = own_half(series, model)
+            mean, *others = _millimetres(judged.candidate)
+            goal = Goal(mean, LARGEST_MEAN_MM[model][series])
+            predicted = judged.predicted_total_rms_m * 1e3
+            table.add("", judged.candidate.n, model, mean, goal, *others, predicted)
     return table
 
 
@@ -87,6 +99,7 @@ def later_table() -> Table:
             "model of",
             "used in",
             "poses",
+            "model",
             "nominal mean",
             "mean",
             "goal",
@@ -99,14 +112,13 @@ def later_table() -> Table:
         "later data, for both models; the geometry is held. A's grid fills the workspace, "
         "C's poses a part of it.",
     )
-    for source, series in ("AB", "AC", "AD", "CB", "CD"):
-        judged = carried_over(source, series)
+    for (source, series), model in product(("AB", "AC", "AD", "CB", "CD"), MODELS):
+        judged = carried_over(source, series, model)
         after = _millimetres(judged.candidate)
-        goal = Goal(after[0], LARGEST_LATER_MEAN_MM[series]) if source == "A" else None
+        goal = Goal(after[0], LARGEST_LATER_MEAN_MM[model][series]) if source == "A" else None
         table.add(
-            source, f"{series} ({WHEN[series]})", judged.candidate.n, judged.nominal.mean_m * 1e3,
-            after[0], goal, *after[1:],
-            judged.verdict.code.name,
+            source, f"{series} ({WHEN[series]})", judged.candidate.n, model,
+            judged.nominal.mean_m * 1e3, after[0], goal, *after[1:], judged.verdict.code.name,
         )  # fmt: skip
     return table
 
@@ -116,23 +128,24 @@ def few_poses_table() -> Table:
     table = Table(
         "ur10_few_poses",
         f"UR10, campaign C: how many poses? rms at 1500 other poses, mean of {DRAWS} draws, mm",
-        ("poses", "nominal", "least squares", "with prior (default)", "accepted"),
-        "Accepted: of the draws, with prior, judged on as many other poses as identified it (at "
-        "least 20). The prior's width is found from the data.",
+        ("poses", "nominal", "least squares", "with prior", "full (default)", "accepted"),
+        "Accepted: of the draws, the full model, judged on as many other poses as identified it "
+        "(at least 20). The prior's width is found from the data.",
     )
     arm, data = load_robot("ur10"), load_campaign("C")
-    for count in (12, 16, 24, 40, 80, 160):
-        squares, accepted = np.zeros(3), 0
+    for count in (12, 16, 24, 40, 60, 120, 250):
+        squares, accepted = np.zeros(4), 0
         for seed in range(DRAWS):
             order = np.random.default_rng(seed).permutation(len(data))
             train, rest = data.take(order[:count]), data.take(order[-1500:])
             judge_by = data.take(order[count : 2 * count + max(20 - count, 0)])
             plain = identify_and_judge(arm, train, rest, method="lsq")
-            mine = identify_and_judge(arm, train, rest)
-            squares += [
-                errors.rms_m**2 for errors in (plain.nominal, plain.candidate, mine.candidate)
-            ]
-            accepted += identify_and_judge(arm, train, judge_by).verdict.accept
+            prior = identify_and_judge(arm, train, rest)
+            full = identify_and_judge(arm, train, rest, model="full")
+            errors = (plain.nominal, plain.candidate, prior.candidate, full.candidate)
+            squares += [summary.rms_m**2 for summary in errors]
+            judged = identify_and_judge(arm, train, judge_by, model="full")
+            accepted += judged.verdict.accept
         table.add(count, *(np.sqrt(squares / DRAWS) * 1e3).tolist(), f"{accepted} of {DRAWS}")
     return table
 
