@@ -415,12 +415,10 @@ MB = 1_000_000
 class Maker:
     """A recorder, the same after a restart.
 
-    Attributes
-    ----------
-    node : the full name of its node.
-    serial : of its robot; "" without.
-    place : what tells it from others of its name where there is no serial: host and ROS domain.
-    run : of this start alone; no part of who it is.
+    ``node``: the full name of its node.
+    ``serial``: of its robot; "" without.
+    ``place``: what tells it from others of its name where there is no serial: host and ROS domain.
+    ``run``: of this start alone; no part of who it is.
     """
 
     node: str
@@ -446,13 +444,11 @@ class MarkedRecording:
 class FreedSpace:
     """What became of the attempt to make room.
 
-    Attributes
-    ----------
-    deleted : recordings that are gone.
-    left : why something that looks like a recording was left alone, by its name.
-    short_bytes : so much is missing to what shall stay free, and no deleting would bring it.
-    rivals : recordings that others write who say to be the same recorder: what earlier runs made
-        may be theirs, and stays.
+    ``deleted``: recordings that are gone.
+    ``left``: why something that looks like a recording was left alone, by its name.
+    ``short_bytes``: so much is missing to what shall stay free, and no deleting would bring it.
+    ``rivals``: recordings that others write who say to be the same recorder: what earlier runs made
+    may be theirs, and stays.
     """
 
     deleted: tuple[Path, ...]

@@ -49,11 +49,9 @@ class Played:
 class ReplayTopics:
     """One reliable publisher for each topic.
 
-    Attributes
-    ----------
-    played : by recorded name.
-    skipped : topics that are not played, and why.
-    unacknowledged : messages that a reliable subscriber did not confirm in time.
+    ``played``: by recorded name.
+    ``skipped``: topics that are not played, and why.
+    ``unacknowledged``: messages that a reliable subscriber did not confirm in time.
     """
 
     def __init__(self, node: Node, latched: Collection[str]) -> None:

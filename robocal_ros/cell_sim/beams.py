@@ -29,11 +29,9 @@ FINEST_S = 1e-9  # what a perfect input claims
 class RoundTool:
     """A tool of revolution with a round tip.
 
-    Attributes
-    ----------
-    T_flange_tool : (4, 4) its tip, and its axis from flange to tip along z.
-    height, radius : (k,) of spheres above the tip, m; the tool is the hull of each two in turn.
-        The lowest one touches the tip: its height is its radius.
+    ``T_flange_tool`` (4, 4): its tip, and its axis from flange to tip along z.
+    ``height``, ``radius``: (k,) of spheres above the tip, m; the tool is the hull of each two in
+    turn. The lowest one touches the tip: its height is its radius.
     """
 
     T_flange_tool: Array
@@ -73,12 +71,10 @@ class RoundTool:
 class TrueBeam:
     """A beam, base.
 
-    Attributes
-    ----------
-    start, end : (3,) points on its middle, from emitter to receiver, m.
-    diameter : m.
-    dark_at, light_at : shares of its light still there when the input switches; their difference
-        is the receiver's hysteresis.
+    ``start``, ``end``: (3,) points on its middle, from emitter to receiver, m.
+    ``diameter``: m.
+    ``dark_at``, ``light_at``: shares of its light still there when the input switches; their
+    difference is the receiver's hysteresis.
     """
 
     start: Array
@@ -140,13 +136,11 @@ def _hull_distance(a: Array, b: Array, radius_a: float, radius_b: float) -> Arra
 class TrueInput:
     """What happens between a beam and a stamp.
 
-    Attributes
-    ----------
-    latency_s, jitter_s : constant and random delay.
-    sample_period_s : period of the input; an edge is seen at the next sample. 0: by interrupt.
-    first_sample_s : time of one of its samples; None: another one for each motion.
-    bounce_s : largest time for which a contact bounces; 0: none does.
-    lost_share : chance that an edge is never reported.
+    ``latency_s``, ``jitter_s``: constant and random delay.
+    ``sample_period_s``: period of the input; an edge is seen at the next sample. 0: by interrupt.
+    ``first_sample_s``: time of one of its samples; None: another one for each motion.
+    ``bounce_s``: largest time for which a contact bounces; 0: none does.
+    ``lost_share``: chance that an edge is never reported.
     """
 
     latency_s: float = 0.0

@@ -95,21 +95,19 @@ NEAR = float(np.radians(8.0))  # corrections are smaller, working poses further 
 class CellPlan:
     """What the cell is made of.
 
-    Attributes
-    ----------
-    robot : the true one; its ``nominal`` is what the program and the readings' users know.
-    station : the true one; its ``noise`` is the robot's scatter there.
-    tool : as it is mounted at the begin.
-    q_start : (n,) where the robot stands then.
-    fastest : (n,) or one for all: greatest speeds of its drives, rad/s (prismatic: m/s).
-    limits, lag_s : whether its drives refuse what is faster; their lag: see `JointMotion`.
-    controller : parameters of its trajectory controller.
-    rate_hz, reading_noise_rad : of the joint readings; without noise they are exact.
-    ripple : relative, of the speed of circles that the robot's program drives.
-    heat : what warms it up; None: it stays cold.
-    sphere : what it shows to a sensor; None: nothing.
-    profile : what it looks at with a sensor of its own; None: nothing.
-    working : (k, n) poses of its work, at which its tool is judged.
+    ``robot``: the true one; its ``nominal`` is what the program and the readings' users know.
+    ``station``: the true one; its ``noise`` is the robot's scatter there.
+    ``tool``: as it is mounted at the begin.
+    ``q_start`` (n,): where the robot stands then.
+    ``fastest``: (n,) or one for all: greatest speeds of its drives, rad/s (prismatic: m/s).
+    ``limits``, ``lag_s``: whether its drives refuse what is faster; their lag: see `JointMotion`.
+    ``controller``: parameters of its trajectory controller.
+    ``rate_hz``, ``reading_noise_rad``: of the joint readings; without noise they are exact.
+    ``ripple``: relative, of the speed of circles that the robot's program drives.
+    ``heat``: what warms it up; None: it stays cold.
+    ``sphere``: what it shows to a sensor; None: nothing.
+    ``profile``: what it looks at with a sensor of its own; None: nothing.
+    ``working`` (k, n): poses of its work, at which its tool is judged.
     """
 
     robot: TrueRobot
@@ -262,13 +260,11 @@ def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:
 class Happened:
     """What came of a stretch of time; each stamp bears what a fault did to it.
 
-    Attributes
-    ----------
-    time_s, q, qd : (k,), (k, n), (k, n) joint readings.
-    edges : those whose stamp has passed, in its order.
-    shots : measurements of the spheres that were told by now.
-    profiles : those that were told by now.
-    temperatures : of the motors.
+    ``time_s``, ``q``, ``qd``: (k,), (k, n), (k, n) joint readings.
+    ``edges``: those whose stamp has passed, in its order.
+    ``shots``: measurements of the spheres that were told by now.
+    ``profiles``: those that were told by now.
+    ``temperatures``: of the motors.
     """
 
     time_s: Array
@@ -295,12 +291,10 @@ STILL = 1e-9  # a joint that goes less in a tick stands, rad (prismatic: m)
 class SimulatedCell:
     """The cell over time, which begins at 0.
 
-    Attributes
-    ----------
-    motion : of the joints; ``gate``: what passes commands on to it, and its speed scaling.
-    next_tool : mounted when the next motion begins: how a tool gets bent.
-    faults : what is wrong now.
-    heating : None where the robot stays cold.
+    ``motion``: of the joints; ``gate``: what passes commands on to it, and its speed scaling.
+    ``next_tool``: mounted when the next motion begins: how a tool gets bent.
+    ``faults``: what is wrong now.
+    ``heating``: None where the robot stays cold.
     """
 
     def __init__(self, plan: CellPlan) -> None:

@@ -145,10 +145,8 @@ def size_of(fault: AnyFault, size: float = 0.0) -> float:
 class Faults:
     """What is wrong now.
 
-    Attributes
-    ----------
-    sizes : size, in SI, of each fault in force.
-    seed : of the cell; the directions in which its station is knocked follow from it.
+    ``sizes``: size, in SI, of each fault in force.
+    ``seed``: of the cell; the directions in which its station is knocked follow from it.
     """
 
     sizes: dict[AnyFault, float] = field(default_factory=dict)
@@ -267,9 +265,7 @@ class CommandGate:
 
     ``begun`` is called when one has been taken.
 
-    Attributes
-    ----------
-    scale : speed scaling that was asked for; 1 without.
+    ``scale``: speed scaling that was asked for; 1 without.
     """
 
     def __init__(

@@ -205,11 +205,9 @@ Commanded = tuple[NDArray[np.int64], Array]
 class CellOutputs:
     """Publishers of a cell.
 
-    Attributes
-    ----------
-    told : number of messages sent on each topic.
-    commanded : which (k,) working poses were commanded last, and the joints (k, n) for them; None
-        before.
+    ``told``: number of messages sent on each topic.
+    ``commanded``: which (k,) working poses were commanded last, and the joints (k, n) for them;
+    None before.
     """
 
     def __init__(

@@ -78,11 +78,9 @@ class Stem:
 class Prism:
     """A body of one cross-section.
 
-    Attributes
-    ----------
-    T_base_user : (4, 4) its frame.
-    outline : (k, 2) corners y, z of the cross-section, once around.
-    length_m : it reaches from x = 0 to there.
+    ``T_base_user`` (4, 4): its frame.
+    ``outline`` (k, 2): corners y, z of the cross-section, once around.
+    ``length_m``: it reaches from x = 0 to there.
     """
 
     T_base_user: Array
@@ -214,20 +212,19 @@ Mask = NDArray[np.bool_]
 class ProfileSensor:
     """A sensor.
 
-    Attributes
-    ----------
-    columns : of a profile, at equal steps of x / z.
-    near_m, far_m : measuring range along z.
-    half_angle_rad : of the fan.
-    baseline_m : y of the camera.
-    flattest_rad : angle from the surface's normal, of light or view, beyond which nothing is seen.
-    noise_m : standard deviation of z.
-    quantum_m : step of z; 0 without.
-    spikes, spike_m : share of speckled columns, and how far at most they are off along z.
-    dropouts : share of columns without a return.
-    gaps, gap_columns : number of longer gaps in a profile, and their width.
-    ghosts : share of columns where, given a second surface to mirror the light to, the camera
-        takes the mirrored spot for the direct one.
+    ``columns``: of a profile, at equal steps of x / z.
+    ``near_m``, ``far_m``: measuring range along z.
+    ``half_angle_rad``: of the fan.
+    ``baseline_m``: y of the camera.
+    ``flattest_rad``: angle from the surface's normal, of light or view, beyond which nothing is
+    seen.
+    ``noise_m``: standard deviation of z.
+    ``quantum_m``: step of z; 0 without.
+    ``spikes``, ``spike_m``: share of speckled columns, and how far at most they are off along z.
+    ``dropouts``: share of columns without a return.
+    ``gaps``, ``gap_columns``: number of longer gaps in a profile, and their width.
+    ``ghosts``: share of columns where, given a second surface to mirror the light to, the camera
+    takes the mirrored spot for the direct one.
     """
 
     columns: int = 1280
@@ -304,14 +301,13 @@ STEM_EXPANSION_PER_K = 12e-6  # steel
 class SphereSensor:
     """A sensor with its errors.
 
-    Attributes
-    ----------
-    T_sensor_base : (4, 4) where it stands.
-    ball : (3,) sphere centre in the flange frame, cold, m; the stem leads there from the flange's
-        centre.
-    noise : standard deviation of each coordinate, m.
-    warm_up : (3,) drift of a warm sensor in its own frame, m, reached with ``warm_up_tau_s``.
-    outlier_share, outlier_size : how often something else is measured, and how far off it is, m.
+    ``T_sensor_base`` (4, 4): where it stands.
+    ``ball`` (3,): sphere centre in the flange frame, cold, m; the stem leads there from the
+    flange's centre.
+    ``noise``: standard deviation of each coordinate, m.
+    ``warm_up`` (3,): drift of a warm sensor in its own frame, m, reached with ``warm_up_tau_s``.
+    ``outlier_share``, ``outlier_size``: how often something else is measured, and how far off it
+    is, m.
     """
 
     T_sensor_base: Array
@@ -358,11 +354,9 @@ class SphereSensor:
 class CloudScene:
     """How the sphere is seen.
 
-    Attributes
-    ----------
-    radius_m, noise_m : true radius, and scatter of the points along the normal.
-    half_angle_rad : of the cone of normals that the sensor still resolves.
-    stem, background, spikes : shares of the points that are not the sphere's.
+    ``radius_m``, ``noise_m``: true radius, and scatter of the points along the normal.
+    ``half_angle_rad``: of the cone of normals that the sensor still resolves.
+    ``stem``, ``background``, ``spikes``: shares of the points that are not the sphere's.
     """
 
     radius_m: float = 0.01905
@@ -412,13 +406,11 @@ SPHERE_ROOM = 1.3  # the field's corners are farther than its middle
 class SphereStation:
     """The sensor, its field and its pace.
 
-    Attributes
-    ----------
-    floor : (3,) centre of the sphere on the floor, in the sensor's frame, m.
-    floor_sigma_m : scatter of its measured centre, a mean of some readings.
-    points : of a cloud; 0: none, the centre alone is told.
-    settle_s, period_s : rest before the first measurement, and between two of them.
-    delay_s : from a measurement to when it is told.
+    ``floor`` (3,): centre of the sphere on the floor, in the sensor's frame, m.
+    ``floor_sigma_m``: scatter of its measured centre, a mean of some readings.
+    ``points``: of a cloud; 0: none, the centre alone is told.
+    ``settle_s``, ``period_s``: rest before the first measurement, and between two of them.
+    ``delay_s``: from a measurement to when it is told.
     """
 
     sensor: SphereSensor
@@ -473,11 +465,9 @@ class SphereStation:
 class SphereShot:
     """A measurement, in the sensor's frame, m.
 
-    Attributes
-    ----------
-    time_s, told_s : its stamp, and when it is told.
-    centre, floor : (3,) of the sphere on the flange and of the one on the floor.
-    points : (count, 3) of the first one's cloud; none where the station gives no clouds.
+    ``time_s``, ``told_s``: its stamp, and when it is told.
+    ``centre``, ``floor``: (3,) of the sphere on the flange and of the one on the floor.
+    ``points`` (count, 3): of the first one's cloud; none where the station gives no clouds.
     """
 
     time_s: float
@@ -494,12 +484,10 @@ TARGET_ROOM = 2.0  # a target further away than this many times the range is not
 class ProfileStation:
     """The sensor and its pace.
 
-    Attributes
-    ----------
-    T_flange_sensor : (4, 4) where it truly sits.
-    target : (3,) about where the scene is, base, m.
-    settle_s, period_s : rest before the first profile, and between two of them.
-    delay_s : from a profile to when it is told.
+    ``T_flange_sensor`` (4, 4): where it truly sits.
+    ``target`` (3,): about where the scene is, base, m.
+    ``settle_s``, ``period_s``: rest before the first profile, and between two of them.
+    ``delay_s``: from a profile to when it is told.
     """
 
     sensor: ProfileSensor

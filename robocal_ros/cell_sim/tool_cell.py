@@ -30,11 +30,9 @@ def _moved(T_base_flange: Array, shift: Array) -> Array:
 class Circle:
     """One turn, from ``start_s``, with a run-up and a run-out of ``ramp_s`` along the circle.
 
-    Attributes
-    ----------
-    T_base_centre : (4, 4) the flange at the centre.
-    R_base_laser : (3, 3) the circle lies in its x-y plane; ``start_rad`` counts from x.
-    ripple : relative amplitude of the speed, ``ripples`` times a turn.
+    ``T_base_centre`` (4, 4): the flange at the centre.
+    ``R_base_laser`` (3, 3): the circle lies in its x-y plane; ``start_rad`` counts from x.
+    ``ripple``: relative amplitude of the speed, ``ripples`` times a turn.
     """
 
     T_base_centre: Array
@@ -204,10 +202,8 @@ COUNT_RAD = 1e-6
 class SmoothPath:
     """Way points in order of time; between them the joints run smoothly (minimum jerk).
 
-    Attributes
-    ----------
-    arrive, depart : (w,) times of each way point, s.
-    q : (w, n) joint values there, rad.
+    ``arrive``, ``depart``: (w,) times of each way point, s.
+    ``q`` (w, n): joint values there, rad.
     """
 
     arrive: Array

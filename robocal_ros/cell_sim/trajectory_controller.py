@@ -34,12 +34,10 @@ MOST = 1000  # cycles that are computed together
 class Trajectory:
     """Points for joints ``names``, as a message holds them.
 
-    Attributes
-    ----------
-    time_s : (k,) from the start.
-    q, qd, qdd : (k, n) rad, rad/s, rad/s² (prismatic: m); zeros where a point has none.
-    has_qd, has_qdd : (k,) which points have them.
-    start_s : when it starts; None: when the controller first samples it.
+    ``time_s`` (k,): from the start.
+    ``q``, ``qd``, ``qdd``: (k, n) rad, rad/s, rad/s² (prismatic: m); zeros where a point has none.
+    ``has_qd``, ``has_qdd``: (k,) which points have them.
+    ``start_s``: when it starts; None: when the controller first samples it.
     """
 
     names: tuple[str, ...]
@@ -201,11 +199,9 @@ class TrajectoryGoal:
 class ControllerOptions:
     """Parameters of the controller, by its own names, with its defaults.
 
-    Attributes
-    ----------
-    velocity_states : the drives report velocities (``state_interfaces``); mock hardware with
-        positions alone does not.
-    goal_time : with ``trajectory`` and ``goal`` of each joint (prismatic: m): `Tolerances`.
+    ``velocity_states``: the drives report velocities (``state_interfaces``); mock hardware with
+    positions alone does not.
+    ``goal_time``: with ``trajectory`` and ``goal`` of each joint (prismatic: m): `Tolerances`.
     """
 
     velocity_states: bool = True
@@ -243,11 +239,9 @@ class Cycles:
 class TrajectoryController:
     """Of joints ``names`` that stand at ``q`` (n,), with a cycle of ``period_s``.
 
-    Attributes
-    ----------
-    scale : speed scaling, 0 and more; 0 halts and keeps what runs.
-    active : the goal that runs; None without one.
-    own_tolerances : those of the options.
+    ``scale``: speed scaling, 0 and more; 0 halts and keeps what runs.
+    ``active``: the goal that runs; None without one.
+    ``own_tolerances``: those of the options.
     """
 
     names: tuple[str, ...]
@@ -463,11 +457,9 @@ class JointMotion:
         Without, they follow: nobody behind a controller looks at its command.
     lag_s : drives smooth their command: a mean that lags so much, in whole half cycles.
 
-    Attributes
-    ----------
-    controller : takes trajectories, see `TrajectoryController`.
-    peak : (n,) greatest speeds that were commanded, rad/s (prismatic: m/s).
-    faults : number of drive faults; ``fault``: what the last one was.
+    ``controller``: takes trajectories, see `TrajectoryController`.
+    ``peak`` (n,): greatest speeds that were commanded, rad/s (prismatic: m/s).
+    ``faults``: number of drive faults; ``fault``: what the last one was.
     """
 
     def __init__(

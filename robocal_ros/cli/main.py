@@ -234,11 +234,9 @@ Document = dict[str, Any]
 class CliResult:
     """Result of a command.
 
-    Attributes
-    ----------
-    document : what ``--json`` prints; finite numbers only.
-    render : prints the same for people.
-    exit_code : exit status.
+    ``document``: what ``--json`` prints; finite numbers only.
+    ``render``: prints the same for people.
+    ``exit_code``: exit status.
     """
 
     document: Document

@@ -181,15 +181,13 @@ _OF_OTHER_NODES = {"tool": replay_tool, "hand_eye": replay_hand_eye}
 class ReplayRequest:
     """What to replay and how.
 
-    Attributes
-    ----------
-    find_robot : gives the arm for the recorded configuration (None: nothing was recorded).
-    robot_named : whether the user said which robot it is.
-    cold, warm : windows, s from the first joint reading; without any the recorded commands.
-    topics : input to topic of the bag, where given.
-    state : folder of a history that is kept; None: one that is not.
-    accept : with ``auto``, accept each candidate that its verdict accepts.
-    observe : gets a thermal session and its samples, and hands these on.
+    ``find_robot``: gives the arm for the recorded configuration (None: nothing was recorded).
+    ``robot_named``: whether the user said which robot it is.
+    ``cold``, ``warm``: windows, s from the first joint reading; without any the recorded commands.
+    ``topics``: input to topic of the bag, where given.
+    ``state``: folder of a history that is kept; None: one that is not.
+    ``accept``: with ``auto``, accept each candidate that its verdict accepts.
+    ``observe``: gets a thermal session and its samples, and hands these on.
     """
 
     bag: Path

@@ -383,12 +383,10 @@ class CycleErrors:
 class ReplayedCycle:
     """A candidate of the history, with the errors around it.
 
-    Attributes
-    ----------
-    hours : since the cold reference, else since the first joint reading.
-    measured : at the cycle's own poses, by models that it did not make; None for a calibration.
-    true : at check poses that were never measured; None without a truth.
-    drift, sigma : (k,) since the cold reference, SI.
+    ``hours``: since the cold reference, else since the first joint reading.
+    ``measured``: at the cycle's own poses, by models that it did not make; None for a calibration.
+    ``true``: at check poses that were never measured; None without a truth.
+    ``drift``, ``sigma``: (k,) since the cold reference, SI.
     """
 
     entry: Entry

@@ -98,15 +98,13 @@ class TemperatureSample:
 class Measurements:
     """Joint readings paired with measured positions or poses of named targets on the flange.
 
-    Attributes
-    ----------
-    q : (m, n) joint readings, rad (prismatic: m).
-    position : (m, 3) target position in the measuring frame, m.
-    target : m names; each name is one point (or frame) fixed to the flange.
-    sample : m unique ids, for naming rejected samples.
-    rotation : (m, 3, 3) R_frame_target, or None when only positions were measured.
-    sigma : (m,) standard deviation of each position coordinate, m, or None when unknown.
-    stamp_ns : (m,) int64, or None.
+    ``q`` (m, n): joint readings, rad (prismatic: m).
+    ``position`` (m, 3): target position in the measuring frame, m.
+    ``target``: m names; each name is one point (or frame) fixed to the flange.
+    ``sample``: m unique ids, for naming rejected samples.
+    ``rotation`` (m, 3, 3): R_frame_target, or None when only positions were measured.
+    ``sigma`` (m,): standard deviation of each position coordinate, m, or None when unknown.
+    ``stamp_ns`` (m,): int64, or None.
     """
 
     q: Array
@@ -364,11 +362,9 @@ CLOCK_JUMP_NS = 1_000_000_000
 class StandstillRule:
     """When a robot counts as standing still around an instant.
 
-    Attributes
-    ----------
-    before_s, after_s : the window about the instant.
-    tolerance_rad : largest range of any joint in the window (prismatic: m).
-    gap_s : longest pause between two joint readings in the window.
+    ``before_s``, ``after_s``: the window about the instant.
+    ``tolerance_rad``: largest range of any joint in the window (prismatic: m).
+    ``gap_s``: longest pause between two joint readings in the window.
     """
 
     before_s: float = 0.3

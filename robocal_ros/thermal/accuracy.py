@@ -32,10 +32,8 @@ FEWEST_CYCLES = 10
 class LearnedDrift:
     """Expected drift.
 
-    Attributes
-    ----------
-    covariance : (k, k) of the free parameters' drift since the cold visit, SI.
-    cycles : how many cycles it was learned from.
+    ``covariance`` (k, k): of the free parameters' drift since the cold visit, SI.
+    ``cycles``: how many cycles it was learned from.
     """
 
     covariance: Array
@@ -101,10 +99,8 @@ class EarlierShift:
 class LearnedProcess:
     """What a tracker needs.
 
-    Attributes
-    ----------
-    process, sigma_m : of the drift, and of one coordinate of one visit.
-    gains : of the motors' temperatures; None: track without them.
+    ``process``, ``sigma_m``: of the drift, and of one coordinate of one visit.
+    ``gains``: of the motors' temperatures; None: track without them.
     """
 
     process: DriftProcess
@@ -407,10 +403,8 @@ class AccuracyLevel(IntEnum):
 class Work:
     """Where the tool is to be accurate.
 
-    Attributes
-    ----------
-    q : (m, n) working poses, rad (prismatic: m); None: throughout the joint limits.
-    tip : (3,) of the tool, flange, m; None: the first measured target.
+    ``q`` (m, n): working poses, rad (prismatic: m); None: throughout the joint limits.
+    ``tip`` (3,): of the tool, flange, m; None: the first measured target.
     """
 
     q: Array | None = None
@@ -428,10 +422,8 @@ class Work:
 class ToolError:
     """Expected error of the tool at all poses of the work, m.
 
-    Attributes
-    ----------
-    rms_m : root mean square length.
-    bound_m : 95 % of the errors are shorter.
+    ``rms_m``: root mean square length.
+    ``bound_m``: 95 % of the errors are shorter.
     """
 
     rms_m: float
@@ -565,10 +557,8 @@ def _over_mean(freedom: float) -> float:
 class Accuracy:
     """What the line reads.
 
-    Attributes
-    ----------
-    error : expected error of the tool; None where it is not known.
-    due_in_s : time until a measurement is due; negative when overdue, 0 where nothing is known.
+    ``error``: expected error of the tool; None where it is not known.
+    ``due_in_s``: time until a measurement is due; negative when overdue, 0 where nothing is known.
     """
 
     level: AccuracyLevel

@@ -52,15 +52,13 @@ NAMES = (
 class SensorCalibration:
     """A placed sensor.
 
-    Attributes
-    ----------
-    T_sensor_base : (4, 4) the robot's base in the sensor's frame.
-    sphere_in_flange : (3,) centre of the sphere in the flange frame, m.
-    covariance : (9, 9), SI, of ``NAMES``: shift of the base and turn about it (sensor axes), and
-        the sphere (flange axes); None for the classic method, which has no noise model.
-    residual : (m, 3) predicted minus measured centre, sensor axes, m.
-    left_out : (m,) distance at each pose of a calibration from the others, m.
-    rejected : names of the samples that do not fit the others.
+    ``T_sensor_base`` (4, 4): the robot's base in the sensor's frame.
+    ``sphere_in_flange`` (3,): centre of the sphere in the flange frame, m.
+    ``covariance``: (9, 9), SI, of ``NAMES``: shift of the base and turn about it (sensor axes), and
+    the sphere (flange axes); None for the classic method, which has no noise model.
+    ``residual`` (m, 3): predicted minus measured centre, sensor axes, m.
+    ``left_out`` (m,): distance at each pose of a calibration from the others, m.
+    ``rejected``: names of the samples that do not fit the others.
     """
 
     method: SensorMethod
@@ -308,13 +306,11 @@ class SensorField:
 class PosePlan:
     """Chosen poses in the order of the shortest way.
 
-    Attributes
-    ----------
-    q : (m, n) joints.
-    chosen : (m,) their places among the candidates.
-    predicted_rms_m : error of the tool at the working poses after one cycle of them.
-    random_rms_m : the same of as many candidates drawn at random, median of 50 draws.
-    before_rms_m : the same of the prior, without any cycle.
+    ``q`` (m, n): joints.
+    ``chosen`` (m,): their places among the candidates.
+    ``predicted_rms_m``: error of the tool at the working poses after one cycle of them.
+    ``random_rms_m``: the same of as many candidates drawn at random, median of 50 draws.
+    ``before_rms_m``: the same of the prior, without any cycle.
     """
 
     q: Array
@@ -394,11 +390,9 @@ def _seen(cell: CellModel, field: SensorField, q: Array) -> NDArray[np.bool_]:
 class Design:
     """What each candidate measures, and what matters.
 
-    Attributes
-    ----------
-    rows : (c, 3, d) of the drift and the set-up, whitened by the noise of a displacement.
-    prior : (d, d) covariance before the cycle.
-    weight : (d, d): the mean squared error at the working poses is trace(weight C).
+    ``rows`` (c, 3, d): of the drift and the set-up, whitened by the noise of a displacement.
+    ``prior`` (d, d): covariance before the cycle.
+    ``weight`` (d, d): the mean squared error at the working poses is trace(weight C).
     """
 
     rows: Array
@@ -532,10 +526,8 @@ COLD_VISITS = 3
 class PlannedCycle:
     """Planned poses beside a user's own.
 
-    Attributes
-    ----------
-    own_rms_m : predicted error of the tool after a cycle of the user's own poses; None without.
-    candidates, working : how many poses there were to choose from, and to judge at.
+    ``own_rms_m``: predicted error of the tool after a cycle of the user's own poses; None without.
+    ``candidates``, ``working``: how many poses there were to choose from, and to judge at.
     """
 
     plan: PosePlan

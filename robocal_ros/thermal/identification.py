@@ -71,12 +71,10 @@ _VISIBLE = 1e-6  # share of an undetermined direction that counts as being in it
 class SubsetDrift:
     """Drift of p chosen parameters in t cycles.
 
-    Attributes
-    ----------
-    chosen : (p,) columns of the parameters.
-    drift : (t, p) since the cold visit, SI.
-    basis : (3m, p) orthonormal, of the displacements that the chosen parameters can cause.
-    inverse : (p, p) from coordinates in that basis to parameters.
+    ``chosen`` (p,): columns of the parameters.
+    ``drift`` (t, p): since the cold visit, SI.
+    ``basis`` (3m, p): orthonormal, of the displacements that the chosen parameters can cause.
+    ``inverse`` (p, p): from coordinates in that basis to parameters.
     """
 
     chosen: Index
@@ -204,17 +202,15 @@ FEWEST_POSES = 2
 class CycleDrift:
     """A drift identified from one cycle.
 
-    Attributes
-    ----------
-    drift, covariance : (k,) of the free parameters since the cold visit, and (k, k), SI.
-    prior_covariance : (k, k) of the drift before the cycle; None where there was none.
-    arm : the cold arm with the drift added.
-    warm : the visits, those of one pose averaged; m of them.
-    left_out : (m, 3) displacement at each sample less what all other samples say of it, m.
-    left_out_sigma : (m,) rms length of the same that the covariances predict, m.
-    rejected : (m,) samples that the others contradict.
-    noise_m : rms standard deviation of a coordinate of the visits.
-    seen, unobservable : what the data alone determine, and what not, in words.
+    ``drift``, ``covariance``: (k,) of the free parameters since the cold visit, and (k, k), SI.
+    ``prior_covariance`` (k, k): of the drift before the cycle; None where there was none.
+    ``arm``: the cold arm with the drift added.
+    ``warm``: the visits, those of one pose averaged; m of them.
+    ``left_out`` (m, 3): displacement at each sample less what all other samples say of it, m.
+    ``left_out_sigma`` (m,): rms length of the same that the covariances predict, m.
+    ``rejected`` (m,): samples that the others contradict.
+    ``noise_m``: rms standard deviation of a coordinate of the visits.
+    ``seen``, ``unobservable``: what the data alone determine, and what not, in words.
     """
 
     drift: Array
@@ -358,10 +354,8 @@ SENSOR_WANDER_M = 1e-5  # a sensor that warms up moves by so much without a knoc
 class Cause:
     """Something that may have moved.
 
-    Attributes
-    ----------
-    name : ``sensor`` (or the robot's base, which looks the same), ``sphere``, or a joint's name.
-    words : what moved and by how much.
+    ``name``: ``sensor`` (or the robot's base, which looks the same), ``sphere``, or a joint's name.
+    ``words``: what moved and by how much.
     """
 
     name: str
@@ -372,10 +366,8 @@ class Cause:
 class FixedSphere:
     """How a sphere that is fixed in the cell has moved since the cold visit.
 
-    Attributes
-    ----------
-    shift_m : (3,) in the measuring frame.
-    moved : whether by more than noise and the sensor's own wander allow.
+    ``shift_m`` (3,): in the measuring frame.
+    ``moved``: whether by more than noise and the sensor's own wander allow.
     """
 
     shift_m: Array

@@ -30,15 +30,13 @@ CONTRADICTION = 8.0  # median distances from the spot's median; noise alone stay
 class ColdSpots:
     """Each pose and target of a cold visit once.
 
-    Attributes
-    ----------
-    cell : the cold model with base and targets.
-    q : (s, n) mean joints.
-    target : (s,) index into the cell's targets.
-    error : (s, 3) mean of predicted minus measured position, m; the arm's static errors.
-    visits : (s,) how many cold measurements went into it.
-    first : (s,) the first of them.
-    rejected : names of cold measurements that other visits of the same spot contradict.
+    ``cell``: the cold model with base and targets.
+    ``q`` (s, n): mean joints.
+    ``target`` (s,): index into the cell's targets.
+    ``error`` (s, 3): mean of predicted minus measured position, m; the arm's static errors.
+    ``visits`` (s,): how many cold measurements went into it.
+    ``first`` (s,): the first of them.
+    ``rejected``: names of cold measurements that other visits of the same spot contradict.
     """
 
     cell: CellModel
@@ -167,13 +165,12 @@ class ColdSpots:
 class ColdReference:
     """Cold visit of the measuring poses.
 
-    Attributes
-    ----------
-    cell : the cold model with base and targets as fitted to the cold visit.
-    data : the cold measurements.
-    rejected : names of those that did not fit the others.
-    temperature : (n,) of the motors, degrees Celsius; None where they were not read.
-    fixed : (n, 3) centres of a sphere fixed in the cell, measured at the same visit, m; n may be 0.
+    ``cell``: the cold model with base and targets as fitted to the cold visit.
+    ``data``: the cold measurements.
+    ``rejected``: names of those that did not fit the others.
+    ``temperature`` (n,): of the motors, degrees Celsius; None where they were not read.
+    ``fixed`` (n, 3): centres of a sphere fixed in the cell, measured at the same visit, m; n may be
+    0.
     """
 
     cell: CellModel
@@ -279,10 +276,8 @@ ONLY_CYCLE = "1"
 class Visits:
     """Measurements at named poses.
 
-    Attributes
-    ----------
-    pose : (m,) name of the pose, which cold and warm visits share.
-    cycle : (m,) name of the cycle; all ``ONLY_CYCLE`` where none is given.
+    ``pose`` (m,): name of the pose, which cold and warm visits share.
+    ``cycle`` (m,): name of the cycle; all ``ONLY_CYCLE`` where none is given.
     """
 
     data: Measurements
@@ -367,9 +362,8 @@ FALSE_ALARM = 0.001  # chance that a set-up that stands still looks moved
 class DriftShare:
     """How much of a drift is in a visit: 0 for the cold robot, 1 for one as warm as the drift.
 
-    Attributes
-    ----------
-    share, sigma : its estimate and standard deviation; infinite where the visit shows nothing.
+    ``share``, ``sigma``: its estimate and standard deviation; infinite where the visit shows
+    nothing.
     """
 
     share: float = 0.5

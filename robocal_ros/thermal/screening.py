@@ -22,13 +22,11 @@ FEWEST_KNOWN = 21  # as many as the test of stationarity needs
 class DriftHistory:
     """Displacements since the cold visit in t cycles, in order of time.
 
-    Attributes
-    ----------
-    names : (k,) parameters.
-    displacement, rows : (t, 3m) at the spots, m, and (3m, k) the same by each parameter, in
-        measuring axes. They identify.
-    check, check_rows : (t, 3c) and (3c, k) at the check points, in axes of their own if need
-        be. They judge.
+    ``names`` (k,): parameters.
+    ``displacement``, ``rows``: (t, 3m) at the spots, m, and (3m, k) the same by each parameter, in
+    measuring axes. They identify.
+    ``check``, ``check_rows``: (t, 3c) and (3c, k) at the check points, in axes of their own if need
+    be. They judge.
     """
 
     names: tuple[str, ...]
@@ -119,12 +117,10 @@ FEWEST = 3 * LAGS
 class Stationarity:
     """Tests of k series, each against white noise about a level.
 
-    Attributes
-    ----------
-    autocorrelation : (LAGS, k) at lags 1 ... LAGS.
-    bound : half width of the interval that holds 95 % of a white series' autocorrelations.
-    outside : (k,) how many lags lie outside it; ``allowed`` of them is what chance allows.
-    p_value : (k,) of Ljung and Box's test.
+    ``autocorrelation`` (LAGS, k): at lags 1 ... LAGS.
+    ``bound``: half width of the interval that holds 95 % of a white series' autocorrelations.
+    ``outside`` (k,): how many lags lie outside it; ``allowed`` of them is what chance allows.
+    ``p_value`` (k,): of Ljung and Box's test.
     """
 
     autocorrelation: Array
@@ -200,15 +196,13 @@ UNDETERMINED = -1.0  # orders a set that the poses do not determine below any sh
 class Round:
     """One round: the parameters left at its beginning.
 
-    Attributes
-    ----------
-    names : the parameters left.
-    share : lambda with these identified; None where the poses do not determine them.
-    undetermined : the directions that the poses leave open, in words.
-    stationary : the set S, in the order of ``names``.
-    candidates : those of which one is removed: S; all, if S is empty; where a direction is
-        open those in it, because their series mean nothing.
-    removed : the one that is; None in the last round.
+    ``names``: the parameters left.
+    ``share``: lambda with these identified; None where the poses do not determine them.
+    ``undetermined``: the directions that the poses leave open, in words.
+    ``stationary``: the set S, in the order of ``names``.
+    ``candidates``: those of which one is removed: S; all, if S is empty; where a direction is open
+    those in it, because their series mean nothing.
+    ``removed``: the one that is; None in the last round.
     """
 
     names: tuple[str, ...]
@@ -396,10 +390,8 @@ _AT_ONCE = 20_000
 class BestSubset:
     """The subset of its size that explains most.
 
-    Attributes
-    ----------
-    names : its parameters.
-    cp : Mallows' C_p per cycle; a subset without bias has about as much as it has parameters.
+    ``names``: its parameters.
+    ``cp``: Mallows' C_p per cycle; a subset without bias has about as much as it has parameters.
     """
 
     names: tuple[str, ...]

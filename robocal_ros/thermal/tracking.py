@@ -39,12 +39,10 @@ class DriftProcess:
     the flange) does the same in its own small way: sensors warm up and stems expand, and neither
     may pass for a drift of the arm.
 
-    Attributes
-    ----------
-    covariance : (k, k) of the parameters' steady state, SI.
-    approach_s, steady_s : time constants; the first one is the shorter.
-    setup_sigma_m, setup_approach_s : standard deviation of the steady state of each of the
-        set-up's six coordinates, and how fast they approach it.
+    ``covariance`` (k, k): of the parameters' steady state, SI.
+    ``approach_s``, ``steady_s``: time constants; the first one is the shorter.
+    ``setup_sigma_m``, ``setup_approach_s``: standard deviation of the steady state of each of the
+    set-up's six coordinates, and how fast they approach it.
 
     Raises `InputError` when the steady state is forgotten before it is approached.
     """
@@ -89,11 +87,9 @@ SWING_TIME_S = 3600.0
 class Heat:
     """Motor temperatures above those at the cold visit, K: as last read, and lagged.
 
-    Attributes
-    ----------
-    time_s : of the last reading.
-    motor, lagged : (n,).
-    lag_s : time constant of the lag.
+    ``time_s``: of the last reading.
+    ``motor``, ``lagged``: (n,).
+    ``lag_s``: time constant of the lag.
     """
 
     time_s: float
@@ -156,10 +152,8 @@ class Heat:
 class HeatGains:
     """Change of each parameter per kelvin of each of its sources.
 
-    Attributes
-    ----------
-    mean, covariance : (3k,) and (3k, 3k), SI per K; parameter by parameter.
-    lag_s : how slowly links follow the motors.
+    ``mean``, ``covariance``: (3k,) and (3k, 3k), SI per K; parameter by parameter.
+    ``lag_s``: how slowly links follow the motors.
     """
 
     mean: Array
@@ -202,17 +196,15 @@ class DriftState:
 class Innovation:
     """What a cycle brought against what was expected.
 
-    Attributes
-    ----------
-    time_s : at which the expectation was.
-    squared, freedom : normalised square of the innovation, and its degrees of freedom.
-    limit : the square above which a cycle is not applied.
-    applied : whether it was.
-    kept : (m,) samples that agree with the others.
-    deviation, covariance : (3m,) measured less expected displacement, m, and (3m, 3m) what the
-        tracker expected of it.
-    log_likelihood : of all samples; those that do not fit lie anywhere within a millimetre.
-    whitened : (freedom,) the innovation in units of its own spread: standard normal.
+    ``time_s``: at which the expectation was.
+    ``squared``, ``freedom``: normalised square of the innovation, and its degrees of freedom.
+    ``limit``: the square above which a cycle is not applied.
+    ``applied``: whether it was.
+    ``kept`` (m,): samples that agree with the others.
+    ``deviation``, ``covariance``: (3m,) measured less expected displacement, m, and (3m, 3m) what
+    the tracker expected of it.
+    ``log_likelihood``: of all samples; those that do not fit lie anywhere within a millimetre.
+    ``whitened`` (freedom,): the innovation in units of its own spread: standard normal.
     """
 
     time_s: float
@@ -438,11 +430,10 @@ class DriftTracker:
 class TrackedCycle:
     """A cycle that the tracker took or refused.
 
-    Attributes
-    ----------
-    found : the drift after the cycle; before it where the cycle was refused.
-    judged : figures and verdict; each pose is forecast from all earlier cycles and the other poses.
-    innovation : what the cycle brought against what was expected.
+    ``found``: the drift after the cycle; before it where the cycle was refused.
+    ``judged``: figures and verdict; each pose is forecast from all earlier cycles and the other
+    poses.
+    ``innovation``: what the cycle brought against what was expected.
     """
 
     found: CycleDrift

@@ -53,12 +53,10 @@ class BeamEdge:
 class InputRule:
     """What the input does to an edge.
 
-    Attributes
-    ----------
-    jitter_s : standard deviation of a stamp.
-    sample_period_s : period at which the input is read; 0 where edges are stamped by interrupt.
-        An edge is seen up to one period late: half of it is latency, the rest is uniform.
-    debounce_s : edges of one beam closer than this belong to one contact that bounces.
+    ``jitter_s``: standard deviation of a stamp.
+    ``sample_period_s``: period at which the input is read; 0 where edges are stamped by interrupt.
+    An edge is seen up to one period late: half of it is latency, the rest is uniform.
+    ``debounce_s``: edges of one beam closer than this belong to one contact that bounces.
     """
 
     jitter_s: float = 20e-6
@@ -228,10 +226,8 @@ class StepWatch:
     or leaves, or when edges are missing and it has left or rested for long. The last step of a
     run is over with its last edge.
 
-    Attributes
-    ----------
-    up : (3,) the laser's z, base.
-    first_edge_s : time of the first edge; None before.
+    ``up`` (3,): the laser's z, base.
+    ``first_edge_s``: time of the first edge; None before.
     """
 
     kind: StepKind

@@ -85,10 +85,8 @@ ABB_REMARK = "! mass and centre of gravity are placeholders: enter this tool's, 
 class Load:
     """What ABB's tooldata holds beside the frame.
 
-    Attributes
-    ----------
-    mass_kg : of the tool, above 0.
-    centre : (x, y, z) of gravity in the flange frame, m.
+    ``mass_kg``: of the tool, above 0.
+    ``centre`` (x, y, z): of gravity in the flange frame, m.
     """
 
     mass_kg: float

@@ -39,11 +39,9 @@ LEVERS = 65
 class BendRule:
     """Where a tool may bend.
 
-    Attributes
-    ----------
-    nearest_m : lever of a bend at or below the upper circle. What bends below it also looks as if
-        it had this one: the axis is the line through both circles, and the tip lies on it.
-    farthest_m : from the mount to the tip; nothing of the tool bends beyond.
+    ``nearest_m``: lever of a bend at or below the upper circle. What bends below it also looks as
+    if it had this one: the axis is the line through both circles, and the tip lies on it.
+    ``farthest_m``: from the mount to the tip; nothing of the tool bends beyond.
     """
 
     nearest_m: float
@@ -62,11 +60,10 @@ class BendRule:
 class Witness:
     """What a change of the measured tool says of its cause.
 
-    Attributes
-    ----------
-    tip_m : how far the tip seems to have moved.
-    tilt_rad, tilt_sigma_rad : of the axis, and its standard deviation in one direction.
-    lever_m : that explains shift and tilt best. It and the sigma are None where no noise is known.
+    ``tip_m``: how far the tip seems to have moved.
+    ``tilt_rad``, ``tilt_sigma_rad``: of the axis, and its standard deviation in one direction.
+    ``lever_m``: that explains shift and tilt best. It and the sigma are None where no noise is
+    known.
     """
 
     cause: Cause
@@ -163,11 +160,9 @@ UNCHANGED = 0.95  # a difference below this quantile of its noise is none
 class ToolLimits:
     """What a tool measurement may say without being doubted.
 
-    Attributes
-    ----------
-    sigma_m : largest standard deviation of the tip in any direction.
-    change_m, tilt_rad : largest change from the taught tool: what the joint correction makes up
-        for, so that no tool is proposed that it would not take over.
+    ``sigma_m``: largest standard deviation of the tip in any direction.
+    ``change_m``, ``tilt_rad``: largest change from the taught tool: what the joint correction makes
+    up for, so that no tool is proposed that it would not take over.
     """
 
     sigma_m: float = 2e-4
@@ -179,12 +174,10 @@ class ToolLimits:
 class KnownTool:
     """A tool as it is kept.
 
-    Attributes
-    ----------
-    T_flange_tool : (4, 4) pose in the flange frame.
-    covariance : (5, 5) as of a `ToolEstimate`; None: not measured.
-    own_covariance : (5, 5) what of it is its own run's alone; None: not known.
-    against : (4, 4) the healthy tool as measured, where this tool is the change against it.
+    ``T_flange_tool`` (4, 4): pose in the flange frame.
+    ``covariance`` (5, 5): as of a `ToolEstimate`; None: not measured.
+    ``own_covariance`` (5, 5): what of it is its own run's alone; None: not known.
+    ``against`` (4, 4): the healthy tool as measured, where this tool is the change against it.
     """
 
     T_flange_tool: Array
@@ -376,11 +369,9 @@ LOOSE = 0.999  # and a mandrel that is sound to have tilted one in a thousand
 class StationFinding:
     """What a mandrel says of the station.
 
-    Attributes
-    ----------
-    shift : (3,) of the beams' crossing since the commissioning, base, m; ``covariance`` (3, 3).
-    verdict : ACCEPT: it stands. STATION_MOVED: it does not. TOO_FEW_SAMPLES: cannot be told.
-        WRONG_TOOL: the mandrel itself has tilted, which no knock of the station makes of it.
+    ``shift`` (3,): of the beams' crossing since the commissioning, base, m; ``covariance`` (3, 3).
+    ``verdict``: ACCEPT: it stands. STATION_MOVED: it does not. TOO_FEW_SAMPLES: cannot be told.
+    WRONG_TOOL: the mandrel itself has tilted, which no knock of the station makes of it.
     """
 
     shift: Array
@@ -470,10 +461,8 @@ HELD_ALONG_M = 5e-3  # nor how far the tip reaches
 class CheckRule:
     """What a tool may move.
 
-    Attributes
-    ----------
-    limit_m : largest deviation of the tip.
-    lever_m : from where a bent tool bends to its tip; a tool bends at its mount.
+    ``limit_m``: largest deviation of the tip.
+    ``lever_m``: from where a bent tool bends to its tip; a tool bends at its mount.
     """
 
     limit_m: float = 2e-4
@@ -484,13 +473,11 @@ class CheckRule:
 class QuickCheck:
     """The answer.
 
-    Attributes
-    ----------
-    deviation : (3,) of the tip from the stored one, tool axes, m; ``covariance`` (3, 3) of it.
-        Along the axis 0 where the tip is too far off sideways for the plunge to tell.
-    deviation_m, sigma_m : length of it, and the standard deviation along it.
-    tilt_rad : the tilt that moves the tip sideways by as much, if the tool bent at its mount; one
-        circle cannot tell a tilt from a shift.
+    ``deviation`` (3,): of the tip from the stored one, tool axes, m; ``covariance`` (3, 3) of it.
+    Along the axis 0 where the tip is too far off sideways for the plunge to tell.
+    ``deviation_m``, ``sigma_m``: length of it, and the standard deviation along it.
+    ``tilt_rad``: the tilt that moves the tip sideways by as much, if the tool bent at its mount;
+    one circle cannot tell a tilt from a shift.
     """
 
     answer: Answer

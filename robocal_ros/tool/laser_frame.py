@@ -39,14 +39,12 @@ class LaserFrame:
     Raises `RankDeficientError` when two points of a beam coincide, or the beams are nearly
     parallel; `InputError` when the beams pass each other at more than 2 mm.
 
-    Attributes
-    ----------
-    points : (4, 3) points A, B on the x-beam and C, D on the y-beam, base, m; beams point from A
-        to B and from C to D, from emitter to receiver.
-    sigma_m : standard deviation of each coordinate of a point across its beam; 0 where the same
-        frame serves both measurements of a change, so that its error cancels.
-    reach : (2,) how far from its middle each beam is broken, m: negative where a tool must cover
-        more than half of the light. It moves the height of a tip, and nothing else.
+    ``points`` (4, 3): points A, B on the x-beam and C, D on the y-beam, base, m; beams point from A
+    to B and from C to D, from emitter to receiver.
+    ``sigma_m``: standard deviation of each coordinate of a point across its beam; 0 where the same
+    frame serves both measurements of a change, so that its error cancels.
+    ``reach`` (2,): how far from its middle each beam is broken, m: negative where a tool must cover
+    more than half of the light. It moves the height of a tip, and nothing else.
     """
 
     points: Array
@@ -166,11 +164,9 @@ REQUIRED = ("station", "points_mm", "sigma_mm", "reach_mm", "robot", "model_hash
 class LaserFile:
     """Beams in a robot's base, and whose they are.
 
-    Attributes
-    ----------
-    station : name of the beams' station, as its edges carry it.
-    robot, model_hash : the nominal model whose flange poses placed the beams.
-    serial : of the robot, where it is known.
+    ``station``: name of the beams' station, as its edges carry it.
+    ``robot``, ``model_hash``: the nominal model whose flange poses placed the beams.
+    ``serial``: of the robot, where it is known.
     """
 
     laser: LaserFrame
@@ -257,12 +253,10 @@ class JointPath:
     Raises `TooFewSamplesError` or `InputError`: fewer than four readings; stamps that do not
     increase.
 
-    Attributes
-    ----------
-    arm : the model in force, so that the thermal drift is in the poses.
-    time_s : (n,) stamps of the readings, in increasing order.
-    q : (n, joints) readings, rad (prismatic: m).
-    longest_gap_s : longest pause between two readings around an edge.
+    ``arm``: the model in force, so that the thermal drift is in the poses.
+    ``time_s`` (n,): stamps of the readings, in increasing order.
+    ``q`` (n, joints): readings, rad (prismatic: m).
+    ``longest_gap_s``: longest pause between two readings around an edge.
     """
 
     arm: SerialArm

@@ -132,9 +132,7 @@ class TcfOutputs:
     add : creates a publisher.
     base : name of the base frame.
 
-    Attributes
-    ----------
-    missing : what cannot be published on this machine; empty when everything can.
+    ``missing``: what cannot be published on this machine; empty when everything can.
     """
 
     def __init__(

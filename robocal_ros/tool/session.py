@@ -71,10 +71,8 @@ from robocal_ros.tool.run import (
 class ToolInForce(HistoryFollower):
     """What the history has in force for a tool, as of the last look.
 
-    Attributes
-    ----------
-    head, thermal, healthy, mandrel : heads of the tools, of the thermal models and of the
-        measurements of the healthy tool and of the mandrel.
+    ``head``, ``thermal``, ``healthy``, ``mandrel``: heads of the tools, of the thermal models and
+    of the measurements of the healthy tool and of the mandrel.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
@@ -392,10 +390,8 @@ class ToolSession(SessionBase):
     A command ``measure_tool`` begins a run; each step that `recognised` sees the end of becomes a
     command of its own, so that a recording holds which samples it was made of.
 
-    Attributes
-    ----------
-    current : tool, thermal model and healthy tool in force.
-    run : the run that is open; None while there is none.
+    ``current``: tool, thermal model and healthy tool in force.
+    ``run``: the run that is open; None while there is none.
     """
 
     def __init__(

@@ -73,12 +73,10 @@ class _TouchProblem:
 class TouchFit:
     """A touched tool.
 
-    Attributes
-    ----------
-    tip : (3,) flange frame, m; ``covariance`` (3, 3), m^2.
-    point : (3,) the touched point, base, m.
-    rotation : R_flange_tool (3, 3) of seven points; None of four.
-    residual : (m, 3) of the touches, base, m.
+    ``tip`` (3,): flange frame, m; ``covariance`` (3, 3), m^2.
+    ``point`` (3,): the touched point, base, m.
+    ``rotation``: R_flange_tool (3, 3) of seven points; None of four.
+    ``residual`` (m, 3): of the touches, base, m.
     """
 
     tip: Array
