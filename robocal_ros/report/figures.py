@@ -125,34 +125,25 @@ def error_by_pose(report: ShiftErrors) -> Figure:
     return figure
 
 
-@dataclass(frozen=True, eq=False)
-class ModelDrift:
-    """How the models of a session's cycles moved.
-
-    ``hours`` (c,) of each model; names of the k parameters, with their unit; ``drift`` in those
-    units and its ``sigma`` (c, k).
-    """
-
-    hours: Array
-    parameter_names: Sequence[str]
-    drift: Array
-    sigma: Array
-
-
-def parameter_drift(report: ModelDrift) -> Figure:
+def parameter_drift(cycles: Sequence[Document]) -> Figure:
     """Drift of the parameters that moved most in units of their sigma, with two sigma."""
+    hours = [cycle["hours"] for cycle in cycles]
+    drift, spread = (
+        np.array([list(cycle[key].values()) for cycle in cycles]) for key in ("drift", "sigma")
+    )
+    names = list(cycles[0]["drift"])
     with mpl.rc_context(STYLE | {"axes.titlesize": 9.5, "axes.titlepad": 5, "font.size": 8.5}):
         figure = Figure(figsize=(8.0, 3.8), layout="constrained")
-        size = np.max(np.abs(report.drift) / np.maximum(report.sigma, 1e-12), axis=0)
+        size = np.max(np.abs(drift) / np.maximum(spread, 1e-12), axis=0)
         chosen = np.sort(np.argsort(-size)[:SHOWN_PARAMETERS])
         grid = figure.subplots(2, (len(chosen) + 1) // 2, sharex=True, squeeze=False).ravel()
         for axes, k in zip(grid, chosen, strict=False):
-            value, sigma = report.drift[:, k], report.sigma[:, k]
+            value, sigma = drift[:, k], spread[:, k]
             low, high = value - 2.0 * sigma, value + 2.0 * sigma
-            axes.fill_between(report.hours, low, high, step="post", color=AFTER, alpha=0.16, lw=0)
-            axes.step(report.hours, value, where="post", color=AFTER, lw=1.6)
+            axes.fill_between(hours, low, high, step="post", color=AFTER, alpha=0.16, lw=0)
+            axes.step(hours, value, where="post", color=AFTER, lw=1.6)
             axes.axhline(0.0, color=FAINT, lw=0.8)
-            name, _, unit = report.parameter_names[k].rpartition("_")
+            name, _, unit = names[k].rpartition("_")
             for word, letter in GREEK.items():
                 name = name.replace(word, letter)
             axes.set_title(f"{name}, {unit}")
@@ -429,14 +420,7 @@ def thermal_figures(
     if not cycles:
         return found
     found.append(Drawn.of("cycles", CYCLES_CAPTION, accuracy_by_cycle(cycles, mark)))
-    names = list(cycles[0]["drift"])
-    moved = ModelDrift(
-        hours=np.array([cycle["hours"] for cycle in cycles]),
-        parameter_names=names,
-        drift=np.array([list(cycle["drift"].values()) for cycle in cycles]),
-        sigma=np.array([list(cycle["sigma"].values()) for cycle in cycles]),
-    )
-    found.append(Drawn.of("drift", DRIFT_CAPTION, parameter_drift(moved)))
+    found.append(Drawn.of("drift", DRIFT_CAPTION, parameter_drift(cycles)))
     return found
 
 
