@@ -93,7 +93,7 @@ def prepare(seed: int, effects: Effects) -> list[Judged]:
                 truth=between[PARTS - 1 :: PARTS],
                 between=between,
                 rows=rows,
-                prior=learned.covariance,
+                prior=learned,
                 history=history,
                 screened=tuple(arm.parameters.names.index(name) for name in chosen),
                 learned=learn_process([_earlier(teacher)]),

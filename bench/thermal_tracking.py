@@ -72,7 +72,7 @@ def trained(seed: int) -> Trained:
         cell=cell,
         arm=arm,
         rows=arm.parameter_jacobian(cell.check, kr150.TOOL)[:, :3],
-        prior=learn_drift(histories, sigma_m=noise).covariance,
+        prior=learn_drift(histories, sigma_m=noise),
         trackers=learned,
     )
 

@@ -28,24 +28,13 @@ from robocal_ros.thermal.tracking import DriftProcess, DriftTracker, HeatGains
 FEWEST_CYCLES = 10
 
 
-@dataclass(frozen=True, eq=False)
-class LearnedDrift:
-    """Expected drift.
-
-    ``covariance`` (k, k): of the free parameters' drift since the cold visit, SI.
-    ``cycles``: how many cycles it was learned from.
-    """
-
-    covariance: Array
-    cycles: int
-
-
 def learn_drift(
     histories: Sequence[tuple[ColdSpots, Sequence[Measurements]]], *, sigma_m: float
-) -> LearnedDrift:
-    """Learn from cold visits and the cycles that followed each, all of one robot.
+) -> Array:
+    """Covariance (k, k), SI, of the free parameters' drift since the cold visit, from earlier ones.
 
-    Each cycle is identified with the default prior; ``process.learned_prior`` weighs what the
+    ``histories``: cold visits and the cycles that followed each, all of one robot.
+    Each cycle is identified with the default prior; `learned_prior` weighs what the
     cycles show against it. What no cycle can show keeps its default.
 
     Raises `InputError` when a cycle does not belong to its cold visit; `TooFewSamplesError` with
@@ -64,7 +53,7 @@ def learn_drift(
     ]
     drifts = np.array([one.drift for one in found])
     covariances = np.array([one.covariance for one in found])
-    return LearnedDrift(learned_prior(default, drifts, covariances), total)
+    return learned_prior(default, drifts, covariances)
 
 
 # Widths are chosen where earlier cycles are most likely, each shift judged by what the others
@@ -160,7 +149,7 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     def covariance(of: Sequence[EarlierShift]) -> Array:
         every = max(1, min(THINNED, sum(len(s.cycles) for s in of) // FEWEST_CYCLES))
         histories = [(shift.spots, shift.cycles[::every]) for shift in of]
-        return learn_drift(histories, sigma_m=sigma_m).covariance
+        return learn_drift(histories, sigma_m=sigma_m)
 
     pairs = [
         (covariance([s for s in shifts if s is not judged] or [judged]), _fewer(judged))

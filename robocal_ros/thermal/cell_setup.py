@@ -223,9 +223,9 @@ def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
     quat = np.array(pose.numbers("quat_xyzw", 4))
     if abs(float(np.linalg.norm(quat)) - 1.0) > QUATERNION_TOLERANCE:
         raise InputError("T_sensor_base: the quaternion is not of unit length", file=str(path))
-    xyz = np.array(pose.numbers("xyz_mm", 3)) * 1e-3
-    sphere = np.array(top.numbers("sphere_in_flange_mm", 3)) * 1e-3
-    return PlacedSensor(frames.transform_from_quat(xyz, quat), sphere)
+    pose.numbers("xyz_mm", 3)
+    top.numbers("sphere_in_flange_mm", 3)
+    return placed_of(top.values)
 
 
 def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
@@ -256,12 +256,12 @@ def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
     }
 
 
-def placed_of(document: Mapping[str, Any]) -> tuple[Array, Array]:
-    """T_sensor_base (4, 4) and the sphere in the flange's frame (3,), m, of a sensor's document."""
+def placed_of(document: Mapping[str, Any]) -> PlacedSensor:
+    """Read it from what `sensor_document` gave."""
     pose = document["T_sensor_base"]
     xyz = np.array(pose["xyz_mm"]) * 1e-3
     T_sensor_base = frames.transform_from_quat(xyz, pose["quat_xyzw"])
-    return T_sensor_base, np.array(document["sphere_in_flange_mm"]) * 1e-3
+    return PlacedSensor(T_sensor_base, np.array(document["sphere_in_flange_mm"]) * 1e-3)
 
 
 MARGIN_RAD = float(np.radians(5.0))  # from a joint's limit (prismatic: m, a tenth of it)
@@ -538,8 +538,7 @@ class PlannedCycle:
 
 def plan_cycle(
     arm: SerialArm,
-    T_sensor_base: Array,
-    sphere_in_flange: Array,
+    sensor: PlacedSensor,
     field: SensorField,
     *,
     prior: Array,
@@ -550,11 +549,10 @@ def plan_cycle(
     own: Array | None = None,
     seed: int = 0,
 ) -> PlannedCycle:
-    """Plan ``count`` poses for a sensor that stands at ``T_sensor_base`` (4, 4).
+    """Plan ``count`` poses for a placed sensor.
 
     Parameters
     ----------
-    sphere_in_flange : (3,), m.
     prior : (k, k) covariance of the expected drift, SI; ``sigma_m`` of one visit's coordinate.
     working : (w, n) poses where the tool must be right; None: all over the joint limits.
     own : (o, n) measuring poses to compare with, or None.
@@ -562,8 +560,8 @@ def plan_cycle(
     Raises `LimitError` or `TooFewSamplesError` when the sphere cannot be brought into the field
     often enough.
     """
-    tool = frames.transform(np.eye(3), sphere_in_flange)[None]
-    cell = CellModel(arm, T_sensor_base, ("sphere",), tool)
+    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
+    cell = CellModel(arm, sensor.T_sensor_base, ("sphere",), tool)
     rng = np.random.default_rng(seed)
     found = candidate_poses(cell, field, candidates, rng)
     where = random_postures(arm) if working is None else working

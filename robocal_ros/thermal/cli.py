@@ -240,15 +240,15 @@ def run_learn_prior(args: argparse.Namespace) -> CliResult:
         cold, spots = cold_spots(arm, sensor, cold_file)
         warm = warm_visits(warm_file, arm, cold)
         histories.append((spots, [warm.of_cycle(name).data for name in warm.cycles]))
-    learned = learn_drift(histories, sigma_m=args.sigma_mm * 1e-3)
-    spread = np.sqrt(np.diag(learned.covariance)) * arm.parameters.to_display
+    covariance = learn_drift(histories, sigma_m=args.sigma_mm * 1e-3)
+    spread = np.sqrt(np.diag(covariance)) * arm.parameters.to_display
     document: Document = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "parameters": list(arm.parameters.names),
-        "covariance": learned.covariance.tolist(),
+        "covariance": covariance.tolist(),
         "sigma": dict(zip(arm.parameters.names, spread.tolist(), strict=True)),
-        "cycles": learned.cycles,
+        "cycles": sum(len(cycles) for _, cycles in histories),
         "output": None,
         "warnings": warnings,
     }
@@ -416,8 +416,7 @@ def run_plan_poses(args: argparse.Namespace) -> CliResult:
     own = None if args.own is None else read_measurements(args.own, arm).q
     found = plan_cycle(
         arm,
-        sensor.T_sensor_base,
-        sensor.sphere_in_flange,
+        sensor,
         SensorField(*(1e-3 * x for x in args.field_mm)),
         prior=drift_prior(arm) if args.prior is None else read_prior(args.prior, arm),
         sigma_m=args.sigma_mm * 1e-3,

@@ -316,9 +316,10 @@ class ThermalServices:
         response.left_out_rms_mm = -1.0
         if outcome.document is None:
             return response
-        T_sensor_base, sphere = placed_of(outcome.document)
-        response.sensor_base = transform_message(T_sensor_base)
-        response.sphere_in_flange = Point(**dict(zip("xyz", sphere.tolist(), strict=True)))
+        placed = placed_of(outcome.document)
+        response.sensor_base = transform_message(placed.T_sensor_base)
+        sphere = placed.sphere_in_flange.tolist()
+        response.sphere_in_flange = Point(**dict(zip("xyz", sphere, strict=True)))
         response.rejected = list(outcome.document["rejected"])
         if outcome.document["left_out"] is not None:
             response.left_out_rms_mm = outcome.document["left_out"]["rms_mm"]
@@ -328,7 +329,6 @@ class ThermalServices:
         sensor = self._history.head(SENSOR).model
         if sensor is None:
             raise ConflictError("the sensor is not placed: call calibrate_sensor first")
-        T_sensor_base, sphere = placed_of(sensor)
         if request.count > MOST_POSES:
             raise LimitError(f"{request.count} poses: at most {MOST_POSES} are planned at a time")
         names = self._nominal.joint_names
@@ -336,8 +336,7 @@ class ThermalServices:
         own = np.array([state.position[state.order(names)] for state in states])
         found = plan_cycle(
             self._nominal,
-            T_sensor_base,
-            sphere,
+            placed_of(sensor),
             SensorField(*(1e-3 * x for x in self._settings["sensor_field_mm"])),
             prior=self._prior(),
             sigma_m=self._settings["sigma_mm"] * 1e-3,
@@ -505,9 +504,9 @@ class ThermalNode(SessionNode[ThermalSession]):
             model = model_document(self._nominal) if head.model is None else head.model
             self._outputs.model(model, head.revision, stamp)
         if sensor.model is not None and sensor.calibration_id and self._shown[3:] != shown[3:]:
-            T_sensor_base, _ = placed_of(sensor.model)
+            T_base_sensor = frames.invert(placed_of(sensor.model).T_sensor_base)
             stamp = history.get(sensor.calibration_id).stamp_ns
-            self._outputs.sensor(frames.invert(T_sensor_base), sensor.model["frame"], stamp)
+            self._outputs.sensor(T_base_sensor, sensor.model["frame"], stamp)
         self._shown = shown
         self._outputs.events.tell(configuration(session, self._topics), None)
 

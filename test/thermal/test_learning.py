@@ -38,7 +38,7 @@ def test_a_learned_prior_does_better_than_the_default():
         return drift, spots, [visit(drifted(cell, drift), q, rng)]
 
     taught = [cycle()[1:] for _ in range(40)]
-    learned = learn_drift(taught, sigma_m=SIGMA).covariance
+    learned = learn_drift(taught, sigma_m=SIGMA)
     gain = []
     for drift, spots, (warm,) in (cycle() for _ in range(160)):
         by_default, by_learned = (
