@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -89,20 +90,15 @@ def step_words(step: PlannedStep) -> str:
     return f"{place}, once round it {way} at {step.radius_m * 1e3:.1f} mm and {speed}"
 
 
+@dataclass(frozen=True)
 class ToolMessages:
-    """Tools of one robot as messages.
+    """Tools of one robot as messages; ``flange``, ``tool``: names of the frames."""
 
-    Parameters
-    ----------
-    flange, tool : names of the frames.
-    """
-
-    def __init__(
-        self, nominal: SerialArm, serial: str, robot_file_hash: str, flange: str, tool: str
-    ) -> None:
-        self._nominal, self._serial = nominal, serial
-        self._robot_file_hash = robot_file_hash
-        self._flange, self._tool = flange, tool
+    nominal: SerialArm
+    serial: str
+    robot_file_hash: str
+    flange: str
+    tool: str
 
     def frame(
         self, known: KnownTool, revision: int, thermal_revision: int, state: int, stamp_ns: int
@@ -110,12 +106,12 @@ class ToolMessages:
         """A tool with where it comes from."""
         flat = np.zeros(0) if known.covariance is None else known.covariance.ravel()
         return ToolFrame(
-            header=header(stamp_ns, self._flange),
-            child_frame_id=self._tool,
-            robot=self._nominal.name,
-            serial=self._serial,
-            model_hash=self._nominal.model_hash,
-            robot_file_hash=self._robot_file_hash,
+            header=header(stamp_ns, self.flange),
+            child_frame_id=self.tool,
+            robot=self.nominal.name,
+            serial=self.serial,
+            model_hash=self.nominal.model_hash,
+            robot_file_hash=self.robot_file_hash,
             revision=revision,
             thermal_revision=thermal_revision,
             tool=transform_message(known.T_flange_tool),
@@ -125,12 +121,7 @@ class ToolMessages:
 
 
 class TcfOutputs:
-    """Publishers of one tool's results.
-
-    Parameters
-    ----------
-    add : creates a publisher.
-    base : name of the base frame.
+    """Publishers of one tool's results; ``frames``: names of the base's, the flange's, the tool's.
 
     ``missing``: what cannot be published on this machine; empty when everything can.
     """
