@@ -62,13 +62,10 @@ def offered_qos(latched: bool) -> str:
 class BagWriter:
     """Writes one ``.mcap`` file; a context manager, the file is complete when it is left.
 
-    Parameters
-    ----------
-    path : str or Path
-        An existing file is replaced.
-    latched : topics that are published latched (transient-local); looked up with a topic's first
-        message.
-    compression, chunk_bytes : of the chunks; larger ones are smaller on the disk.
+    ``path``: an existing file is replaced.
+    ``latched``: topics that are published latched (transient-local); looked up with a topic's first
+    message.
+    ``compression``, ``chunk_bytes``: of the chunks; larger ones are smaller on the disk.
 
     Raises `InputError` when the file cannot be made.
     """
@@ -234,11 +231,9 @@ class BagRecording:
     A new file is begun when one is full. ``metadata.yaml``, which ``ros2 bag play`` looks for,
     names each file from its begin on, so that a crash hides none; its counts are of that time.
 
-    Parameters
-    ----------
-    folder : made where it is not there; see `recording_folders.new_folder`.
-    latched : topics that are published latched; may grow.
-    file_bytes : size of a file.
+    ``folder``: made where it is not there; see `recording_folders.new_folder`.
+    ``latched``: topics that are published latched; may grow.
+    ``file_bytes``: size of a file.
 
     Raises `StorageError` when it cannot be written; what was written before stays readable.
     """

@@ -84,10 +84,7 @@ class BagReader:
     Topics have the names that they had on the graph, also where they were recorded under another
     one (`recorded_names`).
 
-    Parameters
-    ----------
-    path : str or Path
-        An ``.mcap`` file, or a folder of ``ros2 bag record`` with one or more of them.
+    ``path``: an ``.mcap`` file, or a folder of ``ros2 bag record`` with one or more of them.
 
     Raises `InputError` when it is not such a file or folder, or broke off before any message; the
     message says what to do.

@@ -89,10 +89,8 @@ class RecordedTopic:
 class RecordedTopics:
     """Subscriptions of the wanted topics, as they appear.
 
-    Parameters
-    ----------
-    wanted : topics; relative ones are in the node's namespace, ``~/`` is the node's own.
-    take : is given topic, type and serialized message.
+    ``wanted``: topics; relative ones are in the node's namespace, ``~/`` is the node's own.
+    ``take``: is given topic, type and serialized message.
 
     ``found``: by resolved name.
     ``latched``: those that are offered latched, by both their names; grows.

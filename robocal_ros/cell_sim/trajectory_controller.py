@@ -449,13 +449,11 @@ class JointMotion:
     What is asked for a time happens up to then. A message after that counts from the cycle after
     its own time on, and what was computed beyond it is done again.
 
-    Parameters
-    ----------
-    q : (n,) where the joints stand at time 0, rad (prismatic: m).
-    fastest : (n,) or one for all: the drives' greatest speeds, rad/s (prismatic: m/s).
-    limits : drives refuse what is faster by more than `ROOM`: a drive fault, the robot brakes.
-        Without, they follow: nobody behind a controller looks at its command.
-    lag_s : drives smooth their command: a mean that lags so much, in whole half cycles.
+    ``q`` (n,): where the joints stand at time 0, rad (prismatic: m).
+    ``fastest``: (n,) or one for all: the drives' greatest speeds, rad/s (prismatic: m/s).
+    ``limits``: drives refuse what is faster by more than `ROOM`: a drive fault, the robot brakes.
+    Without, they follow: nobody behind a controller looks at its command.
+    ``lag_s``: drives smooth their command: a mean that lags so much, in whole half cycles.
 
     ``controller``: takes trajectories, see `TrajectoryController`.
     ``peak`` (n,): greatest speeds that were commanded, rad/s (prismatic: m/s).

@@ -402,10 +402,8 @@ class ReplayedCycle:
 class ThermalHistory:
     """The history of a replayed thermal session.
 
-    Parameters
-    ----------
-    nominal : the arm without any calibration.
-    start_ns : first joint reading.
+    ``nominal``: the arm without any calibration.
+    ``start_ns``: first joint reading.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, start_ns: int) -> None:

@@ -46,12 +46,8 @@ class RobocalError(Exception):
 class InputError(RobocalError):
     """Input that cannot be read or makes no sense.
 
-    Parameters
-    ----------
-    message : str
-        What is wrong, with the value, and what to do.
-    file, row, column : optional
-        Where: file name, row number (the header is row 1) and column name.
+    ``message``: what is wrong, with the value, and what to do.
+    ``file``, ``row``, ``column``: where, as far as that is known; the header is row 1.
     """
 
     def __init__(

@@ -225,10 +225,8 @@ class SoleUser:
 
     Two robots that keep one history would bring each other's calibrations into force.
 
-    Parameters
-    ----------
-    name : the part, as the executable is called.
-    timeout_s : longest wait for one that is just ending.
+    ``name``: the part, as the executable is called.
+    ``timeout_s``: longest wait for one that is just ending.
 
     Raises `ConflictError`: another process holds it; `StorageError`: the file cannot be made.
     """

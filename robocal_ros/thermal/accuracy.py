@@ -434,10 +434,8 @@ class ToolError:
 class AccuracyForecast:
     """Expected error of a model in force, from what the tracker knows.
 
-    Parameters
-    ----------
-    in_force : an arm of the cold model's type.
-    work : where the error is asked for.
+    ``in_force``: an arm of the cold model's type.
+    ``work``: where the error is asked for.
     """
 
     def __init__(self, tracker: DriftTracker, in_force: SerialArm, work: Work) -> None:

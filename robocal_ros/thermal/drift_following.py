@@ -221,10 +221,9 @@ class InForce(HistoryFollower):
 class DriftFollower:
     """Takes cycles in the order in which they are kept.
 
-    Parameters
-    ----------
-    expected : how the robot is expected to drift; with temperatures where the reference has them.
-    work : where the forecast is asked for.
+    ``expected``: how the robot is expected to drift; with temperatures where the reference has
+    them.
+    ``work``: where the forecast is asked for.
     """
 
     def __init__(self, reference: ColdReference, expected: LearnedProcess, work: Work) -> None:

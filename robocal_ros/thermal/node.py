@@ -246,10 +246,8 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig
 class ThermalServices:
     """Services, and the Trigger twins of those that need no more than a name.
 
-    Parameters
-    ----------
-    add, ask : create a service; give a command to the session and await its outcome.
-    settings : the node's; ``prior`` tells the expected drift of the session, (k, k), SI.
+    ``add``, ``ask``: create a service; give a command to the session and await its outcome.
+    ``settings``: the node's; ``prior`` tells the expected drift of the session, (k, k), SI.
     """
 
     def __init__(

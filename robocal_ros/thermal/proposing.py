@@ -55,10 +55,8 @@ SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")
 class Proposer:
     """Solves what a command asks for, against what is in force, and keeps the result.
 
-    Parameters
-    ----------
-    software : version that makes the candidates.
-    current : what is in force, followed by the session.
+    ``software``: version that makes the candidates.
+    ``current``: what is in force, followed by the session.
     """
 
     def __init__(

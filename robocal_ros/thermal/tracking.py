@@ -222,12 +222,10 @@ class Innovation:
 class DriftTracker:
     """Follows one robot from its cold reference on.
 
-    Parameters
-    ----------
-    sigma_m : standard deviation of one coordinate of one visit (repeatability and sensor), of
-        the cold visits and of warm ones that bring no covariance of their own.
-    gains : of the motors' temperatures, which ``read_temperatures`` then brings; the process is
-        what they leave. The cold visit is at ``time_s``.
+    ``sigma_m``: standard deviation of one coordinate of one visit (repeatability and sensor), of
+    the cold visits and of warm ones that bring no covariance of their own.
+    ``gains``: of the motors' temperatures, which ``read_temperatures`` then brings; the process is
+    what they leave. The cold visit is at ``time_s``.
     """
 
     def __init__(

@@ -206,12 +206,10 @@ def load_measuring(arm: SerialArm) -> None:
 class ToolDriver:
     """Turns the awaited steps of a session into joint motions; times are of a steady clock.
 
-    Parameters
-    ----------
-    send : publishes a plan, and whether it is a stop; returns when, where that is not now.
-    ask : gives a command to the session.
-    closed : why nothing may move at a time, empty: it may; asked before anything begins.
-    hard_stop : stops a robot that does not obey, by other means; takes why.
+    ``send``: publishes a plan, and whether it is a stop; returns when, where that is not now.
+    ``ask``: gives a command to the session.
+    ``closed``: why nothing may move at a time, empty: it may; asked before anything begins.
+    ``hard_stop``: stops a robot that does not obey, by other means; takes why.
 
     ``robot``: where it is, and how fast its controller's clock runs.
     ``phase``: what the robot does now.

@@ -147,10 +147,8 @@ CODE_OF: dict[Answer, Code] = {
 class ToolResults:
     """Ends runs and remembers what came of them.
 
-    Parameters
-    ----------
-    current : what is in force, followed by the session.
-    software : version that made the tools.
+    ``current``: what is in force, followed by the session.
+    ``software``: version that made the tools.
     """
 
     def __init__(
