@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -35,6 +36,7 @@ from robocal_ros.report.figures import (
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
+LEFT = -0.1  # mm: there stands a figure
 NAMES = {
     "A": "A  grid, July 2020",
     "B": "B  joint configurations, 2020",
@@ -75,13 +77,18 @@ def campaign_figure(found: Mapping[str, Mapping[str, float]]) -> Figure:
             )
             if "old" in errors:
                 axes.plot(errors["old"], y, "o", mfc="white", mec=AFTER, mew=1.6, ms=7)
-            axes.text(-0.015, y + 0.1, NAMES[series], ha="right", va="center")
+            axes.text(LEFT - 0.015, y + 0.1, NAMES[series], ha="right", va="center")
             axes.text(
-                -0.015, y - 0.22, f"{errors['n']:,} held-out poses".replace(",", "\u2009"),
+                LEFT - 0.015, y - 0.22, f"{errors['n']:,} held-out poses".replace(",", "\u2009"),
                 ha="right", va="center", color=FAINT, fontsize=8,
             )  # fmt: skip
         _legend(axes)
-        axes.set(xlim=(0.0, 1.15), ylim=(0.4, len(found) + 0.75), yticks=[])
+        axes.set(
+            xlim=(LEFT, 1.15),
+            ylim=(0.4, len(found) + 0.75),
+            yticks=[],
+            xticks=np.arange(0.0, 1.1, 0.2),
+        )
         axes.set_xlabel("mean position error at held-out poses, mm")
         axes.grid(visible=False, axis="y")
         axes.spines["left"].set_visible(False)
