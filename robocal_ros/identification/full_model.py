@@ -43,6 +43,7 @@ _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry 
 # The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:
 # these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
+SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
 _ROUNDS = 4  # of solving, and judging the samples anew
 
 
@@ -223,8 +224,15 @@ class _FullProblem:
             count=3.0 * float(np.sum(weight)) * (1.0 + _turn_share(residual)),
             flat=flat,
             fixed=fixed,
-            noise_least=0.0 if self.data.sigma is None else 1.0,
+            noise_least=self.noise_least,
         )
+
+    @property
+    def noise_least(self) -> float:
+        """Few poses can be met exactly: their noise is not taken to be functions for the most."""
+        if self.data.sigma is not None:
+            return 1.0
+        return SMALLEST_SHARE * self.start.estimate.scale if len(self.data) <= MANY_POSES else 0.0
 
     @cached_property
     def limit(self) -> float:
