@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from std_srvs.srv import SetBool
@@ -33,8 +34,8 @@ class Watched:
         self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
         self.watch = CommandPath(self.own, PATH, ACTION, (ACCURACY, CORRECTION))
 
-    def process(self, name: str) -> Process:
-        self.processes.append(Process(self.graph.domain, name))
+    def process(self, name: str, kind: type[Node] = Node) -> Process:
+        self.processes.append(Process(self.graph.domain, name, kind))
         return self.processes[-1]
 
     def becomes(self, words: str) -> None:
@@ -62,7 +63,7 @@ def test_a_node_of_the_cell_may_command_the_robot_and_no_other_of_its_process(
 ) -> None:
     """A process is composed of many nodes: the program's too."""
     watched.becomes("")
-    process = watched.process("another_name")
+    process = watched.process("another_name", LifecycleNode)
     own, planner = process.node, Node("planner", context=process.context)
     own.create_publisher(kind, topic, endpoints.LATCHED)
     watched.graph.spin_until(lambda: watched.own.count_publishers(topic), "it is of the cell")
