@@ -11,8 +11,8 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:\.(\d+))?(?![\w.])")
 # First cell of a table of accuracy.md; part and table of bench/results; how many rows make one of
 # the page's.
 QUOTED = [
-    ("campaign", "real_data", "ur10_campaigns", 2),
-    ("used in", "real_data", "ur10_later", 1),
+    ("campaign", "real_data", "ur10_campaigns", 3),
+    ("used in", "real_data", "ur10_later", 2),
     ("poses", "real_data", "ur10_few_poses", 1),
     ("unknown", "monte_carlo", "efficiency", 1),
     ("true robot", "monte_carlo", "unmodelled", 1),

@@ -214,11 +214,24 @@ class SerialArm:
 
     @cached_property
     def layer(self) -> Array:
-        """Constants of the joint functions (n + 1, 7 + m) for the kernels; of an arm with some."""
-        from robocal_ros.kinematics import kernels
+        """Constants of the joint functions (n + 1, 7 + m) for the kernels; of an arm with some.
 
-        assert self.functions is not None
-        return kernels.pack_layer(self.functions, self.load)
+        Of a joint: first knot, 1 / spacing, compliance, mass and its centre, the coefficients. The
+        last row: gravity (base), mass of the payload and its centre.
+        """
+        from robocal_ros.kinematics.kernels import CENTRE, COMPLIANCE, MASS, PER_STEP, TABLE
+
+        functions, load = self.functions, self.load
+        assert functions is not None
+        n, m = functions.coefficients.shape
+        packed = np.zeros((n + 1, TABLE + m))
+        packed[:n, 0], packed[:n, PER_STEP] = functions.first, 1.0 / functions.step
+        packed[:n, COMPLIANCE], packed[:n, TABLE:] = functions.compliance, functions.coefficients
+        if load is not None:
+            packed[:n, MASS], packed[:n, CENTRE:TABLE] = load.mass, load.centre
+            packed[n, :MASS], packed[n, MASS] = load.gravity, load.payload_mass
+            packed[n, CENTRE:TABLE] = load.payload_centre
+        return packed
 
     @cached_property
     def parameters(self) -> ParameterSet:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.compiled import inlined, kernel, lean
-from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 
 # ---- sines --------------------------------------------------------------------------------------
 
@@ -405,7 +404,7 @@ def parameter_batch(
 
 # ---- joint functions and winding under load: what the joints turn besides what is read ----------
 #
-# ``layer`` (n + 1, 7 + k), see `pack_layer`: all about a joint in a row, behind them the payload.
+# ``layer`` (n + 1, 7 + k), see `SerialArm.layer`: all about a joint in a row, then the payload.
 
 
 PER_STEP, COMPLIANCE, MASS, CENTRE, TABLE = 1, 2, 3, 4, 7
@@ -413,23 +412,6 @@ PER_STEP, COMPLIANCE, MASS, CENTRE, TABLE = 1, 2, 3, 4, 7
 MOVED, TURNED, SLOPE, SCRATCH = 6, 9, 10, 11
 MOST_ROUNDS = 20
 EXACT_TURN = 1e-13  # rad, m
-
-
-def pack_layer(functions: JointFunctions, load: ArmLoad | None) -> Array:
-    """Constants of the joints' own functions for the kernels.
-
-    Of a joint: first knot, 1 / spacing, compliance, mass and its centre, the coefficients. The
-    last row: gravity (base), mass of the payload and its centre.
-    """
-    n, m = functions.coefficients.shape
-    packed = np.zeros((n + 1, TABLE + m))
-    packed[:n, 0], packed[:n, PER_STEP] = functions.first, 1.0 / functions.step
-    packed[:n, COMPLIANCE], packed[:n, TABLE:] = functions.compliance, functions.coefficients
-    if load is not None:
-        packed[:n, MASS], packed[:n, CENTRE:TABLE] = load.mass, load.centre
-        packed[n, :MASS], packed[n, MASS] = load.gravity, load.payload_mass
-        packed[n, CENTRE:TABLE] = load.payload_centre
-    return packed
 
 
 @lean

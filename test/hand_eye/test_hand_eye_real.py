@@ -71,7 +71,7 @@ def test_a_height_that_is_taken_for_a_distance_is_named():
         real.solved(task_of(SphereTarget(real.RADIUS_M), None), data)
 
 
-@pytest.mark.parametrize("radius_mm", [25.0, 37.0, 39.0, 41.0, 42.0])
+@pytest.mark.parametrize("radius_mm", [25.0, 41.0, 42.0])
 def test_another_radius_is_refused_with_the_reason(radius_mm):
     data = real.read_set("experiments_sphere")
     with pytest.raises(ResidualError, match=r"which sphere is mounted"):
