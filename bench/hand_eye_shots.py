@@ -28,8 +28,8 @@ from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.robot import Warmth
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.data import profile_of
 from robocal_ros.hand_eye.mount_fit import MountFit
+from robocal_ros.hand_eye.profiles import profile_of
 from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings
 from robocal_ros.hand_eye.solve import solve_task
 from robocal_ros.hand_eye.stairs import StepTask

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocal_ros.cell_sim.robot import shift, turn
 from robocal_ros.cell_sim.sensors import Ball, ProfileSensor, ScannedBody, Scene, block
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.data import profile_of
+from robocal_ros.hand_eye.profiles import profile_of
 from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise
 from robocal_ros.kinematics import SerialArm

@@ -4,7 +4,7 @@ The builders accept any object with the attributes of the ROS message, so that l
 bag readers make the same samples from the same bytes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -275,11 +275,19 @@ MOST_POINTS = 5_000_000
 def cloud_points(message: Any) -> Array:
     """Points (n, 3), m, of the fields x, y, z; missing points stay not-a-number.
 
+    Raises as `cloud_columns`.
+    """
+    return cloud_columns(message, "xyz")
+
+
+def cloud_columns(message: Any, names: Sequence[str]) -> Array:
+    """Values (n, k) of the named fields of a cloud.
+
     Raises `InputError` when a field is missing or the data do not have the size that the message
     tells.
     """
     fields = {field.name: field for field in message.fields}
-    missing = [name for name in "xyz" if name not in fields]
+    missing = [name for name in names if name not in fields]
     if missing:
         raise InputError(
             f"the cloud has no field {', '.join(missing)}; it has {', '.join(fields) or 'none'}"
@@ -297,8 +305,8 @@ def cloud_points(message: Any) -> Array:
         )
     order = ">" if message.is_bigendian else "<"
     grid = data[: row * height].reshape(height, row)[:, : width * step].reshape(count, step)
-    points = np.empty((count, 3))
-    for axis, name in enumerate("xyz"):
+    points = np.empty((count, len(names)))
+    for axis, name in enumerate(names):
         field = fields[name]
         if field.datatype not in TYPES:
             raise InputError(f"field {name} of the cloud has the unknown type {field.datatype}")

@@ -22,8 +22,6 @@ from robocal_ros.ground.samples import StandstillRule
 from robocal_ros.hand_eye.data import (
     FEATURES,
     PROFILE,
-    Z_GROWS,
-    Profile,
     StandingShot,
     Standstills,
     captured_marks,
@@ -32,6 +30,7 @@ from robocal_ros.hand_eye.data import (
     flange_poses,
 )
 from robocal_ros.hand_eye.files import PoseTable, read_flange_mount, read_pose_table, read_profiles
+from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, Profile, SensorDescription, sensor_of
 from robocal_ros.hand_eye.result import METHODS, HandEyeSettings, by_shot, hand_eye_document
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
@@ -88,18 +87,34 @@ def add_shots(parser: argparse.ArgumentParser) -> None:
         help="topic of an input in the bag: joint_states, profile, session_events",
     )
     add_robot(parser, "bags and tables of joints")
-    add_sense(parser)
+    add_sensor(parser)
 
 
-def add_sense(parser: argparse.ArgumentParser) -> None:
-    """Offer which way the sensor's z grows."""
+def add_description(parser: argparse.ArgumentParser) -> None:
+    """Offer how the sensor tells its profiles."""
+    parser.add_argument(
+        "--sensor",
+        default="",
+        metavar="NAME",
+        help=f"how the profiles are told: {', '.join(PRESETS)}, or a YAML file that describes it",
+    )
+
+
+def add_sensor(parser: argparse.ArgumentParser) -> None:
+    """Offer the same, and which way z grows."""
+    add_description(parser)
     parser.add_argument(
         "--z-grows",
         choices=Z_GROWS,
-        default=Z_GROWS[0],
-        help="z of the profiles: away from the sensor, a distance (the default), or towards it, a "
-        "height",
+        default="",
+        help="z of the profiles: away from the sensor, a distance, or towards it, a height; "
+        "default: as --sensor has it, away without one",
     )
+
+
+def described(args: argparse.Namespace) -> SensorDescription:
+    """The sensor that is given. Raises as `sensor_of`."""
+    return sensor_of(args.sensor, getattr(args, "z_grows", ""))
 
 
 def add_robot(parser: argparse.ArgumentParser, needed: str = "tables of joints") -> None:
@@ -206,20 +221,23 @@ def given_shots(
     if args.bag is None:
         if args.poses is None:
             raise InputError("give the shots: --poses, or --bag")
-        return read_shots(judges or args.poses, args.profiles or args.poses.parent, arm)
+        folder = args.profiles or args.poses.parent
+        return read_shots(judges or args.poses, folder, arm, described(args))
 
     if args.poses is not None or args.profiles is not None:
         raise InputError("the shots are given twice: --bag, and --poses or --profiles; keep one")
     if arm is None:
         raise InputError("a bag holds joints, not poses: name its robot with --robot")
-    data, rejected = read_bag_shots(judges or args.bag, arm, dict(args.topic))
+    data, rejected = read_bag_shots(judges or args.bag, arm, dict(args.topic), described(args))
     return ReadShots(data, None, rejected)
 
 
-def read_shots(poses: Path, profiles: Path, arm: SerialArm | None) -> ReadShots:
+def read_shots(
+    poses: Path, profiles: Path, arm: SerialArm | None, sensor: SensorDescription
+) -> ReadShots:
     """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
     table = read_pose_table(poses, arm)
-    seen = read_profiles(profiles, table)
+    seen = read_profiles(profiles, table, sensor)
     return ReadShots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
 
 
@@ -254,7 +272,9 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> Las
     raise InputError(missing[kind])
 
 
-def read_bag_shots(path: Path, arm: SerialArm, topics: Mapping[str, str]) -> BagShots:
+def read_bag_shots(
+    path: Path, arm: SerialArm, topics: Mapping[str, str], sensor: SensorDescription
+) -> BagShots:
     """Shots of a bag, and the profiles that are none with the reason.
 
     ``topics``: input to topic, where given.
@@ -269,7 +289,7 @@ def read_bag_shots(path: Path, arm: SerialArm, topics: Mapping[str, str]) -> Bag
             seen = [topic for topic in reader.info.topics if topic_kind(topic) == PROFILE]
             if len(seen) == 1:
                 given.setdefault(PROFILE, seen[0])
-            return _recorded(open_recording(reader, given), arm)
+            return _recorded(open_recording(reader, given), arm, sensor)
     return _saved(path, arm), {}
 
 
@@ -289,7 +309,7 @@ def _saved(path: Path, arm: SerialArm) -> HandEyeData:
     )
 
 
-def _recorded(recording: BagOverview, arm: SerialArm) -> BagShots:
+def _recorded(recording: BagOverview, arm: SerialArm, sensor: SensorDescription) -> BagShots:
     path = recording.reader.info.path
     if PROFILE not in recording.inputs.values():
         raise InputError(
@@ -300,7 +320,7 @@ def _recorded(recording: BagOverview, arm: SerialArm) -> BagShots:
     rule, configured = StandstillRule(), recording.configured
     if configured is not None and session_kind(configured) == "hand_eye":
         rule = HandEyeConfig.of_document(configured.arguments["config"]).standstill
-    standstills = Standstills(arm.joint_names, rule)
+    standstills = Standstills(arm.joint_names, rule, sensor)
     for recorded in recording.samples():
         standstills.take(recording.inputs[recorded.topic], recorded.message)
     standstills.close()
@@ -441,7 +461,7 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
     """Do ``sphere``, ``step`` or ``line``. Raises `RobocalError` for what a user can mend."""
     arm, settings = arm_of(args), settings_of(args)
     target = given_target(kind, args.target, getattr(args, "radius_mm", None))
-    classic, towards = args.method == "classic", args.z_grows == "towards"
+    classic, towards = args.method == "classic", described(args).towards
     task = task_of(target, getattr(args, "line_kind", None), classic, towards)
     shots = given_shots(args, arm)
     judges = None if args.check is None else given_shots(args, arm, args.check)
@@ -476,7 +496,7 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
             help=f"folder with poses.csv, profiles/ and target.yaml of a {kind}{without}",
         )
     add_feature(parser)
-    add_sense(parser)
+    add_sensor(parser)
     add_robot(parser)
     add_limits(parser, "default: from the residuals")
     parser.add_argument(
@@ -499,11 +519,11 @@ def run_joint(args: argparse.Namespace) -> CliResult:
         file, profiles = folder / "target.yaml", folder / "profiles"
         known = kind != "line" or file.exists()
         target = given_target(kind, file if known else None, None)
-        task = task_of(target, args.line_kind, towards=args.z_grows == "towards")
-        shots = read_shots(folder / "poses.csv", profiles, arm)
+        task = task_of(target, args.line_kind, towards=described(args).towards)
+        shots = read_shots(folder / "poses.csv", profiles, arm, described(args))
         parts.append((task, shots.data))
         if args.check is not None and (folder / args.check).exists():
-            judges = read_shots(folder / args.check, profiles, arm)
+            judges = read_shots(folder / args.check, profiles, arm, described(args))
             if judges.table is not None and shots.table is not None:
                 require_unused(judges.table, shots.table)
             checks[task.kind] = judges.data
@@ -535,7 +555,7 @@ def run_verify(args: argparse.Namespace) -> CliResult:
     settings = settings_of(args)
     T_flange_sensor = read_flange_mount(args.result)
     target = given_target(args.target_kind, args.target, args.radius_mm)
-    task = task_of(target, args.line_kind, towards=args.z_grows == "towards")
+    task = task_of(target, args.line_kind, towards=described(args).towards)
     shots = given_shots(args, arm_of(args))
     found = verify(task, shots.data, T_flange_sensor, settings)
     errors = errors_document(summarise(found.distance_m))

@@ -41,6 +41,7 @@ from robocal_ros.hand_eye.camera_data import (
 )
 from robocal_ros.hand_eye.camera_fit import GivenNoise
 from robocal_ros.hand_eye.cli import (
+    add_description,
     add_limit,
     add_limits,
     add_robot,
@@ -48,6 +49,7 @@ from robocal_ros.hand_eye.cli import (
     add_target,
     add_target_kind,
     arm_of,
+    described,
     given_target,
     require_unused,
     robot_sigma_of,
@@ -57,7 +59,7 @@ from robocal_ros.hand_eye.cli import (
     show_sigma,
     show_verdict,
 )
-from robocal_ros.hand_eye.data import MOUNTS, Profile
+from robocal_ros.hand_eye.data import MOUNTS
 from robocal_ros.hand_eye.files import (
     PoseTable,
     exported,
@@ -76,6 +78,7 @@ from robocal_ros.hand_eye.planning import (
     check_plan,
     planned_target,
 )
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise, hand_eye_document
 from robocal_ros.hand_eye.targets import FARTHEST_MM, TrackerTarget, read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
@@ -313,6 +316,7 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
         help="of the tracker: role (arc_a, arc_b, sphere, face_1, face_2), x_mm, y_mm, z_mm, and "
         "on the arcs the joints",
     )
+    add_description(parser)
     target = parser.add_mutually_exclusive_group(required=True)
     target.add_argument("--target", type=Path, metavar="YAML", help="radii and reflector's height")
     target.add_argument(
@@ -365,7 +369,7 @@ def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[s
             file=str(args.poses),
             row=1,
         )
-    shots = read_profiles(args.profiles, table)
+    shots = read_profiles(args.profiles, table, described(args))
     rejected = {
         name: str(shot)
         for name, shot in zip(table.names, shots, strict=True)
@@ -462,10 +466,10 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
         sensor.add_argument(
             f"--{name}-mm",
             type=float if name in ("near", "far") else positive,
-            default=value,
             metavar="L",
-            help=f"{words}; default {value:g}",
+            help=f"{words}; default: as --sensor has it, {value:g} without",
         )
+    add_description(parser)
     add_limits(parser, f"default {ROBOT_SIGMA_MM:g} mm, 0 deg")
     parser.add_argument("--propose", type=Path, metavar="CSV", help="write the proposed poses")
 
@@ -473,14 +477,15 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
 def run_check_plan(args: argparse.Namespace) -> CliResult:
     """Do ``check-plan``. Raises `RobocalError` for what a user can mend."""
     settings = settings_of(args)
-    if not 0.0 < abs(args.near_mm - args.far_mm) < FARTHEST_MM:
-        raise InputError(f"--near-mm {args.near_mm:g} is --far-mm: the field has no depth")
-    sensor = SensorRange(
-        near_m=args.near_mm * 1e-3,
-        far_m=args.far_mm * 1e-3,
-        width_m=args.width_mm * 1e-3,
-        noise_m=args.noise_mm * 1e-3,
-    )
+    told = {f"{name}_mm": getattr(args, f"{name}_mm") for name in SENSOR}
+    told = {name: value for name, value in told.items() if value is not None}
+    if len({"near_mm", "far_mm"} & set(told)) == 1:
+        raise InputError("give both --near-mm and --far-mm, or none")
+    known_sensor = replace(described(args), **told)
+    near, far, width, along = known_sensor.field(*(value for value, _ in SENSOR.values()))
+    sensor = SensorRange(near, far, width, noise_m=along)
+    if not 0.0 < abs(sensor.near_m - sensor.far_m) < FARTHEST_MM * 1e-3:
+        raise InputError(f"--near-mm {sensor.near_m * 1e3:g} is --far-mm: the field has no depth")
     known = given_target(args.target_kind, args.target, args.radius_mm)
     table = read_pose_table(args.poses, arm_of(args), None)
     centre = None if args.center_mm is None else tuple(x * 1e-3 for x in args.center_mm)

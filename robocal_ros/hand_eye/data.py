@@ -11,22 +11,22 @@ from functools import cached_property
 from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import (
     JOINTS,
     JointStream,
     NotStillError,
     StandstillRule,
-    cloud_points,
     image_array,
     joint_sample,
     pose_sample,
     stamp_ns,
 )
 from robocal_ros.hand_eye.camera_data import Mount, find_corners
+from robocal_ros.hand_eye.profiles import DEFAULT, SensorDescription, cloud_profile, profile_of
 from robocal_ros.hand_eye.targets import BoardTarget, target_of
 from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
@@ -36,72 +36,24 @@ from robocal_ros.session.events import GAP_NS, Command, Ignored
 
 Array = NDArray[np.float64]
 
-FEWEST_POINTS = 10
-NO_RETURN_M = 0.02  # from all points: what lies nearer may be a surface
-NARROWEST_M, WIDEST_M = 1e-3, 20.0  # no line laser's field of view is outside of this
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
 SHOTS = (PROFILE, TARGET_POSE, IMAGE)
-PLANE_M = 1e-5  # a profile's points lie so near to y = 0
 MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
 AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
-    """Points of one profile.
-
-    ``points`` (n, 2) x along the laser line and z along the beam, either way, sensor frame, m, in
-    the order of the sensor's columns; its plane is y = 0. What the sensor did not see is left out.
-    ``name``: of the shot, for reports.
-    """
-
-    points: Array
-    name: str
-
-
-def profile_of(points: ArrayLike, name: str) -> Profile:
-    """Check and wrap points (n, 2), m; columns without a return are left out.
-
-    Those are not-a-number, or hold one z that recurs and lies farther from all others than these
-    extend: what stands for no return depends on the sensor (0, -32768 steps, -99.9999 mm …).
-
-    Raises `InputError` when the points are not (n, 2), or their extent is that of another unit;
-    `TooFewSamplesError` when nearly nothing was seen.
-    """
-    rows = np.asarray(points, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 2:
-        raise InputError(f"profile {name} has shape {rows.shape}, not (points, 2)")
-    rows = rows[np.all(np.isfinite(rows), axis=1)]
-    for value in (np.min(rows[:, 1], initial=np.inf), np.max(rows[:, 1], initial=-np.inf)):
-        same = rows[:, 1] == value
-        if np.sum(same) > 1 and len(others := rows[~same, 1]) >= FEWEST_POINTS:
-            apart = float(np.min(np.abs(others - value)))
-            if apart > max(float(np.ptp(others)), NO_RETURN_M):
-                rows = rows[~same]
-    if len(rows) < FEWEST_POINTS:
-        raise TooFewSamplesError(
-            f"profile {name} has {len(rows)} points (at least {FEWEST_POINTS}): check the exposure "
-            "and that the target is in range"
-        )
-    extent = float(np.ptp(rows, axis=0).max())
-    if not NARROWEST_M <= extent <= WIDEST_M:
-        small = extent < NARROWEST_M
-        width = f"{extent * 1e3:.4g} mm" if small else f"{extent:.4g} m"
-        raise InputError(
-            f"profile {name} comes out {width} wide: is it a thousand times too "
-            f"{'small' if small else 'large'}? A table's x_mm and z_mm hold mm, a message m"
-        )
-    return Profile(rows, name)
-
-
-@dataclass(frozen=True, eq=False)
 class Shot:
-    """One profile (``PointCloud2``), target pose (``PoseStamped``) or image (``Image``)."""
+    """One profile (``PointCloud2``), target pose (``PoseStamped``) or image (``Image``).
+
+    ``sensor``: how a line laser tells its profiles.
+    """
 
     topic: str
     stamp_ns: int
     frame: str
     message: Any
+    sensor: SensorDescription = DEFAULT
 
     @property
     def size(self) -> int:
@@ -110,6 +62,8 @@ class Shot:
 
     @cached_property
     def _values(self) -> NDArray[Any]:
+        if self.topic == PROFILE:
+            return cloud_profile(self.message, self.sensor).points
         return _READERS[self.topic](self.message)
 
     def read(self) -> NDArray[Any]:
@@ -118,30 +72,15 @@ class Shot:
         That is position, m, and quaternion x, y, z, w of the target in the sensor frame. Of an
         image its grey pixels (h, w), 8 bits.
 
-        Raises `InputError` when the message is no cloud or image that is read, points are not in
-        the plane y = 0, a value of a pose is not finite or its quaternion is not of unit length;
-        `TooFewSamplesError` when nearly nothing was seen.
+        Raises as `cloud_profile`, and `InputError` when the message is no image that is read, a
+        value of a pose is not finite or its quaternion is not of unit length.
         """
         return self._values
 
 
-def shot_of(topic: str, message: Any) -> Shot:
+def shot_of(topic: str, message: Any, sensor: SensorDescription = DEFAULT) -> Shot:
     """A shot from the message of an input; its content is not looked at."""
-    return Shot(topic, stamp_ns(message.header.stamp), message.header.frame_id, message)
-
-
-def _points(message: Any) -> Array:
-    at_ns = stamp_ns(message.header.stamp)
-    points = cloud_points(message)
-    points = points[np.all(np.isfinite(points), axis=1)]
-    profile = profile_of(points[:, [0, 2]], f"at {at_ns} ns")
-    off_m = float(np.max(np.abs(points[:, 1])))
-    if off_m > PLANE_M:
-        raise InputError(
-            f"profile {profile.name} has points {off_m * 1e3:.4g} mm beside the plane y = 0: "
-            "x is along the laser line, z along the beam; turn the sensor's axes accordingly"
-        )
-    return profile.points
+    return Shot(topic, stamp_ns(message.header.stamp), message.header.frame_id, message, sensor)
 
 
 def _pose(message: Any) -> Array:
@@ -151,7 +90,6 @@ def _pose(message: Any) -> Array:
 
 
 _READERS: Mapping[str, Callable[[Any], NDArray[Any]]] = {
-    PROFILE: _points,
     TARGET_POSE: _pose,
     IMAGE: image_array,
 }
@@ -227,8 +165,10 @@ class Standstills:
     ``ignored``: joint readings that were not used.
     """
 
-    def __init__(self, joint_names: tuple[str, ...], rule: StandstillRule) -> None:
-        self._stream, self._rule = JointStream(joint_names), rule
+    def __init__(
+        self, joint_names: tuple[str, ...], rule: StandstillRule, sensor: SensorDescription
+    ) -> None:
+        self._stream, self._rule, self._sensor = JointStream(joint_names), rule, sensor
         self._waiting: deque[tuple[str, Shot]] = deque()
         self._count, self._frame = 0, ""
         self.found: list[StandingShot] = []
@@ -258,7 +198,7 @@ class Standstills:
         self._count += 1
         name = f"shot_{self._count:02d}"
         try:
-            shot = shot_of(PROFILE, message)
+            shot = shot_of(PROFILE, message, self._sensor)
             shot.read()
         except RobocalError as error:
             self.rejected[name] = str(error)
@@ -330,7 +270,6 @@ TO_HAND: Mount = "to-hand"
 MOUNTS = (IN_HAND, TO_HAND)
 WITHOUT_FILE = ("line", "camera")  # solved with the sensor's place
 FEATURES: tuple[Feature, ...] = ("edge", "groove")
-Z_GROWS = ("away", "towards")  # of a line laser's z, from the sensor: a distance or a height
 TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
 
 MOST_CAPTURES = 500

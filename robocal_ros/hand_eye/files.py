@@ -22,7 +22,14 @@ from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
 from robocal_ros.hand_eye.camera_data import Image, decode_image
-from robocal_ros.hand_eye.data import Profile, profile_of
+from robocal_ros.hand_eye.profiles import (
+    CLOUDS,
+    DEFAULT,
+    Profile,
+    SensorDescription,
+    columns_profile,
+    file_profile,
+)
 from robocal_ros.hand_eye.tracker_data import FACES, Arc
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, read_pose
@@ -173,24 +180,29 @@ def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | 
     return frames.transform(read_rotations(table, layout.orientation), position)
 
 
-def read_profile(path: Path, name: str) -> Profile:
+def read_profile(path: Path, name: str, sensor: SensorDescription = DEFAULT) -> Profile:
     """Read a profile; rows without a return (an empty cell, or nan) are left out.
 
     Raises `InputError`, with file, row and column, when it is no table of ``x_mm`` and ``z_mm``, or
-    is in another unit; `TooFewSamplesError` when nearly nothing was seen.
+    is in another unit; as `file_profile` where the sensor tells other columns, and for clouds;
+    `TooFewSamplesError` when nearly nothing was seen.
     """
+    if sensor.tells_columns or path.suffix.lower() in CLOUDS:
+        return file_profile(path, sensor, name)
     lines = [line for line in read_bytes(path, "profile").splitlines() if line.strip()]
     if len(lines) < 2:
         raise TooFewSamplesError(f"profile {name} is empty ({path})")
     table = read_cells(path, lambda header, file: check_plain(header, file, PROFILE))
-    points = 1e-3 * np.column_stack([table.numbers(column, gaps=True) for column in PROFILE])
+    x, z = (table.numbers(column, gaps=True) for column in PROFILE)
     try:
-        return profile_of(points, name)
+        return columns_profile({"x": x, "z": z}, 0, sensor, 1e-3, name)
     except InputError as error:
         raise InputError(str(error), file=str(path)) from error
 
 
-def read_profiles(folder: Path, table: PoseTable) -> list[Profile | TooFewSamplesError]:
+def read_profiles(
+    folder: Path, table: PoseTable, sensor: SensorDescription = DEFAULT
+) -> list[Profile | TooFewSamplesError]:
     """Profiles (m,) of the shots; for one that shows next to nothing the reason.
 
     Raises `InputError` when a file is missing (all are looked for first), or is no profile.
@@ -198,7 +210,7 @@ def read_profiles(folder: Path, table: PoseTable) -> list[Profile | TooFewSample
     profiles: list[Profile | TooFewSamplesError] = []
     for path, name in zip(table.files_in(folder), table.names, strict=True):
         try:
-            profiles.append(read_profile(path, name))
+            profiles.append(read_profile(path, name, sensor))
         except TooFewSamplesError as error:
             profiles.append(error)
     return profiles

@@ -22,8 +22,8 @@ from robocal_ros.hand_eye.data import (
     PROFILE,
     TARGET_POSE,
     TOPIC_OF,
-    Z_GROWS,
 )
+from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, sensor_of
 from robocal_ros.hand_eye.result import METHODS
 from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
 from robocal_ros.hand_eye.session import (
@@ -75,10 +75,16 @@ SETTINGS = (
     Setting("target_file", "", "File where a call names none; for the target that it describes"),
     Setting("feature", FEATURES[0], "What a line is in a profile", choices=FEATURES),
     Setting(
+        "sensor",
+        "",
+        f"How a line laser tells its profiles: {', '.join(PRESETS)}, or a file that describes it",
+    ),
+    Setting(
         "z_grows",
-        Z_GROWS[0],
-        "z of a line laser: away from the sensor, a distance, or towards it, a height",
-        choices=Z_GROWS,
+        "",
+        "z of a line laser: away from the sensor, a distance, or towards it, a height; empty: as "
+        "sensor has it, away without one",
+        choices=("", *Z_GROWS),
     ),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
@@ -102,13 +108,20 @@ SETTINGS = (
     Setting(
         "sensor_range_mm",
         [190.0, 210.0, 60.0],
-        "z of the near and the far end of the sensor's field, and its width; for check_plan",
+        "z of the near and the far end of the sensor's field, and its width; for check_plan, where "
+        "sensor does not tell them",
         unit="mm",
         low=-20000.0,
         high=20000.0,
         check=_range_fault,
     ),
-    number("sensor_noise_mm", 0.037, "Noise of a point along the beam; for check_plan", 1e-4, 10.0),
+    number(
+        "sensor_noise_mm",
+        0.037,
+        "Noise of a point along the beam; for check_plan, the same",
+        1e-4,
+        10.0,
+    ),
     *advanced(
         *STANDSTILL,
         Setting(
@@ -126,8 +139,8 @@ SETTINGS = (
 def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
     """Settings of the session, in SI.
 
-    Raises `InputError` when the sensor's frame has no name of its own, or the error of a turn is
-    given alone.
+    Raises `InputError` when the sensor's frame has no name of its own, the error of a turn is
+    given alone, or the sensor is described by no preset or file.
     """
     names = settings["base_frame"], settings["flange_frame"], settings["sensor_frame"]
     if not all(names) or len(set(names)) < len(names):
@@ -145,7 +158,7 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
         robot_sigma_m=settings["robot_sigma_mm"] * 1e-3 or None,
         robot_sigma_rad=float(np.radians(settings["robot_sigma_deg"])) or None,
         limit_m=settings["limit_mm"] * 1e-3,
-        z_grows=settings["z_grows"],
+        sensor=sensor_of(settings["sensor"], settings["z_grows"]),
     )
 
 

@@ -15,7 +15,7 @@ from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.hand_eye.data import DataSet, Profile
+from robocal_ros.hand_eye.data import DataSet
 from robocal_ros.hand_eye.mount_fit import OPEN_M, joined, open_directions
 from robocal_ros.hand_eye.mount_problem import (
     LineModel,
@@ -28,6 +28,7 @@ from robocal_ros.hand_eye.mount_problem import (
     TargetView,
     same_pose,
 )
+from robocal_ros.hand_eye.profiles import Profile, SensorDescription
 from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, at_origin, expected_error_m
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.stairs import StepTask
@@ -631,7 +632,11 @@ def _candidate(data: DataSet | None, history: CalibrationHistory) -> int:
 
 
 def sphere_centre(
-    data: DataSet, history: CalibrationHistory, arm: SerialArm, T_flange_sensor: Array
+    data: DataSet,
+    history: CalibrationHistory,
+    arm: SerialArm,
+    T_flange_sensor: Array,
+    sensor: SensorDescription,
 ) -> Array | None:
     """Where the sphere was last found (3,), base; None where neither result nor samples tell."""
     target = target_of(data.target)
@@ -644,7 +649,7 @@ def sphere_centre(
         return None
     profiles = [Profile(sample.values, str(sample.handle)) for sample in samples]
     poses = arm.fk(np.array([sample.q for sample in samples]))
-    task = SphereTask(target)
+    task = SphereTask(target, sensor.towards)
     shots = HandEyeData(tuple(profile.name for profile in profiles), poses, profiles)
     try:
         view = task.read(shots, T_flange_sensor).view

@@ -422,8 +422,11 @@ class HandEyeServices:
             raise ConflictError("no data set is open: call start, so that the target is known")
         arm, joints = session.current.arm, [joint_sample(one) for one in request.joints]
         poses = planning.planned_poses(arm, joints, [_parts(pose) for pose in request.flange])
-        near, far, width = (1e-3 * x for x in settings["sensor_range_mm"])
-        sensor = planning.SensorRange(near, far, width, noise_m=settings["sensor_noise_mm"] * 1e-3)
+        near, far, width = settings["sensor_range_mm"]
+        noise_mm = settings["sensor_noise_mm"]
+        described = session.config.sensor
+        near, far, width, noise = described.field(near, far, width, noise_mm)
+        sensor = planning.SensorRange(near, far, width, noise_m=noise)
         given = [planning.pose_of(*_parts(pose), "sensor") for pose in request.sensor]
         mount, who = planning.rough_mount(
             session, self._history, next(iter(given), None), given_pose(settings, ROUGH)
@@ -431,7 +434,7 @@ class HandEyeServices:
         if request.center:
             centre: Array | None = planning.require_near(_point(request.center[0]), "center")
         else:
-            centre = planning.sphere_centre(data, self._history, arm, mount)
+            centre = planning.sphere_centre(data, self._history, arm, mount, described)
         found = planning.judged_plan(
             data, poses, list(request.marks), mount, sensor, session.config, centre
         )

@@ -37,12 +37,10 @@ from robocal_ros.hand_eye.data import (
     TO_HAND,
     TOPIC_OF,
     WITHOUT_FILE,
-    Z_GROWS,
     Capture,
     DataSet,
     HandEyeSample,
     PoseModels,
-    Profile,
     Shot,
     ShotLog,
     board_of,
@@ -52,6 +50,7 @@ from robocal_ros.hand_eye.data import (
     seen_corners,
     shot_of,
 )
+from robocal_ros.hand_eye.profiles import DEFAULT, Profile, SensorDescription
 from robocal_ros.hand_eye.result import (
     METHODS,
     HandEyeResult,
@@ -92,7 +91,7 @@ class HandEyeConfig:
     axis, one sigma; None: found from the samples, but the second of a line laser as
     `HandEyeSettings`.
     ``limit_m``: largest expected error at the working distance that is accepted.
-    ``z_grows``: of a line laser, away from the sensor or towards it.
+    ``sensor``: how a line laser tells its profiles.
     """
 
     base_frame: str = "base"
@@ -103,7 +102,7 @@ class HandEyeConfig:
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
     limit_m: float = 1e-3
-    z_grows: str = Z_GROWS[0]
+    sensor: SensorDescription = DEFAULT
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
@@ -113,7 +112,11 @@ class HandEyeConfig:
         """
         try:
             values = dict(document)
-            return cls(standstill=StandstillRule(**values.pop("standstill")), **values)
+            sensor = SensorDescription.of_document(values.pop("sensor", {}))
+            if "z_grows" in values:  # alone, before there were descriptions
+                sensor = replace(sensor, z_grows=values.pop("z_grows"))
+            rule = StandstillRule(**values.pop("standstill"))
+            return cls(standstill=rule, sensor=sensor, **values)
         except (KeyError, TypeError) as error:
             raise InputError(f"the recorded configuration cannot be read: {error}") from error
 
@@ -188,7 +191,7 @@ def solved(
     )
     settings = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad, config.limit_m)
     target: Any = target_of(data.target)
-    task = task_of(target, data.feature, towards=config.z_grows == "towards")
+    task = task_of(target, data.feature, towards=config.sensor.towards)
     return solve_task(task, shots, cast(Method, method), settings)
 
 
@@ -531,7 +534,7 @@ def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> N
         if kind == JOINTS:
             session.add(joint_sample(message))
         elif kind in SHOTS:
-            session.add(shot_of(kind, message))
+            session.add(shot_of(kind, message, session.config.sensor))
     except RobocalError as error:
         session.refuse(kind, error)
 

@@ -18,7 +18,6 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Document
-from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.mount_fit import (
     OPEN_M,
     MountFit,
@@ -46,6 +45,7 @@ from robocal_ros.hand_eye.mount_problem import (
     in_plane,
     pivot_of,
 )
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import (
     HandEyeResult,
     HandEyeSettings,

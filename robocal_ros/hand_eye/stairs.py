@@ -12,9 +12,9 @@ from robocal_ros.estimation.edge import CornerFit, CornerRule, EdgeRule, Kind, f
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError, TooFewSamplesError
 from robocal_ros.ground.frames import Document, transform_document
-from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.mount_fit import MountFit, first_look, misfit
 from robocal_ros.hand_eye.mount_problem import CornerModel, Index, MountState, TargetView, in_plane
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.targets import LaserTarget, SphereTarget, StepTarget
 from robocal_ros.hand_eye.tasks import (
     SEED,

@@ -23,7 +23,6 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Document
-from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.mount_problem import (
     LineModel,
@@ -36,6 +35,7 @@ from robocal_ros.hand_eye.mount_problem import (
     in_plane,
     same_pose,
 )
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import PoseNoise, TargetKind
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget
 

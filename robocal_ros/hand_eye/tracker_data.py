@@ -18,7 +18,7 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.hand_eye.data import Profile
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.kinematics import SerialArm
 

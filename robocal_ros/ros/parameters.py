@@ -97,7 +97,7 @@ class Setting:
     def bounds(self) -> str:
         """The allowed values in words."""
         if self.choices:
-            return "one of " + ", ".join(self.choices)
+            return "one of " + ", ".join(choice or "nothing" for choice in self.choices)
         low = "" if self.low is None else f"at least {self.low:g}"
         high = "" if self.high is None else f"at most {self.high:g}"
         limits = " and ".join(part for part in (low, high) if part)

@@ -15,7 +15,7 @@ from bench.laser_tracker import (
 from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.sensors import Ball, Scene
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.data import Profile, profile_of
+from robocal_ros.hand_eye.profiles import Profile, profile_of
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 

@@ -12,8 +12,8 @@ import pytest
 from robocal_ros.bags.bags import BagMessage, bag_info, read_bag
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import cloud_points
-from robocal_ros.hand_eye.data import Profile
 from robocal_ros.hand_eye.files import read_pose_table, read_profiles
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget, read_target
 from robocal_ros.kinematics.robots import load_robot
 

@@ -96,8 +96,10 @@ def test_a_shot_that_is_stamped_before_the_call_is_told_as_that(history):
 def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkeypatch):
     driver = begun(history)
     read = []
-    points = hand_eye_data.cloud_points
-    monkeypatch.setattr(hand_eye_data, "cloud_points", lambda m: read.append(m) or points(m))
+    points = hand_eye_data.cloud_profile
+    monkeypatch.setattr(
+        hand_eye_data, "cloud_profile", lambda m, sensor: read.append(m) or points(m, sensor)
+    )
     driver.robot.rest(1.0, SHOTS[0][1])
     assert not read
     driver.ask(events.CAPTURE)

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from bench.hand_eye_files import write_profile, write_target
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
-from robocal_ros.hand_eye.data import Profile, profile_of
 from robocal_ros.hand_eye.files import (
     PoseTable,
     exported,
@@ -24,6 +23,7 @@ from robocal_ros.hand_eye.files import (
     read_profiles,
     write_pose_table,
 )
+from robocal_ros.hand_eye.profiles import Profile, profile_of
 from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LineTarget,

@@ -21,6 +21,7 @@ from robocal_ros.hand_eye.planning import (
     rough_mount,
     sphere_centre,
 )
+from robocal_ros.hand_eye.profiles import DEFAULT
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.session import events
 
@@ -64,14 +65,18 @@ def test_the_sphere_is_where_it_was_seen(history):
     driver = driver_of(history)
     driver.sphere(2)
     data = driver.session.data
-    assert sphere_centre(data, history, ARM, TRUTH) is None  # two profiles do not tell their sides
+    assert (
+        sphere_centre(data, history, ARM, TRUTH, DEFAULT) is None
+    )  # two profiles do not tell their sides
     driver.sphere(6)
     data = driver.session.data
     # Off by what the mount is off: 2 mm along each axis.
-    assert np.linalg.norm(sphere_centre(data, history, ARM, CONFIGURED) - CENTRE) < 4e-3
+    assert np.linalg.norm(sphere_centre(data, history, ARM, CONFIGURED, DEFAULT) - CENTRE) < 4e-3
     number = driver.ask(events.CALIBRATE).calibration_id
     found_mm = history.document(number)["target"]["center_mm"]
-    assert sphere_centre(data, history, ARM, CONFIGURED) == pytest.approx(1e-3 * np.array(found_mm))
+    assert sphere_centre(data, history, ARM, CONFIGURED, DEFAULT) == pytest.approx(
+        1e-3 * np.array(found_mm)
+    )
 
 
 def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):

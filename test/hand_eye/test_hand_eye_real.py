@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import robocal_json
 
 from bench import hand_eye_real as real
 from robocal_ros.ground import frames
@@ -47,6 +48,25 @@ def test_what_is_left_out_is_off_as_predicted(name):
     view = task.read(data).view
     found, predicted = real.left_out_m(fit_mount((view,), look(task, view)[0]))
     assert 0.8 < found / predicted < 1.25
+
+
+def test_a_make_and_other_formats_tell_the_same_mount(sets, results, tmp_path):
+    """The first set as PLY, the table beside it, by the command and a preset."""
+    name = "experiments_sphere"
+    table = (sets / name / "poses.csv").read_text()
+    (tmp_path / "poses.csv").write_text(table.replace(".csv", ".ply"))
+    for path in (sets / name).glob("p*.csv"):
+        if path.name == "poses.csv":
+            continue
+        points = np.insert(np.loadtxt(path, delimiter=",", skiprows=1), 1, 0.0, axis=1)
+        head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+        head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        body = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
+        (tmp_path / path.with_suffix(".ply").name).write_text(head + body)
+    args = ("hand-eye", "sphere", "--poses", tmp_path / "poses.csv", "--radius-mm", 40)
+    found = robocal_json("hand-eye.sphere.json", *args, "--sensor", "lmi-gocator")
+    expected = results[name].T_flange_sensor[:3, 3] * 1e3
+    assert found["T_flange_sensor"]["xyz_mm"] == pytest.approx(expected.tolist(), abs=1e-6)
 
 
 def test_two_targets_tell_one_mount(results):

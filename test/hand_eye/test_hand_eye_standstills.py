@@ -18,6 +18,7 @@ from hand_eye_driver import (
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import StandstillRule
 from robocal_ros.hand_eye.data import StandingShot, Standstills, captured_marks, first_of_each
+from robocal_ros.hand_eye.profiles import DEFAULT
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
@@ -29,7 +30,7 @@ SHOTS = list(sphere_shots_of(3))
 
 @pytest.fixture
 def pairs() -> Standstills:
-    return Standstills(ARM.joint_names, RULE)
+    return Standstills(ARM.joint_names, RULE, DEFAULT)
 
 
 def show(pairs: Standstills, message: Recorded) -> None:

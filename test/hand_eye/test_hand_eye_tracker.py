@@ -19,7 +19,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.hand_eye import tracker
-from robocal_ros.hand_eye.data import Profile
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.tracker import (
     SENSOR,
     UNKNOWNS,

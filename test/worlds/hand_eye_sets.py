@@ -5,7 +5,7 @@ import numpy as np
 from bench.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots, TrueStairs
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.hand_eye.data import profile_of
+from robocal_ros.hand_eye.profiles import profile_of
 from robocal_ros.hand_eye.result import HandEyeResult, increment
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
 from robocal_ros.hand_eye.tasks import HandEyeData
