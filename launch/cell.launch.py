@@ -25,7 +25,6 @@ NODES = (
     "recorder_node",
 )
 CONTROLLER = "joint_trajectory_controller/joint_trajectory"
-ACTION = "joint_trajectory_controller/follow_joint_trajectory"
 STATE = "joint_trajectory_controller/controller_state"
 MOTIONS = {"follow_joint_trajectory": LaunchConfiguration("action")}
 
@@ -70,7 +69,7 @@ def generate_launch_description():
             DeclareLaunchArgument("params", default_value=in_share("config", "cell.yaml")),
             DeclareLaunchArgument("namespace", default_value=""),
             DeclareLaunchArgument("controller", default_value=CONTROLLER),
-            DeclareLaunchArgument("action", default_value=ACTION),
+            DeclareLaunchArgument("action", default_value=""),
             DeclareLaunchArgument("state", default_value=STATE),
             DeclareLaunchArgument("simulated", default_value="false"),
             *(cell_node(name) for name in NODES),

@@ -252,8 +252,8 @@ class MaintenanceNode(HouseNode):
         self._motion, default_gap_s = motion, settings["default_gap_s"]
         self._driver = MaintenanceDriver(self, motion, self._answered, self._moves)
         self._lease = LeaseHolder(self, self._nominal.name, self._serial_in_use)
-        path, mine = (motion.topic.topic_name, motion.action), self._outputs.accuracy_topic
-        self._others = CommandPath(self, *path, ("motion_lease", CORRECTION), mine)
+        path, mine = motion.topic.topic_name, self._outputs.accuracy_topic
+        self._others = CommandPath(self, path, ("motion_lease", CORRECTION), mine)
         self._calls = MaintenanceServices(
             self, self._running, self._looked, self._clocks, self._outputs, default_gap_s
         )
@@ -367,8 +367,11 @@ class MaintenanceNode(HouseNode):
 
     def _carry_out(self, requests: list[DriverRequest]) -> None:
         for request in requests:
-            if isinstance(request, Move) and self._looked() and self._others.violation:
-                continue  # the cycle has ended by that
+            if isinstance(request, Move):
+                self._motion.look()
+                self._looked()
+                if self._others.violation:
+                    continue  # the cycle has ended by that
             if self._driver is not None:
                 self._driver.carry_out(request)
 
@@ -404,7 +407,9 @@ class MaintenanceNode(HouseNode):
         """Who else commands the robot ends a cycle, and lets none begin."""
         session, now_s = self._running(), self._steady.now_s()
         self._look_s = now_s + LOOK_S
-        session.second(self._others.look(), now_s)
+        if not (session.robot.moving or session.robot.stopping.under_way):
+            self._motion.look()
+        session.second(self._others.look(self._motion.action), now_s)
         return session
 
     def _show_accuracy(self) -> None:

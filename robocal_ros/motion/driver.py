@@ -1,7 +1,8 @@
 """Sends the motions of a node to the robot's controller, and reports what it makes of them.
 
 Motions go as goals of FollowJointTrajectory: a rejection, a violated tolerance and an end are then
-known. Where nobody serves that action they go on a topic, which tells nothing. Whoever moves the
+known. The action is that of the node which takes trajectories on the topic, as the graph shows it
+before each motion. Where there is none they go on the topic, which tells nothing. Whoever moves the
 robot holds the cell's motion lease meanwhile (docs/tool.md).
 
 A stop is a plan that first goes on as the robot moves now (`REACTION_S`). Where the controller
@@ -10,6 +11,10 @@ the command goes on along the plan without a step, whatever the hardware tells a
 and a stop that comes after its end is rejected. Else it begins when it arrives, where the robot is
 measured; as lines, where the hardware tells no velocities: the controller would begin cubics with
 a speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers 4.42.1).
+
+A message may be lost. So a stop is sent up to `COPIES` times, `COPY_S` apart: by the action until
+it is answered, on the topic where it is stamped. Stamped ones are the same to the last bit, so that
+one that comes after another changes nothing; others are of the same plan at their own time.
 """
 
 import functools
@@ -26,7 +31,9 @@ from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance, JointTrajectoryControllerState
 from numpy.typing import ArrayLike, NDArray
 from rclpy.action import ActionClient
+from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
+from rclpy.type_support import check_for_type_support
 from robocal_msgs.msg import MotionLease
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -42,8 +49,10 @@ from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport, RobotWatch, S
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.graph import actions_beside
 from robocal_ros.ros.parameters import Setting, advanced, number
 
+COPIES, COPY_S = 3, 0.006  # the last one that arrives alone still steps no command back
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
 SPOKEN_S = 1.0  # a controller whose state is newer tells whether there are velocities
@@ -316,8 +325,9 @@ CONTROLLER = (
         "follow_joint_trajectory",
         "",
         "FollowJointTrajectory of the robot's controller, for example "
-        "/joint_trajectory_controller/follow_joint_trajectory; empty, or while nobody serves it: "
-        "motions go on ~/joint_trajectory, and no rejection is seen",
+        "/joint_trajectory_controller/follow_joint_trajectory; empty: that of the node which "
+        "subscribes ~/joint_trajectory. While nobody serves it motions go on that topic, and no "
+        "rejection is seen",
     ),
     HARD_STOP,
 )
@@ -357,14 +367,15 @@ class MotionDriver:
     of motions, see `goal_tolerances`; a stop has the controller's own, and is watched. ``robot``:
     where readings of the controller go now; None: nowhere. ``now``: their steady clock.
     ``hard_stop``: for a robot that does not obey.
-    ``way``: how the last motion went out, in words; empty before any.
+    ``action``: by which the next motion goes; empty: by the ``topic``. ``named`` is its name, where
+    it is given. ``way``: how the last motion went out, in words; empty before any.
     """
 
     def __init__(
         self,
         node: EndpointNode,
         names: Sequence[str],
-        action: str,
+        named: str,
         hard_stop: str,
         tolerances: Mapping[str, Any],
         reported: Callable[[MotionReport], None],
@@ -376,10 +387,12 @@ class MotionDriver:
         self._index: dict[tuple[str, ...], list[int]] = {}
         self._now = now
         self.topic = node.add_output(JointTrajectory, "~/joint_trajectory", endpoints.RELIABLE)
-        self.action = node.resolve_topic_name(action) if action else ""
-        self._client = None
-        if self.action:  # rclpy remaps the parts of an action, but not its name
-            self._client = ActionClient(node, FollowJointTrajectory, self.action)
+        # rclpy remaps the parts of an action, but not its name
+        self._named = [node.resolve_topic_name(named)] if named else []
+        self.action, self._found = "", self._named
+        self._client: ActionClient | None = None
+        check_for_type_support(FollowJointTrajectory)  # its libraries: 80 ms, else at a motion
+        self.look()
         self.hard_stop = HardStopService(node, hard_stop)
         node.add_input(
             JointTrajectoryControllerState, "controller_state", self._take_state, endpoints.SENSOR
@@ -387,14 +400,36 @@ class MotionDriver:
         node.add_input(Float64, "speed_scaling", self._take_scaling, endpoints.SENSOR)
         self._controller = StatedController()
         self._scaling, self._rejected = SpeedScaling(), False
-        self._newest = 0
+        self._first = self._newest = 0  # what was sent of the present motion, or stop
+        self._stop: Callable[[], JointTrajectory] | None = None  # that may have been lost
+        self._copies = 0
+        # It goes on where a node that sent a stop is deactivated.
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._repeats = node.create_timer(COPY_S, guarded(node, self._repeat), clock=clock)
+        self._repeats.cancel()
         self.way = ""
 
     def close(self) -> None:
-        """Take the action's client down, while nothing spins it."""
+        """Take timer and the action's client down, while nothing spins them."""
+        self._node.destroy_timer(self._repeats)
+        self._drop()
+
+    def _drop(self) -> None:
         if self._client is not None:
             self._client.destroy()
-        self._client = None
+        self.action, self._client = "", None
+
+    def look(self) -> str:
+        """Look for the action, while nothing moves; its name, empty where the topic is left."""
+        topic = self.topic.topic_name
+        self._found = self._named or actions_beside(self._node, topic)
+        action = self._found[0] if len(self._found) == 1 else ""
+        if action != self.action:
+            self._drop()
+            self.action = action
+            if action:
+                self._client = ActionClient(self._node, FollowJointTrajectory, action)
+        return action
 
     def send(self, plan: JointPlan, *, stop: bool) -> None:
         """Send a motion, which takes the place of what the controller drives.
@@ -403,45 +438,75 @@ class MotionDriver:
         rejection no stamp is trusted.
         """
         self._rejected = self._rejected and stop
-        if stop:
+        self._repeats.cancel()
+        self._first = self._newest + 1
+        if not stop:
+            self.look()
+            self._send(joint_trajectory(self._names, *plan.points()), self._tolerances)
+            return
+        begin_s, going_on = self._now(), plan.going_on(REACTION_S)
+
+        def message(*, trusted: bool = False) -> JointTrajectory:
             now_s = self._now()
-            message = self._controller.stop_message(
-                plan.going_on(REACTION_S),
+            return self._controller.stop_message(
+                going_on,
                 self._names,
                 now_s,
                 self._scaling.at(now_s),
-                trusted=not self._rejected,
+                at_s=now_s - begin_s,
+                trusted=trusted,
             )
+
+        first = message(trusted=not self._rejected)
+        stamped = first.header.stamp != Time()
+        by_action = self._send(first, {})
+        if stamped or by_action:
+            self._stop, self._copies = (lambda: first) if stamped else message, 1
+            self._repeats.reset()
+
+    def _repeat(self) -> None:
+        if self._stop is not None and self._copies < COPIES:
+            self._copies += 1
+            self._send(self._stop(), {})
         else:
-            message = joint_trajectory(self._names, *plan.points())
+            self._repeats.cancel()
+
+    def _send(self, message: JointTrajectory, tolerances: Mapping[str, Any]) -> bool:
+        """Send a trajectory; whether it went by the action."""
         self._newest += 1
         number = self._newest
         if self._client is None or not self._client.server_is_ready():
             self.topic.publish(message)
             self._say(f"the topic {self.topic.topic_name}; no rejection is seen")
-            return
-        tolerances = {} if stop else self._tolerances
+            return False
         goal = FollowJointTrajectory.Goal(trajectory=message, **tolerances)
         future = self._client.send_goal_async(goal)
         future.add_done_callback(guarded(self._node, lambda done: self._answered(number, done)))
         self._say(f"the action {self.action}")
+        return True
 
     def _say(self, way: str) -> None:
         if way == self.way:
             return
         self.way, logger = way, self._node.get_logger()
-        if self.action and not way.startswith("the action"):
+        if self._named and not way.startswith("the action"):
             logger.warning(f"nobody serves {self.action}: motions go on {way}")
+        elif len(self._found) > 1:
+            which = ", ".join(self._found)
+            logger.warning(f"follow_joint_trajectory: name one of {which}; motions go on {way}")
         else:
             logger.info(f"motions go on {way}")
 
     def _answered(self, number: int, future: Future) -> None:
         handle: Any = future.result()
+        if number >= self._first:
+            self._repeats.cancel()
+            if not handle.accepted:
+                self._rejected = True
+                words = "the controller rejected the motion"
+                self._reported(MotionReport(failed=True, words=words))
         if not handle.accepted:
-            self._rejected = True
-            self._report(number, failed=True, words="the controller rejected the motion")
             return
-        self._report(number)
         result = handle.get_result_async()
         result.add_done_callback(guarded(self._node, lambda done: self._ended(number, done)))
 
@@ -450,12 +515,8 @@ class MotionDriver:
         result, succeeded = answer.result, answer.status == GoalStatus.STATUS_SUCCEEDED
         code = VIOLATIONS.get(result.error_code, result.error_code)
         words = f"the controller ended the motion ({code}): {result.error_string}"
-        self._report(number, ended=True, failed=not succeeded, words=words)
-
-    def _report(self, number: int, **found: Any) -> None:
-        """Of the newest motion; one before it ended because this one took its place."""
-        if number == self._newest:
-            self._reported(MotionReport(**found))
+        if number == self._newest:  # one before it ended because this one took its place
+            self._reported(MotionReport(ended=True, failed=not succeeded, words=words))
 
     def _take_state(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()

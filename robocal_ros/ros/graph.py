@@ -6,6 +6,7 @@ used, of rmw_fastrtps and Fast DDS:
 - The first 12 bytes of an endpoint's gid are its participant's prefix, one per ROS context: what a
   process publishes and serves shares them (a process of two contexts has two).
 - A client of an action is a publisher of the DDS topic ``rq/<action>/_action/send_goalRequest``.
+- The actions of a node whose name is not discovered yet are not known (RCLError).
 """
 
 import time
@@ -16,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -31,6 +34,7 @@ from robocal_ros.ros.parameters import Setting
 
 PREFIX = 12  # bytes of a gid
 TRAJECTORY, ACTION = "joint_trajectory", "follow_joint_trajectory"  # a controller's two inputs
+_FOLLOWS = "control_msgs/action/FollowJointTrajectory"
 _LIFECYCLE = "lifecycle_msgs/srv/GetState"
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
 KILLED = "one that was killed counts until DDS gives it up, after up to 20 s"
@@ -61,6 +65,22 @@ def clients(node: Node, action: str) -> list[Endpoint]:
     """Who sends goals to an action of that resolved name."""
     topic = f"rq{action}/_action/send_goalRequest"
     return _endpoints(node.get_publishers_info_by_topic(topic, no_mangle=True))
+
+
+def actions_beside(node: Node, topic: str) -> list[str]:
+    """FollowJointTrajectory actions of the nodes that take trajectories by a resolved topic.
+
+    joint_trajectory_controller serves ``~/follow_joint_trajectory`` beside ``~/joint_trajectory``.
+    """
+    found = set()
+    for taker in _endpoints(node.get_subscriptions_info_by_topic(topic)):
+        namespace, _, name = taker.name.rpartition("/")
+        try:
+            served = get_action_server_names_and_types_by_node(node, name, namespace or "/")
+        except RCLError:
+            continue
+        found |= {action for action, kinds in served if _FOLLOWS in kinds}
+    return sorted(found)
 
 
 def _endpoints(found: Iterable[Any]) -> list[Endpoint]:
@@ -147,27 +167,27 @@ def commanding(
 class CommandPath:
     """Looks at who commands a robot.
 
-    ``topic``, ``action``: resolved names by which this node commands it; an empty action is none.
+    ``topic``: resolved name by which this node commands it.
     ``cell``: topics whose publishers may command it too: each waits while another holds the lease.
     ``mine``: topic that one node of this kind publishes for each robot; empty: `cell` tells all.
     ``violation``: who else commands the robot; empty: nobody.
     """
 
-    def __init__(
-        self, node: Node, topic: str, action: str, cell: Sequence[str], mine: str = ""
-    ) -> None:
-        self._node, self._mine = node, mine
-        # A controller takes trajectories on the topic beside its action, and the other way round.
-        topics = {topic, beside(action, TRAJECTORY)} if action else {topic}
-        self._topics = dict.fromkeys(sorted(topics), 1)
-        self._actions = {action: 1} if action else {beside(topic, ACTION): 0}
+    def __init__(self, node: Node, topic: str, cell: Sequence[str], mine: str = "") -> None:
+        self._node, self._topic, self._mine = node, topic, mine
         self._cell = [node.resolve_topic_name(each) for each in cell]
         self._own = own_endpoint(node)
         self.violation = ""
 
-    def look(self) -> str:
-        """Look now, before anything begins to move and twice a second; the violation."""
+    def look(self, action: str) -> str:
+        """Look now, before anything begins to move and twice a second; the violation.
+
+        ``action``: resolved name by which this node commands the robot too; empty: none.
+        """
         node, found = self._node, []
+        # A controller takes trajectories on the topic beside its action, and the other way round.
+        topics = {self._topic, beside(action, TRAJECTORY)} if action else {self._topic}
+        actions = {action: 1} if action else {beside(self._topic, ACTION): 0}
         same = publishers(node, self._mine) if self._mine else []
         if len(same) > 1:
             who = ", ".join(sorted(f"{one.name} [{one.participant.hex()}]" for one in same))
@@ -176,7 +196,7 @@ class CommandPath:
                 "robot; end the others"
             )
         cell = [one for each in self._cell for one in publishers(node, each)]
-        found += commanding(node, self._own, self._topics, self._actions, cell)
+        found += commanding(node, self._own, dict.fromkeys(sorted(topics), 1), actions, cell)
         self.violation = "; ".join(found)
         if found:
             self.violation += (

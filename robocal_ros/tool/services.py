@@ -253,7 +253,7 @@ class TcfMotion:
             self._steady.now_s,
         )
         self._lease = LeaseHolder(node, arm.name, serial)
-        self._others = CommandPath(node, self._motion.topic.topic_name, self._motion.action, CELL)
+        self._others = CommandPath(node, self._motion.topic.topic_name, CELL)
         self._gap = Gap(stale_s) if (stale_s := settings["gap_stale_s"]) > 0.0 else None
         if self._gap is not None:
             is_bool = settings["gap_bool"]
@@ -365,6 +365,12 @@ class TcfMotion:
                 return why
         return self._others.violation
 
+    def _look(self, driver: ToolDriver) -> None:
+        """Look for the controller's action, and who else commands the robot."""
+        if not driver.moves:
+            self._motion.look()
+        self._others.look(self._motion.action)
+
     def _tick(self) -> None:
         now_s = self._steady.now_s()
         if self._gap is not None:
@@ -372,7 +378,7 @@ class TcfMotion:
         if self.driver is not None:
             if now_s >= self._looked_s + LOOK_S:
                 self._looked_s = now_s
-                self._others.look()
+                self._look(self.driver)
             self.driver.tick(now_s)
             self._lease.hold(f"tool: {self.driver.words()}" if self.driver.moves else "")
 
@@ -389,7 +395,7 @@ class TcfMotion:
             return response
         now_s = self._steady.now_s()
         if request.data:
-            self._others.look()
+            self._look(self.driver)
             self.driver.arm(now_s)
         else:
             self.driver.disarm("disarmed by a call", now_s)
@@ -402,7 +408,7 @@ class TcfMotion:
         return response
 
     def _send(self, plan: JointPlan, stop: bool) -> float:
-        if not stop and (why := self._others.look()):
+        if not stop and (why := self._others.look(self._motion.look())):
             raise ConflictError(why)  # at which the driver stops and disarms
         sent_s = self._steady.now_s()  # not after it: a robot ahead of its plan is off it
         self._motion.send(plan, stop=stop)

@@ -21,7 +21,7 @@ from robocal_ros.correction.robot_state import RobotTrack
 from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import StatedController
+from robocal_ros.motion.driver import COPIES, COPY_S, StatedController
 from robocal_ros.motion.plan import MotionLimits, stop
 from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch, WatchedStop
 
@@ -78,8 +78,8 @@ class Driven:
         else:
             self.stated.hear(speeds, 6, now_s)
 
-    def obeys(self, message: Any, late_s: float) -> np.ndarray:
-        """Take a stop so late; the speed of the command in each cycle, from just before."""
+    def takes(self, message: Any, late_s: float) -> None:
+        """Take a stop so late."""
         stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         points = message.points
         times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points]
@@ -87,6 +87,11 @@ class Driven:
         places = [p.positions for p in points]
         given = Trajectory.of(message.joint_names, times, places, speeds, start_s=stamp_s or None)
         self.motion.take(2.0 + late_s, given)
+        self.motion.pass_to(2.0 + late_s)
+
+    def obeys(self, message: Any, late_s: float) -> np.ndarray:
+        """The same; the speed of the command in each cycle, from just before."""
+        self.takes(message, late_s)
         self.motion.pass_to(3.5)
         rows = self.motion._rows[: self.motion._count - self.motion._begin]
         return np.diff(rows[round(1.9 / CYCLE_S) :, 2, 0]) / CYCLE_S
@@ -154,6 +159,46 @@ def test_without_its_reference_a_stop_steps_by_no_more_than_the_drives_lag(stop,
     assert np.min(speed) > SPEED - back - even
     assert np.max(np.abs(np.diff(speed))) < back + even
     assert np.max(np.abs(np.diff(speed))) > 0.9 * back  # no sender can help it
+
+
+def own_stop(driven: Driven, deceleration: float, taken: Any) -> tuple[float, np.ndarray]:
+    """Length of an own stop, and the command's speed, where these of its copies arrive."""
+    q, qd = driven.motion.last()[1][4:6]
+    planned = stop(NOMINAL, MotionLimits(stop_deceleration=deceleration), q, qd)
+    plan, messages = planned.going_on(REACTION_S), []
+    for number in range(COPIES):
+        at_s = number * COPY_S
+        if not number or not messages[0].header.stamp.nanosec:
+            messages.append(
+                driven.stated.stop_message(plan, NAMES, driven.robot.now, 1.0, at_s=at_s)
+            )
+    for number in taken[:-1]:
+        driven.takes(messages[min(number, len(messages) - 1)], 0.008 + number * COPY_S)
+    last = messages[min(taken[-1], len(messages) - 1)]
+    return planned.duration_s, driven.obeys(last, 0.008 + taken[-1] * COPY_S)
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("deceleration", [20.0, 5.0, 2.0])
+def test_a_stop_that_is_lost_twice_ends_as_it_was_planned(deceleration, told, velocities):
+    """Whatever its length: each copy is of the same plan at its own time."""
+    for lost in range(COPIES):
+        lag_s = LAG_S if told else 0.0
+        duration_s, speed = own_stop(Driven(velocities, lag_s, told), deceleration, [lost])
+        moves_s = CYCLE_S * (1 + np.flatnonzero(np.abs(speed) > 1e-6)[-1]) - 0.1
+        assert moves_s <= 1.5 * duration_s
+        # Where it begins before it arrives, and from a drive's place, up to two cycles in one.
+        assert moves_s <= REACTION_S + duration_s + 0.008 + 2.0 * CYCLE_S
+        assert np.min(speed) > -1e-3
+        assert np.max(speed) < SPEED * (1.0 if told else 1.2) + 1e-3
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_a_stamped_stop_that_comes_three_times_is_one(velocities):
+    once = own_stop(Driven(velocities, LAG_S, told=True), 5.0, [0])
+    thrice = own_stop(Driven(velocities, LAG_S, told=True), 5.0, [0, 1, 2])
+    assert thrice[1] == pytest.approx(once[1], abs=1e-9)
 
 
 def test_a_stop_that_a_pausing_controller_is_seen_to_take_is_over():

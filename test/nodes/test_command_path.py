@@ -32,7 +32,7 @@ class Watched:
         self.own = self.process("tcf_node").node
         self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
         self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
-        self.watch = CommandPath(self.own, PATH, ACTION, (ACCURACY, CORRECTION))
+        self.watch = CommandPath(self.own, PATH, (ACCURACY, CORRECTION))
 
     def process(self, name: str, kind: type[Node] = Node) -> Process:
         self.processes.append(Process(self.graph.domain, name, kind))
@@ -41,7 +41,7 @@ class Watched:
     def becomes(self, words: str) -> None:
         """Wait until it says so; empty: until nothing is wrong."""
         self.graph.spin_until(
-            lambda: words in self.watch.look() if words else not self.watch.look(),
+            lambda: words in self.watch.look(ACTION) and bool(words) == bool(self.watch.violation),
             f"'{words}', not '{self.watch.violation}'",
         )
 
@@ -86,7 +86,7 @@ def test_a_node_of_the_cell_may_command_the_robot_and_no_other_of_its_process(
 
 def test_the_topic_beside_the_controllers_action_is_looked_at(watched: Watched) -> None:
     """Motions go by the action, so that the topic of this node was left as it is."""
-    watched.watch = CommandPath(watched.own, "/tcf_node/joint_trajectory", ACTION, ())
+    watched.watch = CommandPath(watched.own, "/tcf_node/joint_trajectory", ())
     watched.becomes("")
     watched.process("planner").node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(f"/planner publishes {PATH}")

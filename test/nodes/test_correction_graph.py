@@ -162,11 +162,11 @@ def test_a_client_of_the_action_beside_the_topic_is_a_stranger(watched: Watched)
     mover, planner = watched.process("tcf_node"), watched.process("planner")
     topic, action = "/robot/joint_trajectory", "/robot/follow_joint_trajectory"
     mover.node.create_publisher(JointTrajectory, topic, endpoints.RELIABLE)
-    path = CommandPath(mover.node, topic, "", ())
-    assert not path.look()
+    path = CommandPath(mover.node, topic, ())
+    assert not path.look("")
     client = ActionClient(planner.node, FollowJointTrajectory, action)
     words = f"/planner is a client of {action}"
-    watched.graph.spin_until(lambda: words in path.look(), words)
+    watched.graph.spin_until(lambda: words in path.look(""), words)
     client.destroy()
 
 

@@ -4,8 +4,13 @@ import time
 from typing import Any
 
 import numpy as np
+from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
+from rclpy.action import ActionServer
 from std_msgs.msg import Float64
+from test_correction_graph import Process
+from trajectory_controllers import HOME as Q_UR10
+from trajectory_controllers import accepted_goals
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.kinematics.robots import load_robot
@@ -16,8 +21,10 @@ from robocal_ros.motion.driver import MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.graph import actions_beside
 
 ARM = load_robot("kr150_r3100")
+ACTION = "/controller/follow_joint_trajectory"
 DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=MotionLimits())
 
 
@@ -43,6 +50,61 @@ def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
     assert out_by_then == [0]
     graph.spin_until(lambda: len(inbox) == 1, "the motion goes out")
     driver.close()
+    node.destroy_node()
+
+
+def test_each_motion_goes_by_the_action_that_is_there_when_it_begins(graph: Any) -> None:
+    """And its stop as it went, whatever has come since."""
+    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
+    graph.executor.add_node(node)
+    names, path = load_robot("ur10").joint_names, "/driver/joint_trajectory"
+    motion = MotionDriver(
+        node, names, "", "", {}, lambda report: None, lambda: None, time.monotonic
+    )
+    node.trigger_configure()
+    node.trigger_activate()
+    inbox, goals = graph.collect(JointTrajectory, path), accepted_goals(graph, ACTION)
+    graph.spin_until(lambda: motion.topic.get_subscription_count() > 0, "the probe listens")
+    rest = np.zeros((2, 6))
+    plan = JointPlan(np.array([0.0, 1.0]), rest + Q_UR10, rest, rest)
+
+    def sent(stop: bool) -> str:
+        """Where it came: a stop that is answered late is sent again."""
+        inbox.clear()
+        goals.clear()
+        motion.send(plan, stop=stop)
+        graph.spin_until(lambda: inbox or goals, "it comes")
+        graph.spin_for(0.1)
+        assert not (inbox and goals)
+        return "topic" if inbox else "action"
+
+    assert sent(stop=False) == "topic"
+    assert motion.way == f"the topic {path}; no rejection is seen"
+    wired = {"__node": "controller", "joint_trajectory": path}
+    controller = graph.start("cell_sim_node", {"rate_hz": 50.0}, wired)
+    graph.spin_until(lambda: actions_beside(node, path) == [ACTION], "the controller", 30.0)
+    assert sent(stop=True) == "topic"
+    assert sent(stop=False) == "action"
+    assert motion.way == f"the action {ACTION}"
+    assert sent(stop=True) == "action"
+    others = [Process(graph.domain, name) for name in ("one", "two")]
+    try:
+        for other in others:
+            other.node.create_subscription(JointTrajectory, path, inbox.append, 1)
+        graph.spin_until(lambda: motion.topic.get_subscription_count() == 4, "they listen")
+        assert sent(stop=False) == "action"  # a recorder serves nothing
+        for other in others:
+            ActionServer(other.node, FollowJointTrajectory, "~/follow", inbox.append)
+        graph.spin_until(lambda: len(actions_beside(node, path)) == 3, "they serve")
+        assert sent(stop=False) == "topic"
+    finally:
+        for other in others:
+            other.end()
+    assert controller.stop() == 0
+    graph.spin_until(lambda: not actions_beside(node, path), "the controller is gone")
+    assert sent(stop=False) == "topic"
+    motion.close()
+    graph.executor.remove_node(node)
     node.destroy_node()
 
 

@@ -15,6 +15,7 @@ from robocal_msgs.msg import AccuracyState, GapOpen, MaintenanceStatus, SessionE
 from robocal_msgs.srv import CaptureReference
 from sensor_msgs.msg import JointState
 from shift import BALL, NOISE_M, T_SENSOR_BASE
+from trajectory_controllers import accepted_goals
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.kinematics.arm import inverse
@@ -78,7 +79,8 @@ class LiveCell:
         self.rng = np.random.default_rng(2)
         self.is_open = self.beating = self.sensing = True
         self.joints: list[JointState] = []
-        self.sent = graph.collect(JointTrajectory, ROBOT)
+        self.goals = accepted_goals(graph, "/cell_sim_node/follow_joint_trajectory")
+        self.on_topic = graph.collect(JointTrajectory, ROBOT)
         self.statuses = graph.collect(
             MaintenanceStatus, "/maintenance_node/status", endpoints.LATCHED
         )
@@ -212,7 +214,7 @@ class LiveCell:
             ROBOT,
             joint_trajectory(self.arm.joint_names, *plan.points()),
             lambda: near(end, REST_RAD) or not near(stood, 10.0 * REST_RAD),
-            subscribers=2,  # the robot, and `sent`
+            subscribers=2,  # the robot, and `on_topic`
         )
         self.graph.spin_until(lambda: near(end, REST_RAD), "its end", plan.duration_s + 5.0)
 

@@ -1,6 +1,6 @@
 """A node that moves the robot as maintenance_node does, by orders of the test; run as a process.
 
-`MotionDriver` sends, `Mover` supervises and stops; nothing of them is replaced. Orders and reports
+`MotionDriver` sends, `Mover` supervises and stops; what goes out may be lost. Orders and reports
 are JSON.
 """
 
@@ -42,6 +42,18 @@ DEEP = QoSProfile(
 )
 
 
+class LossyDriver(MotionDriver):
+    """The network loses the next ``lost`` messages."""
+
+    lost = 0
+
+    def _send(self, message: Any, tolerances: Any) -> bool:
+        if self.lost > 0:
+            self.lost -= 1
+            return bool(self.action)
+        return super()._send(message, tolerances)
+
+
 class OwnMotions(HouseNode):
     """Orders: ``go`` to joints, from rest; ``stop``.
 
@@ -64,7 +76,7 @@ class OwnMotions(HouseNode):
         self._going = False
         self._names = list(ARM.joint_names)
         self._ticked_s = self._longest_tick_s = 0.0
-        self.motion = MotionDriver(
+        self.motion = LossyDriver(
             self,
             self._names,
             self.settings["follow_joint_trajectory"],
@@ -127,9 +139,7 @@ class OwnMotions(HouseNode):
 
     def _send(self, plan: JointPlan, *, stop: bool) -> None:
         order, names = self._order, list(ARM.joint_names)
-        if order.get("lost", 0) > 0:
-            order["lost"] -= 1
-            return
+        self.motion.lost += order.pop("lost", 0)
         if order.get("rejected", 0) > 0:
             order["rejected"] -= 1
             names = [f"no_{name}" for name in names]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from action_msgs.msg import GoalStatusArray
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from builtin_interfaces.msg import Duration, Time
 from control_msgs.action import FollowJointTrajectory
@@ -75,6 +76,20 @@ def _parts(time_s: float) -> dict[str, int]:
 def seconds(stamp: Any) -> float:
     """Of a time or a duration."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def accepted_goals(graph: Any, action: str) -> list[bytes]:
+    """Goals that a controller's action accepted from now on, whoever sent them; it grows."""
+    goals: list[bytes] = []
+
+    def take(message: GoalStatusArray) -> None:
+        told = [bytes(status.goal_info.goal_id.uuid) for status in message.status_list]
+        goals.extend(goal for goal in told if goal not in goals)
+
+    graph.probe.create_subscription(
+        GoalStatusArray, f"{action}/_action/status", take, endpoints.LATCHED
+    )
+    return goals
 
 
 class Controlled:
