@@ -10,7 +10,7 @@ from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
-from robocal_ros.motion.cell import MotionCell, ToolBody, along, departure, joint_way, raised_way
+from robocal_ros.motion.cell import MotionCell, along, departure, joint_way, raised_way
 from robocal_ros.motion.plan import JointPlan, joined, start_near, stop, stop_time
 from robocal_ros.motion.robot_watch import (
     VELOCITY_S,
@@ -65,14 +65,14 @@ class Ways:
             raise InputError(f"home has {config.home.size} joints, {arm.name} has {arm.n}")
         if config.poses.ndim != 2 or config.poses.shape[1] != arm.n:
             raise InputError(f"measuring poses {config.poses.shape}: {arm.n} joints each")
-        body = ToolBody(
-            config.T_flange_tool,
-            driving.tool_length_m,
-            driving.tool_radius_m,
-            driving.flange_radius_m,
+        self.station = MotionCell(
+            arm,
+            driving.body(config.T_flange_tool),
+            np.eye(4) if laser is None else laser,
+            driving.housing,
+            driving.limits,
+            driving.mandrel,
         )
-        T_base_laser = np.eye(4) if laser is None else laser
-        self.station = MotionCell(arm, body, T_base_laser, driving.housing, driving.limits)
         travel = replace(driving.limits, tcp_speed_m_s=config.travel_speed_m_s)
         self.cell = replace(self.station, limits=travel)
         self._home, self._points = config.home, np.vstack([config.home, config.poses])

@@ -3,6 +3,7 @@
 import inspect
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -90,18 +91,22 @@ class Housing:
 
 @dataclass(frozen=True, eq=False)
 class ToolBody:
-    """A tool as two capsules, along its axis from the tip and on to the flange, and the flange."""
+    """A tool as two capsules, along its axis from the tip and on to the flange, and the flange.
+
+    A mandrel is one too.
+    """
 
     T_flange_tool: Array  # (4, 4) tip, and axis from flange to tip along z
     # length_m, radius_m: of the part along the axis; the rest of the tool has this radius too
     length_m: float
     radius_m: float
     flange_radius_m: float  # of a ball around the flange's origin
+    name: str = "tool"
 
     def __post_init__(self) -> None:
         sizes = {
-            "tool length": self.length_m,
-            "tool radius": self.radius_m,
+            f"{self.name} length": self.length_m,
+            f"{self.name} radius": self.radius_m,
             "flange radius": self.flange_radius_m,
         }
         for name, size in sizes.items():
@@ -127,8 +132,8 @@ class ToolBody:
         tip, upper, flange = np.swapaxes(p_laser, 0, 1)
         radius = self.radius_m + margin_m
         return {
-            "the tool": housing.cut_by(tip, upper, radius),
-            "the tool's upper part": housing.cut_by(upper, flange, radius),
+            f"the {self.name}": housing.cut_by(tip, upper, radius),
+            f"the {self.name}'s upper part": housing.cut_by(upper, flange, radius),
             "the flange": housing.cut_by(flange, flange, self.flange_radius_m + margin_m),
         }
 
@@ -149,6 +154,11 @@ class DrivingConfig:
     silence_s: float = 0.1  # joint states may pause for so long while the robot moves
     late_s: float = 0.15  # the robot lags at most so far behind its plan
     armed_s: float = 60.0  # without a run it disarms after so long
+    mandrel: ToolBody | None = None  # on the flange beside the tool
+
+    def body(self, T_flange_tool: Array) -> ToolBody:
+        """A tool (4, 4) of these sizes."""
+        return ToolBody(T_flange_tool, self.tool_length_m, self.tool_radius_m, self.flange_radius_m)
 
 
 ROUNDING = 1e-6  # relative, of a speed that is driven at its limit
@@ -161,10 +171,21 @@ class MotionCell:
     """What motions are planned for."""
 
     arm: SerialArm  # the model in force, with the joints' limits
-    tool: ToolBody
+    tool: ToolBody  # whose tip moves
     T_base_laser: Array  # (4, 4) of the station
     housing: Housing
     limits: MotionLimits = field(default_factory=MotionLimits)
+    beside: ToolBody | None = None  # what the flange carries too
+
+    @cached_property
+    def bodies(self) -> tuple[ToolBody, ...]:
+        """All that is to be kept clear."""
+        return (self.tool,) if self.beside is None else (self.tool, self.beside)
+
+    @cached_property
+    def corners(self) -> Array:
+        """Of the bodies (3 k, 3), flange frame; the tip is the first."""
+        return np.vstack([body.corners for body in self.bodies])
 
     def T_base_tip(self, q: Array) -> Array:
         """The tip's place with the flange's axes (4, 4) at joints (n,)."""
@@ -224,7 +245,10 @@ class MotionCell:
         stopping = 0.5 * fastest * stop_time(self.arm, self.limits, seen.qd)
         margin = float(np.max(stopping) + np.max(fastest) * np.max(np.diff(seen.time_s)))
         places = self.in_laser(seen.corners)
-        for part, cut in self.tool.cuts(self.housing, places, margin).items():
+        cuts: dict[str, Array] = {}
+        for body, own in zip(self.bodies, np.split(places, len(self.bodies), 1), strict=True):
+            cuts |= body.cuts(self.housing, own, margin)
+        for part, cut in cuts.items():
             i = int(np.argmax(cut))
             if cut[i] > 0.0:
                 x, y, z = 1e3 * places[i, 0]
@@ -247,14 +271,14 @@ class MotionCell:
 
     def _moving(self, time: Array, q: Array, qd: Array) -> "_Sampled":
         T, twist = self.arm.fk(q), (self.arm.jacobian(q) @ qd[:, :, None])[:, :, 0]
-        arms = self.tool.corners @ np.swapaxes(T[:, :3, :3], 1, 2)
+        arms = self.corners @ np.swapaxes(T[:, :3, :3], 1, 2)
         velocity = twist[:, None, :3] + np.cross(twist[:, None, 3:], arms)
         return _Sampled(time, q, qd, T[:, None, :3, 3] + arms, np.linalg.norm(velocity, axis=2))
 
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """A plan at instants (m,): joints, places (m, 3, 3) and speeds (m, 3) of the tool's corners."""
+    """A plan at instants (m,): joints; places (m, k, 3), speeds (m, k) of the cell's corners."""
 
     time_s: Array
     q: Array
@@ -349,9 +373,9 @@ def lifted(cell: MotionCell, T: Array, by_m: float) -> Array:
 
 
 def way_m(cell: MotionCell, here: Array, there: Array) -> float:
-    """No point between tip and flange moves further, m."""
+    """No point of what the flange carries moves further, m."""
     turn = np.linalg.norm(frames.log_rotation(there[:3, :3] @ here[:3, :3].T))
-    reach = np.max(np.linalg.norm(cell.tool.corners - cell.tool.p_tip, axis=1))
+    reach = np.max(np.linalg.norm(cell.corners - cell.tool.p_tip, axis=1))
     return float(np.linalg.norm(there[:3, 3] - here[:3, 3]) + turn * reach)
 
 

@@ -43,14 +43,14 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.motion.cell import DrivingConfig, Housing
+from robocal_ros.motion.cell import DrivingConfig, Housing, ToolBody
 from robocal_ros.motion.plan import LEAD_S, REACTION_S, JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport, RobotWatch, SpeedScaling
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.graph import actions_beside
-from robocal_ros.ros.parameters import Setting, advanced, number
+from robocal_ros.ros.parameters import Setting, advanced, given_pose, number, pose_settings
 
 COPIES, COPY_S = 3, 0.006  # the last one that arrives alone still steps no command back
 LINES_S = 0.01  # between points for a controller that has no velocities
@@ -230,6 +230,13 @@ MOTION = (
     number("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
     number("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
     number("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
+    *pose_settings(
+        "mandrel",
+        "End of the mandrel in the flange frame; as the quaternion at its default: there is none",
+        "Its orientation: z along its axis to its end",
+    ),
+    number("mandrel_length_mm", 100.0, "Length of the mandrel along its axis", 1.0, 2e3),
+    number("mandrel_radius_mm", 10.0, "Its radius", 0.5, 500.0),
     number("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
     number(
         "deviation_deg",
@@ -258,7 +265,14 @@ def driving_config(settings: Mapping[str, Any], **plunge: float) -> DrivingConfi
 
     Raises `InputError` when sizes contradict each other.
     """
+    T_flange_mandrel = given_pose(settings, "mandrel")
+    flange_radius_m = settings["flange_radius_mm"] * 1e-3
+    mandrel = None
+    if T_flange_mandrel is not None:
+        length_m, radius_m = (settings[f"mandrel_{of}_mm"] * 1e-3 for of in ("length", "radius"))
+        mandrel = ToolBody(T_flange_mandrel, length_m, radius_m, flange_radius_m, "mandrel")
     return DrivingConfig(
+        mandrel=mandrel,
         housing=Housing(
             clear_radius_m=settings["opening_radius_mm"] * 1e-3,
             top_m=settings["housing_top_mm"] * 1e-3,
@@ -268,7 +282,7 @@ def driving_config(settings: Mapping[str, Any], **plunge: float) -> DrivingConfi
         ),
         tool_length_m=settings["tool_length_mm"] * 1e-3,
         tool_radius_m=settings["tool_radius_mm"] * 1e-3,
-        flange_radius_m=settings["flange_radius_mm"] * 1e-3,
+        flange_radius_m=flange_radius_m,
         limits=MotionLimits(
             joint_velocity=np.radians(settings["joint_velocity_deg_s"]),
             joint_acceleration=np.radians(settings["joint_acceleration_deg_s2"]),

@@ -5,6 +5,7 @@ only when the one before has ended there.
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from enum import Enum
 from itertools import pairwise
 
@@ -19,7 +20,6 @@ from robocal_ros.motion.cell import (
     ROUNDING,
     DrivingConfig,
     MotionCell,
-    ToolBody,
     along,
     corner_ride,
     load_motion,
@@ -39,7 +39,7 @@ from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWat
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
 from robocal_ros.tool.laser_frame import FEWEST_READINGS, JointPath
 from robocal_ros.tool.run import PlannedStep, ToolRun
-from robocal_ros.tool.session import ToolSession
+from robocal_ros.tool.session import OF_MANDREL, ToolSession
 
 STANDS_S = 0.2  # a robot that a run takes over has rested for so long
 SETTLED_S = 0.03  # one whose own motion has ended
@@ -65,11 +65,21 @@ class StopError(RobocalError):
         self.code = code
 
 
-def station_cell(run: ToolRun, config: DrivingConfig) -> MotionCell:
-    """Robot, the tool as it was seen last, and the station of a run."""
+def station_cell(run: ToolRun, config: DrivingConfig, T_flange_tool: Array) -> MotionCell:
+    """Robot, what it measures as it was seen last, and the station of a run.
+
+    ``T_flange_tool`` (4, 4): the tool in force, which hangs beside a mandrel that is measured.
+
+    Raises `ConflictError` where a mandrel's sizes are not known.
+    """
     seen = run.plan.T_flange_tool if run.seen is None else run.seen
-    body = ToolBody(seen, config.tool_length_m, config.tool_radius_m, config.flange_radius_m)
-    return MotionCell(run.arm, body, run.plan.laser.T_base_laser, config.housing, config.limits)
+    body, beside = config.body(seen), config.mandrel
+    if run.mode in OF_MANDREL:
+        if beside is None:
+            raise ConflictError("the mandrel's sizes are not known: nothing moves beside it")
+        body, beside = replace(beside, T_flange_tool=seen), config.body(T_flange_tool)
+    T_base_laser = run.plan.laser.T_base_laser
+    return MotionCell(run.arm, body, T_base_laser, config.housing, config.limits, beside)
 
 
 def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:
@@ -381,7 +391,8 @@ class ToolDriver:
         self._driven = self._number()
         if self._session.run is None:
             raise ConflictError("no run is open")
-        self._cell = station_cell(self._session.run, self._config)
+        tool = self._session.current.tool.T_flange_tool
+        self._cell = station_cell(self._session.run, self._config, tool)
         plan = approach(self._cell, step, q, after_circle=self._kind == "circle")
         self._start(plan, self._cell, DrivePhase.APPROACH, now_s)
 

@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from robocal_ros import __version__
-from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, Silence
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import TOOL
@@ -39,8 +39,6 @@ from robocal_ros.tool.session import (
     FULL,
     QUICK,
     REFERENCE,
-    WITNESS,
-    WITNESS_REFERENCE,
     ToolSession,
     configuration,
     take_tool_message,
@@ -56,11 +54,6 @@ SETTINGS = (
         "taught",
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",
         "Its orientation: z from flange to tip",
-    ),
-    *pose_settings(
-        "mandrel",
-        "End of the mandrel in the flange frame; as the quaternion at its default: there is none",
-        "Its orientation: z along its axis to its end",
     ),
     Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
     Setting("base_frame", "base", "Name of the robot's base frame"),
@@ -408,9 +401,6 @@ class TcfNode(SessionNode[ToolSession]):
         session = self._session
         known = session is not None and session.answered(mode, cycle_id)
         if self._motion is not None and not known:
-            if mode in (WITNESS, WITNESS_REFERENCE):
-                words = "the way of the tool beside the mandrel is not known here"
-                raise ConflictError(f"{words}: the robot's program drives it (motion: program)")
             self._motion.require_ready()
         return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
 

@@ -133,8 +133,8 @@ class ToolInForce(HistoryFollower):
 
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"
-WITNESS, WITNESS_REFERENCE = "witness", "witness reference"  # of the mandrel
-MODES = (FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE)
+OF_MANDREL = WITNESS, WITNESS_REFERENCE = "witness", "witness reference"
+MODES = (FULL, QUICK, REFERENCE, *OF_MANDREL)
 WITNESS_NS = 600 * 10**9  # so long a mandrel's answer holds for measurements of the tool after it
 REMEMBERED = 200  # answers, and calibrations back to which a cycle's id is known
 CODE_OF: dict[Answer, Code] = {
@@ -171,7 +171,7 @@ class ToolResults:
 
         Raises `ConflictError` when there is no mandrel, or nobody knows how it measures.
         """
-        if mode not in (WITNESS, WITNESS_REFERENCE):
+        if mode not in OF_MANDREL:
             return self._config.T_flange_taught
         if self._config.mandrel is None:
             raise ConflictError("there is no mandrel: say where it sits on the flange ('mandrel')")

@@ -1,6 +1,7 @@
 """A robot that is silent, off its plan, pushed, or not at home; faults and their ends."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,10 +25,12 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.ground.errors import Code, RobocalError, StorageError
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import Code, LimitError, RobocalError, StorageError
 from robocal_ros.maintenance.mover import Ways
 from robocal_ros.maintenance.robot_interface import CellInterface, DriverAnswer
 from robocal_ros.maintenance.session import MaintenanceState
+from robocal_ros.motion.cell import ToolBody
 from robocal_ros.motion.plan import SHORTEST_STOP_S
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
@@ -260,6 +263,14 @@ def test_a_robot_that_has_not_come_to_rest_is_not_handed_over(history):
     assert "not handed over at home" in cell.session.status(cell.now_s).fault
     over(cell, fault=True)
     cell.session.acknowledge("me")
+
+
+def test_a_mandrel_beside_the_tool_must_be_clear_of_the_housing_too():
+    """It hangs deeper than the tool: down to the beams on each taught way."""
+    longer = config_of().T_flange_tool @ frames.transform(np.eye(3), [0.06, 0.0, 0.25])
+    driving = replace(DRIVING, mandrel=ToolBody(longer, 0.1, 0.008, 0.05, "mandrel"))
+    with pytest.raises(LimitError, match=r"taught way .: the mandrel"):
+        Ways(ARM, config_of(driving=driving))
 
 
 @pytest.mark.parametrize("left_s", [0.05, 5.0])

@@ -6,10 +6,12 @@ from driven_robot import LAG_S, PERIOD_S, AheadMotion, Robot
 from tool_driver import TAUGHT, TRUTH
 
 from robocal_ros.cell_sim.beams import bent
+from robocal_ros.cell_sim.faults import Faults
 from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.motion.plan import MotionLimits
-from robocal_ros.session.events import MEASURE_TOOL, Command
+from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.driving import DrivePhase
 from robocal_ros.tool.edges import EdgeSample
 from robocal_ros.tool.judging import KnownTool
@@ -34,6 +36,48 @@ def test_a_whole_run_is_driven_and_then_disarmed(robot, history):
     assert robot.driver.phase is DrivePhase.IDLE
     assert robot.driver.told == "the run has ended"
     assert len(robot.sent) == 10  # a way and a motion for each of five steps
+
+
+# Across the flange, so that the tool lies above the housing while it stands in the beams.
+ACROSS = frames.exp_rotation(np.radians([-85.0, 0.0, 0.0]))
+MANDREL = frames.transform(ACROSS, 0.17 * ACROSS[:, 2] + [0.0, 0.0, 0.04])
+
+
+def with_mandrel(history, mandrel) -> Robot:
+    made = Robot(history, TAUGHT, mandrel)
+    made.run(0.5)
+    return made
+
+
+def driven(robot, mode) -> Outcome:
+    robot.driver.arm(robot.now_s)
+    robot.measure(mode)
+    robot.run(100.0, until=robot.at_rest)
+    robot.run(0.5)
+    return robot.outcomes[-1]
+
+
+def test_a_mandrel_is_driven_through_the_beams_and_tells_of_a_knock(history):
+    robot = with_mandrel(history, MANDREL)
+    assert driven(robot, "witness reference").status is Code.ACCEPT
+    before, station = robot.cell.station.beams[0].start, robot.cell.station
+    robot.cell.station = Faults({"station_knocked_shift": 8e-4}, 1).station(station)
+    found = driven(robot, "witness")
+    assert found.status is Code.STATION_MOVED, found.message
+    moved = robot.cell.station.beams[0].start - before
+    off_mm = np.array(found.document["station_shift_mm"]) - 1e3 * moved
+    assert np.all(np.abs(off_mm) < 4.0 * np.array(found.document["sigma_mm"]))
+
+
+@pytest.mark.parametrize("mode", ["full", "witness reference"])
+def test_what_hangs_beside_what_is_measured_must_be_clear_of_the_housing(history, mode):
+    """Straight down, 80 mm beside the tool: the other one would go into the housing's wall."""
+    robot = with_mandrel(history, bent(TAUGHT, [0.08, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    found = driven(robot, mode)
+    other = "mandrel" if mode == "full" else "tool"
+    assert found.status is Code.LIMIT_EXCEEDED
+    assert f"the {other}, with" in found.message
+    assert robot.sent == []
 
 
 def test_speeds_stay_within_the_limits(robot):

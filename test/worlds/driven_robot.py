@@ -9,12 +9,13 @@ from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.cell_sim.trajectory_controller import JointMotion
 from robocal_ros.ground.samples import JointSample
-from robocal_ros.motion.cell import DrivingConfig, Housing
+from robocal_ros.motion.cell import DrivingConfig, Housing, ToolBody
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.session.events import MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.tool.driving import DrivePhase, ToolDriver
 from robocal_ros.tool.edges import EdgeSample
+from robocal_ros.tool.run import rows_of
 from robocal_ros.tool.session import ToolSession
 
 PERIOD_S = 0.008
@@ -44,11 +45,16 @@ class Robot:
     ``true`` is the arm as it is; one that drifts is another one than the nodes know.
     """
 
-    def __init__(self, history, tool=TRUTH, **changes):
+    def __init__(self, history, tool=TRUTH, mandrel=None, **changes):
         self.cell = noisy_cell()
         arm = self.true = self.cell.arm
-        self.session = ToolSession(arm, history, config_of(self.cell), "test")
+        known = {} if mandrel is None else {"mandrel": rows_of(mandrel)}
+        self.session = ToolSession(arm, history, config_of(self.cell, **known), "test")
         config = DrivingConfig(HOUSING, 0.1, 0.008, 0.05, **changes)
+        self.mandrel = None
+        if mandrel is not None:
+            config = replace(config, mandrel=ToolBody(mandrel, 0.08, 0.008, 0.05, "mandrel"))
+            self.mandrel = RoundTool.cylinder(mandrel, 0.004)
         self.gap, self.beating = Gap(STALE_S), True
         self.driver = ToolDriver(self.session, config, self.send, self.ask, self.closed)
         self.tool = RoundTool.cylinder(tool, 0.0025)
@@ -87,11 +93,16 @@ class Robot:
         at_s += self.shift_s
         self.motion.follow(at_s, time_s + at_s, q, qd)
         motion, end_s = self.motion, at_s + plan.duration_s
-        moved = self.cell.station.edges(
-            self.tool, lambda t: self.true.fk(motion.joints(t)), (at_s, end_s), self.rng
-        )
+        moved = [
+            edge
+            for body in filter(None, (self.tool, self.mandrel))
+            for edge in self.cell.station.edges(
+                body, lambda t: self.true.fk(motion.joints(t)), (at_s, end_s), self.rng
+            )
+        ]
         self.edges = [
-            EdgeSample(self.ns(e.time_s), "", e.beam, e.blocked, e.sigma_s) for e in moved
+            EdgeSample(self.ns(e.time_s), "", e.beam, e.blocked, e.sigma_s)
+            for e in sorted(moved, key=lambda edge: edge.time_s)
         ]
         if self.deaf:
             self.edges.clear()
