@@ -354,7 +354,8 @@ def identify_full(
     """Identify the full model; functions and compliances only where the evidence wants them.
 
     Where it wants none, or the geometry is not in ``fit``, the answer is that of `identify`.
-    Functions that ``arm`` has are found anew. Compliances need the arm's ``load``.
+    Functions that ``arm`` has are found anew, or held where the data tell less of them.
+    Compliances need the arm's ``load``.
 
     Raises
     ------
@@ -368,9 +369,14 @@ def identify_full(
     q = np.ascontiguousarray(data.q)
     data = replace(data, q=q)
     problem = _FullProblem(start, data, start.lever_m)
-    before = len(start.layout.names)
+    before, rival = len(start.layout.names), problem
+    if arm.functions is not None:
+        held = identify(arm, data, fit=fit, method=method)
+        rival = min(
+            problem, _FullProblem(held, data, held.lever_m), key=_FullProblem.geometric_left_out
+        )
     if 3.0 * len(data) < FEWEST_NUMBERS * before:
-        return start
+        return rival.start
     at = _Solution(
         start.cell,
         JointTerms.cover(q, torque, before, coarse=True),
@@ -385,7 +391,7 @@ def identify_full(
     functions, bends = _unwanted(at)
     terms = JointTerms.cover(q, torque, before).without(functions, bends)
     if terms.size == before:
-        return start
+        return rival.start
     amplitude = np.where(functions, 0.0, at.prior.amplitude)
     rigid = replace(at.cell, arm=bare(at.cell.arm))
     at = _Solution(rigid, terms, replace(at.prior, amplitude=amplitude))
@@ -399,7 +405,7 @@ def identify_full(
             break
     full = _reported(problem, at, last, weight)
     needed = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
-    return full if full.left_out_rms_m < needed * problem.geometric_left_out() else start
+    return full if full.left_out_rms_m < needed * rival.geometric_left_out() else rival.start
 
 
 def _round(

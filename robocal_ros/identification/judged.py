@@ -251,6 +251,7 @@ def identify_and_hold_out(
     share: float,
     seed: int,
     method: Method = "map",
+    model: Model = "geometric",
     in_force: SerialArm | None = None,
 ) -> JudgedIdentification:
     """Identify base, targets and model from a part of the poses, judge on the ``share`` left out.
@@ -265,7 +266,7 @@ def identify_and_hold_out(
     held = hold_out(pose_groups(data.q), share, seed)
     require_match(arm, data, base=True, tool=True)
     train, check = data.take(~held), data.take(held)
-    return identify_and_judge(arm, train, check, method=method, in_force=in_force)
+    return identify_and_judge(arm, train, check, method=method, model=model, in_force=in_force)
 
 
 def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:

@@ -143,6 +143,7 @@ class Proposer:
                 share=self._config.hold_out,
                 seed=self._config.seed,
                 method=method,
+                model="full",
                 in_force=current.arm if current.head.model is not None else None,
             )
             model = identified_model_document(found.identification)
@@ -180,6 +181,7 @@ class Proposer:
     ) -> tuple[Document, Document, Verdict]:
         """Since the cold visit, against the cold model: never a step on what is in force."""
         config, spots, in_force = self._config, reference.spots, self._current.arm
+        held = self._require_functions()
         fixed = None
         if len(reference.fixed) and len(beside.fixed):
             fixed = fixed_sphere(reference.fixed, beside.fixed, config.sigma_m)
@@ -190,12 +192,16 @@ class Proposer:
             names = config.drift_parameters or self._nominal.parameters.names
             found = identify_subset(spots, data, names, sigma_m=config.sigma_m)
             judged = judge_cycle(found, spots, in_force=in_force, sigma_m=config.sigma_m)
-        model = model_document(found.arm) | {
-            "parameters": list(self._nominal.parameters.names),
-            "covariance": found.covariance.tolist(),
-            "reference_mdh": reference.cell.arm.mdh.tolist(),
-            "reference_stamp_ns": reference.data.middle_ns,
-        }
+        model = (
+            model_document(found.arm)
+            | held
+            | {
+                "parameters": list(self._nominal.parameters.names),
+                "covariance": found.covariance.tolist(),
+                "reference_mdh": reference.cell.arm.mdh.tolist(),
+                "reference_stamp_ns": reference.data.middle_ns,
+            }
+        )
         visited = spots.visited(data.q)
         document = cycle_document(found, judged, spots, self._nominal, method) | {
             "poses": {
@@ -204,6 +210,21 @@ class Proposer:
             }
         }
         return document, model, judged.verdict
+
+    def _require_functions(self) -> Document:
+        """The load of the reference's model, of which a drift holds functions and compliances.
+
+        Raises `ConflictError` where the model in force has other joint functions: a drift since
+        this reference would put them out of force.
+        """
+        reference, model = self._current.reference_model or {}, self._current.head.model or {}
+        functions = model.get("functions")
+        if functions is not None and functions != reference.get("functions"):
+            raise ConflictError(
+                "the model in force has other joint functions than the cold reference: capture a "
+                "new one with the cold robot"
+            )
+        return _load_of(reference)
 
     def capture(
         self, command: Command, data: Measurements, beside: Beside, wall_ns: int
@@ -215,6 +236,7 @@ class Proposer:
 
         Raises `RobocalError` when they cannot be one, or the history refuses.
         """
+        current = self._current
         visit, which_arm = self._visit(data)
         reference = replace(visit, fixed=beside.fixed, temperature=beside.temperature)
         rms_mm = summarise(reference.cell.residual(reference.used)).rms_m * 1e3
@@ -230,10 +252,14 @@ class Proposer:
         message += which_arm + from_what
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
         verdict = Verdict(Code.ACCEPT, message)
-        model = reference_document(reference) | {
-            EXPECTED: expected,
-            COMMISSIONED: self._current.commissioned.mdh.tolist(),
-        }
+        model = (
+            reference_document(reference)
+            | _load_of(current.head.model or {})
+            | {
+                EXPECTED: expected,
+                COMMISSIONED: current.commissioned.mdh.tolist(),
+            }
+        )
         chosen = self._propose(
             REFERENCE, command, wall_ns, "lsq", verdict, document, model, data.arrays()
         )
@@ -307,3 +333,8 @@ class Proposer:
         if verdict.accept:
             self._accept(chosen, command, "placed", wall_ns)
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
+
+
+def _load_of(model: Document) -> Document:
+    """The load that a model's compliances were found with; today's payload may be another one."""
+    return {} if model.get("load") is None else {"load": model["load"]}

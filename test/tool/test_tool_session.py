@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from joint_errors import with_joint_errors
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import RoundTool, bent
@@ -336,11 +337,13 @@ def test_a_program_that_never_rests_ends_the_run(history):
     assert "rest after each step" in driver.outcomes[-1].message
 
 
-def test_flange_poses_come_from_the_thermal_model_in_force(history):
-    """A robot that has drifted by 0.5 mm: with its accepted model the tool is found."""
+@pytest.mark.parametrize("full", [False, True])
+def test_flange_poses_come_from_the_thermal_model_in_force(history, full):
+    """A robot that has drifted by 0.5 mm, or whose joints err besides: the tool is found."""
     cell = noisy_cell()
     nominal = cell.arm
     drifted = nominal.with_mdh(nominal.mdh + np.array([5e-4, 0.0, 5e-4, 0.0, 0.0]))
+    drifted = with_joint_errors(drifted, 1) if full else drifted
     bring_into_force(history, THERMAL, nominal, model_document(drifted), "test")
     driver = driver_of(history, TRUTH, replace(cell, arm=drifted))
     driver.session = ToolSession(nominal, history, config_of(cell), "test")
