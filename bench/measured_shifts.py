@@ -140,8 +140,10 @@ def simulate(
         for pose in poses:
             exact = pose + SERVO_RAD * rng.standard_normal(pose.shape)
             reading = np.round(exact / COUNT_RAD) * COUNT_RAD
+            way, gears = reading - course.q[-1], robot.backlash
             course.move(reading, REST_S, level)
-            flange = robot.flange(reading, course.warmth, rng)[0]
+            behind = None if gears is None else gears.behind(way)
+            flange = robot.flange(reading, course.warmth, rng, behind)[0]
             at = course.time_s - REST_S + SETTLE_S
             rise = float(course.warmth.link[-1])
             visits.append(Visit(at, name, reading, sensor.measure(flange, rise, at, rng)))
@@ -351,6 +353,9 @@ def _visit(
 ) -> tuple[Array, Array]:
     servo = SERVO_RAD * rng.standard_normal(cell.sphere.shape)
     q = np.round((cell.sphere + servo) / COUNT_RAD) * COUNT_RAD
-    flange = cell.robot.flange(q, state, rng)
+    gears, behind = cell.robot.backlash, None
+    if gears is not None:
+        behind = gears.behind(np.diff(cell.sphere, axis=0, prepend=cell.sphere[-1:]))
+    flange = cell.robot.flange(q, state, rng, behind)
     rise = float(state.link[-1])
     return q, np.array([sensor.measure(T, rise, time_s, rng) for T in flange])

@@ -41,6 +41,7 @@ from robocal_ros.cell_sim.faults import (
     JointReadings,
     size_of,
 )
+from robocal_ros.cell_sim.gears import BacklashPlay
 from robocal_ros.cell_sim.kr150 import UNCORRECTED
 from robocal_ros.cell_sim.robot import (
     Draws,
@@ -321,6 +322,8 @@ class SimulatedCell:
         self._station = on_one_clock(plan.station, self._draws.of(Stream.STATION).random())
         self._standing = Standing()
         self._scatter = Scatter(3 + plan.arm.n)
+        gears = plan.robot.backlash
+        self._play = None if gears is None else BacklashPlay(gears, plan.q_start)
         self._hand, self._drawn = np.zeros(3), np.zeros(3 + plan.arm.n)
         self._ticks = self._motions = 0
         self._way = np.zeros((BEAT, plan.arm.n))
@@ -428,7 +431,9 @@ class SimulatedCell:
     def flange(self, time_s: Array) -> Array:
         """True T_base_flange (m, 4, 4) at times (m,), the robot as warm as it is now."""
         off = self._scatter.at(time_s)
-        T = self.plan.robot.flange(self.motion.joints(time_s) + off[:, 3:], self.warmth)
+        behind = None if self._play is None else self._play.at(time_s)
+        reading = self.motion.joints(time_s) + off[:, 3:]
+        T = self.plan.robot.flange(reading, self.warmth, behind=behind)
         T[:, :3, 3] += off[:, :3]
         return T
 
@@ -457,6 +462,8 @@ class SimulatedCell:
         time, now = np.asarray(ticks * TICK_S), self._ticks
         q = self.motion.joints(time)
         way = np.abs(np.diff(q, axis=0))
+        if self._play is not None:
+            self._play.follow(time, q)
         departed, stood = self._standing.look(now, np.max(way, axis=1) > STILL)
         for tick in departed.tolist():  # it moves after a rest: another scatter
             robot, noise = self.plan.robot, self.plan.station.noise.step_m

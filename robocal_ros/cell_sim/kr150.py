@@ -6,6 +6,7 @@ errors, encoder phases) is drawn from ``rng``.
 
 import numpy as np
 
+from robocal_ros.cell_sim.gears import gear_errors
 from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot, WarmUp
 from robocal_ros.cell_sim.sensors import SphereSensor
 from robocal_ros.ground import frames
@@ -78,6 +79,7 @@ def true_robot(
         phase=rng.uniform(-np.pi, np.pi, n),
         repeatability=REPEATABILITY_RAD,
         effects=effects or Effects(),
+        gears=gear_errors(n, rng.spawn(1)[0]),
     )
 
 

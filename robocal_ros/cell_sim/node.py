@@ -21,12 +21,14 @@ from robocal_ros.cell_sim.cell import (
     worked_for,
 )
 from robocal_ros.cell_sim.faults import CONTROLLER_FAULTS, FAULTS
+from robocal_ros.cell_sim.gears import gear_errors, ur10_gears
 from robocal_ros.cell_sim.messages import (
     CellOutputs,
     SimulatedController,
     planned_step,
     trajectory_of,
 )
+from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import TICK_S
 from robocal_ros.cell_sim.trajectory_controller import LAG_S, ControllerOptions
 from robocal_ros.ground import frames
@@ -47,7 +49,7 @@ TAPER = 0.1  # of the cone
 NOZZLE_M = 3.5e-3  # by so much the torch's nozzle is wider than its wire
 TOOLS = ("cylinder", "cone", "torch")
 CELLS = ("tool", "kr150")
-KR150 = "kr150_r3100"
+KR150, UR10 = "kr150_r3100", "UR10"
 
 
 def _numbers(count: int) -> Callable[[Any], str | None]:
@@ -131,6 +133,7 @@ SETTINGS = (
         0,
         100_000,
     ),
+    Setting("gears", False, "The robot's gears err as real ones do, and have backlash"),
     Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
     Setting("profile", False, "A line laser on the flange of the kr150"),
     Setting("profile_frame", "profile_sensor", "Frame of the line laser"),
@@ -232,6 +235,7 @@ def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
         plan = kr150_cell(
             load_robot(KR150),
             seed,
+            Effects(gears=settings["gears"]),
             points=settings["cloud_points"],
             profile=settings["profile"],
         )
@@ -275,8 +279,12 @@ def _tool_cell(settings: Mapping[str, Any]) -> CellPlan:
         tool = RoundTool.torch(T, radius, radius + NOZZLE_M)
     else:
         tool = RoundTool.cylinder(T, radius)
+    robot = rigid_robot(arm, settings["arm_error_mm"] * MM, rng)
+    if settings["gears"]:
+        gears = ur10_gears() if arm.name == UR10 else gear_errors(arm.n, rng)
+        robot = replace(robot, gears=gears, effects=replace(robot.effects, gears=True))
     return CellPlan(
-        robot=rigid_robot(arm, settings["arm_error_mm"] * MM, rng),
+        robot=robot,
         station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), noise=noise),
         tool=tool,
         q_start=np.where(arm.prismatic, given * MM, np.radians(given)),

@@ -10,8 +10,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robocal_ros.cell_sim.gears import GearErrors
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.joint_functions import JointFunctions
 
 Array = NDArray[np.float64]
 
@@ -79,8 +79,9 @@ class Effects:
     """Which parts of the truth are switched on.
 
     The estimators model ``static`` and ``drift``, and know the size of ``noise``. Those of a
-    drift know nothing of ``compliance``, ``eccentricity`` (with what else joints add), ``stem`` and
-    ``sensor_warm_up``, and are to recognise ``outliers``.
+    drift know nothing of ``compliance``, ``eccentricity``, ``gears``, ``stem`` and
+    ``sensor_warm_up``, and are to recognise ``outliers``. ``gears`` are asked for: without them
+    stand the figures of docs/simulation.md but where it says so.
     """
 
     static: bool = True
@@ -91,6 +92,7 @@ class Effects:
     stem: bool = True
     sensor_warm_up: bool = True
     outliers: bool = True
+    gears: bool = False
 
     @classmethod
     def none(cls) -> "Effects":
@@ -133,8 +135,7 @@ class TrueRobot:
     body : masses and stiffness.
     eccentricity, phase : (n,) amplitude and phase of each encoder's once-per-turn error, rad.
     repeatability : standard deviation of the joint values at rest, rad.
-    functions : what gears and couplings add to each joint beside the encoder's error; its
-        compliances are not used, `body` has the stiffness.
+    gears : their errors; None: none.
     """
 
     nominal: SerialArm
@@ -146,7 +147,12 @@ class TrueRobot:
     phase: Array
     repeatability: float
     effects: Effects = field(default_factory=Effects)
-    functions: JointFunctions | None = None
+    gears: GearErrors | None = None
+
+    @property
+    def backlash(self) -> GearErrors | None:
+        """The gears where their errors are switched on."""
+        return self.gears if self.effects.gears else None
 
     def mdh(self, warmth: Warmth) -> Array:
         """True parameters (n, 5) at these temperatures, without the joints' elastic deflection."""
@@ -158,19 +164,29 @@ class TrueRobot:
         return mdh
 
     def flange(
-        self, reading: ArrayLike, warmth: Warmth, rng: np.random.Generator | None = None
+        self,
+        reading: ArrayLike,
+        warmth: Warmth,
+        rng: np.random.Generator | None = None,
+        behind: Array | None = None,
     ) -> Array:
         """True T_base_flange (m, 4, 4) while the encoders show ``reading`` (m, n).
 
-        ``rng`` adds the repeatability of one visit; None gives the mean over visits.
+        ``rng`` adds the repeatability of one visit; None gives the mean over visits. ``behind``
+        (m, n): how far backlash holds each joint back, rad; a visit that is not told comes from
+        either side.
         """
         q = np.atleast_2d(np.asarray(reading, dtype=np.float64))
         joint = q.copy()
         if self.effects.eccentricity:
             joint += self.eccentricity * np.sin(q + self.phase)
-            joint += 0.0 if self.functions is None else self.functions.delta(q)
         if rng is not None and self.effects.noise:
             joint += self.repeatability * rng.standard_normal(q.shape)
+        if (gears := self.backlash) is not None:
+            joint += gears.at(q)
+            if behind is None and rng is not None:
+                behind = gears.behind(rng.uniform(-1.0, 1.0, q.shape))
+            joint -= 0.0 if behind is None else behind
         mdh = self.mdh(warmth)
         if not self.effects.compliance:
             return self._frames(joint, mdh)[-1]

@@ -19,7 +19,9 @@ from robocal_ros.ground.files import StateFile
 from robocal_ros.ground.samples import JOINTS, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge, damage_notice, history_path, state_folder
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of, layer_of, payload_note
 from robocal_ros.kinematics.robots import robot_file_hash
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.ros.conversions import summary_message, time_message
@@ -341,6 +343,7 @@ class SessionNode(HouseNode, Generic[SessionT]):
         ``command_s``: a command waits at most so long for its samples. ``sole``: a robot has one
         such node at most. Raises as `open_history`.
         """
+        self._payload = -1, ""  # revision of the thermal model, and what is said of it
         self._serial_in_use, self._history = open_history(
             self.settings, self._nominal, self.NAME if sole else ""
         )
@@ -411,11 +414,26 @@ class SessionNode(HouseNode, Generic[SessionT]):
             return health
         health.values = {"revision in force": session.in_force.revision}
         self.report(session, history, health)
+        if note := self._payload_note(history):
+            health.worsen(WARN, note)
         health.values |= session.ignored.listed() | self._stamps.judge(health)
         for fault in filter(None, (self._guard.fault, session.fault)):
             health.worsen(ERROR, fault)
         warn_of_history(health, history)
         return health
+
+    def _payload_note(self, history: CalibrationHistory) -> str:
+        """What another payload than the thermal model's may cost; looked at once for each model."""
+        try:
+            head = history.head(THERMAL)
+            if self._payload[0] != head.revision:
+                model, note = head.model, ""
+                if model is not None:
+                    note = payload_note(arm_of(model, self._nominal), layer_of(model)[1])
+                self._payload = head.revision, note
+            return self._payload[1]
+        except RobocalError:  # told as the session's fault
+            return ""
 
 
 LIST_LIMIT = 50

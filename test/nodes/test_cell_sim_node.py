@@ -391,7 +391,7 @@ class WholeCell(Cell):
 
 
 def test_the_whole_cell_shows_its_spheres_and_temperatures(graph):
-    cell = WholeCell(graph, cloud_points=300)
+    cell = WholeCell(graph, cloud_points=300, gears=True)
     cell.go(poses("cycle")[0], 1.5)
     cell.wait_for("sphere_cloud", 2)
     cloud = cell.told["sphere_cloud"][0]

@@ -3,9 +3,11 @@
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from cell import DEEP, Cell, message_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped
+from joint_errors import with_joint_errors
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
@@ -26,13 +29,15 @@ from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge
-from robocal_ros.history.history_records import CalibrationState, Head, Proposal
+from robocal_ros.history.history_records import THERMAL, CalibrationState, Head, Proposal
 from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.robots import load_robot, save_robot
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.endpoints import Health
 from robocal_ros.ros.session_node import history_notice
+from robocal_ros.session.events import bring_into_force
 from robocal_ros.thermal.node import ThermalNode
 
 POSES = 8
@@ -371,6 +376,21 @@ def test_every_node_says_that_a_history_was_set_aside_until_it_is_acknowledged(g
     for node in nodes:
         assert said not in node.health().message
     assert history_notice({"serial": "s1", "state_dir": ""}) == ""
+
+
+def test_every_node_tells_what_another_payload_than_the_models_may_cost(graph, nominal, tmp_path):
+    model = with_joint_errors(nominal, 1)
+    path = tmp_path / "loaded.yaml"
+    save_robot(replace(nominal, load=replace(model.load, payload_mass=120.0)), path)
+    arm = load_robot(path)
+    graph.state.mkdir()
+    with CalibrationHistory.open("s1", model_hash=arm.model_hash, state_dir=graph.state) as history:
+        bring_into_force(history, THERMAL, arm, model_document(model), "test")
+    for kind in (ThermalNode, HandEyeNode):
+        health = graph.add(kind, {"serial": "s1", "robot": str(path)}).health()
+        assert health.level != endpoints.OK
+        told = r"payload of 10 kg .* the robot file says 120 kg .* up to [0-9.]+ mm at the flange"
+        assert re.search(told, health.message)
 
 
 def test_a_history_that_vanishes_fails_calls_and_not_the_node(graph):
