@@ -216,7 +216,7 @@ TICK_S = 0.002
 BATCH = 200
 STATUS_S = 1.0
 PATIENCE_S = 0.05  # a tick waits at most so long for acknowledgements
-EXIT_LOSS = 3
+EXIT_LOSS, EXIT_CANNOT = 3, 2
 DDS_PROFILE = "replay_dds.xml"
 WAITING, PLAYING, PAUSED, DONE, FAILED = "waiting", "playing", "paused", "done", "failed"
 NO_BAG = "no bag"
@@ -239,7 +239,11 @@ SETTINGS = (
         0.1,
         600.0,
     ),
-    Setting("exit_at_end", False, "End the process: status 0, or 3 when anything was lost"),
+    Setting(
+        "exit_at_end",
+        False,
+        "End the process: status 0, 3 when anything was lost, 2 when it cannot play",
+    ),
 )
 
 
@@ -283,6 +287,14 @@ class ReplayNode(HouseNode):
         self.add_timer(TICK_S, self._tick, steady=True)
         self.add_timer(STATUS_S, self._report, steady=True)
         self.add_timer(LOG_EVERY_S, self._tell_waiting, steady=True)
+
+    def autostart(self) -> None:
+        """As `HouseNode.autostart`; who waits for the end is not left waiting for a beginning."""
+        super().autostart()
+        begun = self.is_active and self._topics is not None
+        asked = self.get_parameter("autostart").value and self.get_parameter("exit_at_end").value
+        if asked and not begun:
+            raise SystemExit(EXIT_CANNOT)
 
     def activate(self) -> None:
         """Begin at the start of the bag."""

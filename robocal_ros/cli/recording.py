@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.bags import BagMessage, BagReader, TopicInfo
 from robocal_ros.bags.replay import (
     EVENTS,
     first_configuration,
@@ -26,7 +26,17 @@ from robocal_ros.bags.replay import (
 from robocal_ros.cli.main import describe_robot
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.frames import Array
-from robocal_ros.ground.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
+from robocal_ros.ground.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    MEASURING,
+    REFERENCE_SPHERE,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
+    TEMPERATURES,
+    stamp_ns,
+)
 from robocal_ros.hand_eye.data import SHOTS
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_folders
@@ -36,6 +46,20 @@ from robocal_ros.tool.edges import EDGES
 MEASURED = (*MEASURING, EDGES, *SHOTS)
 UNASKED = "while this was recorded nobody gave its node a command"
 INPUTS = (JOINTS, *MEASURED, TEMPERATURES)
+_POSES = (
+    "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry",
+)  # fmt: skip
+_POINTS = ("geometry_msgs/msg/PointStamped", *_POSES)
+TYPES = {  # of the messages that an input is read from, where others may look like it
+    JOINTS: ("sensor_msgs/msg/JointState",),
+    MEASURED_POINT: _POINTS,
+    SPHERE_CENTER: _POINTS,
+    REFERENCE_SPHERE: _POINTS,
+    MEASURED_POSE: _POSES,
+    SPHERE_CLOUD: ("sensor_msgs/msg/PointCloud2",),
+    TEMPERATURES: ("sensor_msgs/msg/Temperature",),
+}
 
 
 @dataclass(frozen=True)
@@ -50,12 +74,21 @@ class BagOverview:
     start_ns: int  # stamp of the first joint reading
 
     @property
+    def lacks_measurements(self) -> str:
+        """Says that the bag has no input that is measured, and which could be one; else empty."""
+        info = self.reader.info
+        if set(MEASURED) & set(self.inputs.values()):
+            return ""
+        return (
+            f"{info.path} has none of {', '.join(MEASURED)}; {_has(info.topics)}; choose with "
+            f"--topic INPUT:=TOPIC{_others(MEASURED_POINT, info.topics)}"
+        )
+
+    @property
     def warnings(self) -> list[str]:
         """What is wrong with the bag, as far as it was read, and what it lacks."""
-        info = self.reader.info
-        lacking = not set(MEASURED) & set(self.inputs.values())
-        words = f"{info.path} has none of {', '.join(MEASURED)}; {_has(info.topics)}"
-        return [*info.notes, words] if lacking else list(info.notes)
+        lacks = self.lacks_measurements
+        return [*self.reader.info.notes, *([lacks] if lacks else [])]
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -106,6 +139,12 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
             raise InputError(f"--topic {kind}: the inputs are {known}")
         if topic not in info.topics:
             raise InputError(f"no topic {topic}; {_has(info.topics)}", file=info.path)
+        if not _fits(kind, info.topics[topic].msgtype):
+            raise InputError(
+                f"topic {topic} is of type {info.topics[topic].msgtype}; {kind} is read from "
+                f"{', '.join(TYPES[kind])}{_others(kind, info.topics)}",
+                file=info.path,
+            )
     told = [topic for topic in info.topics if topic_kind(topic) == EVENTS]
     if EVENTS in given:
         told = [given[EVENTS]]
@@ -118,12 +157,26 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
     event_topic = told[0] if told else None
     configured = first_configuration(reader.messages(told))
     inputs = {topic: kind for kind, topic in given.items() if kind != EVENTS}
-    others = [topic for topic in info.topics if topic not in inputs]
+    others = [
+        topic
+        for topic, held in info.topics.items()
+        if topic not in inputs and _fits(topic_kind(topic), held.msgtype)
+    ]
     found = input_topics(others, configured)
     inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
     start_ns = _first_joint_stamp(reader, inputs)
     configured, commands = read_events(reader.messages(told), start_ns)
     return BagOverview(reader, event_topic, inputs, configured, commands, start_ns)
+
+
+def _fits(kind: str, msgtype: str) -> bool:
+    return kind not in TYPES or msgtype in TYPES[kind]
+
+
+def _others(kind: str, topics: Mapping[str, TopicInfo]) -> str:
+    """Which topics could be an input, by their type; empty without any."""
+    found = [topic for topic, held in topics.items() if held.msgtype in TYPES.get(kind, ())]
+    return f"; of such a type: {', '.join(found)}" if found else ""
 
 
 def _has(topics: Mapping[str, Any]) -> str:
@@ -145,7 +198,8 @@ def _first_joint_stamp(reader: BagReader, inputs: Mapping[str, str]) -> int:
     topics = [topic for topic, kind in inputs.items() if kind == JOINTS]
     if not topics:
         raise InputError(
-            f"no joint states; {_has(reader.info.topics)}; choose with --topic {JOINTS}:=TOPIC",
+            f"no joint states; {_has(reader.info.topics)}; choose with --topic {JOINTS}:=TOPIC"
+            f"{_others(JOINTS, reader.info.topics)}",
             file=reader.info.path,
         )
     stamps = (stamp_ns(recorded.message.header.stamp) for recorded in reader.messages(topics))

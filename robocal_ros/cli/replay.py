@@ -4,7 +4,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from robocal_ros import __version__
-from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.bags import BagMessage
+from robocal_ros.bags.foreign import StreamAverage, open_bag, stream_timing
 from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
 from robocal_ros.cli.identify import show_identification
 from robocal_ros.cli.main import (
@@ -76,7 +77,7 @@ def commanded_document(
 ) -> Document:
     """What a replay tells, whatever it measures; ``candidates`` stand behind the topics."""
     topic = {kind: name for name, kind in recording.inputs.items()}
-    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
+    ignored = {topic.get(kind, kind): why for kind, why in session.ignored.told().items()}
     stream, damaged = session.stream, recording.reader.info.lost
     return {
         "robot": session.nominal.name,
@@ -211,7 +212,7 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
     """
     given = bool(request.auto or request.cold or request.warm)  # in place of recorded commands
     with ExitStack() as opened:
-        reader = opened.enter_context(BagReader(request.bag))
+        reader = opened.enter_context(open_bag(request.bag))
         recording = open_recording(reader, request.topics)
         if not given:
             _require_commands(request, recording)
@@ -230,14 +231,26 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
                 )
             return _OF_OTHER_NODES[kind](recording, arm, history, watch("replaying", recording))
         kept = _GOES_ON.format(history.path) if history.list(1) else ""
-        session = _session(recording, arm, history)
-        commands = _commands(request, recording, arm, history, watch)
-        samples = watch("replaying", recording)
+        streams = None
+        if recording.configured is None:  # no node of ours, which takes each sample as it comes
+            timing = stream_timing(reader, recording.inputs, arm)
+            streams = StreamAverage(recording.inputs, timing) if timing else None
+
+        def read(what: str, recording: BagOverview) -> Samples:
+            samples = watch(what, recording)
+            return samples if streams is None else streams.of(samples)
+
+        session = _session(recording, arm, history, streams)
+        commands = _commands(request, recording, arm, history, streams, read)
+        samples = read("replaying", recording)
         if request.observe is not None:
             samples = request.observe(session, recording, samples)
         report = replay(session, samples, commands, recording.inputs, take_message)
         used = commands is recording.commands
         document = _document(report, session, recording) | {"recorded": used}
+        if streams is not None:
+            document["streams"] = {topic: asdict(one) for topic, one in streams.timing.items()}
+            document["warnings"] += [one.words(topic) for topic, one in streams.timing.items()]
         document["warnings"] += [kept] if kept else []
         return document
 
@@ -269,9 +282,17 @@ def _require_commands(request: ReplayRequest, recording: BagOverview) -> None:
     recording.require_inputs()
 
 
-def _session(recording: BagOverview, arm: SerialArm, history: CalibrationHistory) -> ThermalSession:
+def _session(
+    recording: BagOverview,
+    arm: SerialArm,
+    history: CalibrationHistory,
+    streams: StreamAverage | None,
+) -> ThermalSession:
     if recording.configured is None:
-        return ThermalSession(arm, history, ThermalConfig(), __version__)
+        config = ThermalConfig()
+        if streams is not None:
+            config = replace(config, standstill=streams.standstill(config.standstill))
+        return ThermalSession(arm, history, config, __version__)
     return session_as_recorded(arm, history, recording.configured, __version__)
 
 
@@ -280,6 +301,7 @@ def _commands(
     recording: BagOverview,
     arm: SerialArm,
     history: CalibrationHistory,
+    streams: StreamAverage | None,
     watch: Watch,
 ) -> Commands:
     """The user's windows, else what --auto finds, else what was recorded."""
@@ -293,13 +315,14 @@ def _commands(
         return window_commands(cold, [stamps(window) for window in request.warm])
     if not request.auto:
         return recording.commands
-    scout = _session(recording, arm, history)
+    scout = _session(recording, arm, history, streams)
     for sample in one_by_one(scout, watch("looking for cycles", recording)):
         feed(scout, sample, recording.inputs, take_message)
     observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:
         lost = scout.desk.ignored.words()
         words = "no measurement at standstill in this recording" + (f"; {lost}" if lost else "")
+        words = recording.lacks_measurements or words
         raise InputError(words, file=str(request.bag))
     commands = automatic_commands(observed)
     return accepting(commands, by="replay") if request.accept else commands
@@ -434,7 +457,9 @@ _SHOW_EVERY = 100
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``replay``."""
-    parser.add_argument("bag", type=Path, metavar="BAG", help=".mcap file, or folder of a bag")
+    parser.add_argument(
+        "bag", type=Path, metavar="BAG", help=".mcap, .db3 or .bag (ROS 1) file, or folder of a bag"
+    )
     parser.add_argument(
         "--robot", metavar="R.yaml", help=f"{ROBOT_HELP}; default: the one recorded"
     )

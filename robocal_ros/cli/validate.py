@@ -35,6 +35,7 @@ from robocal_ros.cli.main import (
     Document,
     count,
     crash,
+    input_topic,
     progress_console,
     refusal,
     tell,
@@ -249,13 +250,25 @@ LIBRARIES = ("numpy", "scipy", "numba", "rosbags", "mcap")
 def add_validate(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``validate``."""
     parser.add_argument(
-        "bags", type=Path, nargs="+", metavar="BAG", help=".mcap files, or folders of bags"
+        "bags",
+        type=Path,
+        nargs="+",
+        metavar="BAG",
+        help=".mcap, .db3 or .bag (ROS 1) files, or folders of bags",
     )
     parser.add_argument(
         "--report", required=True, type=Path, metavar="DIR", help="folder of the report"
     )
     parser.add_argument(
         "--robot", metavar="R.yaml", help=f"{ROBOT_HELP}; of bags that do not say which it is"
+    )
+    parser.add_argument(
+        "--topic",
+        type=input_topic,
+        action="append",
+        default=[],
+        metavar="INPUT:=TOPIC",
+        help="topic of an input as in 'robocal replay', for bags without session_events",
     )
     parser.add_argument(
         "--jobs",
@@ -277,7 +290,7 @@ def run_validate(args: argparse.Namespace) -> CliResult:
     from robocal_ros.report.validation import summary_rows
 
     args.report.mkdir(parents=True, exist_ok=True)
-    jobs = _jobs(args.bags, args.robot)
+    jobs = _jobs(args.bags, args.robot, dict(args.topic))
     results: dict[int, Document] = {}
     figures: dict[str, Sequence[Sequence[Drawn]]] = {}
     with _progress(len(jobs)) as one_more:
@@ -298,7 +311,7 @@ def run_validate(args: argparse.Namespace) -> CliResult:
     return CliResult(document, partial(_show_validate, document=document), status)
 
 
-def _jobs(paths: Sequence[Path], robot: str | None) -> "list[Job]":
+def _jobs(paths: Sequence[Path], robot: str | None, topics: dict[str, str]) -> "list[Job]":
     """A job for each bag, under a name that no other has."""
     from robocal_ros.cli.validating import Job
 
@@ -309,7 +322,7 @@ def _jobs(paths: Sequence[Path], robot: str | None) -> "list[Job]":
         numbered = (f"{place.stem}-{number}" for number in range(2, len(paths) + 1))
         stem = next(name for name in (place.stem, *numbered) if name not in stems)
         name = f"{stem}{place.suffix}"
-        jobs.append(Job(str(path.absolute()), name, robot))
+        jobs.append(Job(str(path.absolute()), name, robot, topics))
     return jobs
 
 

@@ -8,7 +8,7 @@ import math
 import tempfile
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.foreign import open_bag
 from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
 from robocal_ros.cell_sim.faults import SIZES
 from robocal_ros.cli.main import Document, refusal
@@ -66,11 +67,15 @@ _EVERY_ENTRY = 1_000_000
 
 @dataclass(frozen=True)
 class Job:
-    """A bag to validate, by a name of its own; ``robot`` is for a bag that names none."""
+    """A bag to validate, by a name of its own; ``robot`` is for a bag that names none.
+
+    ``topics``: input to topic, for a bag that holds no events.
+    """
 
     path: str
     name: str
     robot: str | None
+    topics: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ def validate_bag(job: Job) -> Validated:
     """Replay and judge a bag; one that cannot be is told, not raised."""
     head: Document = {"bag": job.name, "path": job.path}
     try:
-        with BagReader(job.path) as reader:
+        with open_bag(job.path) as reader:
             info = reader.info
             start_ns, end_ns = info.start_ns or 0, info.end_ns or 0
             head |= {
@@ -101,7 +106,7 @@ def validate_bag(job: Job) -> Validated:
             }
             recordings, skipped, others = _recordings(reader)
             if not recordings and not skipped:
-                recordings = [open_recording(reader, {})]
+                recordings = [open_recording(reader, job.topics)]
             truth = BagTruth(reader)
             sessions = [_SessionReplay(job, recording, truth).judged() for recording in recordings]
             courses = cell_courses(reader, truth)
@@ -195,7 +200,7 @@ class _SessionReplay:
                 find_robot=self._robot,
                 auto=auto,
                 accept=auto,
-                topics={} if topic is None else {EVENTS: topic},
+                topics=self._job.topics if topic is None else {EVENTS: topic},
                 state=Path(folder),
                 observe=self._forecasts.observed,
             )

@@ -206,8 +206,8 @@ def joint_sample(message: Any) -> JointSample:
 
 
 def frame_and_target(frame_id: str, default_target: str) -> tuple[str, str]:
-    """Measuring frame and target of a ``frame[/target]``."""
-    frame, _, target = frame_id.partition("/")
+    """Measuring frame and target of a ``frame[/target]``; ROS 1 wrote ``/frame``."""
+    frame, _, target = frame_id.removeprefix("/").partition("/")
     return frame, target or default_target
 
 
@@ -220,11 +220,29 @@ def _finite(values: Array, what: str) -> Array:
 def point_sample(
     message: Any, default_target: str = DEFAULT_TARGET, topic: str = MEASURED_POINT
 ) -> PointSample:
-    """Build a sample from a ``geometry_msgs/PointStamped`` (frame_id ``frame[/target]``)."""
-    frame, target = frame_and_target(message.header.frame_id, default_target)
-    p = message.point
+    """Build a sample from a ``geometry_msgs/PointStamped`` (frame_id ``frame[/target]``).
+
+    Of a pose (see `pose_sample`) the position is taken; a sample is one already.
+    """
+    if isinstance(message, PointSample):
+        return message
+    frame, target = _frame_and_target(message, default_target)
+    p = message.point if hasattr(message, "point") else _position_and_turn(message)[0]
     position = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured point")
     return PointSample(stamp_ns(message.header.stamp), frame, target, position, topic)
+
+
+def _frame_and_target(message: Any, default_target: str) -> tuple[str, str]:
+    child = getattr(message, "child_frame_id", "").strip("/")
+    return frame_and_target(message.header.frame_id, child or default_target)
+
+
+def _position_and_turn(message: Any) -> tuple[Any, Any]:
+    """Position and quaternion of a message that holds a pose or a transform."""
+    if hasattr(message, "transform"):
+        return message.transform.translation, message.transform.rotation
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    return pose.position, pose.orientation
 
 
 def temperature_sample(message: Any) -> TemperatureSample:
@@ -242,13 +260,18 @@ def temperature_sample(message: Any) -> TemperatureSample:
 def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PointSample:
     """Build a sample from a ``geometry_msgs/PoseStamped`` (frame_id ``frame[/target]``).
 
+    So of a ``PoseWithCovarianceStamped``, and of a ``TransformStamped`` or ``nav_msgs/Odometry``,
+    whose child frame is the target; a sample is one already.
+
     Raises `InputError` when a value is not finite or the quaternion is not of unit length
     (tolerance 1e-3).
     """
+    if isinstance(message, PointSample):
+        return message
     from robocal_ros.ground.frames import transform_from_quat
 
-    frame, target = frame_and_target(message.header.frame_id, default_target)
-    p, o = message.pose.position, message.pose.orientation
+    frame, target = _frame_and_target(message, default_target)
+    p, o = _position_and_turn(message)
     xyz = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured position")
     quat = _finite(np.array([o.x, o.y, o.z, o.w], dtype=np.float64), "measured orientation")
     norm = float(np.linalg.norm(quat))

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robocal_ros.bags.bags import DATA_SET, BagReader, read_data_set
+from robocal_ros.bags.bags import DATA_SET, read_data_set
+from robocal_ros.bags.foreign import open_bag
 from robocal_ros.bags.replay import topic_kind
 from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, input_topic, positive, text
 from robocal_ros.cli.recording import BagOverview, open_recording
@@ -283,7 +284,7 @@ def read_bag_shots(
     when a data file was made with another robot; `TooFewSamplesError` when no profile was taken at
     standstill.
     """
-    with BagReader(path) as reader:
+    with open_bag(path) as reader:
         if DATA_SET not in reader.info.topics:
             given = dict(topics)
             seen = [topic for topic in reader.info.topics if topic_kind(topic) == PROFILE]

@@ -403,6 +403,13 @@ class Ignored(dict[str, Counter[str]]):
             for key, count in counter.items()
         }
 
+    def told(self) -> dict[str, dict[str, int]]:
+        """By topic the latest words of each reason, with its count."""
+        return {
+            topic: {self._last[topic, key]: count for key, count in counter.items()}
+            for topic, counter in self.items()
+        }
+
     def words(self) -> str:
         """Tell the most frequent reason of each topic; empty when nothing was ignored."""
         parts = [

@@ -404,21 +404,28 @@ def automatic_commands(
     if not observations:
         raise InputError("no measurement at standstill in this recording")
 
-    def same(a: Observation, b: Observation) -> bool:
-        near = np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD
-        return a.sample.target == b.sample.target and bool(near)
+    def same(a: list[Observation], b: list[Observation]) -> bool:
+        return bool(np.max(np.abs(a[0].q - b[0].q)) < SAME_VISIT_RAD)
 
-    first, stamps = observations[0], [o.sample.stamp_ns for o in observations]
-    limit = min(len(observations), LARGEST_CYCLE + 1)
-    length = next((i for i in range(1, limit) if same(first, observations[i])), None)
-    known, later = observations[:length], observations[length or len(observations) :]
-    recurring = sum(any(same(o, k) for k in known) for o in later)
+    visits: list[list[Observation]] = []  # of a pose, however much was measured there
+    for one in observations:
+        if visits and same(visits[-1], [one]):
+            visits[-1].append(one)
+        else:
+            visits.append([one])
+    limit = min(len(visits), LARGEST_CYCLE + 1)
+    length = next((i for i in range(1, limit) if same(visits[0], visits[i])), None)
+    known, later = visits[:length], visits[length or len(visits) :]
+    recurring = sum(any(same(visit, k) for k in known) for visit in later)
     if length is None or recurring < 0.9 * len(later):
+        stamps = [one.sample.stamp_ns for one in observations]
         return window_commands(None, [(stamps[0], stamps[-1])])
-    starts = [i for i, o in enumerate(observations) if same(first, o)]
-    edges = [stamps[i] for i in starts]
-    last = [stamps[i - 1] for i in starts[1:]] + [stamps[-1]]
-    windows = list(zip(edges, last, strict=True))
+    starts = [i for i, visit in enumerate(visits) if same(visits[0], visit)]
+    ends = [*(i - 1 for i in starts[1:]), len(visits) - 1]
+    windows = [
+        (visits[start][0].sample.stamp_ns, visits[end][-1].sample.stamp_ns)
+        for start, end in zip(starts, ends, strict=True)
+    ]
     return window_commands(windows[0], windows[1:])
 
 

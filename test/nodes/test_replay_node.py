@@ -223,6 +223,12 @@ def test_a_bag_that_is_none_is_said(graph, tmp_path):
     assert "broken.mcap" in process.output
 
 
+@pytest.mark.parametrize("settings", [{}, {"bag": "/there/is/none.mcap"}])
+def test_who_waits_for_an_end_is_not_left_waiting_where_nothing_can_be_played(graph, settings):
+    process = graph.start("replay_node", settings | {"exit_at_end": True})
+    assert process.process.wait(30) == 2
+
+
 def test_wrong_choices_are_named():
     recorded = {"/a": "std_msgs/msg/String"}
     with pytest.raises(InputError, match=r"no topic /b; it has /a"):

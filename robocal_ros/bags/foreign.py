@@ -1,0 +1,406 @@
+"""Bags as others record them: ROS 1, SQLite, and what streams through them with clocks of its own.
+
+A tracker streams: it measures while the robot moves too, its stamps are often those of its
+receipt, late and in bursts, and its computer's clock may be another. `stream_timing` finds by how
+much from the motion, `Averaged` makes single measurements of what stands still.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag1 import ReaderError as Ros1Error
+from rosbags.rosbag2 import Reader as Ros2Reader
+from rosbags.rosbag2 import ReaderError as Ros2Error
+from rosbags.typesys import Stores, get_typestore
+
+from robocal_ros.bags.bags import BagInfo, BagMessage, BagReader, TopicInfo
+from robocal_ros.bags.mcap_files import register_schema
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array, nearest_rotation
+from robocal_ros.ground.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    JointSample,
+    PointSample,
+    StandstillRule,
+    joint_sample,
+    point_sample,
+    pose_sample,
+)
+from robocal_ros.kinematics import SerialArm
+
+ROS1, SQLITE = ".bag", ".db3"
+
+
+def open_bag(path: str | Path) -> BagReader:
+    """Open a bag of any kind: MCAP, SQLite (``.db3``), or of ROS 1 (``.bag``).
+
+    ``path``: a file, or a folder of them.
+
+    Raises `InputError` when it is no such bag, or broke off before any message.
+    """
+    path = Path(path)
+    files = [path]
+    if path.is_dir():
+        files = sorted(path.glob(f"*{ROS1}"))
+        if not files and not list(path.glob("*.mcap")) and list(path.glob(f"*{SQLITE}*")):
+            described = path / "metadata.yaml"
+            files = [path] if described.is_file() else sorted(path.glob(f"*{SQLITE}"))
+    if files and (path.is_dir() or path.suffix in (ROS1, SQLITE)):
+        return ForeignBagReader(path, files)
+    return BagReader(path)
+
+
+class ForeignBagReader(BagReader):
+    """As `BagReader`, of bags of ROS 1 and of SQLite ones, which rosbags reads.
+
+    Types of ROS 1 have their names of ROS 2 (``sensor_msgs/msg/JointState``).
+    """
+
+    def __init__(self, path: Path, files: Iterable[Path]) -> None:
+        self._path, self._stack = path, ExitStack()
+        self._store = get_typestore(Stores.EMPTY)
+        self._readers: list[Ros1Reader | Ros2Reader] = []
+        try:
+            for file in files:
+                reader = Ros1Reader(file) if file.suffix == ROS1 else Ros2Reader(file)
+                self._stack.enter_context(reader)
+                self._readers.append(reader)
+        except (Ros1Error, Ros2Error, OSError) as error:
+            self._stack.close()
+            raise InputError(
+                f"cannot be read as a bag: {error}; 'rosbag reindex' (ROS 1) or 'ros2 bag reindex' "
+                "mends one that broke off",
+                file=str(path),
+            ) from error
+
+    @property
+    def info(self) -> BagInfo:
+        """What the bag holds."""
+        topics: dict[str, TopicInfo] = {}
+        for connection in (c for reader in self._readers for c in reader.connections):
+            before = topics.get(connection.topic, TopicInfo(connection.msgtype, 0))
+            count = before.messages + connection.msgcount
+            topics[connection.topic] = TopicInfo(connection.msgtype, count)
+        held = [reader for reader in self._readers if reader.message_count]
+        return BagInfo(
+            path=str(self._path),
+            topics=dict(sorted(topics.items())),
+            start_ns=min((reader.start_time for reader in held), default=None),
+            end_ns=max((reader.end_time - 1 for reader in held), default=None),
+            truncated=False,
+            notes=(),
+        )
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        raw: bool = False,
+        blocks: Collection[str] = (),
+    ) -> Iterator[BagMessage]:
+        """As `BagReader.messages`; joint states come one by one.
+
+        Raises `InputError` when a type is not known, or a message cannot be decoded.
+        """
+        for reader in sorted(self._readers, key=lambda one: one.start_time):
+            wanted = [c for c in reader.connections if topics is None or c.topic in topics]
+            if not wanted:
+                continue
+            for connection in wanted:
+                definition = connection.msgdef
+                register_schema(
+                    self._store, connection.msgtype, "ros2msg" if definition.data else "",
+                    definition.data, str(self._path),
+                )  # fmt: skip
+            ros1 = isinstance(reader, Ros1Reader)
+            decode = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
+            for connection, log_time_ns, data in reader.messages(wanted):
+                try:
+                    message = data if raw else decode(data, connection.msgtype)
+                except Exception as error:  # whatever bytes of another's recorder make of it
+                    words = f"a message of {connection.topic} cannot be decoded: {error}"
+                    raise InputError(words, file=str(self._path)) from error
+                yield BagMessage(connection.topic, connection.msgtype, log_time_ns, message)
+
+
+# ---- streams and their clocks -------------------------------------------------------------------
+
+STREAMS_HZ = 5.0  # what measures oftener does so while the robot moves too
+FORESEEN_S = 900.0  # of a recording is looked at for its clocks
+GRID_S = 0.02
+WINDOW = 10  # of the grid, from which a speed is taken: receipt in bursts makes speeds of its own
+LATEST_S = 1.5  # a stream lags behind the joints, or they behind it, by no more
+OTHER_CLOCK_S = 1.0  # stamps further from their receipt than the joints' are of another clock
+BLOCK_S = 1.0  # of a standstill become one measurement
+LIKENESS = 0.6  # six sigma: two motions that are not one scatter by 0.1 in a hundred windows
+SAME_MOTION_S = 20.0  # of motion that a delay is found from, at a time
+
+
+@dataclass(frozen=True)
+class StreamTiming:
+    """When a stream was measured, by the joints' clock: ``stamp - later_ns``.
+
+    ``rate_hz``: of its messages. ``clock_ns``: its clock ahead of the joints' clock, 0 where both
+    are one. ``latency_s``, ``latency_sigma_s``: how late it is behind the joints by that clock,
+    with its standard deviation; None: too little motion shows it. ``burst``: most messages that
+    came within a hundredth of a second.
+    """
+
+    rate_hz: float
+    clock_ns: int = 0
+    latency_s: float | None = None
+    latency_sigma_s: float | None = None
+    burst: int = 1
+
+    @property
+    def later_ns(self) -> int:
+        """What a stamp is later than the joints' stamp of the same instant."""
+        return self.clock_ns + round((self.latency_s or 0.0) * 1e9)
+
+    def words(self, topic: str) -> str:
+        """What is known of a topic's clock, for people."""
+        parts = [f"{topic} streams at {self.rate_hz:.0f} Hz"]
+        if self.clock_ns:
+            parts.append(f"its clock is {self.clock_ns * 1e-9:+.3f} s from the joints', taken out")
+        if self.latency_s is None:
+            parts.append("the recording has too little motion to show its delay, taken as 0")
+        else:
+            parts.append(
+                f"measured {self.latency_s:.3f} s before its stamps say "
+                f"(sigma {self.latency_sigma_s:.3f} s), taken out"
+            )
+        if self.burst > 2:
+            parts.append(f"its messages come in bursts of up to {self.burst}")
+        return "; ".join(parts)
+
+
+def stream_timing(
+    reader: BagReader, inputs: Mapping[str, str], arm: SerialArm, target: str = ""
+) -> dict[str, StreamTiming]:
+    """Find how each stream of measurements stands to the joints' clock, by topic.
+
+    The speed of the flange, from the joints, and that of the target are one motion: the shift that
+    makes them alike is the delay. Turning speeds are alike in every frame and serve where poses
+    are measured; of points the speed is compared, from which the target's lever differs little.
+
+    Only topics of more than 5 Hz are streams. The first 15 minutes are looked at.
+
+    Raises `InputError` when the bag cannot be read.
+    """
+    seen = _Seen.of(reader, inputs, arm)
+    return {
+        topic: _timing(seen, topic)
+        for topic in seen.stamp_ns
+        if topic != seen.joints and _rate_hz(np.array(seen.log_ns[topic])) > STREAMS_HZ
+    }
+
+
+@dataclass
+class _Seen:
+    """Stamps, receipt and motion of the joints and of each stream, of the recording's beginning."""
+
+    arm: SerialArm
+    joints: str
+    stamp_ns: dict[str, list[int]] = field(default_factory=dict)
+    log_ns: dict[str, list[int]] = field(default_factory=dict)
+    values: dict[str, list[Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, reader: BagReader, inputs: Mapping[str, str], arm: SerialArm) -> "_Seen":
+        measured = {MEASURED_POINT, MEASURED_POSE, JOINTS}
+        topics = {topic: kind for topic, kind in inputs.items() if kind in measured}
+        joints = next((topic for topic, kind in topics.items() if kind == JOINTS), "")
+        seen = cls(arm, joints)
+        until_ns = (reader.info.start_ns or 0) + int(FORESEEN_S * 1e9)
+        for recorded in reader.messages(topics):
+            if recorded.log_time_ns > until_ns:
+                break
+            try:
+                sample = _sample(topics[recorded.topic], recorded.message)
+            except InputError:
+                continue  # counted by the session, with its reason
+            if isinstance(sample, JointSample):
+                if not set(arm.joint_names) <= set(sample.names):
+                    continue
+                value: Any = sample.position[sample.order(arm.joint_names)]
+            else:
+                value = sample
+            seen.stamp_ns.setdefault(recorded.topic, []).append(sample.stamp_ns)
+            seen.log_ns.setdefault(recorded.topic, []).append(recorded.log_time_ns)
+            seen.values.setdefault(recorded.topic, []).append(value)
+        return seen
+
+
+def _sample(kind: str, message: Any) -> Any:
+    if kind == JOINTS:
+        return joint_sample(message)
+    return point_sample(message) if kind == MEASURED_POINT else pose_sample(message)
+
+
+def _rate_hz(log_ns: NDArray[np.int64]) -> float:
+    """Messages per second while they come: pauses, as of one that is switched off, do not count."""
+    if len(log_ns) < 20:
+        return 0.0
+    steps = np.diff(log_ns) * 1e-9
+    return len(steps) / max(float(steps[steps < 2.0].sum()), 1e-3)
+
+
+def _timing(seen: _Seen, topic: str) -> StreamTiming:
+    log_ns = np.array(seen.log_ns[topic])
+    lead_ns = [
+        float(np.median(np.array(seen.stamp_ns[name]) - np.array(seen.log_ns[name])))
+        for name in (topic, seen.joints)
+        if name in seen.stamp_ns
+    ]
+    apart_ns = round(lead_ns[0] - lead_ns[1]) if len(lead_ns) == 2 else 0
+    clock_ns = apart_ns if abs(apart_ns) > OTHER_CLOCK_S * 1e9 else 0
+    ends = np.searchsorted(log_ns, log_ns + 10_000_000, side="right")
+    timing = StreamTiming(
+        _rate_hz(log_ns), clock_ns, burst=int(np.max(ends - np.arange(len(log_ns))))
+    )
+    if seen.joints not in seen.stamp_ns:
+        return timing
+    samples: list[PointSample] = seen.values[topic]
+    flange = seen.arm.fk(np.array(seen.values[seen.joints]))
+    moved, measured = flange[:, :3, 3], np.array([sample.position_m for sample in samples])
+    if all(sample.rotation is not None for sample in samples):
+        moved = flange[:, :3, :3].reshape(-1, 9)
+        measured = np.array([sample.rotation for sample in samples]).reshape(-1, 9)
+    delay = delay_between(
+        np.array(seen.stamp_ns[seen.joints]), moved,
+        np.array(seen.stamp_ns[topic]) - clock_ns, measured,
+    )  # fmt: skip
+    return (
+        timing if delay is None else replace(timing, latency_s=delay[0], latency_sigma_s=delay[1])
+    )
+
+
+def delay_between(
+    first_ns: NDArray[np.int64], first: Array, other_ns: NDArray[np.int64], other: Array
+) -> tuple[float, float] | None:
+    """How much later than ``first`` the stamps of ``other`` are, s, with its standard deviation.
+
+    None where too little motion shows it, or the two are not one motion.
+
+    Parameters
+    ----------
+    first, other : (n, 3) positions, or (n, 9) rotation matrices row by row, in whatever frames:
+        speeds are compared. ``first_ns`` (n,), ``other_ns`` (m,): their stamps.
+    """
+    at = [_rising(first_ns, first), _rising(other_ns, other)]
+    start_ns = max(int(stamps[0]) for stamps, _ in at)
+    end_ns = min(int(stamps[-1]) for stamps, _ in at)
+    grid = np.arange(0.0, max((end_ns - start_ns) * 1e-9, 0.0), GRID_S)
+    if len(grid) <= WINDOW:
+        return None
+    speeds = []
+    for stamps, values in at:
+        since = (stamps - start_ns) * 1e-9
+        x = np.column_stack([np.interp(grid, since, column) for column in values.T])
+        speeds.append(np.linalg.norm(x[WINDOW:] - x[:-WINDOW], axis=1))
+    busy = np.cumsum(speeds[1] > 0.1 * np.quantile(speeds[1], 0.99)) * GRID_S
+    pieces = max(int(busy[-1] // SAME_MOTION_S), 1)
+    ends = np.searchsorted(busy, np.linspace(0.0, busy[-1], pieces + 1)[1:])
+    delays = [
+        delay
+        for start, end in zip(np.concatenate(([0], ends[:-1])), ends + 1, strict=True)
+        if (delay := _delay_s(speeds[0][start:end], speeds[1][start:end])) is not None
+    ]
+    if 2 * len(delays) <= pieces:
+        return None
+    found = np.array(delays)
+    scatter = 1.4826 * np.median(np.abs(found - np.median(found)))
+    sigma_s = float(np.hypot(scatter, GRID_S / np.sqrt(12.0)) / np.sqrt(len(found)))
+    return float(np.median(found)), sigma_s
+
+
+def _rising(stamps: NDArray[np.int64], values: Array) -> tuple[NDArray[np.int64], Array]:
+    """Those that are stamped after all before them."""
+    newest = np.maximum.accumulate(stamps)
+    later = np.concatenate(([True], stamps[1:] > newest[:-1]))
+    return stamps[later], values[later]
+
+
+def _delay_s(flange: Array, target: Array) -> float | None:
+    """How much later (n,) ``target`` is than ``flange``; None where they are not one motion."""
+    most = round(LATEST_S / GRID_S)
+    if len(flange) < 4 * most:
+        return None
+    middle = flange[most:-most]
+    likeness = [
+        float(np.corrcoef(middle, target[most + lag : len(target) - most + lag])[0, 1])
+        for lag in range(-most, most + 1)
+    ]
+    best = int(np.argmax(likeness))
+    if not likeness[best] >= LIKENESS or best in (0, 2 * most):
+        return None
+    before, at, after = likeness[best - 1 : best + 2]
+    return float(best - most + 0.5 * (before - after) / (before - 2.0 * at + after)) * GRID_S
+
+
+@dataclass(frozen=True)
+class StreamAverage:
+    """Streams of a recording as single measurements by the joints' clock: one for each second.
+
+    ``inputs``: topic to input. ``timing``: of each stream, see `stream_timing`.
+    """
+
+    inputs: Mapping[str, str]
+    timing: Mapping[str, StreamTiming]
+
+    @staticmethod
+    def standstill(rule: StandstillRule) -> StandstillRule:
+        """The rule, for measurements that are of a whole second about their stamp."""
+        half = BLOCK_S / 2.0
+        return replace(rule, before_s=rule.before_s + half, after_s=rule.after_s + half)
+
+    def of(self, messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
+        """Messages with each stream averaged; what is no stream comes as it was recorded.
+
+        What cannot be read comes too, so that it is counted where it would have been used.
+        """
+        blocks: dict[tuple[str, str, str], list[PointSample]] = {}
+        for recorded in messages:
+            if (timing := self.timing.get(recorded.topic)) is None:
+                yield recorded
+                continue
+            try:
+                sample: PointSample = _sample(self.inputs[recorded.topic], recorded.message)
+            except InputError:
+                yield recorded
+                continue
+            sample = replace(sample, stamp_ns=sample.stamp_ns - timing.later_ns)
+            block = blocks.setdefault((recorded.topic, sample.frame, sample.target), [])
+            if block and not 0 <= sample.stamp_ns - block[0].stamp_ns < BLOCK_S * 1e9:
+                yield recorded._replace(message=_mean(block))
+                block.clear()
+            block.append(sample)
+        for (topic, _, _), block in blocks.items():
+            yield BagMessage(topic, "", block[-1].stamp_ns, _mean(block))
+
+
+def _mean(block: list[PointSample]) -> PointSample:
+    """Mean of what was measured in a row, without what lies far from the others."""
+    position = np.array([sample.position_m for sample in block])
+    away = np.abs(position - np.median(position, axis=0))
+    scale = 1.4826 * np.median(away, axis=0) + 1e-6
+    kept = np.flatnonzero((away <= 5.0 * scale).all(axis=1))
+    kept = kept if len(kept) else np.arange(len(block))
+    variance = position[kept].var(axis=0, ddof=1).mean() if len(kept) > 1 else 0.0
+    stamps = np.array([block[i].stamp_ns for i in kept])
+    turns = [R for i in kept if (R := block[i].rotation) is not None]
+    return replace(
+        block[-1],
+        stamp_ns=int(stamps[0]) + round(float(np.mean(stamps - stamps[0]))),
+        position_m=position[kept].mean(axis=0),
+        sigma_m=float(np.sqrt(variance / len(kept))),
+        rotation=nearest_rotation(np.mean(turns, axis=0)) if len(turns) == len(kept) else None,
+    )
