@@ -461,6 +461,14 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "cli.robot:import_ur",
         "turn the factory calibration of a Universal Robots arm into a robot file",
     ),
+    "import-urdf": CliCommand(
+        "cli.urdf:import_urdf",
+        "turn a URDF, or a kinematics.yaml of Universal Robots' description, into a robot file",
+    ),
+    "export-urdf": CliCommand(
+        "cli.urdf:export_urdf",
+        "put a robot file's kinematics, as identified, into a URDF or such a kinematics.yaml",
+    ),
 }
 """Each command, in the order of the help."""
 
