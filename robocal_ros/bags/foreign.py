@@ -134,6 +134,8 @@ class ForeignBagReader(BagReader):
 # ---- streams and their clocks -------------------------------------------------------------------
 
 STREAMS_HZ = 5.0  # what measures oftener does so while the robot moves too
+MOVING_SHARE = 0.1  # of a stream's measurements come while the robot moves
+HALF_NS = 200_000_000  # about a measurement, in which the robot moves or not
 FORESEEN_S = 900.0  # of a recording is looked at for its clocks
 GRID_S = 0.02
 WINDOW = 10  # of the grid, from which a speed is taken: receipt in bursts makes speeds of its own
@@ -191,15 +193,18 @@ def stream_timing(
     makes them alike is the delay. Turning speeds are alike in every frame and serve where poses
     are measured; of points the speed is compared, from which the target's lever differs little.
 
-    Only topics of more than 5 Hz are streams. The first 15 minutes are looked at.
+    A stream comes at more than 5 Hz, and while the robot moves too. The first 15 minutes are looked
+    at.
 
     Raises `InputError` when the bag cannot be read.
     """
     seen = _Seen.of(reader, inputs, arm)
     return {
-        topic: _timing(seen, topic)
+        topic: timing
         for topic in seen.stamp_ns
-        if topic != seen.joints and _rate_hz(np.array(seen.log_ns[topic])) > STREAMS_HZ
+        if topic != seen.joints
+        and _rate_hz(np.array(seen.log_ns[topic])) > STREAMS_HZ
+        and (timing := _timing(seen, topic)) is not None
     }
 
 
@@ -250,10 +255,12 @@ def _rate_hz(log_ns: NDArray[np.int64]) -> float:
     if len(log_ns) < 20:
         return 0.0
     steps = np.diff(log_ns) * 1e-9
-    return len(steps) / max(float(steps[steps < 2.0].sum()), 1e-3)
+    following = steps[steps < 2.0]
+    return len(following) / float(following.sum()) if 2 * len(following) > len(steps) else 0.0
 
 
-def _timing(seen: _Seen, topic: str) -> StreamTiming:
+def _timing(seen: _Seen, topic: str) -> StreamTiming | None:
+    """The timing of what streams; None of what is measured at standstill alone."""
     log_ns = np.array(seen.log_ns[topic])
     lead_ns = [
         float(np.median(np.array(seen.stamp_ns[name]) - np.array(seen.log_ns[name])))
@@ -269,15 +276,19 @@ def _timing(seen: _Seen, topic: str) -> StreamTiming:
     if seen.joints not in seen.stamp_ns:
         return timing
     samples: list[PointSample] = seen.values[topic]
-    flange = seen.arm.fk(np.array(seen.values[seen.joints]))
+    joint_ns, q = np.array(seen.stamp_ns[seen.joints]), np.array(seen.values[seen.joints])
+    measured_ns = np.array(seen.stamp_ns[topic]) - clock_ns
+    about = (np.stack([measured_ns - HALF_NS, measured_ns + HALF_NS]) - joint_ns[0]) * 1e-9
+    turned = [np.diff(np.interp(about, *_since(joint_ns, column)), axis=0) for column in q.T]
+    moving = np.max(np.abs(turned), axis=0) > StandstillRule().tolerance_rad
+    if np.mean(moving) < MOVING_SHARE:
+        return None
+    flange = seen.arm.fk(q)
     moved, measured = flange[:, :3, 3], np.array([sample.position_m for sample in samples])
     if all(sample.rotation is not None for sample in samples):
         moved = flange[:, :3, :3].reshape(-1, 9)
         measured = np.array([sample.rotation for sample in samples]).reshape(-1, 9)
-    delay = delay_between(
-        np.array(seen.stamp_ns[seen.joints]), moved,
-        np.array(seen.stamp_ns[topic]) - clock_ns, measured,
-    )  # fmt: skip
+    delay = delay_between(joint_ns, moved, measured_ns, measured)
     return (
         timing if delay is None else replace(timing, latency_s=delay[0], latency_sigma_s=delay[1])
     )
@@ -320,6 +331,12 @@ def delay_between(
     scatter = 1.4826 * np.median(np.abs(found - np.median(found)))
     sigma_s = float(np.hypot(scatter, GRID_S / np.sqrt(12.0)) / np.sqrt(len(found)))
     return float(np.median(found)), sigma_s
+
+
+def _since(stamps: NDArray[np.int64], values: Array) -> tuple[Array, Array]:
+    """Times, s, and values in the order of rising stamps."""
+    later, kept = _rising(stamps, values)
+    return (later - stamps[0]) * 1e-9, kept
 
 
 def _rising(stamps: NDArray[np.int64], values: Array) -> tuple[NDArray[np.int64], Array]:

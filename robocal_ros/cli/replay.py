@@ -322,7 +322,8 @@ def _commands(
     if not observed:
         lost = scout.desk.ignored.words()
         words = "no measurement at standstill in this recording" + (f"; {lost}" if lost else "")
-        words = recording.lacks_measurements or words
+        lacks = recording.lacks_measurements
+        words = f"no measurement at standstill in this recording: {lacks}" if lacks else words
         raise InputError(words, file=str(request.bag))
     commands = automatic_commands(observed)
     return accepting(commands, by="replay") if request.accept else commands
