@@ -20,6 +20,7 @@ from bench.laser_tracker import prp_cell
 from robocal_ros.cli.main import COMMANDS
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics.robots import load_description, load_robot, save_robot
+from robocal_ros.kinematics.urdf import urdf_of
 
 UR_NOMINAL = """[DH]
 a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
@@ -270,6 +271,18 @@ CASES = {
         ["import-ur", "--calibration", "n.conf", "--nominal", "n.conf", "--output", "no.yaml"],
         (2, "BAD_INPUT"),
     ),
+    "import-urdf": (
+        "import-urdf.json",
+        ["import-urdf", "arm.urdf", "--output", "of_urdf.yaml"],
+        ["import-urdf", "arm.urdf", "--tip", "nowhere", "--output", "no.yaml"],
+        (2, "BAD_INPUT"),
+    ),
+    "export-urdf": (
+        "export-urdf.json",
+        ["export-urdf", "--robot", ROBOT, "--into", "arm.urdf", "--output", "out.urdf"],
+        ["export-urdf", "--robot", "ur10", "--into", "arm.urdf", "--output", "no.urdf"],
+        (2, "BAD_INPUT"),
+    ),
 }
 
 
@@ -277,6 +290,7 @@ CASES = {
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("commands")
     save_robot(with_joint_errors(load_robot(ROBOT), 1), folder / "full.yaml")
+    (folder / "arm.urdf").write_text(urdf_of(load_robot(ROBOT)))
     table(folder / "data.csv", measured(60))
     table(folder / "few.csv", measured(3))
     visits = shift()
