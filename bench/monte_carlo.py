@@ -205,6 +205,7 @@ def _binomial_bounds(trials: int, p: float, doubt: float) -> tuple[float, float]
     return float(low), float(high)
 
 
+ROBOTS = 12
 HEAVY = ArmLoad(kr150.BODY.mass, kr150.BODY.centre)  # the last link's with the payload
 
 
@@ -212,7 +213,7 @@ def unmodelled_table() -> Table:
     """The same with effects that the geometry of rigid links does not hold, and the full model."""
     table = Table(
         "unmodelled",
-        "KR 150 with effects that geometry does not hold, 60 robots",
+        f"KR 150 with effects that geometry does not hold, {ROBOTS} robots",
         ("true robot", "poses", "nominal rms, mm", "geometry rms, mm", "reported with noise, mm",
          "full model rms, mm", "goal", "reported with noise, mm"),
         "Error at fresh poses throughout the joint limits. Encoders with a once-per-turn error and "
@@ -237,11 +238,11 @@ def unmodelled_table() -> Table:
     return table
 
 
-def _unmodelled(effects: Effects, poses: int, robots: int = 60) -> Array:
+def _unmodelled(effects: Effects, poses: int) -> Array:
     """Mean square figures of one kind of truth, as rms in mm."""
     nominal, rng = load_robot("kr150_r3100"), np.random.default_rng(4)
     cold, sums, first = Warmth.cold(nominal.n), np.zeros(5), np.zeros(FRESH, dtype=np.int64)
-    for _ in range(robots):
+    for _ in range(ROBOTS):
         robot = kr150.true_robot(nominal, rng, effects)
 
         def visit(q: Array, noise: float, robot=robot) -> Measurements:  # type: ignore[no-untyped-def]
@@ -261,7 +262,7 @@ def _unmodelled(effects: Effects, poses: int, robots: int = 60) -> Array:
             squares.append(np.mean(np.sum(after.cell.residual(fresh) ** 2, axis=1)))
             squares.append(np.mean(variance) + 3.0 * after.noise_m**2)
         sums += squares
-    return np.asarray(np.sqrt(sums / robots) * 1e3)
+    return np.asarray(np.sqrt(sums / ROBOTS) * 1e3)
 
 
 def tables() -> Sequence[Table]:
