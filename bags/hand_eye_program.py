@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.tool_cell import SmoothPath
+from robocal_ros.cell_sim.beams import SmoothPath
 from robocal_ros.hand_eye.targets import KIND_OF, LaserTarget, target_document
 from robocal_ros.session import events
 from robocal_ros.session.events import Command

@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 from bench.measured_shifts import Shift, ShiftPlan, simulate
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.beams import read_poses, readings
 from robocal_ros.cell_sim.robot import Effects, TrueRobot
 from robocal_ros.cell_sim.sensors import SphereSensor
-from robocal_ros.cell_sim.tool_cell import read_poses, readings
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]

@@ -59,10 +59,10 @@ from bench.hand_eye_files import write_shots, write_target
 from bench.measured_runs import Q_NEAR
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim.beams import SmoothPath, readings
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
-from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.targets import (

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robocal_ros.cell_sim.beams import PEAK
 from robocal_ros.cell_sim.cell import Happened, station_name
 from robocal_ros.cell_sim.faults import Faults
-from robocal_ros.cell_sim.tool_cell import PEAK
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.ground.samples import (
     MEASURED_POINT,

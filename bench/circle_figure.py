@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
 
 from bench.measured_runs import NO_NOISE, PERFECT
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, beams_of
-from robocal_ros.cell_sim.tool_cell import Circle
+from robocal_ros.cell_sim.beams import BeamStation, Circle, RoundTool, beams_of
 from robocal_ros.ground import frames
 from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE
 from robocal_ros.tool.edges import BeamEdge

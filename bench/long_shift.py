@@ -16,8 +16,8 @@ from bench.measured_shifts import MEASURING, MOVE_S, Shift, ShiftPlan, poses, si
 from robocal_ros.bags.bag_writer import BagWriter, ros_time
 from robocal_ros.bags.mcap_files import encode
 from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.beams import readings
 from robocal_ros.cell_sim.sensors import sphere_cloud
-from robocal_ros.cell_sim.tool_cell import readings
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]

@@ -10,12 +10,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise
-from robocal_ros.cell_sim.tool_cell import (
+from robocal_ros.cell_sim.beams import (
     SWEEP_M,
     SWEEP_S,
+    BeamStation,
     Circle,
     Plunge,
+    RoundTool,
+    TrueInput,
+    TrueNoise,
     joints_at,
     raised,
     step_move,

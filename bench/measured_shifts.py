@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.cell_sim.beams import COUNT_RAD, SmoothPath, read_poses
 from robocal_ros.cell_sim.kr150 import BALL, TOOL, UNCORRECTED, WARM_UP, sphere_sensor
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth, WarmUp
 from robocal_ros.cell_sim.sensors import SphereSensor
-from robocal_ros.cell_sim.tool_cell import COUNT_RAD, SmoothPath, read_poses
 from robocal_ros.thermal.screening import share_within
 
 Array = NDArray[np.float64]

@@ -26,14 +26,16 @@ from bench.measured_runs import (
 )
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.beams import (
+    CYLINDER_M,
     BeamStation,
+    Circle,
     RoundTool,
     TrueBeam,
     TrueInput,
     TrueNoise,
     beams_of,
+    laser_points,
 )
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M, Circle, laser_points
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.circle import CircleMotion, classic_tool, closed_form, fit_circle, label_edges

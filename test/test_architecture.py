@@ -77,7 +77,7 @@ def test_imports_run_one_way(path):
         if parts[0] in ROS:
             assert for_ros, f"{path} imports {name}: only what a node is made of may"
         if parts[0] == "robocal_ros" and len(parts) > 1 and own:
-            allowed = MAY_IMPORT[own] | {own, "single_thread"}
+            allowed = MAY_IMPORT[own] | {own}
             # A room's commands; the command line loads them by name, and nobody else.
             if path.stem in COMMANDS:
                 allowed |= {"cli", "report"}

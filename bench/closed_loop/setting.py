@@ -4,8 +4,8 @@ import numpy as np
 
 from bench.cell_samples import SPIN_RAD
 from bench.measured_runs import point_sigma
+from robocal_ros.cell_sim.beams import CYLINDER_M
 from robocal_ros.cell_sim.cell import T_BASE_LASER, TAUGHT, CellPlan, known_laser, poses
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M
 from robocal_ros.maintenance.accuracy import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import MotionLimits

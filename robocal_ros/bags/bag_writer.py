@@ -130,12 +130,10 @@ class BagWriter:
     ) -> None:
         """Append a message.
 
-        Parameters
-        ----------
-        msgtype : ``package/msg/Type``, a common interface of Jazzy or one of robocal_msgs.
-        message : an object with the type's attributes (of rclpy, of a bag), a mapping of its
-            fields (those left out are zero or empty), or its CDR as bytes.
-        publish_time_ns : the log time when it is not given.
+        ``msgtype``: ``package/msg/Type``, a common interface of Jazzy or one of robocal_msgs.
+        ``message``: an object with the type's attributes (of rclpy, of a bag), a mapping of its
+        fields (those left out are zero or empty), or its CDR as bytes.
+        ``publish_time_ns``: the log time when it is not given.
 
         Raises `InputError` when the type is not known; `ValueError` when a mapping has a field that
         the type has not.
@@ -283,11 +281,8 @@ class BagRecording:
     def look(self) -> None:
         """Look whether what is written still lies in the folder.
 
-        Raises
-        ------
-        StorageError
-            When the folder or the file was removed, moved or replaced: what is written from here on
-            would be found by nobody. What was moved is complete.
+        Raises `StorageError` when the folder or the file was removed, moved or replaced: what is
+        written from here on would be found by nobody. What was moved is complete.
         """
         try:
             lies = lies_at(self.folder / OPEN, self._open.fileno())

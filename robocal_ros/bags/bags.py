@@ -308,10 +308,8 @@ def write_data_set(
 ) -> None:
     """Write a data set; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    document : of the data set, with its ``samples`` in SI.
-    topic : ``profile``, ``target_pose`` or ``image``; ``frame``: the sensor's.
+    ``document``: of the data set, with its ``samples`` in SI.
+    ``topic``: ``profile``, ``target_pose`` or ``image``; ``frame``: the sensor's.
 
     Raises `InputError` when the file is there already, or cannot be written.
     """

@@ -23,13 +23,19 @@ from numpy.typing import ArrayLike
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.beams import (
+    JITTER_RAD,
     BeamStation,
     BeamWatch,
+    Circle,
+    Plunge,
     RoundTool,
     TrueInput,
     TrueNoise,
     beams_of,
+    laser_points,
     on_one_clock,
+    program,
+    read_poses,
 )
 from robocal_ros.cell_sim.faults import (
     LASTING,
@@ -65,14 +71,6 @@ from robocal_ros.cell_sim.sensors import (
     Standing,
     ball_on_table,
     standstills,
-)
-from robocal_ros.cell_sim.tool_cell import (
-    JITTER_RAD,
-    Circle,
-    Plunge,
-    laser_points,
-    program,
-    read_poses,
 )
 from robocal_ros.cell_sim.trajectory_controller import (
     LAG_S,

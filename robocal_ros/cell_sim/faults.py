@@ -10,14 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
+from robocal_ros.cell_sim.beams import COUNT_RAD, BeamStation, RoundTool, bent
 from robocal_ros.cell_sim.robot import Draws, Stream
-from robocal_ros.cell_sim.tool_cell import COUNT_RAD
-from robocal_ros.cell_sim.trajectory_controller import (
-    JointMotion,
-    Trajectory,
-    TrajectoryGoal,
-)
+from robocal_ros.cell_sim.trajectory_controller import JointMotion, Trajectory, TrajectoryGoal
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array

@@ -22,10 +22,8 @@ LONGEST_STEP_S = 5.0
 class Warmth:
     """Temperatures above those of the cold robot, K.
 
-    Attributes
-    ----------
-    motor : (n,) of each joint's motor and gear.
-    link : (n,) of the link that follows each joint.
+    ``motor`` (n,): of each joint's motor and gear.
+    ``link`` (n,): of the link that follows each joint.
     """
 
     motor: Array
@@ -44,11 +42,9 @@ class WarmUp:
     ``tau dT/dt = T_end - T``: a motor tends to ``motor_rise`` times its duty, a link to
     ``link_share`` times the mean of the motors at its two ends.
 
-    Attributes
-    ----------
-    motor_rise : (n,) steady rise of each motor at duty 1, K.
-    motor_tau_s, link_tau_s : time constants.
-    link_share : (n,) part of the motors' rise that a link reaches.
+    ``motor_rise`` (n,): steady rise of each motor at duty 1, K.
+    ``motor_tau_s``, ``link_tau_s``: time constants.
+    ``link_share`` (n,): part of the motors' rise that a link reaches.
     """
 
     motor_rise: Array
@@ -109,12 +105,10 @@ class Effects:
 class FlexibleBody:
     """Masses and joint stiffness.
 
-    Attributes
-    ----------
-    mass : (n,) of each link with its drives, the last one with the payload, kg.
-    centre : (n, 3) centre of mass in the link's own frame (the one after its joint), m.
-    stiffness : (n,) of each joint, N m / rad (prismatic: N / m).
-    softening : relative loss of stiffness per kelvin of the joint's motor.
+    ``mass`` (n,): of each link with its drives, the last one with the payload, kg.
+    ``centre`` (n, 3): centre of mass in the link's own frame (the one after its joint), m.
+    ``stiffness`` (n,): of each joint, N m / rad (prismatic: N / m).
+    ``softening``: relative loss of stiffness per kelvin of the joint's motor.
     """
 
     mass: Array
@@ -294,10 +288,8 @@ ROUNDED_K = 0.1  # a temperature is told in such steps
 class HeatPlan:
     """What heats a robot.
 
-    Attributes
-    ----------
-    rated : (n,) mean speed of each joint that is duty 1, rad/s (prismatic: m/s).
-    ambient_c, noise_k : of the cell, and of a told temperature.
+    ``rated`` (n,): mean speed of each joint that is duty 1, rad/s (prismatic: m/s).
+    ``ambient_c``, ``noise_k``: of the cell, and of a told temperature.
     """
 
     warm_up: WarmUp
@@ -317,10 +309,8 @@ class Temperatures:
 class Heating:
     """A robot that warms up, from cold.
 
-    Attributes
-    ----------
-    warmth : as it is.
-    level : factor on the heat; 0: it stays as it is, or cools.
+    ``warmth``: as it is.
+    ``level``: factor on the heat; 0: it stays as it is, or cools.
     """
 
     def __init__(self, plan: HeatPlan, draws: Draws) -> None:

@@ -328,11 +328,9 @@ class SphereSensor:
     ) -> Array:
         """Measured centre (3,) in the sensor frame, m.
 
-        Parameters
-        ----------
-        T_base_flange : (4, 4) true pose of the flange.
-        flange_rise : of the flange's temperature, K.
-        since_start_s : time since the cold sensor was switched on.
+        ``T_base_flange`` (4, 4): true pose of the flange.
+        ``flange_rise``: of the flange's temperature, K.
+        ``since_start_s``: time since the cold sensor was switched on.
         """
         T = self.T_sensor_base @ T_base_flange
         ball = self.ball

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.main import CliResult, Document, count, text
+from robocal_ros.cli.main import CliResult, Document, count, print_table, print_words, text
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -30,33 +30,37 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+_LISTED = (
+    "id", "revision", "kind", "state", "verdict", "rms mm", "data (UTC)", "cycle", "last decision",
+)  # fmt: skip
+_CORRECTED = (
+    "since (UTC)", "correction", "model", "tool", "reference", "from", "its hash", "version",
+)  # fmt: skip
 _STYLES = {"in_force": "bold green", "pending": "bold yellow", "refused": "red"}
 
 
 def show_list(console: "Console", document: Document) -> None:
     """Print the calibrations as a table, and what is in force."""
-    from rich.table import Table
     from rich.text import Text
 
     _show_damage(console, document)
-    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
-    for name in ("id", "revision", "kind", "state", "verdict", "rms mm", "data (UTC)", "cycle"):
-        table.add_column(name, justify="right" if name in ("id", "revision", "rms mm") else "left")
-    table.add_column("last decision")
+    rows = []
     for entry in document["calibrations"]:
         rms = entry["candidate_rms_mm"]
-        table.add_row(
-            str(entry["id"]),
-            str(entry["revision"] or ""),
-            Text(entry["kind"]),
-            Text(entry["state"], style=_STYLES.get(entry["state"], "")),
-            entry["code"],
-            "" if rms is None else f"{rms:.3f}",
-            _time(entry["stamp_ns"]),
-            Text(entry["cycle_id"]),
-            Text(_words(entry["decisions"][-1]) if entry["decisions"] else ""),
+        rows.append(
+            [
+                str(entry["id"]),
+                str(entry["revision"] or ""),
+                entry["kind"],
+                Text(entry["state"], style=_STYLES.get(entry["state"], "")),
+                entry["code"],
+                "" if rms is None else f"{rms:.3f}",
+                _time(entry["stamp_ns"]),
+                entry["cycle_id"],
+                _words(entry["decisions"][-1]) if entry["decisions"] else "",
+            ]
         )
-    console.print(table)
+    print_table(console, f"Robot {document['serial']}", _LISTED, rows, words=(2, 3, 4, 6, 7, 8))
     for head in document["in_force"]:
         number = head["calibration_id"]
         name = "the nominal model" if number is None else f"calibration {number}"
@@ -90,43 +94,40 @@ def show_entry(console: "Console", document: Document) -> None:
 
 def show_corrections(console: "Console", document: Document) -> None:
     """Print what the commands were corrected with, and since when."""
-    from rich.table import Table
     from rich.text import Text
 
     _show_damage(console, document)
-    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
-    for name in ("since (UTC)", "correction", "model", "tool", "reference", "from", "its hash"):
-        table.add_column(name, justify="right" if name in ("model", "tool") else "left")
-    table.add_column("version")
+    rows = []
     for record in document["corrections"]:
         asked = ("shadow" if record["shadow"] else "on") if record["enabled"] else "off"
-        table.add_row(
-            _time(record["wall_ns"]),
-            Text(asked, style="bold green" if asked == "on" else ""),
-            str(record["model_revision"] or "none"),
-            str(record["tool_revision"] or "taught"),
-            record["reference"],
-            Text(record["reference_source"]),
-            record["reference_hash"][:8],
-            Text(record["software"]),
+        rows.append(
+            [
+                _time(record["wall_ns"]),
+                Text(asked, style="bold green" if asked == "on" else ""),
+                str(record["model_revision"] or "none"),
+                str(record["tool_revision"] or "taught"),
+                record["reference"],
+                record["reference_source"],
+                record["reference_hash"][:8],
+                record["software"],
+            ]
         )
-    console.print(table)
+    words = (0, 1, 4, 5, 6, 7)
+    print_table(console, f"Robot {document['serial']}", _CORRECTED, rows, words)
     if not document["corrections"]:
         console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
 
 
 def show_done(console: "Console", document: Document) -> None:
     """Print what was decided, or which damaged histories somebody knows of now."""
-    from rich.text import Text
-
     if "acknowledged" in document:
         for path in document["acknowledged"]:
-            console.print(Text(f"Acknowledged by {document['by']}: {path}"), soft_wrap=True)
+            print_words(console, f"Acknowledged by {document['by']}: {path}")
         if not document["acknowledged"]:
             console.print("There is nothing to acknowledge")
         return
     _show_damage(console, document)
-    console.print(Text(document["verdict"]["reason"].capitalize()), soft_wrap=True)
+    print_words(console, document["verdict"]["reason"].capitalize())
 
 
 def _show_damage(console: "Console", document: Document) -> None:
@@ -266,8 +267,7 @@ def run_history(args: argparse.Namespace) -> CliResult:
         "file": str(history.path),
         "damaged": str(damaged[-1]) if damaged else None,
     }
-    complete = place | document
-    return CliResult(complete, lambda console: render(console, complete))
+    return CliResult(place | document, render)
 
 
 Answer = tuple[Document, Callable[..., None]]

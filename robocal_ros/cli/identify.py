@@ -3,7 +3,6 @@
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,11 +18,12 @@ from robocal_ros.cli.main import (
     Document,
     describe_robot,
     parts,
+    print_output,
+    print_table,
+    print_words,
     refusal,
     seed,
     share,
-    tell,
-    warn,
 )
 from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
@@ -45,7 +45,6 @@ from robocal_ros.kinematics.tables import beyond_limits, read_measurements
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
 
 MOVED_SIGMA = 2.0
@@ -67,15 +66,12 @@ def headline(document: Document) -> str:
 
 def show_identification(console: "Console", document: Document) -> None:
     """Print an identification."""
-    from rich.text import Text
-
     verdict = document["verdict"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(headline(document), style=style), soft_wrap=True)
+    print_words(console, headline(document), "bold green" if verdict["accept"] else "bold red")
     if not verdict["accept"]:
-        console.print(Text(f"Why: {verdict['reason']}"), soft_wrap=True)
+        print_words(console, f"Why: {verdict['reason']}")
     console.print()
-    console.print(_errors(document))
+    _show_errors(console, document)
     predicted = document["calibrated"]["predicted"]
     console.print(
         f"Uncertainty of the model itself: {predicted['model_rms_mm']:.3f} mm rms at these poses, "
@@ -88,36 +84,25 @@ def show_identification(console: "Console", document: Document) -> None:
         _show_joints(console, document)
     _show_parameters(console, document)
     _show_doubts(console, document)
-    if document.get("output"):
-        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+    print_output(console, document)
 
 
-def _errors(document: Document) -> "Table":
-    from rich.table import Table
-
-    table = Table(title="Errors at held-out measurements, mm", title_justify="left", box=None)
-    table.add_column("")
-    for name in _FIGURES:
-        table.add_column(name, justify="right")
-    rows = {"nominal model": document["nominal"]}
+def _show_errors(console: "Console", document: Document) -> None:
+    models = {"nominal model": document["nominal"]}
     if document["in_force"] != document["nominal"]:
-        rows["model in force"] = document["in_force"]
-    rows["identified model"] = document["calibrated"]
-    for name, judged in rows.items():
-        errors = judged["held_out"]
-        table.add_row(name, *(f"{errors[f'{figure}_mm']:.3f}" for figure in _FIGURES))
+        models["model in force"] = document["in_force"]
+    models["identified model"] = document["calibrated"]
+    rows = [
+        [name, *(f"{judged['held_out'][f'{figure}_mm']:.3f}" for figure in _FIGURES)]
+        for name, judged in models.items()
+    ]
     predicted = document["calibrated"]["predicted"]["total_rms_mm"]
-    table.add_row("  predicted by its covariance", "", f"{predicted:.3f}", "", "")
-    return table
+    rows.append(["  predicted by its covariance", "", f"{predicted:.3f}", "", ""])
+    print_table(console, "Errors at held-out measurements, mm", ("", *_FIGURES), rows)
 
 
 def _show_joints(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
-    table = Table(title="Joints", title_justify="left", box=None)
-    table.add_column("joint")
-    for name in ("measured from", "to", "own function, rms", "its sigma", "compliance"):
-        table.add_column(name, justify="right")
+    rows = []
     for row in document["joints"]:
         unit = "deg" if "measured_deg" in row else "mm"
         micro = "urad" if unit == "deg" else "um"
@@ -127,8 +112,9 @@ def _show_joints(console: "Console", document: Document) -> None:
             shown = [f"{function[f'{name}_{micro}']:.0f} {micro}" for name in ("rms", "sigma")]
         load = f"{bends * 1e6:.2f} {micro}/{'N m' if unit == 'deg' else 'N'}" if bends else "none"
         lower, upper = row[f"measured_{unit}"]
-        table.add_row(row["name"], f"{lower:.0f}", f"{upper:.0f} {unit}", *shown, load)
-    console.print(table)
+        rows.append([row["name"], f"{lower:.0f}", f"{upper:.0f} {unit}", *shown, load])
+    head = ("joint", "measured from", "to", "own function, rms", "its sigma", "compliance")
+    print_table(console, "Joints", head, rows)
     if document["check_outside"]:
         there = ", and its function is zero there" if document["model"] == "full" else ""
         console.print(
@@ -140,34 +126,25 @@ def _show_joints(console: "Console", document: Document) -> None:
 
 
 def _show_parameters(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
     parameters = document["parameters"]
     solved = {name: row for name, row in parameters.items() if row["sigma"] is not None}
     if not solved:
         console.print("No model parameter was solved for.")
         return
-    table = Table(
-        title=f"Parameters that moved by more than {MOVED_SIGMA:g} sigma",
-        title_justify="left",
-        box=None,
-    )
-    table.add_column("parameter")
-    for name in ("nominal", "identified", "change", "sigma"):
-        table.add_column(name, justify="right")
+    rows = []
     for name, row in solved.items():
         change = row["value"] - row["nominal"]
         if abs(change) > MOVED_SIGMA * row["sigma"]:
             shown = (f"{row['nominal']:.4f}", f"{row['value']:.4f}", f"{change:+.4f}")
-            table.add_row(name, *shown, f"{row['sigma']:.4f}")
-    if table.row_count:
-        console.print(table)
-    console.print(f"{table.row_count} of {len(solved)} parameters moved.")
+            rows.append([name, *shown, f"{row['sigma']:.4f}"])
+    if rows:
+        title = f"Parameters that moved by more than {MOVED_SIGMA:g} sigma"
+        head = ("parameter", "nominal", "identified", "change", "sigma")
+        print_table(console, title, head, rows)
+    console.print(f"{len(rows)} of {len(solved)} parameters moved.")
 
 
 def _show_doubts(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
     condition = document["condition"]
     scale = "" if condition is None else f", condition {condition:.3g}"
     console.print(
@@ -177,18 +154,14 @@ def _show_doubts(console: "Console", document: Document) -> None:
         owner = "held as they were" if document["held"] else "left to the prior"
         console.print(f"Not seen in the data, {owner}:")
         for words in document["unobservable"]:
-            console.print(Text(f"  {words}"), soft_wrap=True)
-    rejected, not_judging = document["rejected"], document["held_out_rejected"]
-    if rejected:
-        words = f"Rejected, {len(rejected)} of {document['samples']} samples: {_listed(rejected)}"
-        console.print(Text(words), soft_wrap=True)
-    if not_judging:
-        words = f"Left out of the judgement, no model fits them: {_listed(not_judging)}"
-        console.print(Text(words), soft_wrap=True)
-
-
-def _listed(samples: list[str]) -> str:
-    return ", ".join(samples[:MOST_LISTED]) + (" …" if len(samples) > MOST_LISTED else "")
+            print_words(console, f"  {words}")
+    for key, words in (
+        ("rejected", f"Rejected, {len(document['rejected'])} of {document['samples']} samples"),
+        ("held_out_rejected", "Left out of the judgement, no model fits them"),
+    ):
+        if samples := document[key]:
+            more = " …" if len(samples) > MOST_LISTED else ""
+            print_words(console, f"{words}: {', '.join(samples[:MOST_LISTED])}{more}")
 
 
 _HOLD_OUT = 0.5
@@ -258,8 +231,7 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
 
-    warnings: list[str] = []
-    robot = describe_robot(args.robot, warnings)
+    robot, warnings = describe_robot(args.robot)
     judged, document = _identified(robot.arm, args, warnings)
     verdict = judged.verdict
     document["output"] = None
@@ -276,28 +248,19 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         document["output"] = str(args.output)
     elif args.output is not None:
         warnings.append(f"{args.output} is not written: the verdict is {verdict.code.name}")
-    document["figures"] = _figures(judged, args.figures)
-    document["warnings"] = warnings
-    warn(warnings)
+    document |= {"figures": None, "warnings": warnings}
+    result = judged.identification
+    if args.figures is not None and isinstance(result, FullIdentification):
+        from robocal_ros.report.figures import joint_functions_figure, svg
+
+        args.figures.mkdir(parents=True, exist_ok=True)
+        document["figures"] = str(args.figures / "joints.svg")
+        write_text(args.figures / "joints.svg", svg(joint_functions_figure(result)))
     status = DONE
     if verdict.code is Code.TOO_FEW_SAMPLES:
         document |= refusal(verdict.code, verdict.reason)
-        tell(verdict.code.name, verdict.reason)
         status = NO_ANSWER
-    return CliResult(document, partial(show_identification, document=document), status)
-
-
-def _figures(judged: JudgedIdentification, folder: Path | None) -> str | None:
-    """Write each joint's function with its band; the file, None where there are none."""
-    result = judged.identification
-    if folder is None or not isinstance(result, FullIdentification):
-        return None
-    from robocal_ros.report.figures import joint_functions_figure, svg
-
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "joints.svg"
-    write_text(path, svg(joint_functions_figure(result)))
-    return str(path)
+    return CliResult(document, show_identification, status)
 
 
 def _require_sense(args: argparse.Namespace) -> None:
@@ -471,9 +434,7 @@ def run_iso9283(args: argparse.Namespace) -> CliResult:
                 f"target {quoted(name)}: {found.n} cycles; ISO 9283 asks for {CYCLES}: RP is less "
                 "certain"
             )
-    warn(warnings)
-    document: Document = {"targets": targets, "warnings": warnings}
-    return CliResult(document, partial(_show_iso9283, document=document))
+    return CliResult({"targets": targets, "warnings": warnings}, _show_iso9283)
 
 
 def _commanded(value: str) -> tuple[str, Point]:
@@ -510,16 +471,11 @@ def _by_target(
 
 
 def _show_iso9283(console: "Console", document: Document) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
     title = "Position accuracy and repeatability as in ISO 9283, 7.2, in mm"
-    table = Table(title=title, title_justify="left", box=None)
-    table.add_column("target")
-    for head in ("cycles", "AP", "AP x", "AP y", "AP z", "RP", "mean distance", "S"):
-        table.add_column(head, justify="right")
+    head = ("target", "cycles", "AP", "AP x", "AP y", "AP z", "RP", "mean distance", "S")
+    rows = []
     keys = ("AP_mm", "AP_x_mm", "AP_y_mm", "AP_z_mm", "RP_mm", "mean_distance_mm", "S_mm")
     for name, found in document["targets"].items():
         values = ["-" if found[key] is None else f"{found[key]:z.4f}" for key in keys]
-        table.add_row(Text(name), str(found["n"]), *values)
-    console.print(table)
+        rows.append([name, str(found["n"]), *values])
+    print_table(console, title, head, rows)

@@ -6,15 +6,17 @@ crash of the program itself; 130 = interrupted.
 """
 
 # ruff: noqa: E402  # threads are set before anything can load NumPy
-from robocal_ros.single_thread import use_one_thread
+import os
 
-use_one_thread()
+# With several threads the order of additions, hence the last bits of a result, depends on the
+# number of cores.
+for _library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ[f"{_library}_NUM_THREADS"] = "1"
 
 import argparse
 import contextlib
 import json
 import math
-import os
 import re
 import sys
 import traceback
@@ -29,6 +31,7 @@ from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
     from robocal_ros.kinematics.robots import RobotDescription
 
@@ -87,12 +90,6 @@ class CommandParser(argparse.ArgumentParser):
             action="store_true",
             default=argparse.SUPPRESS,
             help="print one JSON document on standard output",
-        )
-
-    def add_version(self, version: str) -> None:
-        """Offer ``--version``."""
-        self.add_argument(
-            "--version", action=_Information, version=version, help="show the version and leave"
         )
 
     def error(self, message: str) -> NoReturn:
@@ -191,16 +188,15 @@ def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
     )
 
 
-def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":
-    """Read a robot file; what it leaves open is added to ``warnings``.
+def describe_robot(name: str) -> "tuple[RobotDescription, list[str]]":
+    """Read a robot file; beside it warnings of what it leaves open.
 
     Raises `InputError` when there is no such robot, or its file is not as docs/files.md says.
     """
     from robocal_ros.kinematics.robots import load_description
 
     description = load_description(name)
-    warnings += [f"{description.path}: {note}" for note in description.notes]
-    return description
+    return description, [f"{description.path}: {note}" for note in description.notes]
 
 
 def warn(messages: Iterable[str]) -> None:
@@ -234,13 +230,13 @@ Document = dict[str, Any]
 class CliResult:
     """Result of a command.
 
-    ``document``: what ``--json`` prints; finite numbers only.
-    ``render``: prints the same for people.
-    ``exit_code``: exit status.
+    ``document``: what ``--json`` prints; finite numbers only. Its ``warnings``, and its ``error``
+    where there is one, are told on standard error.
+    ``render``: prints the document for people.
     """
 
     document: Document
-    render: "Callable[[Console], None]"
+    render: "Callable[[Console, Document], None]"
     exit_code: int = DONE
 
 
@@ -297,7 +293,7 @@ def show(outcome: CliResult, stream: TextIO) -> None:
             raise BrokenPipeError
 
     wide = None if stream.isatty() or "COLUMNS" in os.environ else _PIPE_COLUMNS
-    outcome.render(Result(file=stream, highlight=False, width=wide))
+    outcome.render(Result(file=stream, highlight=False, width=wide), outcome.document)
     stream.flush()
 
 
@@ -306,6 +302,55 @@ def progress_console() -> "Console":
     from rich.console import Console
 
     return Console(file=sys.stderr, highlight=False)
+
+
+def print_table(
+    console: "Console",
+    title: str,
+    head: Sequence[str],
+    rows: "Iterable[Sequence[str | Text]]",
+    words: Sequence[int] = (0,),
+) -> None:
+    """Print rows below their heads; the columns ``words`` hold text, all others numbers."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", box=None)
+    for column, name in enumerate(head):
+        table.add_column(name, justify="left" if column in words else "right")
+    for row in rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    console.print(table)
+
+
+def print_words(console: "Console", words: str, style: str = "") -> None:
+    """Print a line as it is: no markup, and wrapped by the terminal alone."""
+    from rich.text import Text
+
+    console.print(Text(words, style=style), soft_wrap=True)
+
+
+def print_text(console: "Console", document: Document) -> None:
+    """Print what was exported, as a file would hold it."""
+    console.out(document["text"], highlight=False)
+
+
+def print_verdict(console: "Console", document: Document) -> None:
+    """Print the decision and why."""
+    verdict = document["verdict"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    print_words(console, f"{verdict['code']}: {verdict['reason']}", style)
+
+
+def print_output(console: "Console", document: Document) -> None:
+    """Print which file was written, if any."""
+    if document.get("output"):
+        print_words(console, f"Written: {document['output']}")
+
+
+def spaced(values: Iterable[float], digits: int, between: str = " ") -> str:
+    """Numbers in one line."""
+    return between.join(f"{value:.{digits}f}" for value in values)
 
 
 # ---- the commands, of which only the one that is named is loaded --------------------------------
@@ -497,11 +542,19 @@ def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
             parser = CommandParser(
                 prog="robocal", description="Accuracy of industrial robots, on files and bags."
             )
-            parser.add_version(f"robocal {__version__}")
+            parser.add_argument(
+                "--version",
+                action=_Information,
+                version=f"robocal {__version__}",
+                help="show the version and leave",
+            )
             words = [word for word in arguments if not word.startswith("-")]
             _declare(parser, "command", COMMANDS, words)
             args = parser.parse_args(arguments)
             outcome: CliResult = args.run_command(args)
+            warn(outcome.document.get("warnings", ()))
+            if "error" in outcome.document:
+                tell(outcome.document["error"]["code"], outcome.document["error"]["message"])
         except OSError as error:
             if error.filename is None or isinstance(error, BrokenPipeError):
                 raise

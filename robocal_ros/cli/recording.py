@@ -219,17 +219,18 @@ def find_robot(name: str | None, warnings: list[str], configured: Command | None
     `WrongRobotError`: it is none of the shipped robots.
     """
     if name is not None:
-        return describe_robot(name, warnings).arm
+        robot, notes = describe_robot(name)
+        warnings += notes
+        return robot.arm
     if configured is None:
         raise InputError("the bag does not say which robot it is of: name it with --robot")
     wanted = configured.arguments.get("model_hash")
     for file in (file for folder in robot_folders() for file in sorted(folder.glob("*.yaml"))):
-        notes: list[str] = []
         with contextlib.suppress(InputError):  # a broken file of another robot is no matter here
-            arm = describe_robot(str(file), notes).arm
-            if arm.model_hash == wanted:
+            robot, notes = describe_robot(str(file))
+            if robot.arm.model_hash == wanted:
                 warnings += notes
-                return arm
+                return robot.arm
     raise WrongRobotError(
         f"recorded with robot '{configured.arguments.get('robot')}', nominal model {wanted}, which "
         "is none of the shipped robots: give its file with --robot"

@@ -26,18 +26,15 @@ from robocal_ros.cli.main import (
     CliResult,
     Document,
     input_topic,
+    print_table,
+    print_words,
     progress_console,
     refusal,
-    tell,
-    warn,
 )
 from robocal_ros.cli.recording import UNASKED, BagOverview, find_robot, open_recording
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.hand_eye.session import (
-    hand_eye_session_as_recorded,
-    take_hand_eye_message,
-)
+from robocal_ros.hand_eye.session import hand_eye_session_as_recorded, take_hand_eye_message
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
@@ -57,7 +54,6 @@ from robocal_ros.tool.session import take_tool_message, tool_session_as_recorded
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
 
 S = TypeVar("S", bound=SessionBase)
@@ -380,14 +376,12 @@ _COLUMNS = (
 
 def show_replay(console: "Console", document: Document) -> None:
     """Print a replay; a single candidate in full, several as a table."""
-    from rich.text import Text
-
     thermal = "candidates" in document
     candidates = document["candidates"] if thermal else []
     if len(candidates) == 1:
         show_identification(console, candidates[0])
     elif candidates:
-        console.print(_candidates(candidates))
+        _show_candidates(console, candidates)
         if not document["recorded"]:
             console.print(_NOTHING_ACCEPTED, soft_wrap=True)
     for entry in document["commands"]:
@@ -396,7 +390,7 @@ def show_replay(console: "Console", document: Document) -> None:
             continue  # it is a candidate
         code = f"{entry['code']}: " if refused or not thermal else ""
         words = f"{entry['command']}: {code}{entry['message']}"
-        console.print(Text(words, style="red" if refused else ""), soft_wrap=True)
+        print_words(console, words, "red" if refused else "")
     if not thermal:
         final = document["final_tool"] if "runs" in document else document["final_sensor"]
         if final is None:
@@ -404,52 +398,42 @@ def show_replay(console: "Console", document: Document) -> None:
         else:
             where = ", ".join(f"{x:.3f}" for x in final["xyz_mm"])
             console.print(f"In force at the end: revision {final['revision']}, ({where}) mm")
-    _show_losses(console, document)
-    if document["recorded"]:
-        if not document["differs"]:
-            console.print("Every recorded result comes out equal, bit for bit.", style="green")
-        for words in document["differs"]:
-            console.print(Text(f"Differs from the recording: {words}", style="red"), soft_wrap=True)
-
-
-def _candidates(candidates: list[Document]) -> "Table":
-    from rich.table import Table
-    from rich.text import Text
-
-    title = "Candidates; rms errors at unseen measurements in mm"
-    table = Table(title=title, title_justify="left", box=None)
-    for name in _COLUMNS:
-        words = name in ("time (UTC)", "cycle", "verdict")
-        table.add_column(name, justify="left" if words else "right")
-    for number, one in enumerate(candidates, start=1):
-        verdict = one["verdict"]
-        table.add_row(
-            str(number),
-            datetime.fromtimestamp(one["stamp"], UTC).strftime("%Y-%m-%d %H:%M:%S"),
-            Text(one["cycle_id"]),
-            str(one["samples"]),
-            f"{one['in_force']['held_out']['rms_mm']:.3f}",
-            f"{one['calibrated']['held_out']['rms_mm']:.3f}",
-            f"{one['calibrated']['predicted']['total_rms_mm']:.3f}",
-            Text(verdict["code"], style="green" if verdict["accept"] else "red"),
-        )
-    return table
-
-
-def _show_losses(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
     for topic, reasons in document["ignored_reasons"].items():
-        count = document["ignored"][topic]
-        console.print(Text(f"Not used: {count} messages of {topic}"), soft_wrap=True)
-        most = sorted(reasons.items(), key=lambda item: -item[1])[:MOST_REASONS]
-        for reason, number in most:
-            console.print(Text(f"  {number}: {reason}"), soft_wrap=True)
+        print_words(console, f"Not used: {document['ignored'][topic]} messages of {topic}")
+        for reason, number in sorted(reasons.items(), key=lambda item: -item[1])[:MOST_REASONS]:
+            print_words(console, f"  {number}: {reason}")
     gaps = document["gaps"]
     if gaps["count"]:
         console.print(
             f"{gaps['count']} pauses in the joint readings, the longest {gaps['longest_s']:.2f} s"
         )
+    if document["recorded"]:
+        if not document["differs"]:
+            console.print("Every recorded result comes out equal, bit for bit.", style="green")
+        for words in document["differs"]:
+            print_words(console, f"Differs from the recording: {words}", "red")
+
+
+def _show_candidates(console: "Console", candidates: list[Document]) -> None:
+    from rich.text import Text
+
+    rows = []
+    for number, one in enumerate(candidates, start=1):
+        verdict = one["verdict"]
+        rows.append(
+            [
+                str(number),
+                datetime.fromtimestamp(one["stamp"], UTC).strftime("%Y-%m-%d %H:%M:%S"),
+                one["cycle_id"],
+                str(one["samples"]),
+                f"{one['in_force']['held_out']['rms_mm']:.3f}",
+                f"{one['calibrated']['held_out']['rms_mm']:.3f}",
+                f"{one['calibrated']['predicted']['total_rms_mm']:.3f}",
+                Text(verdict["code"], style="green" if verdict["accept"] else "red"),
+            ]
+        )
+    title = "Candidates; rms errors at unseen measurements in mm"
+    print_table(console, title, _COLUMNS, rows, words=(1, 2, 7))
 
 
 _NO_ANSWER = (Code.RANK_DEFICIENT.name, Code.TOO_FEW_SAMPLES.name)
@@ -519,13 +503,10 @@ def run_replay(args: argparse.Namespace) -> CliResult:
     )
     document = replay_bag(request, _watch)
     document["warnings"] = [*warnings, *document["warnings"]]
-    warn(document["warnings"])
     status = DONE
     if "error" in document:
-        error = document["error"]
-        tell(error["code"], error["message"])
-        status = NO_ANSWER if error["code"] in _NO_ANSWER else BAD_REQUEST
-    return CliResult(document, partial(show_replay, document=document), status)
+        status = NO_ANSWER if document["error"]["code"] in _NO_ANSWER else BAD_REQUEST
+    return CliResult(document, show_replay, status)
 
 
 def _watch(what: str, recording: "BagOverview") -> "Iterator[BagMessage]":

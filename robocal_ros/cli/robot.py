@@ -3,13 +3,19 @@
 import argparse
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, warn
+from robocal_ros.cli.main import (
+    ROBOT_HELP,
+    CliResult,
+    Document,
+    describe_robot,
+    print_output,
+    print_table,
+)
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text, write_text
 from robocal_ros.ground.frames import Array, transform_document
@@ -46,8 +52,8 @@ def add_fk(parser: argparse.ArgumentParser) -> None:
 
 def run_fk(args: argparse.Namespace) -> CliResult:
     """Do ``fk``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     q = np.array(_given_joints(args, arm))
     T_base_flange = arm.fk(q)
     joints = []
@@ -68,8 +74,7 @@ def run_fk(args: argparse.Namespace) -> CliResult:
     if not np.array_equal(arm.T_flange_tool, np.eye(4)):
         document["T_base_tool"] = transform_document(T_base_flange @ arm.T_flange_tool)
     document["warnings"] = warnings
-    warn(warnings)
-    return CliResult(document, partial(_show_fk, document=document))
+    return CliResult(document, _show_fk)
 
 
 def _given_joints(args: argparse.Namespace, arm: "SerialArm") -> list[float]:
@@ -114,18 +119,18 @@ def _value(cell: str, unit: str, option: str, arm: "SerialArm", joint: int) -> f
 
 
 def _show_fk(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
     values = ", ".join(f"{joint['value']:g} {joint['unit']}" for joint in document["joints"])
-    table = Table(title=f"{document['robot']} at {values}")
-    for heading in ("", "x mm", "y mm", "z mm", "qx", "qy", "qz", "qw"):
-        table.add_column(heading, justify="right")
-    for key, name in (("T_base_flange", "flange"), ("T_base_tool", "tool")):
-        if key in document:
-            pose = document[key]
-            lengths = [f"{value:z.3f}" for value in pose["xyz_mm"]]
-            table.add_row(name, *lengths, *(f"{value:z.6f}" for value in pose["quat_xyzw"]))
-    console.print(table)
+    rows = [
+        [
+            name,
+            *(f"{value:z.3f}" for value in document[key]["xyz_mm"]),
+            *(f"{value:z.6f}" for value in document[key]["quat_xyzw"]),
+        ]
+        for key, name in (("T_base_flange", "flange"), ("T_base_tool", "tool"))
+        if key in document
+    ]
+    head = ("", "x mm", "y mm", "z mm", "qx", "qy", "qz", "qw")
+    print_table(console, f"{document['robot']} at {values}", head, rows)
 
 
 _ROWS_PER_KNOT = 4  # of a table: a cubic is drawn well by them
@@ -139,8 +144,8 @@ def add_joint_functions(parser: argparse.ArgumentParser) -> None:
 
 def run_joint_functions(args: argparse.Namespace) -> CliResult:
     """Do ``joint-functions``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     functions = arm.functions
     if functions is None:
         raise InputError(f"{arm.name} has no joint functions: identify them", file=args.robot)
@@ -176,29 +181,24 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
     }
-    warn(warnings)
-    return CliResult(document, partial(_show_joint_functions, document=document))
+    return CliResult(document, _show_joint_functions)
 
 
 def _show_joint_functions(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
-    table = Table(title=f"{document['robot']}: what joints turn besides what is read")
-    table.add_column("joint")
-    for heading in ("from", "to", "rms µrad", "largest µrad", "compliance µrad/(N m)"):
-        table.add_column(heading, justify="right")
+    rows = []
     for joint in document["joints"]:
         ends = (joint["from"], joint["to"])
         span = ["" if end is None else f"{end:.1f} {joint['unit']}" for end in ends]
-        numbers = [joint["rms_micro"], joint["largest_micro"]]
-        compliance = f"{joint['compliance_micro']:.4f}"
-        table.add_row(joint["name"], *span, *(f"{value:.1f}" for value in numbers), compliance)
-    console.print(table)
-    if document["output"] is not None:
-        console.print(f"Written: {document['output']}")
+        numbers = [f"{joint[name]:.1f}" for name in ("rms_micro", "largest_micro")]
+        rows.append([joint["name"], *span, *numbers, f"{joint['compliance_micro']:.4f}"])
+    title = f"{document['robot']}: what joints turn besides what is read"
+    head = ("joint", "from", "to", "rms µrad", "largest µrad", "compliance µrad/(N m)")
+    print_table(console, title, head, rows)
+    print_output(console, document)
 
 
 _POSES = 1000
+_UR = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
 
 
 def add_import_ur(parser: argparse.ArgumentParser) -> None:
@@ -240,14 +240,13 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
     dh = replace(nominal, mdh=factory_dh(settings[0], settings[1]))
     save_robot(factory, args.output)
     distances = _distances(nominal, factory)
-    keys = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
     factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
     rows = zip(factory.joint_names, (factory.mdh * factors).tolist(), strict=True)
     document: Document = {
         "robot": name,
         "model_hash": factory.model_hash,
         "output": str(args.output),
-        "joints": [{"name": joint, **dict(zip(keys, row, strict=True))} for joint, row in rows],
+        "joints": [{"name": joint, **dict(zip(_UR, row, strict=True))} for joint, row in rows],
         "from_nominal": {
             "mean_mm": float(distances.mean() * 1e3),
             "max_mm": float(distances.max() * 1e3),
@@ -255,7 +254,7 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
         },
         "conversion_error_mm": float(_distances(dh, factory).max() * 1e3),
     }
-    return CliResult(document, partial(_show_import_ur, document=document))
+    return CliResult(document, _show_import_ur)
 
 
 def _distances(a: "SerialArm", b: "SerialArm") -> "Array":
@@ -265,19 +264,12 @@ def _distances(a: "SerialArm", b: "SerialArm") -> "Array":
 
 
 def _show_import_ur(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
-    table = Table(title=f"{document['robot']}, as calibrated by the factory")
-    headings = {"name": "joint", "d_mm": "d mm", "theta_deg": "theta deg", "a_mm": "a mm"}
-    headings |= {"alpha_deg": "alpha deg", "beta_deg": "beta deg"}
-    for heading in headings.values():
-        table.add_column(heading, justify="left" if heading == "joint" else "right")
-    for joint in document["joints"]:
-        numbers = (f"{joint[key]:z.4f}" for key in headings if key != "name")
-        table.add_row(joint["name"], *numbers)
-    console.print(table)
+    rows = [[joint["name"], *(f"{joint[key]:z.4f}" for key in _UR)] for joint in document["joints"]]
+    title = f"{document['robot']}, as calibrated by the factory"
+    print_table(console, title, ("joint", *(key.replace("_", " ") for key in _UR)), rows)
     far = document["from_nominal"]
     console.print(
         f"The flange is {far['mean_mm']:.3f} mm (at most {far['max_mm']:.3f} mm) from the nominal "
-        f"model's over {far['n']} poses.\nWritten: {document['output']}"
+        f"model's over {far['n']} poses."
     )
+    print_output(console, document)

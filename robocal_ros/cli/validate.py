@@ -19,7 +19,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
 from multiprocessing import forkserver
@@ -36,9 +35,10 @@ from robocal_ros.cli.main import (
     count,
     crash,
     input_topic,
+    print_table,
+    print_words,
     progress_console,
     refusal,
-    tell,
 )
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import write_text
@@ -85,11 +85,9 @@ def warm_up() -> None:
 def validated(jobs: "Sequence[Job]", workers: int, scheduler: str | None) -> "Iterator[Numbered]":
     """Each job's number and result, as they become ready.
 
-    Parameters
-    ----------
-    workers : processes on this machine (see `warm_up`); with one all is done in this process.
-    scheduler : address of a running Dask cluster, which is used instead; it must see the bags by
-        the same paths, and have this software.
+    ``workers``: processes on this machine (see `warm_up`); with one all is done in this process.
+    ``scheduler``: address of a running Dask cluster, which is used instead; it must see the bags by
+    the same paths, and have this software.
 
     Raises `InputError` when Dask is not there, or the cluster does not answer or has no worker.
     """
@@ -286,8 +284,7 @@ def run_validate(args: argparse.Namespace) -> CliResult:
     workers = min(args.jobs or len(os.sched_getaffinity(0)), len(args.bags))
     if workers > 1 and args.scheduler is None:
         warm_up()
-    from robocal_ros.report.page import page
-    from robocal_ros.report.validation import summary_rows
+    from robocal_ros.report.page import page, summary_rows
 
     args.report.mkdir(parents=True, exist_ok=True)
     jobs = _jobs(args.bags, args.robot, dict(args.topic))
@@ -305,10 +302,7 @@ def run_validate(args: argparse.Namespace) -> CliResult:
     told = {name: report[name] for name in ("created", "software", "versions", "tolerance_mm")}
     document = _failure(bags) | told
     document |= {"report": str(args.report / "report.html"), "bags": summary_rows(bags)}
-    if "error" in document:
-        tell(document["error"]["code"], document["error"]["message"])
-    status = NO_ANSWER if "error" in document else DONE
-    return CliResult(document, partial(_show_validate, document=document), status)
+    return CliResult(document, _show_validate, NO_ANSWER if "error" in document else DONE)
 
 
 def _jobs(paths: Sequence[Path], robot: str | None, topics: dict[str, str]) -> "list[Job]":
@@ -327,7 +321,7 @@ def _jobs(paths: Sequence[Path], robot: str | None, topics: dict[str, str]) -> "
 
 
 def _report(bags: Sequence[Document]) -> Document:
-    from robocal_ros.report.validation import TOLERANCE_MM
+    from robocal_ros.report.figures import TOLERANCE_MM
 
     return {
         "title": TITLE,
@@ -372,7 +366,7 @@ def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
 def _write(folder: Path, report: Document, html: str) -> None:
     import json
 
-    from robocal_ros.report.validation import bags_table, cycles_table, decisions_table, hours_table
+    from robocal_ros.report.page import bags_table, cycles_table, decisions_table, hours_table
 
     bags = report["bags"]
     texts = {
@@ -402,36 +396,27 @@ def _progress(total: int) -> Iterator[Callable[[], None]]:
 
 
 def _show_validate(console: "Console", document: Document) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title="Rms errors in mm", title_justify="left", box=None)
-    heads = ("bag", "what", "without", "in force", "after", "candidate", "below bound", "refused")
-    for head in heads:
-        table.add_column(head, justify="left" if head in heads[:2] else "right")
-    for row in document["bags"]:
-        table.add_row(Text(row["bag"]), *_cells(row))
-    console.print(table)
-    console.print(Text(document["report"]), soft_wrap=True)
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    if "error" in row:
-        return [f"not validated: {row['error']['code']}"]
-    if "skipped" in row:
-        return [f"not replayed: {row['node']}"]
-    errors = [row.get(f"rms_{name}_mm") for name in ("without", "in_force", "after", "candidate")]
-    if row["kind"] == "hand_eye":
-        errors[-1] = row["predicted_rms_mm"]
-    share = row.get("share_below_bound")
+    head = ("bag", "what", "without", "in force", "after", "candidate", "below bound", "refused")
     kinds = {
         "thermal": "{cycles} cycles, {accepted} accepted",
         "tool": "{runs} tool runs",
         "hand_eye": "{calibrations} hand-eye",
     }
-    return [
-        kinds[row["kind"]].format(**row),
-        *("" if error is None else f"{error:.3f}" for error in errors),
-        "" if share is None else f"{share:.1%}",
-        str(row["refused"]),
-    ]
+    rows = []
+    for row in document["bags"]:
+        if "error" in row:
+            cells = [f"not validated: {row['error']['code']}"]
+        elif "skipped" in row:
+            cells = [f"not replayed: {row['node']}"]
+        else:
+            names = ("without", "in_force", "after", "candidate")
+            errors = [row.get(f"rms_{name}_mm") for name in names]
+            if row["kind"] == "hand_eye":
+                errors[-1] = row["predicted_rms_mm"]
+            share = row.get("share_below_bound")
+            cells = [kinds[row["kind"]].format(**row)]
+            cells += ["" if error is None else f"{error:.3f}" for error in errors]
+            cells += ["" if share is None else f"{share:.1%}", str(row["refused"])]
+        rows.append([row["bag"], *cells])
+    print_table(console, "Rms errors in mm", head, rows, words=(0, 1))
+    print_words(console, document["report"])

@@ -43,8 +43,16 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Action, Entry
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
-from robocal_ros.report.figures import CellCourse, Drawn, cell_drawn, thermal_figures, tool_figures
-from robocal_ros.report.validation import TOLERANCE_MM, ShiftErrors, figures_of
+from robocal_ros.report.figures import (
+    TOLERANCE_MM,
+    CellCourse,
+    Drawn,
+    ShiftErrors,
+    cell_drawn,
+    thermal_figures,
+    tool_figures,
+)
+from robocal_ros.report.page import figures_of
 from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command, session_kind
 from robocal_ros.thermal.drift_following import ThermalConfig

@@ -177,14 +177,12 @@ class JointSources:
 class GraphWatch:
     """Looks at who commands the robot and who publishes its joints.
 
-    Parameters
-    ----------
-    commands : resolved topics that this node commands the robot by, and how many publishers of
-        its own each has.
-    actions : likewise resolved names of the controller's action, and its own clients.
-    leases : of this robot; the managed nodes that publish on ``lease_topic`` move the robot for the
-        cell, with a lease; the others of their processes do not.
-    state_topic : where the robot's controller, and nobody else, says where it is.
+    ``commands``: resolved topics that this node commands the robot by, and how many publishers of
+    its own each has.
+    ``actions``: likewise resolved names of the controller's action, and its own clients.
+    ``leases``: of this robot; the managed nodes that publish on ``lease_topic`` move the robot for
+    the cell, with a lease; the others of their processes do not.
+    ``state_topic``: where the robot's controller, and nobody else, says where it is.
     """
 
     def __init__(

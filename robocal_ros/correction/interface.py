@@ -451,10 +451,8 @@ def uncorrected(
     Nominal model and taught tool need no correction. An offset that is still on its way counts as
     done. In the state LEASED the program's commands are refused: none goes out uncorrected.
 
-    Parameters
-    ----------
-    told : None: the correction is silent.
-    follows : something came into force so lately that the correction may not know of it yet.
+    ``told``: None: the correction is silent.
+    ``follows``: something came into force so lately that the correction may not know of it yet.
     """
     no_model = thermal.calibration_id is None
     needed = not (no_model and tool.calibration_id is None)

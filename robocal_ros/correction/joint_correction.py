@@ -124,13 +124,12 @@ class CorrectionResult:
 class JointCorrection:
     """Corrects joints from a reference to an actual model, in either direction.
 
-    Parameters
-    ----------
-    models : (2, n + 2, 9 + w) packed reference and actual model (see `pack_model`, `stack_models`).
-    largest : largest shift of a joint, rad (prismatic: m), for all or (n,) for each; the turning
-        joints' least one is b of equation 3.
-    free_axis : the tool may turn about its z; the turn is used to move the joints least.
-    slope : of equation 3; infinite: the bound alone damps.
+    ``models`` (2, n + 2, 9 + w): packed reference and actual model (see `pack_model`,
+    `stack_models`).
+    ``largest``: largest shift of a joint, rad (prismatic: m), for all or (n,) for each; the turning
+    joints' least one is b of equation 3.
+    ``free_axis``: the tool may turn about its z; the turn is used to move the joints least.
+    ``slope``: of equation 3; infinite: the bound alone damps.
     """
 
     def __init__(
@@ -266,12 +265,10 @@ class StagedResult:
 class StagedCorrection:
     """Correction from a reference model to an actual one, in 1 stage, or 2 with a changed tool.
 
-    Parameters
-    ----------
-    reference, actual : packed models (n + 2, 9 + w), see `pack_model`. The taught tool is the
-        reference's.
-    arm_largest, tool_largest : (n,) largest joint shift of each stage, rad (prismatic: m).
-    free_axis : the tool may turn about its z, in both stages.
+    ``reference``, ``actual``: packed models (n + 2, 9 + w), see `pack_model`. The taught tool is
+    the reference's.
+    ``arm_largest``, ``tool_largest`` (n,): largest joint shift of each stage, rad (prismatic: m).
+    ``free_axis``: the tool may turn about its z, in both stages.
     """
 
     def __init__(

@@ -64,12 +64,10 @@ class CorrectionSession:
 
     ``now_s`` is a steady clock of the caller, the same one in all calls.
 
-    Parameters
-    ----------
-    nominal : model that offered models must have been made for.
-    reference : model and tool (``T_flange_tool``) that the program was taught with: the nominal
-        one for a program made off line, the calibrated cold one for a taught program.
-    serial : the robot's.
+    ``nominal``: model that offered models must have been made for.
+    ``reference``: model and tool (``T_flange_tool``) that the program was taught with: the nominal
+    one for a program made off line, the calibrated cold one for a taught program.
+    ``serial``: the robot's.
 
     The caller asks the ``stream`` of targets for what goes out without a message.
     """

@@ -460,12 +460,10 @@ SPACING_S = 0.01  # of the points until then
 class RobotStop:
     """A stop under way, from `begin` until the robot stands.
 
-    Parameters
-    ----------
-    acceleration, velocity : (n,) largest, rad/s^2, rad/s (prismatic: m/s^2 ...); NaN or infinite
-        where none is known.
-    send : puts a plan out, which goes on for `REACTION_S` from now.
-    reference : joints and unscaled velocities (n,) where the controller is; None: not known.
+    ``acceleration``, ``velocity`` (n,): largest, rad/s^2, rad/s (prismatic: m/s^2 ...); NaN or
+    infinite where none is known.
+    ``send``: puts a plan out, which goes on for `REACTION_S` from now.
+    ``reference``: joints and unscaled velocities (n,) where the controller is; None: not known.
 
     ``why``: of the stop under way, empty when none is. ``fault``: why the robot did not stop, empty
     when it did. ``sent``: how often the stop was sent.

@@ -48,14 +48,12 @@ class Verdict:
 class Judgement:
     """A candidate's figures on data that were not used to solve, and the decision.
 
-    Attributes
-    ----------
-    nominal, current, candidate : held-out errors of the nominal model (for a drift: the cold
-        one), of the model in force and of the identified one.
-    predicted_rms_m : the candidate's error expected from its covariance alone.
-    predicted_total_rms_m : the same with the noise of the measurements added.
-    workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
-    held_out_rejected : samples left out of the judgement because no model can fit them.
+    ``nominal``, ``current``, ``candidate``: held-out errors of the nominal model (for a drift: the
+    cold one), of the model in force and of the identified one.
+    ``predicted_rms_m``: the candidate's error expected from its covariance alone.
+    ``predicted_total_rms_m``: the same with the noise of the measurements added.
+    ``workspace_rms_m``: the same as ``predicted_rms_m`` over postures throughout the joint limits.
+    ``held_out_rejected``: samples left out of the judgement because no model can fit them.
     """
 
     nominal: ErrorSummary
@@ -97,10 +95,7 @@ def pose_groups(q: Array) -> Index:
 def hold_out(groups: Index, share: float, seed: int) -> NDArray[np.bool_]:
     """Mark the samples (m,) to hold out: whole groups, about ``share`` of them.
 
-    Raises
-    ------
-    TooFewSamplesError
-        When fewer than two groups are there.
+    Raises `TooFewSamplesError` when fewer than two groups are there.
     """
     count = int(groups.max()) + 1 if len(groups) else 0
     if count < 2:
@@ -125,11 +120,9 @@ def gross(current: Array, candidate: Array) -> NDArray[np.bool_]:
 def judge(current: Array, candidate: Array, groups: Index, uninformative: str = "") -> Verdict:
     """Decide whether a candidate replaces the model in force.
 
-    Parameters
-    ----------
-    current, candidate : (m,) distances, m, at the same samples, none used to solve.
-    groups : (m,) pose group of each sample; visits of one pose count once.
-    uninformative : why the measured poses do not carry over to other ones; empty if they do.
+    ``current``, ``candidate`` (m,): distances, m, at the same samples, none used to solve.
+    ``groups`` (m,): pose group of each sample; visits of one pose count once.
+    ``uninformative``: why the measured poses do not carry over to other ones; empty if they do.
 
     The gain in squared error must be positive at 5 % significance (one-sided t over groups) to
     be accepted, and negative at 5 % to be called worse. What is not a number is refused.
@@ -171,12 +164,10 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
 def too_narrow(error_m: float, change_m: float, current_rms_m: float, remedy: str) -> str:
     """Say why measured poses do not carry over to the whole workspace; empty when they do.
 
-    Parameters
-    ----------
-    error_m : rms error, throughout the joint limits, that the candidate's covariance leaves.
-    change_m : rms displacement there by which the candidate differs from the model in force.
-    current_rms_m : error of the model in force at the check poses.
-    remedy : which poses would do.
+    ``error_m``: rms error, throughout the joint limits, that the candidate's covariance leaves.
+    ``change_m``: rms displacement there by which the candidate differs from the model in force.
+    ``current_rms_m``: error of the model in force at the check poses.
+    ``remedy``: which poses would do.
 
     The error must be at most twice the present one at the check poses (elsewhere the present one
     is not known, and may be that large), or clearly below what the candidate changes: noise

@@ -31,11 +31,9 @@ class Freedom:
     numbers, of those that tell the noise trace(A (W + s^2 P)^-1) (MacKay, Bayesian interpolation,
     1992: the number of well-determined parameters).
 
-    Attributes
-    ----------
-    count : N numbers tell the noise.
-    told, data : (k,) diagonals of A and W in directions in which W + unit P is one.
-    unit : a variance at which data and prior weigh alike.
+    ``count``: N numbers tell the noise.
+    ``told``, ``data`` (k,): diagonals of A and W in directions in which W + unit P is one.
+    ``unit``: a variance at which data and prior weigh alike.
     """
 
     count: int
@@ -96,10 +94,7 @@ class Freedom:
 def require_told(left: float) -> None:
     """Refuse noise that too few numbers tell.
 
-    Raises
-    ------
-    TooFewSamplesError
-        With `NO_MEAN` numbers or fewer.
+    Raises `TooFewSamplesError` with `NO_MEAN` numbers or fewer.
     """
     if left <= NO_MEAN:
         raise TooFewSamplesError(
@@ -145,12 +140,10 @@ class DescentState(Generic[S]):
 class Loss(Generic[S]):
     """Of one step of a descent.
 
-    Attributes
-    ----------
-    prior : (k, k) information about the unknowns.
-    keep : (m,) samples in use.
-    scale : standard deviation of a whitened residual.
-    huber : (m,) length of each sample's residual, in scales, from which it counts linearly.
+    ``prior`` (k, k): information about the unknowns.
+    ``keep`` (m,): samples in use.
+    ``scale``: standard deviation of a whitened residual.
+    ``huber`` (m,): length of each sample's residual, in scales, from which it counts linearly.
     """
 
     problem: Problem[S]
@@ -230,11 +223,9 @@ def chi2_quantile(probability: float, dof: float) -> float:
 class Descent(Generic[S]):
     """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known.
 
-    Attributes
-    ----------
-    sizes : (m,) how many of its c components each sample has; the others are zero.
-    freedom : how many numbers the noise was found from, where it was found from these data.
-    false_rejection : chance that clean data lose any sample.
+    ``sizes`` (m,): how many of its c components each sample has; the others are zero.
+    ``freedom``: how many numbers the noise was found from, where it was found from these data.
+    ``false_rejection``: chance that clean data lose any sample.
     """
 
     problem: Problem[S]

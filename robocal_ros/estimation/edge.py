@@ -44,12 +44,10 @@ Mask = NDArray[np.bool_]
 class CornerRule(SurfaceRule):
     """What the corners in a profile must be like.
 
-    Attributes
-    ----------
-    count : how many corners the profile must show, convex and concave ones; None takes what is
-        there.
-    classic : the published form instead of the best one.
-    repair_m : classic only: a corner farther than this from the line through its like is moved.
+    ``count``: how many corners the profile must show, convex and concave ones; None takes what is
+    there.
+    ``classic``: the published form instead of the best one.
+    ``repair_m``: classic only: a corner farther than this from the line through its like is moved.
     """
 
     count: int | None = None
@@ -61,15 +59,13 @@ class CornerRule(SurfaceRule):
 class CornerFit:
     """Corners in the order of the laser line.
 
-    Attributes
-    ----------
-    points : (k, 2) x, z in the sensor frame, m.
-    covariance : (k, 2, 2) m^2; neighbours share a surface, so their errors are not independent.
-    repaired : (k,) moved onto the line through the others; in the best form none is.
-    convex : (k,) outer edges, nearer to the sensor than the surfaces beside them.
-    left_out : (j, 2) where a surface ends without a corner that is known: its neighbour was not
-        seen, or too little of it.
-    noise_m : standard deviation of a point along z, from the profile.
+    ``points`` (k, 2): x, z in the sensor frame, m.
+    ``covariance`` (k, 2, 2): m^2; neighbours share a surface, so their errors are not independent.
+    ``repaired`` (k,): moved onto the line through the others; in the best form none is.
+    ``convex`` (k,): outer edges, nearer to the sensor than the surfaces beside them.
+    ``left_out`` (j, 2): where a surface ends without a corner that is known: its neighbour was not
+    seen, or too little of it.
+    ``noise_m``: standard deviation of a point along z, from the profile.
     """
 
     points: Array
@@ -85,13 +81,9 @@ def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
 
     Points are in the order of the sensor's columns.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than 20 finite points.
-    ResidualError
-        No corner, or another number of them than expected: the message says where they are, and
-        where surfaces end without one.
+    Raises `TooFewSamplesError`: fewer than 20 finite points; `ResidualError`: no corner, or another
+    number of them than expected: the message says where they are, and where surfaces end without
+    one.
     """
     rows = points[np.all(np.isfinite(points), axis=1)]
     turned = mirror(rule.towards)
@@ -208,14 +200,12 @@ _RIVAL = 0.8  # share of the sharpest turn at which another one could be meant a
 class EdgeRule(SurfaceRule):
     """What the feature in a profile must be like.
 
-    Attributes
-    ----------
-    kind : "edge" is an outer edge, nearer to the sensor than the surfaces beside it; where the best
-        form finds none, it is the end of a surface beyond which a farther one is seen. "groove" is
-        an inner edge, the bottom of a groove or the foot of a step, farther from the sensor than
-        the surfaces beside it.
-    classic : the published form instead of the best one: the largest second derivative of z over x
-        for an edge, the smallest (most negative) for a groove.
+    ``kind``: "edge" is an outer edge, nearer to the sensor than the surfaces beside it; where the
+    best form finds none, it is the end of a surface beyond which a farther one is seen. "groove" is
+    an inner edge, the bottom of a groove or the foot of a step, farther from the sensor than the
+    surfaces beside it.
+    ``classic``: the published form instead of the best one: the largest second derivative of z over
+    x for an edge, the smallest (most negative) for a groove.
     """
 
     kind: Kind = "edge"
@@ -226,10 +216,8 @@ class EdgeRule(SurfaceRule):
 class EdgeFit:
     """A feature.
 
-    Attributes
-    ----------
-    point : (2,) x, z in the sensor frame, m.
-    covariance : (2, 2) m^2.
+    ``point`` (2,): x, z in the sensor frame, m.
+    ``covariance`` (2, 2): m^2.
     """
 
     point: Array
@@ -239,12 +227,8 @@ class EdgeFit:
 def fit_edge(points: Array, rule: EdgeRule) -> EdgeFit:
     """Find the edge or groove in points (n, 2) of a profile: x, z in m.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than 20 finite points.
-    ResidualError
-        No such feature, or several that could be meant: the message says where.
+    Raises `TooFewSamplesError`: fewer than 20 finite points; `ResidualError`: no such feature, or
+    several that could be meant: the message says where.
     """
     turned = mirror(rule.towards)
     profile, noise = ordered(points * turned, rule.kind)

@@ -36,11 +36,9 @@ _CLEAR = 1e-10  # squared singular value above which normal equations, being qui
 class Observability:
     """What the data alone determine, with every column scaled to unit length.
 
-    Attributes
-    ----------
-    rank, condition : of the scaled Jacobian; the condition leaves out the null space.
-    null : (k, k - rank) unobservable directions in the problem's own units, each of unit
-        length after scaling.
+    ``rank``, ``condition``: of the scaled Jacobian; the condition leaves out the null space.
+    ``null`` (k, k - rank): unobservable directions in the problem's own units, each of unit length
+    after scaling.
     """
 
     rank: int
@@ -103,15 +101,13 @@ FREE_ATTEMPTS = 5  # in which a rejected sample may come back
 class Estimate(Generic[S]):
     """Outcome of ``solve``.
 
-    Attributes
-    ----------
-    state : the estimate.
-    covariance : (k, k) of the increments at the estimate, in the problem's units.
-    scale : standard deviation of the whitened residual: 1 where sigmas were given, unless the
-        residuals are clearly larger; then covariances are widened by it.
-    freedom : how many numbers tell the scale: those of the residuals less those that the unknowns
-        take up. What the prior holds takes up none.
-    residual : (m, c) whitened; ``rejected`` (m,) marks samples not used.
+    ``state``: the estimate.
+    ``covariance`` (k, k): of the increments at the estimate, in the problem's units.
+    ``scale``: standard deviation of the whitened residual: 1 where sigmas were given, unless the
+    residuals are clearly larger; then covariances are widened by it.
+    ``freedom``: how many numbers tell the scale: those of the residuals less those that the
+    unknowns take up. What the prior holds takes up none.
+    ``residual`` (m, c): whitened; ``rejected`` (m,) marks samples not used.
     """
 
     state: S
@@ -138,10 +134,7 @@ class Estimate(Generic[S]):
     def settled(self) -> S:
         """The state.
 
-        Raises
-        ------
-        RankDeficientError
-            Where it still crept.
+        Raises `RankDeficientError` where it still crept.
         """
         if self.creeping:
             raise RankDeficientError(self.creeping)
@@ -161,26 +154,19 @@ def solve(
 ) -> Estimate[S]:
     """Find the most likely state.
 
-    Parameters
-    ----------
-    prior_information : (k, k) inverse covariance of the prior, or None (zeros) for a flat one.
-    noise_known : whether residuals are in units of their true sigma; otherwise a common scale
-        is estimated with them.
-    robust : whether to look for outliers.
-    sizes : (m,) how many of its c components each sample has, where they differ; the residuals
-        and Jacobians of the others are zero.
-    freedom : how many numbers the sigmas were found from, where they come from these data: then
-        a sample must be farther off to be an outlier (F distribution).
-    false_rejection : chance that clean data lose any sample.
+    ``prior_information`` (k, k): inverse covariance of the prior, or None (zeros) for a flat one.
+    ``noise_known``: whether residuals are in units of their true sigma; otherwise a common scale is
+    estimated with them.
+    ``robust``: whether to look for outliers.
+    ``sizes`` (m,): how many of its c components each sample has, where they differ; the residuals
+    and Jacobians of the others are zero.
+    ``freedom``: how many numbers the sigmas were found from, where they come from these data: then
+    a sample must be farther off to be an outlier (F distribution).
+    ``false_rejection``: chance that clean data lose any sample.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Without a prior, fewer equations than unknowns.
-    RankDeficientError
-        When the data, and the prior where there is one, leave a direction undetermined.
-    ValueError
-        When the residuals at the start are not finite.
+    Raises `TooFewSamplesError`: without a prior, fewer equations than unknowns;
+    `RankDeficientError` when the data, and the prior where there is one, leave a direction
+    undetermined; `ValueError` when the residuals at the start are not finite.
     """
     residual, jacobian = problem.linearise(start)
     if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):

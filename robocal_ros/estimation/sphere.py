@@ -62,11 +62,9 @@ _FEWEST = 8  # points that improve a start
 def find_circle(points: Array, radius: float, limit: float) -> Array | None:
     """The circle (x0, z0, r) with its near side on most points (n, 2); None if there is none.
 
-    Parameters
-    ----------
-    points : (n, 2) of the profile, m.
-    radius : of the sphere, m; the circle's is 0.2 to 1.5 of it.
-    limit : distance from the circle within which a point is near it, m.
+    ``points`` (n, 2): of the profile, m.
+    ``radius``: of the sphere, m; the circle's is 0.2 to 1.5 of it.
+    ``limit``: distance from the circle within which a point is near it, m.
     """
     circles = _through(_triples(points, radius))
     circles = circles[
@@ -185,13 +183,12 @@ class LargeArcError(ResidualError):
 class ArcRule:
     """What the arc of a sphere in a profile must be like.
 
-    Attributes
-    ----------
-    radius_m : R, of the sphere.
-    radius_tolerance_m : how far the arc's radius may exceed the sphere's.
-    radius_sigma_m : largest standard deviation of the arc's radius; a short arc has a larger one.
-    noise_m : largest standard deviation of a point along its normal.
-    towards : whether z grows towards the sensor (a height), not away from it (a distance).
+    ``radius_m``: R, of the sphere.
+    ``radius_tolerance_m``: how far the arc's radius may exceed the sphere's.
+    ``radius_sigma_m``: largest standard deviation of the arc's radius; a short arc has a larger
+    one.
+    ``noise_m``: largest standard deviation of a point along its normal.
+    ``towards``: whether z grows towards the sensor (a height), not away from it (a distance).
     """
 
     radius_m: float
@@ -205,15 +202,13 @@ class ArcRule:
 class ArcFit:
     """A fitted arc.
 
-    Attributes
-    ----------
-    centre : (2,) x0, z0 of the circle, sensor frame, m.
-    radius_m : r, of the circle.
-    covariance : (3, 3) of (x0, z0, r) from the points' scatter and form, m^2.
-    noise_m : standard deviation of a point along its normal, root mean square over the arc.
-    form_m : rms of the smooth deviation from the circle where it is more than noise, else 0: of
-        the sensor's linearity, of light that enters the surface, of the surface.
-    used : (n,) which points were taken for the arc's.
+    ``centre`` (2,): x0, z0 of the circle, sensor frame, m.
+    ``radius_m``: r, of the circle.
+    ``covariance`` (3, 3): of (x0, z0, r) from the points' scatter and form, m^2.
+    ``noise_m``: standard deviation of a point along its normal, root mean square over the arc.
+    ``form_m``: rms of the smooth deviation from the circle where it is more than noise, else 0: of
+    the sensor's linearity, of light that enters the surface, of the surface.
+    ``used`` (n,): which points were taken for the arc's.
     """
 
     centre: Array
@@ -230,16 +225,10 @@ def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
     Points are in the order of the sensor's columns. The circle's radius is 0.2 R to R of the
     sphere.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than 20 points on a circle.
-    ResidualError
-        No arc, one that opens the other way, an arc larger than the sphere, too much noise, a
-        surface that is not round, or an arc too short to know its radius: the message holds the
-        figure that failed.
-    InputError
-        The radius as given is a thousand times too small or too large for the arc that is there.
+    Raises `TooFewSamplesError`: fewer than 20 points on a circle; `ResidualError`: no arc, one that
+    opens the other way, an arc larger than the sphere, too much noise, a surface that is not round,
+    or an arc too short to know its radius: the message holds the figure that failed; `InputError`:
+    the radius as given is a thousand times too small or too large for the arc that is there.
     """
     finite = np.all(np.isfinite(points), axis=1)
     turned = mirror(rule.towards)
@@ -444,14 +433,12 @@ _CLOSE_M = 1e-8
 class SphereRule:
     """What a measured sphere must be like.
 
-    Attributes
-    ----------
-    radius_m : certified radius.
-    radius_tolerance_m : how far the radius of the measured points may be off.
-    noise_m : largest standard deviation of a point along its normal.
-    centre_sigma_m : largest standard deviation of the centre in any direction.
-    half_angle_rad : smallest half angle of the cap; a smaller one turns a form error of the
-        sensor into several times as much of the centre.
+    ``radius_m``: certified radius.
+    ``radius_tolerance_m``: how far the radius of the measured points may be off.
+    ``noise_m``: largest standard deviation of a point along its normal.
+    ``centre_sigma_m``: largest standard deviation of the centre in any direction.
+    ``half_angle_rad``: smallest half angle of the cap; a smaller one turns a form error of the
+    sensor into several times as much of the centre.
     """
 
     radius_m: float
@@ -465,14 +452,12 @@ class SphereRule:
 class SphereFit:
     """A fitted sphere.
 
-    Attributes
-    ----------
-    centre : (3,) in the frame of the points, m.
-    covariance : (3, 3) of the centre from the points' scatter, m^2.
-    noise_m : standard deviation of a point along its normal.
-    radius_m, radius_sigma_m : of a fit with free radius; checks the known one.
-    half_angle_rad : of the cone about the cap's middle that holds 95 % of its points.
-    used : (n,) which points were taken for the sphere's.
+    ``centre`` (3,): in the frame of the points, m.
+    ``covariance`` (3, 3): of the centre from the points' scatter, m^2.
+    ``noise_m``: standard deviation of a point along its normal.
+    ``radius_m``, ``radius_sigma_m``: of a fit with free radius; checks the known one.
+    ``half_angle_rad``: of the cone about the cap's middle that holds 95 % of its points.
+    ``used`` (n,): which points were taken for the sphere's.
     """
 
     centre: Array
@@ -489,13 +474,9 @@ def fit_sphere(points: Array, rule: SphereRule) -> SphereFit:
 
     The same cloud always gives the same answer: the starts are drawn with a fixed seed.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than 30 finite points on a sphere.
-    ResidualError
-        A wrong radius, too much noise, or a cap too small for a centre that is known well
-        enough: the message holds the figure that failed and its limit.
+    Raises `TooFewSamplesError`: fewer than 30 finite points on a sphere; `ResidualError`: a wrong
+    radius, too much noise, or a cap too small for a centre that is known well enough: the message
+    holds the figure that failed and its limit.
     """
     finite = np.all(np.isfinite(points), axis=1)
     cloud = np.ascontiguousarray(points[finite], dtype=np.float64)
@@ -654,10 +635,8 @@ def cloud_sample(
 ) -> PointSample:
     """Build a sample of a sphere's centre from a ``sensor_msgs/PointCloud2`` of its cap.
 
-    Raises
-    ------
-    InputError, TooFewSamplesError, ResidualError
-        When the message is no cloud, or holds no sphere as the rule wants it.
+    Raises `InputError`, `TooFewSamplesError` or `ResidualError` when the message is no cloud, or
+    holds no sphere as the rule wants it.
     """
     frame, target = frame_and_target(message.header.frame_id, default_target)
     fit = fit_sphere(cloud_points(message), rule)

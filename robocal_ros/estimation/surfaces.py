@@ -39,14 +39,12 @@ _WORST = 0.5  # share of points beside a line that is still one
 class Flank:
     """A straight piece of a profile.
 
-    Attributes
-    ----------
-    rows : (n,) indices of its points in the profile, ascending.
-    middle : (2,) mean of its points, m.
-    direction : (2,) unit vector in the order of the points.
-    start_m, end_m : of its points along the direction, from the middle.
-    noise_m : standard deviation of a point along the normal.
-    spread_m2 : sum of squares of its points along the direction.
+    ``rows`` (n,): indices of its points in the profile, ascending.
+    ``middle`` (2,): mean of its points, m.
+    ``direction`` (2,): unit vector in the order of the points.
+    ``start_m``, ``end_m``: of its points along the direction, from the middle.
+    ``noise_m``: standard deviation of a point along the normal.
+    ``spread_m2``: sum of squares of its points along the direction.
     """
 
     rows: NDArray[np.int64]
@@ -169,14 +167,12 @@ def intersection(a: Flank, b: Flank) -> tuple[Array, Array]:
 class SurfaceRule:
     """What straight surfaces and their corners must be like.
 
-    Attributes
-    ----------
-    towards : whether z grows towards the sensor (a height), not away from it (a distance).
-    least_turn_rad : of the surface at a corner.
-    sigma_m : largest standard deviation of a corner in any direction; a worse one is left out.
-    margin_m : points so near to a corner are left out, for no edge is sharp.
-    shortest_m : a straight piece shorter than this is no surface.
-    reach : how far a surface may be extended to a corner, of the part of it that is seen.
+    ``towards``: whether z grows towards the sensor (a height), not away from it (a distance).
+    ``least_turn_rad``: of the surface at a corner.
+    ``sigma_m``: largest standard deviation of a corner in any direction; a worse one is left out.
+    ``margin_m``: points so near to a corner are left out, for no edge is sharp.
+    ``shortest_m``: a straight piece shorter than this is no surface.
+    ``reach``: how far a surface may be extended to a corner, of the part of it that is seen.
     """
 
     towards: bool = False
@@ -191,12 +187,10 @@ class SurfaceRule:
 class Corner:
     """Where two neighbouring surfaces meet.
 
-    Attributes
-    ----------
-    point : (2,) x, z, m.
-    covariance : (2, 2) m^2.
-    turn_rad : from the first surface to the second; positive where the corner is convex, an outer
-        edge, nearer to the sensor than the surfaces.
+    ``point`` (2,): x, z, m.
+    ``covariance`` (2, 2): m^2.
+    ``turn_rad``: from the first surface to the second; positive where the corner is convex, an
+    outer edge, nearer to the sensor than the surfaces.
     """
 
     point: Array
@@ -376,10 +370,7 @@ def ordered(points: Array, what: str) -> tuple[Array, float]:
 
     ``what`` they are to show, for the message.
 
-    Raises
-    ------
-    TooFewSamplesError
-        Fewer than 20 finite points.
+    Raises `TooFewSamplesError`: fewer than 20 finite points.
     """
     rows = points[np.all(np.isfinite(points), axis=1)]
     if len(rows) < FEWEST_POINTS:
@@ -423,10 +414,8 @@ def on_curve(excess: Array) -> Mask:
     Where another surface meets or crosses the curve, the points near both are left out. Far ones,
     spikes and what is behind the curve, have no say.
 
-    Parameters
-    ----------
-    excess : (n,) a point's squared distance from the curve over the largest that its noise
-        explains, in the order of the columns.
+    ``excess`` (n,): a point's squared distance from the curve over the largest that its noise
+    explains, in the order of the columns.
     """
     near = excess < 1.0
     window = np.ones(min(_NEAR, len(near)))

@@ -13,7 +13,16 @@ import numpy as np
 from robocal_ros.bags.bags import DATA_SET, read_data_set
 from robocal_ros.bags.foreign import open_bag
 from robocal_ros.bags.replay import topic_kind
-from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, input_topic, positive, text
+from robocal_ros.cli.main import (
+    ROBOT_HELP,
+    CliResult,
+    Document,
+    input_topic,
+    positive,
+    print_verdict,
+    spaced,
+    text,
+)
 from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
@@ -371,7 +380,7 @@ def show_mount(console: "Console", document: Document) -> None:
 
 def show_placed(console: "Console", document: Document, what: str, where: str) -> None:
     """Print the decision, where a sensor sits, and how well that is known, ``where`` it looks."""
-    show_verdict(console, document)
+    print_verdict(console, document)
     parent = "flange" if "T_flange_sensor" in document else "base"
     show_pose(console, f"{what} in the {parent} frame", document[f"T_{parent}_sensor"])
     if document["sigma"] is not None:
@@ -393,21 +402,10 @@ def show_judged(console: "Console", document: Document) -> None:
     show_rejected(console, document["rejected_because"])
 
 
-def show_verdict(console: "Console", document: Document) -> None:
-    """Print the decision and why."""
-    from rich.text import Text
-
-    verdict = document["verdict"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
-
-
 def show_pose(console: "Console", what: str, pose: Document) -> None:
     """Print a pose."""
-    xyz = ", ".join(f"{value:.3f}" for value in pose["xyz_mm"])
-    quat = " ".join(f"{value:.6f}" for value in pose["quat_xyzw"])
-    console.print(f"{what}, mm: {xyz}")
-    console.print(f"Orientation, quaternion x y z w: {quat}")
+    console.print(f"{what}, mm: {spaced(pose['xyz_mm'], 3, ', ')}")
+    console.print(f"Orientation, quaternion x y z w: {spaced(pose['quat_xyzw'], 6)}")
 
 
 def show_held_out(console: "Console", held_out: Document) -> None:
@@ -432,8 +430,7 @@ def show_rejected(console: "Console", because: Document) -> None:
 
 def show_sigma(console: "Console", sigma: Document) -> None:
     """Print standard deviations of a pose."""
-    xyz = ", ".join(f"{value:.3f}" for value in sigma["xyz_mm"])
-    turns = ", ".join(f"{value:.4f}" for value in sigma["rot_deg"])
+    xyz, turns = spaced(sigma["xyz_mm"], 3, ", "), spaced(sigma["rot_deg"], 4, ", ")
     console.print(f"Standard deviations: {xyz} mm; {turns} deg")
 
 
@@ -478,8 +475,7 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
             raise ValueError("a result of one target has its place")
         seen = held_out(task, judges.data, result.T_flange_sensor, result.place)
         result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
-    document: Document = hand_eye_document(result)
-    return CliResult(document, partial(show_mount, document=document))
+    return CliResult(hand_eye_document(result), show_mount)
 
 
 add_sphere, add_step, add_line = (partial(add_target_action, kind) for kind in KINDS)
@@ -531,8 +527,7 @@ def run_joint(args: argparse.Namespace) -> CliResult:
     if args.check is not None and not checks:
         raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
     result = solve_joint(parts, settings, checks)
-    document: Document = hand_eye_document(result)
-    return CliResult(document, partial(show_mount, document=document))
+    return CliResult(hand_eye_document(result), show_mount)
 
 
 def add_verify(parser: argparse.ArgumentParser) -> None:
@@ -569,10 +564,10 @@ def run_verify(args: argparse.Namespace) -> CliResult:
         "per_sample_mm": dict(zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)),
         "verdict": verdict_document(found.verdict),
     }
-    return CliResult(document, partial(_show_verify, document=document))
+    return CliResult(document, _show_verify)
 
 
 def _show_verify(console: "Console", document: Document) -> None:
-    show_verdict(console, document)
+    print_verdict(console, document)
     show_pose(console, "Sensor in the flange frame, as given", document["T_flange_sensor"])
     show_held_out(console, document["held_out"])

@@ -2,7 +2,6 @@
 
 import argparse
 from dataclasses import replace
-from functools import partial
 from math import degrees, radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,10 @@ from robocal_ros.cli.main import (
     Document,
     describe_robot,
     positive,
+    print_table,
+    print_text,
+    print_verdict,
+    spaced,
     text,
     three_numbers,
     warn,
@@ -57,7 +60,6 @@ from robocal_ros.hand_eye.cli import (
     show_judged,
     show_placed,
     show_sigma,
-    show_verdict,
 )
 from robocal_ros.hand_eye.data import MOUNTS
 from robocal_ros.hand_eye.files import (
@@ -256,8 +258,7 @@ def run_camera(args: argparse.Namespace) -> CliResult:
         )
     else:
         result = _from_images(args, settings)
-    document = hand_eye_document(result)
-    return CliResult(document, partial(_show_camera, document=document))
+    return CliResult(hand_eye_document(result), _show_camera)
 
 
 def _board(value: str) -> tuple[int, int]:
@@ -269,22 +270,19 @@ def _board(value: str) -> tuple[int, int]:
 
 
 def _show_camera(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
     show_placed(console, document, "Camera", CAMERA_WHERE)
     if document.get("time_offset_s") is not None:
         console.print(
             f"Time offset, to be added to the camera's stamps: {document['time_offset_s']:.4f} s "
             f"± {document['time_offset_sigma_s']:.4f}"
         )
-    table = Table(title="Mean residual, mm", title_justify="left")
-    table.add_column("method")
-    table.add_column("mm", justify="right")
-    for name, value in document["closed_forms_mean_mm"].items():
-        table.add_row(name, "failed" if value is None else f"{value:.3f}")
+    rows = [
+        [name, "failed" if value is None else f"{value:.3f}"]
+        for name, value in document["closed_forms_mean_mm"].items()
+    ]
     per_sample = document["residual_mm"]["per_sample"].values()
-    table.add_row(document["method"], f"{sum(per_sample) / len(per_sample):.3f}")
-    console.print(table)
+    rows.append([document["method"], f"{sum(per_sample) / len(per_sample):.3f}"])
+    print_table(console, "Mean residual, mm", ("method", "mm"), rows)
     show_judged(console, document)
 
 
@@ -337,13 +335,12 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
 
 def run_tracker(args: argparse.Namespace) -> CliResult:
     """Do ``tracker``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
     if args.target is None:
         target = TrackerTarget(args.radius_mm * 1e-3, args.radius_mm * 1e-3)
     else:
         target = read_tracker_target(args.target)
-    data, rejected = _read(args, arm)
+    data, rejected = _read(args, robot.arm)
     noise = TrackerNoise()
     if args.tracker_sigma_mm is not None:
         noise = replace(noise, tracker_m=args.tracker_sigma_mm * 1e-3)
@@ -354,8 +351,7 @@ def run_tracker(args: argparse.Namespace) -> CliResult:
     result = solve_tracker(data, target, noise, args.method, args.limit_mm * 1e-3)
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
-    document = hand_eye_document(result)
-    return CliResult(document, partial(_show_tracker, document=document))
+    return CliResult(hand_eye_document(result), _show_tracker)
 
 
 def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[str, str]]:
@@ -432,7 +428,7 @@ def run_export(args: argparse.Namespace) -> CliResult:
         "text": exported(T, parent, args.child, args.format),
         f"T_{mount.parent}_sensor": transform_document(T),
     }
-    return CliResult(document, lambda console: console.out(document["text"], highlight=False))
+    return CliResult(document, print_text)
 
 
 def add_check_plan(parser: argparse.ArgumentParser) -> None:
@@ -502,7 +498,7 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
         names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
         write_pose_table(args.propose, report.proposed, names=names, mark=marks)
     document = _document(report, table.names) | {"proposed_marks": marks}
-    return CliResult(document, partial(_show_check_plan, document=document))
+    return CliResult(document, _show_check_plan)
 
 
 def _document(report: PlanReport, names: tuple[str, ...]) -> Document:
@@ -526,7 +522,7 @@ def _document(report: PlanReport, names: tuple[str, ...]) -> Document:
 
 
 def _show_check_plan(console: "Console", document: Document) -> None:
-    show_verdict(console, document)
+    print_verdict(console, document)
     console.print(f"Rank: {document['rank']} of {document['unknowns']}")
     for words in document["unobservable"]:
         console.print(f"Open: {words}", soft_wrap=True)
@@ -543,6 +539,5 @@ def _show_check_plan(console: "Console", document: Document) -> None:
     for pose, mark in zip(
         proposed, document["proposed_marks"] or [""] * len(proposed), strict=True
     ):
-        xyz = ", ".join(f"{value:.1f}" for value in pose["xyz_mm"])
-        quat = " ".join(f"{value:.4f}" for value in pose["quat_xyzw"])
+        xyz, quat = spaced(pose["xyz_mm"], 1, ", "), spaced(pose["quat_xyzw"], 4)
         console.print(f"  {xyz} mm; x y z w {quat} {mark}".rstrip())

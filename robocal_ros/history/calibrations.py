@@ -133,10 +133,7 @@ class Ledger:
     def apply(self, decision: Decision) -> None:
         """Add the next decision.
 
-        Raises
-        ------
-        DamagedError
-            It does not follow from the decisions before it.
+        Raises `DamagedError`: it does not follow from the decisions before it.
         """
         revision, in_force = self.head(decision.kind)
         step = 0 if decision.action is Action.REJECT else 1
@@ -168,9 +165,7 @@ class Ledger:
     def check_open(self, calibration_id: int) -> None:
         """Refuse a calibration that was decided before.
 
-        Raises
-        ------
-        ConflictError
+        Raises `ConflictError`.
         """
         standing = self.standing(calibration_id)
         if standing.revision:
@@ -187,9 +182,7 @@ class Ledger:
     def check_head(self, kind: str, expected: int | None) -> None:
         """Refuse when another revision is in force than the caller believes.
 
-        Raises
-        ------
-        ConflictError
+        Raises `ConflictError`.
         """
         revision, _ = self.head(kind)
         if expected is not None and expected != revision:
@@ -207,9 +200,7 @@ class Ledger:
     ) -> None:
         """Refuse what must not come into force.
 
-        Raises
-        ------
-        ConflictError, VerdictError, StaleError
+        Raises `ConflictError`, `VerdictError` or `StaleError`.
         """
         self.check_open(calibration_id)
         if candidate.code is not Code.ACCEPT:
@@ -234,9 +225,7 @@ class Ledger:
         ``to`` None goes to what was in force when the present one was accepted, so that each
         further rollback goes further back and never forward again.
 
-        Raises
-        ------
-        ConflictError
+        Raises `ConflictError`.
         """
         _, in_force = self.head(kind)
         if to is None:
@@ -276,12 +265,10 @@ class HistoryReader:
     Every method raises `StorageError` when the file cannot be read. Not for several threads at
     once.
 
-    Attributes
-    ----------
-    serial : the robot.
-    path : the file.
-    damaged : where a damaged predecessor was set aside at this opening, or None.
-    created : whether this opening made a new, empty history.
+    ``serial``: the robot.
+    ``path``: the file.
+    ``damaged``: where a damaged predecessor was set aside at this opening, or None.
+    ``created``: whether this opening made a new, empty history.
     """
 
     def __init__(
@@ -315,27 +302,18 @@ class HistoryReader:
     ) -> Self:
         """Open the history of a robot.
 
-        Parameters
-        ----------
-        serial : robot serial; any text.
-        model_hash : hash of the nominal model in use; what was made for another one is refused.
-        state_dir : folder of the histories, default `state_folder()`.
-        create : False refuses a robot that has no history.
-        busy_timeout_s : longest wait for other processes.
-        sole_user : the part that only one process may play for this robot; empty: none.
-        owner : sets a damaged file aside and begins anew; others are refused.
+        ``serial``: robot serial; any text.
+        ``model_hash``: hash of the nominal model in use; what was made for another one is refused.
+        ``state_dir``: folder of the histories, default `state_folder()`.
+        ``create``: False refuses a robot that has no history.
+        ``busy_timeout_s``: longest wait for other processes.
+        ``sole_user``: the part that only one process may play for this robot; empty: none.
+        ``owner``: sets a damaged file aside and begins anew; others are refused.
 
-        Raises
-        ------
-        InputError
-            Bad serial, or no history and ``create`` is False.
-        WrongRobotError
-            The file belongs to another serial.
-        StorageError
-            The file cannot be opened, was made by a newer version, or is damaged and ``owner`` is
-            False.
-        ConflictError
-            Another process plays the part of ``sole_user``.
+        Raises `InputError`: bad serial, or no history and ``create`` is False; `WrongRobotError`:
+        the file belongs to another serial; `StorageError`: the file cannot be opened, was made by a
+        newer version, or is damaged and ``owner`` is False; `ConflictError`: another process plays
+        the part of ``sole_user``.
         """
         path = history_path(serial, state_dir or state_folder())
         if not create and not path.exists():
@@ -391,10 +369,8 @@ class HistoryReader:
     def head(self, kind: str = THERMAL) -> Head:
         """Tell what is in force.
 
-        Raises
-        ------
-        WrongRobotError
-            It was made for another nominal model than the one in use: it must not be applied.
+        Raises `WrongRobotError`: it was made for another nominal model than the one in use: it must
+        not be applied.
         """
         with self._reading() as connection:
             revision, in_force = self._ledger.head(kind)
@@ -418,10 +394,7 @@ class HistoryReader:
     def get(self, calibration_id: int) -> Entry:
         """One calibration.
 
-        Raises
-        ------
-        InputError
-            Unknown id.
+        Raises `InputError`: unknown id.
         """
         with self._reading() as connection:
             return self._entry(calibration_id, read_candidate(connection, calibration_id))
@@ -527,14 +500,9 @@ class CalibrationHistory(HistoryReader):
     def propose(self, proposal: Proposal) -> int:
         """Add a calibration and return its id; changes nothing that is in force.
 
-        Raises
-        ------
-        WrongRobotError
-            It corrects another nominal model.
-        StaleError
-            It is based on a revision that this history never had.
-        ValueError
-            A number in its document or model is not finite.
+        Raises `WrongRobotError`: it corrects another nominal model; `StaleError`: it is based on a
+        revision that this history never had; `ValueError`: a number in its document or model is not
+        finite.
         """
         self._require_hash(proposal.model_hash, "the proposal")
         payloads = packed(proposal)
@@ -563,19 +531,10 @@ class CalibrationHistory(HistoryReader):
         whatever is in force when the change is made. ``with_heads``: revisions, by kind, that
         must be in force beside it.
 
-        Raises
-        ------
-        InputError
-            Unknown id.
-        ConflictError
-            Decided before, or another revision is in force than expected.
-        VerdictError
-            Its own verdict refuses it; carries that code.
-        StaleError
-            Solved against a revision that is no longer in force, or measured with another one
-            of ``with_heads``.
-        WrongRobotError
-            Made for another nominal model.
+        Raises `InputError`: unknown id; `ConflictError`: decided before, or another revision is in
+        force than expected; `VerdictError`: its own verdict refuses it; carries that code;
+        `StaleError`: solved against a revision that is no longer in force, or measured with another
+        one of ``with_heads``; `WrongRobotError`: made for another nominal model.
         """
         with self._changing() as connection:
             candidate = read_candidate(connection, calibration_id)
@@ -594,12 +553,7 @@ class CalibrationHistory(HistoryReader):
     def reject(self, calibration_id: int, *, by: str, reason: str, wall_ns: int) -> None:
         """Rule out a calibration that was never accepted.
 
-        Raises
-        ------
-        InputError
-            Unknown id.
-        ConflictError
-            Accepted or rejected before.
+        Raises `InputError`: unknown id; `ConflictError`: accepted or rejected before.
         """
         with self._changing() as connection:
             kind = read_candidate(connection, calibration_id).kind
@@ -621,15 +575,9 @@ class CalibrationHistory(HistoryReader):
         ``to`` is a calibration id; 0 is the nominal model; None is what was in force when the
         present one was accepted, so that repeated rollbacks walk back to the nominal model.
 
-        Raises
-        ------
-        InputError
-            Unknown id, or one of another kind.
-        ConflictError
-            Nothing to roll back, never accepted, in force already, or another revision is in
-            force than expected.
-        WrongRobotError
-            The target was made for another nominal model.
+        Raises `InputError`: unknown id, or one of another kind; `ConflictError`: nothing to roll
+        back, never accepted, in force already, or another revision is in force than expected;
+        `WrongRobotError`: the target was made for another nominal model.
         """
         with self._changing() as connection:
             self._ledger.check_head(kind, expected_head)

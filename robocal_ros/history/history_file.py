@@ -168,10 +168,7 @@ def damage_notice(history: Path) -> str:
 def acknowledge(history: Path, by: str, wall_ns: int) -> tuple[Path, ...]:
     """Write down who knows of the damage; returns what was not acknowledged before.
 
-    Raises
-    ------
-    StorageError
-        When it cannot be written.
+    Raises `StorageError` when it cannot be written.
     """
     files = damaged_files(history)
     if files:
@@ -245,12 +242,10 @@ Verify = Callable[[sqlite3.Connection], None]
 class HistoryFile:
     """One open history file. Use `open_file`.
 
-    Attributes
-    ----------
-    path : the file.
-    connection : autocommit SQLite connection.
-    damaged : where a damaged predecessor was set aside at this opening, or None.
-    created : whether this opening made a new, empty history.
+    ``path``: the file.
+    ``connection``: autocommit SQLite connection.
+    ``damaged``: where a damaged predecessor was set aside at this opening, or None.
+    ``created``: whether this opening made a new, empty history.
     """
 
     def __init__(self, path: Path, serial: str, timeout_s: float, *, owner: bool) -> None:
@@ -289,9 +284,7 @@ class HistoryFile:
     def require_in_place(self) -> None:
         """Refuse to go on with a file that was deleted or replaced while it was open.
 
-        Raises
-        ------
-        StorageError
+        Raises `StorageError`.
         """
         try:
             state = self.path.stat()
@@ -441,12 +434,8 @@ def open_file(
 
     ``owner``: a damaged one is set aside.
 
-    Raises
-    ------
-    StorageError
-        It cannot be opened, is of a newer version, or is damaged and in use elsewhere or not ours.
-    WrongRobotError
-        It belongs to another serial.
+    Raises `StorageError`: it cannot be opened, is of a newer version, or is damaged and in use
+    elsewhere or not ours; `WrongRobotError`: it belongs to another serial.
     """
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -469,10 +458,7 @@ _LONGEST_NAME = 200  # bytes; file systems allow 255, the names of files set asi
 def state_folder() -> Path:
     """Folder of the histories: $ROBOCAL_STATE, else ``robocal`` in the XDG state folder.
 
-    Raises
-    ------
-    StorageError
-        There is no home folder to put it in.
+    Raises `StorageError`: there is no home folder to put it in.
     """
     if chosen := os.environ.get("ROBOCAL_STATE"):
         return Path(chosen).absolute()
@@ -488,10 +474,7 @@ def state_folder() -> Path:
 def history_path(serial: str, folder: Path) -> Path:
     """File of a robot serial; any serial gives a safe name, and the serial can be read back.
 
-    Raises
-    ------
-    InputError
-        Empty or too long serial.
+    Raises `InputError`: empty or too long serial.
     """
     name = quote(serial, safe=" ")
     if name.startswith("."):

@@ -72,17 +72,15 @@ class CalibrationState(StrEnum):
 class Candidate:
     """What is known of a calibration without opening its contents.
 
-    Attributes
-    ----------
-    kind : which model it changes, e.g. ``thermal``; each kind has its own revisions.
-    model_hash : hash of the nominal model that it corrects.
-    based_on : revision in force when it was solved (0 = nominal).
-    cycle_id : measurement cycle that gave the data.
-    stamp_ns : time of the data.
-    created_ns : wall clock when it was proposed.
-    software, method : version and estimator that made it.
-    code, reason : the verdict.
-    candidate_rms_mm : held-out rms error of the proposed model, None when not judged.
+    ``kind``: which model it changes, e.g. ``thermal``; each kind has its own revisions.
+    ``model_hash``: hash of the nominal model that it corrects.
+    ``based_on``: revision in force when it was solved (0 = nominal).
+    ``cycle_id``: measurement cycle that gave the data.
+    ``stamp_ns``: time of the data.
+    ``created_ns``: wall clock when it was proposed.
+    ``software``, ``method``: version and estimator that made it.
+    ``code``, ``reason``: the verdict.
+    ``candidate_rms_mm``: held-out rms error of the proposed model, None when not judged.
     """
 
     kind: str = THERMAL
@@ -102,11 +100,9 @@ class Candidate:
 class Proposal(Candidate):
     """A calibration to be put into the history.
 
-    Attributes
-    ----------
-    document : the JSON document of the identification, finite numbers only.
-    model : the model in full precision, as JSON; what comes into force.
-    inputs : named arrays that it was solved from.
+    ``document``: the JSON document of the identification, finite numbers only.
+    ``model``: the model in full precision, as JSON; what comes into force.
+    ``inputs``: named arrays that it was solved from.
     """
 
     document: Mapping[str, Any]
@@ -167,9 +163,7 @@ def require_measured_with(
 
     ``needed`` and ``revision`` are revisions by kind.
 
-    Raises
-    ------
-    StaleError
+    Raises `StaleError`.
     """
     for kind, measured in needed.items():
         if (found := revision(kind)) != measured:
@@ -189,10 +183,8 @@ _LARGEST_ID = 2**63 - 1
 def packed(proposal: Proposal) -> dict[str, bytes]:
     """Document, model and inputs as bytes; equal contents give equal bytes.
 
-    Raises
-    ------
-    ValueError
-        A number in the document or the model is not finite, or an input array holds objects.
+    Raises `ValueError`: a number in the document or the model is not finite, or an input array
+    holds objects.
     """
     import numpy as np
 
@@ -270,10 +262,7 @@ def read_candidates(
 def read_candidate(connection: sqlite3.Connection, calibration_id: int) -> Candidate:
     """One calibration.
 
-    Raises
-    ------
-    InputError
-        Unknown id.
+    Raises `InputError`: unknown id.
     """
     if 0 < calibration_id <= _LARGEST_ID:
         for _, candidate in read_candidates(connection, "WHERE id = ?", calibration_id):
@@ -284,12 +273,7 @@ def read_candidate(connection: sqlite3.Connection, calibration_id: int) -> Candi
 def read_json(connection: sqlite3.Connection, calibration_id: int, name: str) -> dict[str, Any]:
     """Document or model of a calibration.
 
-    Raises
-    ------
-    InputError
-        Unknown id.
-    DamagedError
-        Its bytes are not those that were stored.
+    Raises `InputError`: unknown id; `DamagedError`: its bytes are not those that were stored.
     """
     found: dict[str, Any] = json.loads(_read(connection, calibration_id, name))
     return found
@@ -324,18 +308,16 @@ NOMINAL, CALIBRATED = "nominal", "calibrated"
 class CorrectionRecord:
     """What the joint correction did from an instant on.
 
-    Attributes
-    ----------
-    wall_ns : when this began.
-    software : version of this software.
-    model_hash : of the nominal model.
-    enabled : whether the correction was asked for.
-    shadow : whether it was only shown.
-    model_revision, tool_revision : in force for it; 0 for none, and for the taught tool.
-    reference : NOMINAL or CALIBRATED: which model the program was made with, as it was chosen.
-    reference_source : where that came from: a robot type, or the path of a robot file.
-    reference_name, reference_hash : of that model.
-    taught_tool : the tool that the program was made with: x, y, z in m, qx, qy, qz, qw.
+    ``wall_ns``: when this began.
+    ``software``: version of this software.
+    ``model_hash``: of the nominal model.
+    ``enabled``: whether the correction was asked for.
+    ``shadow``: whether it was only shown.
+    ``model_revision``, ``tool_revision``: in force for it; 0 for none, and for the taught tool.
+    ``reference``: NOMINAL or CALIBRATED: which model the program was made with, as it was chosen.
+    ``reference_source``: where that came from: a robot type, or the path of a robot file.
+    ``reference_name``, ``reference_hash``: of that model.
+    ``taught_tool``: the tool that the program was made with: x, y, z in m, qx, qy, qz, qw.
     """
 
     wall_ns: int

@@ -81,10 +81,7 @@ class ParameterSet:
     def subset(self, names: tuple[str, ...]) -> "ParameterSet":
         """Return the parameters of these names, in this set's order.
 
-        Raises
-        ------
-        ValueError
-            When a name is not in the set.
+        Raises `ValueError` when a name is not in the set.
         """
         unknown = set(names) - set(self.names)
         if unknown:
@@ -157,16 +154,14 @@ class SerialArm:
     free between nearly parallel axes and d elsewhere. With beta = 0 it is distal
     Denavit-Hartenberg.
 
-    Attributes
-    ----------
-    mdh : (n, 5) columns d, theta, a, alpha, beta in m and rad.
-    sign : (n,) +1 or -1, the controller's direction of counting.
-    prismatic : (n,) bool.
-    lower, upper : (n,) limits of q in rad or m; infinite where unknown.
-    T_base_root : (4, 4) pose of the first joint's frame in the robot's base.
-    T_flange_tool : (4, 4) tool mounted on the flange.
-    functions : what each joint turns besides what is read; None: nothing.
-    load : what gravity pulls at; None: not known.
+    ``mdh`` (n, 5): columns d, theta, a, alpha, beta in m and rad.
+    ``sign`` (n,): +1 or -1, the controller's direction of counting.
+    ``prismatic`` (n,): bool.
+    ``lower``, ``upper`` (n,): limits of q in rad or m; infinite where unknown.
+    ``T_base_root`` (4, 4): pose of the first joint's frame in the robot's base.
+    ``T_flange_tool`` (4, 4): tool mounted on the flange.
+    ``functions``: what each joint turns besides what is read; None: nothing.
+    ``load``: what gravity pulls at; None: not known.
     """
 
     name: str
@@ -304,10 +299,7 @@ class SerialArm:
     def read(self, turned: ArrayLike) -> Array:
         """The q (..., n) of which `turned` makes these: its inverse, to 1e-13 rad.
 
-        Raises
-        ------
-        LimitError
-            Where there is none, as the compliances are too large for the load.
+        Raises `LimitError` where there is none, as the compliances are too large for the load.
         """
         from robocal_ros.kinematics import kernels
 
@@ -404,10 +396,7 @@ def arm_of(model: Document, nominal: SerialArm) -> SerialArm:
 def layer_of(model: Mapping[str, Any]) -> tuple[JointFunctions | None, ArmLoad | None]:
     """Joint functions of a model document, and the load that it was identified with.
 
-    Raises
-    ------
-    InputError
-        When they cannot be.
+    Raises `InputError` when they cannot be.
     """
     functions, load = model.get("functions"), model.get("load")
     try:
@@ -512,10 +501,7 @@ class JointDerivatives:
 def inverse(arm: SerialArm, T_base_flange: ArrayLike, q_near: ArrayLike) -> Array:
     """Joints (m, n) that reach flange poses (m, 4, 4) in turn, the first of them near (n,).
 
-    Raises
-    ------
-    LimitError
-        As `follow`.
+    Raises `LimitError` as `follow`.
     """
     T = np.asarray(T_base_flange, dtype=np.float64)
     still = np.zeros((len(T), 6))
@@ -532,18 +518,14 @@ def follow(
 ) -> JointDerivatives:
     """Joints that carry a point of the flange along a path.
 
-    Parameters
-    ----------
-    T_base_point : (m, 4, 4) poses of the flange, but with the point as their origin.
-    twist, twist_rate : (m, 6) velocity [v; w] of the point, base, and its derivative.
-    q_near : (n,) joints from which the first pose is sought.
-    p_flange : (3,) the point, m.
+    ``T_base_point`` (m, 4, 4): poses of the flange, but with the point as their origin.
+    ``twist``, ``twist_rate`` (m, 6): velocity [v; w] of the point, base, and its derivative.
+    ``q_near`` (n,): joints from which the first pose is sought.
+    ``p_flange`` (3,): the point, m.
 
-    Raises
-    ------
-    LimitError
-        Where a joint limit is passed, a singularity is near (`SMALLEST_SINGULAR_VALUE`), a pose
-        is out of reach, or a joint would have to move by more than `LONGEST_STEP` at once.
+    Raises `LimitError` where a joint limit is passed, a singularity is near
+    (`SMALLEST_SINGULAR_VALUE`), a pose is out of reach, or a joint would have to move by more than
+    `LONGEST_STEP` at once.
     """
     from robocal_ros.kinematics import newton
 

@@ -27,17 +27,12 @@ class JointFunctions:
     cardinal cubic B-spline B3 on [0, 4) (de Boor 1978): twice continuously differentiable, and
     zero outside the table. A joint without a function has zeros.
 
-    Attributes
-    ----------
-    first, step : (n,) first knot and spacing of the knots, rad (prismatic: m).
-    coefficients : (n, m) rad (prismatic: m), in the controller's sense of counting.
-    compliance : (n,) not negative, rad/(N m) (prismatic: m/N).
+    ``first``, ``step`` (n,): first knot and spacing of the knots, rad (prismatic: m).
+    ``coefficients`` (n, m): rad (prismatic: m), in the controller's sense of counting.
+    ``compliance`` (n,): not negative, rad/(N m) (prismatic: m/N).
 
-    Raises
-    ------
-    ValueError
-        For shapes that do not fit, numbers that are not finite, a step or a compliance below zero,
-        or a function that is so steep that a reading may be ambiguous.
+    Raises `ValueError` for shapes that do not fit, numbers that are not finite, a step or a
+    compliance below zero, or a function that is so steep that a reading may be ambiguous.
     """
 
     first: Array
@@ -97,18 +92,14 @@ class JointFunctions:
 class ArmLoad:
     """What gravity pulls at.
 
-    Attributes
-    ----------
-    mass : (n,) of the links, kg.
-    centre : (n, 3) of mass, m, each in the frame behind its joint (of the last: the flange).
-    payload_mass : kg.
-    payload_centre : (3,) m, in the flange.
-    gravity : (3,) m/s², in the base.
+    ``mass`` (n,): of the links, kg.
+    ``centre`` (n, 3): of mass, m, each in the frame behind its joint (of the last: the flange).
+    ``payload_mass``: kg.
+    ``payload_centre`` (3,): m, in the flange.
+    ``gravity`` (3,): m/s², in the base.
 
-    Raises
-    ------
-    ValueError
-        For shapes that do not fit, numbers that are not finite, or a mass below zero.
+    Raises `ValueError` for shapes that do not fit, numbers that are not finite, or a mass below
+    zero.
     """
 
     mass: Array

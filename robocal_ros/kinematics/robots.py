@@ -40,10 +40,7 @@ class _StrictLoader(yaml.SafeLoader):
 def load_yaml(text: str, file: str) -> Any:
     """Parse YAML.
 
-    Raises
-    ------
-    InputError
-        With file and row, when it is not YAML or gives a key twice.
+    Raises `InputError` with file and row, when it is not YAML or gives a key twice.
     """
     try:
         # _StrictLoader is a SafeLoader
@@ -191,12 +188,10 @@ FULL_SPEED_IN_S = 0.5
 class RobotDescription:
     """Content of a robot file.
 
-    Attributes
-    ----------
-    max_velocity : (n,) rad/s (prismatic: m/s), NaN where the file gives none.
-    max_acceleration : (n,) rad/s² (prismatic: m/s²), NaN where neither it nor a speed is given.
-    acceleration_assumed : (n,) bool, where the file gives none: it is max_velocity / 0.5 s.
-    notes : what the file leaves open, in words.
+    ``max_velocity`` (n,): rad/s (prismatic: m/s), NaN where the file gives none.
+    ``max_acceleration`` (n,): rad/s² (prismatic: m/s²), NaN where neither it nor a speed is given.
+    ``acceleration_assumed`` (n,): bool, where the file gives none: it is max_velocity / 0.5 s.
+    ``notes``: what the file leaves open, in words.
     """
 
     arm: SerialArm
@@ -210,14 +205,9 @@ class RobotDescription:
 def load_robot(name: str | Path) -> SerialArm:
     """Arm of a robot file; warns of joint limits that the file does not give.
 
-    Parameters
-    ----------
-    name : path of a file, or name of one in the folders of ``robot_folders``.
+    ``name``: path of a file, or name of one in the folders of ``robot_folders``.
 
-    Raises
-    ------
-    InputError
-        Naming file, joint and key, when the file is not as docs/files.md says.
+    Raises `InputError` naming file, joint and key, when the file is not as docs/files.md says.
     """
     description = load_description(name)
     for note in description.notes:
@@ -277,10 +267,7 @@ def robot_file_hash(name: str | Path) -> str:
 
     Unlike `SerialArm.model_hash` it tells robots of one type apart that have their own files.
 
-    Raises
-    ------
-    InputError
-        When there is no such robot.
+    Raises `InputError` when there is no such robot.
     """
     text = read_text(find_robot(name), "robot file")
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -300,10 +287,7 @@ def robot_folders() -> list[Path]:
 def find_robot(name: str | Path) -> Path:
     """File of a robot's name or path.
 
-    Raises
-    ------
-    InputError
-        When there is none; the message lists the known names.
+    Raises `InputError` when there is none; the message lists the known names.
     """
     path = Path(name)
     if path.is_file():
@@ -327,15 +311,10 @@ def save_robot(
 ) -> None:
     """Write an arm as a robot file; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    like : robot file that the arm was made from; the joint speeds that it gives are kept.
-    comment : lines to begin the file with.
+    ``like``: robot file that the arm was made from; the joint speeds that it gives are kept.
+    ``comment``: lines to begin the file with.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     convention = "mdh" if np.any(arm.mdh[:, 4]) else "dh"
     document: dict[str, Any] = {"robot": arm.name, "convention": convention}
@@ -507,10 +486,7 @@ def write_made(path: Path, document: dict[str, Any], keys: Sequence[str], comman
 def read_fields(path: Path, what: str) -> Fields:
     """Read a YAML (or JSON) file of keys and values.
 
-    Raises
-    ------
-    InputError
-        When there is no such file, or it is not YAML.
+    Raises `InputError` when there is no such file, or it is not YAML.
     """
     return Fields(load_yaml(read_text(path, what), str(path)), str(path), "")
 
@@ -518,12 +494,8 @@ def read_fields(path: Path, what: str) -> Fields:
 def read_made(path: Path, arm: SerialArm, keys: Sequence[str], what: str, remedy: str) -> Fields:
     """Read the keys of such a file, made for ``arm``.
 
-    Raises
-    ------
-    InputError
-        When there is no such file, it is not YAML or has other keys.
-    WrongRobotError
-        When it was made for another nominal model.
+    Raises `InputError` when there is no such file, it is not YAML or has other keys;
+    `WrongRobotError` when it was made for another nominal model.
     """
     top = read_fields(path, what)
     top.only(*keys)
@@ -534,10 +506,7 @@ def read_made(path: Path, arm: SerialArm, keys: Sequence[str], what: str, remedy
 def require_made_for(arm: SerialArm, path: Path, robot: str, model_hash: str, remedy: str) -> None:
     """Refuse a file that was made for another nominal model than ``arm``.
 
-    Raises
-    ------
-    WrongRobotError
-        With what to do: ``remedy``.
+    Raises `WrongRobotError` with what to do: ``remedy``.
     """
     if model_hash != arm.model_hash:
         raise WrongRobotError(
@@ -552,10 +521,8 @@ QUATERNION_TOLERANCE = 1e-3
 def read_pose(fields: Fields) -> Array:
     """Transform (4, 4), m, of ``{xyz_mm, quat_xyzw or rpy_deg}``; not turned without the latter.
 
-    Raises
-    ------
-    InputError
-        For another key, both orientations, or a quaternion that is not of unit length.
+    Raises `InputError` for another key, both orientations, or a quaternion that is not of unit
+    length.
     """
     fields.only("xyz_mm", "quat_xyzw", "rpy_deg")
     xyz = np.array(fields.numbers("xyz_mm", 3)) * 1e-3

@@ -30,10 +30,8 @@ DIGITS = ".12g"  # 1e-9 mm in a metre, and no trailing noise of binary fractions
 class Cells:
     """A table.
 
-    Attributes
-    ----------
-    rows : number of each row in the file (the header is row 1).
-    columns : cells of each column.
+    ``rows``: number of each row in the file (the header is row 1).
+    ``columns``: cells of each column.
     """
 
     file: str
@@ -43,10 +41,7 @@ class Cells:
     def fail(self, message: str, index: int, column: str) -> NoReturn:
         """Refuse the cell of a row, by its place among ``rows``.
 
-        Raises
-        ------
-        InputError
-            Always.
+        Raises `InputError` always.
         """
         raise InputError(message, file=self.file, row=self.rows[index], column=column)
 
@@ -55,10 +50,7 @@ class Cells:
 
         With ``gaps`` a cell that is empty or says nan is not-a-number.
 
-        Raises
-        ------
-        InputError
-            At the first cell that is none.
+        Raises `InputError` at the first cell that is none.
         """
         cells = self.columns[name]
         if gaps:
@@ -82,10 +74,7 @@ class Cells:
     def words(self, name: str) -> tuple[str, ...]:
         """A column of texts (m,), none of them empty; nothing where there is no such column.
 
-        Raises
-        ------
-        InputError
-            At the first empty cell.
+        Raises `InputError` at the first empty cell.
         """
         words = tuple(cell.strip() for cell in self.columns.get(name, ()))
         if "" in words:
@@ -97,10 +86,7 @@ class Cells:
     ) -> NoReturn:
         """Refuse the first cell that ``convert`` refuses, with ``gaps`` the first such text.
 
-        Raises
-        ------
-        InputError
-            Always.
+        Raises `InputError` always.
         """
         for index, cell in enumerate(self.columns[name]):
             try:
@@ -118,10 +104,8 @@ class Cells:
 def read_cells(path: Path, check: Callable[[list[str], str], None]) -> Cells:
     """Read a table; ``check`` refuses a header (its names, and the file's).
 
-    Raises
-    ------
-    InputError
-        When it is no table, has no rows, or rows that are longer or shorter than the header.
+    Raises `InputError` when it is no table, has no rows, or rows that are longer or shorter than
+    the header.
     """
     file = str(path)
     reader = csv.reader(io.StringIO(read_text(path, "table"), newline=""), strict=True)
@@ -156,10 +140,7 @@ def texts(values: Array) -> list[str]:
 def write_cells(path: Path, columns: Mapping[str, Sequence[str]]) -> None:
     """Write a table by its columns; the file appears whole or not at all.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
+    Raises `InputError` when it cannot be written.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -223,10 +204,7 @@ def joint_units(arm: SerialArm, joint: int) -> Mapping[str, float]:
 def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> TableLayout:
     """Understand a header.
 
-    Raises
-    ------
-    InputError
-        For an unknown, missing, doubled or nameless column, and for mixed units.
+    Raises `InputError` for an unknown, missing, doubled or nameless column, and for mixed units.
     """
     names = _names(header, file)
     _check_known(names, (*_of_joints(arm), *_POSES, *NUMBERS, *WORDS), file, arm)
@@ -241,10 +219,7 @@ def read_joint_columns(
 ) -> tuple[tuple[str, ...], Array]:
     """Understand a header of stamps and joint readings: the joints' columns, their factors to SI.
 
-    Raises
-    ------
-    InputError
-        As `read_layout`.
+    Raises `InputError` as `read_layout`.
     """
     names = _names(header, file)
     _check_known(names, ("stamp_s", *_of_joints(arm)), file, arm)
@@ -260,11 +235,8 @@ def read_pose_columns(
 
     Without ``arm`` columns of joints are known by their form alone, and are left out of the layout.
 
-    Raises
-    ------
-    InputError
-        As `read_layout`; for a position without an orientation, and when neither pose nor joints
-        are there.
+    Raises `InputError` as `read_layout`; for a position without an orientation, and when neither
+    pose nor joints are there.
     """
     names = _names(header, file)
     joints = [name for name in names if JOINT.fullmatch(name)]
@@ -292,10 +264,7 @@ def check_plain(
 ) -> None:
     """Refuse a header of plain columns.
 
-    Raises
-    ------
-    InputError
-        For an unknown, missing, doubled or nameless column.
+    Raises `InputError` for an unknown, missing, doubled or nameless column.
     """
     names = _names(header, file)
     _check_known(names, (*required, *optional), file)
@@ -389,10 +358,7 @@ def _position_columns(place: Mapping[str, int], file: str) -> tuple[tuple[str, .
 def orientation_columns(place: Collection[str], file: str) -> tuple[str, ...] | None:
     """The columns of one of ``ORIENTATIONS`` that a header has; None without any.
 
-    Raises
-    ------
-    InputError
-        When it has several, or one in part.
+    Raises `InputError` when it has several, or one in part.
     """
     begun = [names for names in ORIENTATIONS if any(name in place for name in names)]
     if not begun:
@@ -511,10 +477,7 @@ def read_table(path: Path, arm: SerialArm) -> tuple[Cells, TableLayout]:
 def read_samples(table: Cells, otherwise: tuple[str, ...]) -> tuple[str, ...]:
     """Names (m,) of the column ``sample``, all different; ``otherwise`` where there is none.
 
-    Raises
-    ------
-    InputError
-        At the first name that is there already.
+    Raises `InputError` at the first name that is there already.
     """
     require_different(table, "sample")
     return table.words("sample") or otherwise
@@ -523,10 +486,7 @@ def read_samples(table: Cells, otherwise: tuple[str, ...]) -> tuple[str, ...]:
 def require_different(table: Cells, column: str) -> None:
     """Refuse a word that a column has twice.
 
-    Raises
-    ------
-    InputError
-        At the first word that is there already.
+    Raises `InputError` at the first word that is there already.
     """
     first: dict[str, int] = {}
     for index, name in enumerate(table.words(column)):
@@ -546,10 +506,7 @@ def _sigma(table: Cells, sigma_mm: Array) -> Array:
 def read_rotations(table: Cells, kind: tuple[str, ...]) -> Array:
     """Orientations (m, 3, 3) from columns of one of ``ORIENTATIONS``.
 
-    Raises
-    ------
-    InputError
-        When a quaternion is not of unit length.
+    Raises `InputError` when a quaternion is not of unit length.
     """
     values = np.column_stack([table.numbers(name) for name in kind])
     if kind == EULER:
@@ -573,10 +530,7 @@ def read_rotations(table: Cells, kind: tuple[str, ...]) -> Array:
 def read_stamps(table: Cells) -> NDArray[np.int64]:
     """Nanoseconds (m,) of ``stamp_s``, without the rounding that seconds since 1970 suffer.
 
-    Raises
-    ------
-    InputError
-        At the first cell that is no time.
+    Raises `InputError` at the first cell that is no time.
     """
     stamps = []
     try:

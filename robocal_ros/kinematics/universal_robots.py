@@ -27,10 +27,7 @@ JOINT_NAMES = (
 def parse_settings(text: str, file: str) -> dict[str, Array]:
     """Read the numeric lists of a controller's ``.conf`` text: ``name = [ … ]`` by name.
 
-    Raises
-    ------
-    InputError
-        When a list cannot be read; names file and row.
+    Raises `InputError` when a list cannot be read; names file and row.
     """
     found: dict[str, Array] = {}
     for row, line in enumerate(text.splitlines(), start=1):
@@ -60,10 +57,7 @@ def _row(settings: Mapping[str, Array], name: str, file: str) -> Array:
 def factory_dh(nominal: Mapping[str, Array], delta: Mapping[str, Array]) -> Array:
     """DH parameters (6, 5), m and rad: ``urcontrol.conf`` plus the deltas of ``calibration.conf``.
 
-    Raises
-    ------
-    InputError
-        When a list is missing.
+    Raises `InputError` when a list is missing.
     """
     base = {name: _row(nominal, name, "nominal file") for name in ("a", "d", "alpha")}
     mdh = np.zeros((6, 5))

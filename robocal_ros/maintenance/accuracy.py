@@ -322,11 +322,9 @@ def accuracy_of(
 ) -> Accuracy:
     """Judge everything at once; the worst part gives the level.
 
-    Parameters
-    ----------
-    drift : None: the thermal node is silent.
-    uncorrected : why commands are not corrected with what is in force; empty: they are.
-    tool, thermal_id : tool and thermal model (0: nominal) in force.
+    ``drift``: None: the thermal node is silent.
+    ``uncorrected``: why commands are not corrected with what is in force; empty: they are.
+    ``tool``, ``thermal_id``: tool and thermal model (0: nominal) in force.
     """
     parts = []
     if len(config.poses) and drift is None:

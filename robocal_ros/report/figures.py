@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.identification.full_model import FullIdentification
-from robocal_ros.report.validation import NO_FAULT, TOLERANCE_MM, ShiftErrors
 
 BEFORE, AFTER, OLDEST = "#c2603a", "#0f6f86", "#7fb6c3"
 INK, FAINT, GRID = "#22303a", "#6d7b85", "#e6eaed"
@@ -48,7 +47,27 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "svg.fonttype": "path",
 }
 SHOWN_PARAMETERS = 8
+TOLERANCE_MM = 0.1
+NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")  # the last: the model stays
 GREEK = {"theta": "\u03b8", "alpha": "\u03b1", "beta": "\u03b2"}
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftErrors:
+    """True errors of a simulated tool at check poses over a shift, against the cold robot.
+
+    ``hours`` (c,) time of each cycle since the start of the shift.
+    ``accepted``: of each cycle: whether its model came into force.
+    ``before``, ``after`` (c, m, 3) error at the check poses after each cycle, m, without and with
+    correction.
+    ``held`` (c, m, 3) with the correction that was in force just before the cycle: at its oldest.
+    """
+
+    hours: Array
+    accepted: Sequence[bool]
+    before: Array
+    after: Array
+    held: Array
 
 
 def distances_mm(error: Array) -> Array:

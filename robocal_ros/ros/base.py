@@ -222,11 +222,9 @@ ENDING = {signal.SIGINT, signal.SIGTERM}
 def run(node_class: type[HouseNode], *, events: bool = False) -> None:
     """Start the node, spin until SIGINT, SIGTERM or a ROS shutdown, and end cleanly.
 
-    Parameters
-    ----------
-    node_class : what to run; its parameters come from the command line.
-    events : use the events executor: half the CPU and latency, but no ``async`` services; and
-        collect garbage between callbacks only.
+    ``node_class``: what to run; its parameters come from the command line.
+    ``events``: use the events executor: half the CPU and latency, but no ``async`` services; and
+    collect garbage between callbacks only.
     """
     # A signal must not break into a callback: neither as an exception in the middle of it (the
     # conversion of a message then fails) nor as a shutdown of the context below it.

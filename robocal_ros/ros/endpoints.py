@@ -33,10 +33,7 @@ def _profile(
     durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
 ) -> QoSProfile:
     return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=reliability,
-        durability=durability,
+        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability
     )
 
 
@@ -204,12 +201,7 @@ class EndpointNode(LifecycleNode):
         return publisher
 
     def add_service(
-        self,
-        kind: type,
-        name: str,
-        callback: Callable[[Any, Any], Any],
-        *,
-        inactive: bool = False,
+        self, kind: type, name: str, callback: Callable[[Any, Any], Any], *, inactive: bool = False
     ) -> None:
         """Serve until cleanup; ``callback(request, response)`` may be ``async``.
 

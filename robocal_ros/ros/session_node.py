@@ -131,11 +131,7 @@ def open_history(
     """
     serial, state_dir = settings["serial"] or NO_SERIAL, _folder(settings)
     history = CalibrationHistory.open(
-        serial,
-        model_hash=nominal.model_hash,
-        state_dir=state_dir,
-        sole_user=sole_user,
-        owner=owner,
+        serial, model_hash=nominal.model_hash, state_dir=state_dir, sole_user=sole_user, owner=owner
     )
     if serial == NO_SERIAL:
         try:

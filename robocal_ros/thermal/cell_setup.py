@@ -551,11 +551,9 @@ def plan_cycle(
 ) -> PlannedCycle:
     """Plan ``count`` poses for a placed sensor.
 
-    Parameters
-    ----------
-    prior : (k, k) covariance of the expected drift, SI; ``sigma_m`` of one visit's coordinate.
-    working : (w, n) poses where the tool must be right; None: all over the joint limits.
-    own : (o, n) measuring poses to compare with, or None.
+    ``prior`` (k, k): covariance of the expected drift, SI; ``sigma_m`` of one visit's coordinate.
+    ``working`` (w, n): poses where the tool must be right; None: all over the joint limits.
+    ``own`` (o, n): measuring poses to compare with, or None.
 
     Raises `LimitError` or `TooFewSamplesError` when the sphere cannot be brought into the field
     often enough.

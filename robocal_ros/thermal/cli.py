@@ -1,7 +1,6 @@
 """Commands of ``robocal thermal``: calibrate-sensor, identify, learn-prior, plan-poses, screen."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,9 +15,13 @@ from robocal_ros.cli.main import (
     count,
     describe_robot,
     positive,
+    print_output,
+    print_table,
+    print_verdict,
+    print_words,
     seed,
+    spaced,
     text,
-    warn,
 )
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
@@ -80,8 +83,8 @@ def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:
 
 def run_calibrate_sensor(args: argparse.Namespace) -> CliResult:
     """Do ``calibrate-sensor``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     data = read_measurements(args.data, arm)
     document = sensor_document(calibrate_sensor(arm, data, args.method), arm)
     document |= {"data": {"file": str(args.data)}, "output": None}
@@ -92,20 +95,15 @@ def run_calibrate_sensor(args: argparse.Namespace) -> CliResult:
     elif args.output is not None:
         warnings.append(f"{args.output} is not written: the verdict is {verdict['code']}")
     document["warnings"] = warnings
-    warn(warnings)
-    return CliResult(document, partial(_show_calibrate_sensor, document=document))
+    return CliResult(document, _show_calibrate_sensor)
 
 
 def _show_calibrate_sensor(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    verdict, left = document["verdict"], document["left_out"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
-    pose = document["T_sensor_base"]
-    console.print(f"T_sensor_base: {_numbers(pose['xyz_mm'], 3)} mm, quaternion x y z w "
-                  f"{_numbers(pose['quat_xyzw'], 6)}")  # fmt: skip
-    console.print(f"Sphere in the flange frame: {_numbers(document['sphere_in_flange_mm'], 3)} mm")
+    print_verdict(console, document)
+    pose, left = document["T_sensor_base"], document["left_out"]
+    console.print(f"T_sensor_base: {spaced(pose['xyz_mm'], 3)} mm, quaternion x y z w "
+                  f"{spaced(pose['quat_xyzw'], 6)}")  # fmt: skip
+    console.print(f"Sphere in the flange frame: {spaced(document['sphere_in_flange_mm'], 3)} mm")
     if document["sigma"] is not None:
         words = ", ".join(f"{name} {value:.4f}" for name, value in document["sigma"].items())
         console.print(f"Standard deviations: {words}", soft_wrap=True)
@@ -115,13 +113,8 @@ def _show_calibrate_sensor(console: "Console", document: Document) -> None:
             f"rms {left['rms_mm']:.3f}, largest {left['max_mm']:.3f}"
         )
     if document["rejected"]:
-        console.print(Text(f"Rejected: {', '.join(document['rejected'])}"), soft_wrap=True)
-    if document["output"]:
-        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
-
-
-def _numbers(values: list[float], digits: int) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)
+        print_words(console, f"Rejected: {', '.join(document['rejected'])}")
+    print_output(console, document)
 
 
 FIXED, FLANGE = "fixed-sensor", "flange-sensor"
@@ -167,9 +160,8 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
 def run_identify(args: argparse.Namespace) -> CliResult:
     """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
-
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     if args.arrangement == FLANGE:
         sessions = [read_measurements(path, arm) for path in args.data]
         check = None if args.check is None else read_measurements(args.check, arm)
@@ -179,8 +171,7 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     else:
         document = identify_fixed_files(arm, args)
     document |= {"arrangement": args.arrangement, "warnings": warnings}
-    warn(warnings)
-    return CliResult(document, partial(show_identification, document=document))
+    return CliResult(document, show_identification)
 
 
 def _require_sense(args: argparse.Namespace) -> None:
@@ -232,8 +223,8 @@ def run_learn_prior(args: argparse.Namespace) -> CliResult:
             f"{len(args.cold)} --cold and {len(args.warm)} --warm: give one of each for each shift"
         )
 
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     sensor = read_sensor(args.sensor, arm)
     histories = []
     for cold_file, warm_file in zip(args.cold, args.warm, strict=True):
@@ -255,26 +246,14 @@ def run_learn_prior(args: argparse.Namespace) -> CliResult:
     if args.output is not None:
         write_prior(args.output, document)
         document["output"] = str(args.output)
-    warn(warnings)
-    return CliResult(document, partial(_show_learn_prior, document=document))
+    return CliResult(document, _show_learn_prior)
 
 
 def _show_learn_prior(console: "Console", document: Document) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        title=f"Expected drift, learned from {document['cycles']} cycles",
-        title_justify="left",
-        box=None,
-    )
-    table.add_column("parameter")
-    table.add_column("sigma", justify="right")
-    for name, value in document["sigma"].items():
-        table.add_row(name, f"{value:.4f}")
-    console.print(table)
-    if document["output"]:
-        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+    title = f"Expected drift, learned from {document['cycles']} cycles"
+    rows = [[name, f"{value:.4f}"] for name, value in document["sigma"].items()]
+    print_table(console, title, ("parameter", "sigma"), rows)
+    print_output(console, document)
 
 
 def identify_fixed_files(arm: SerialArm, args: argparse.Namespace) -> Document:
@@ -410,8 +389,8 @@ def add_plan_poses(parser: argparse.ArgumentParser) -> None:
 
 def run_plan_poses(args: argparse.Namespace) -> CliResult:
     """Do ``plan-poses``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     sensor = read_sensor(args.sensor, arm)
     own = None if args.own is None else read_measurements(args.own, arm).q
     found = plan_cycle(
@@ -449,14 +428,10 @@ def run_plan_poses(args: argparse.Namespace) -> CliResult:
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
     }
-    warn(warnings)
-    return CliResult(document, partial(_show_plan_poses, document=document))
+    return CliResult(document, _show_plan_poses)
 
 
 def _show_plan_poses(console: "Console", document: Document) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
     console.print(
         f"Predicted error of the tool after one cycle: {document['predicted_mm']:.3f} mm rms; of "
         f"as many random poses {document['random_mm']:.3f} mm ({document['gain']:.0%} less), "
@@ -465,15 +440,10 @@ def _show_plan_poses(console: "Console", document: Document) -> None:
     )
     if document["own_mm"] is not None:
         console.print(f"Of your own {document['own_poses']} poses: {document['own_mm']:.3f} mm.")
-    table = Table(title="In the order of the shortest way", title_justify="left", box=None)
-    table.add_column("pose")
-    for name in document["columns"]:
-        table.add_column(name, justify="right")
-    for pose in document["poses"]:
-        table.add_row(pose["pose"], *(f"{value:.2f}" for value in pose["joints"]))
-    console.print(table)
-    if document["output"]:
-        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+    rows = [[pose["pose"], *(f"{q:.2f}" for q in pose["joints"])] for pose in document["poses"]]
+    head = ("pose", *document["columns"])
+    print_table(console, "In the order of the shortest way", head, rows)
+    print_output(console, document)
 
 
 WANTED = 8
@@ -514,8 +484,8 @@ def add_screen(parser: argparse.ArgumentParser) -> None:
 
 def run_screen(args: argparse.Namespace) -> CliResult:
     """Do ``screen``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     if args.wanted > len(arm.parameters):
         raise InputError(f"--wanted {args.wanted}: this robot has {len(arm.parameters)} parameters")
     history = _history(args, arm)
@@ -545,8 +515,7 @@ def run_screen(args: argparse.Namespace) -> CliResult:
         document["best_subset"] = {"names": list(best.names), "cp": best.cp, "share": share}
     if args.plot is not None:
         draw_rounds(args.plot, document)
-    warn(warnings)
-    return CliResult(document, partial(_show_screen, document=document))
+    return CliResult(document, _show_screen)
 
 
 def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
@@ -568,31 +537,20 @@ def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
 
 
 def _show_screen(console: "Console", document: Document) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        title=f"Share of directions within {document['threshold_mm']:g} mm over "
-        f"{document['cycles']} cycles; uncompensated {document['uncompensated']:.1%}",
-        title_justify="left",
-        box=None,
-    )
-    for name in ("left", "share"):
-        table.add_column(name, justify="right")
-    table.add_column("removed")
-    table.add_column("stationary")
+    rows = []
     for row in document["rounds"]:
         share = "-" if row["share"] is None else f"{row['share']:.1%}"
         names = " ".join(row["stationary"])
-        table.add_row(str(row["parameters"]), share, row["removed"] or "", names)
-    console.print(table)
+        rows.append([str(row["parameters"]), share, row["removed"] or "", names])
+    title = (
+        f"Share of directions within {document['threshold_mm']:g} mm over "
+        f"{document['cycles']} cycles; uncompensated {document['uncompensated']:.1%}"
+    )
+    print_table(console, title, ("left", "share", "removed", "stationary"), rows, words=(2, 3))
     for words, names in (("Chosen", document["chosen"]), ("Highest share", document["highest"])):
-        console.print(Text(f"{words} ({len(names)}): {', '.join(names)}"), soft_wrap=True)
-    other = document["best_subset"]
-    if other is not None:
-        console.print(
-            Text(f"By Mallows' C_p, share {other['share']:.1%}: {', '.join(other['names'])}"),
-            soft_wrap=True,
-        )
+        print_words(console, f"{words} ({len(names)}): {', '.join(names)}")
+    if (other := document["best_subset"]) is not None:
+        shown = f"share {other['share']:.1%}: {', '.join(other['names'])}"
+        print_words(console, f"By Mallows' C_p, {shown}")
     if document["plot"]:
-        console.print(Text(f"Drawn: {document['plot']}"), soft_wrap=True)
+        print_words(console, f"Drawn: {document['plot']}")

@@ -49,11 +49,9 @@ def drift_prior(arm: SerialArm) -> Array:
 def learned_prior(default: Array, drifts: Array, covariances: Array) -> Array:
     """Covariance (k, k) of the drift from identified ones.
 
-    Parameters
-    ----------
-    default : (k, k) prior to start from.
-    drifts, covariances : (n, k) identified drifts against the cold reference and their
-        (n, k, k) covariances.
+    ``default`` (k, k): prior to start from.
+    ``drifts``, ``covariances`` (n, k): identified drifts against the cold reference and their (n,
+    k, k) covariances.
 
     One expectation-maximisation step of a zero-mean Gaussian's covariance with the default as
     its inverse-Wishart prior: the second moment of each drift is its square plus its covariance,
@@ -98,12 +96,10 @@ def subset_drift(
 ) -> SubsetDrift:
     """Solve Y = A X for some columns of A by singular values (thesis eq. 3-8 to 3-10).
 
-    Parameters
-    ----------
-    displacement : (t, 3m) of the spots since the cold visit, m, measuring axes.
-    rows : (3m, k) the same by each parameter, measuring axes.
-    chosen : columns that may drift; the others are held.
-    names : (k,) of all parameters.
+    ``displacement`` (t, 3m): of the spots since the cold visit, m, measuring axes.
+    ``rows`` (3m, k): the same by each parameter, measuring axes.
+    ``chosen``: columns that may drift; the others are held.
+    ``names`` (k,): of all parameters.
 
     Raises `TooFewSamplesError` with fewer equations than chosen parameters; `RankDeficientError`
     when the poses do not tell the chosen parameters apart.
@@ -239,11 +235,9 @@ def identify_cycle(
     Visits of one pose are averaged first: they share the noise of its cold visit, and none may
     judge another.
 
-    Parameters
-    ----------
-    prior_covariance : (k, k), SI, of the drift since the cold visit.
-    sigma_m : standard deviation of one coordinate of one visit, of the cold ones and of warm
-        ones without a sigma of their own.
+    ``prior_covariance``: (k, k), SI, of the drift since the cold visit.
+    ``sigma_m``: standard deviation of one coordinate of one visit, of the cold ones and of warm
+    ones without a sigma of their own.
 
     Raises `InputError` when a sample has no cold counterpart; `TooFewSamplesError` with fewer than
     two poses.

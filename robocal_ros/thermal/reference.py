@@ -400,12 +400,10 @@ def drift_share(
 ) -> DriftShare:
     """Tell how much of the drift from ``visit``'s arm to ``warm`` a visit shows.
 
-    Parameters
-    ----------
-    reference : the one in force, for the static errors at its poses; other poses tell nothing.
-    visit : the new visit, placed with the cold arm.
-    warm : the arm with the drift.
-    sigma_m : standard deviation of one coordinate of one visit.
+    ``reference``: the one in force, for the static errors at its poses; other poses tell nothing.
+    ``visit``: the new visit, placed with the cold arm.
+    ``warm``: the arm with the drift.
+    ``sigma_m``: standard deviation of one coordinate of one visit.
     """
     spots, cold = reference.spots, visit.cell.arm
     again = spots.common(visit.used)

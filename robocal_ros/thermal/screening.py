@@ -270,9 +270,7 @@ def screen(
     the one whose removal gives the highest share, of several the one of the smaller drift in
     units of its sigma.
 
-    Parameters
-    ----------
-    wanted : how many parameters to stop at.
+    ``wanted``: how many parameters to stop at.
 
     Raises `TooFewSamplesError` with fewer equations than parameters, or too few cycles to test
     their series; `ValueError` when the wanted number is not between 1 and the number of parameters.

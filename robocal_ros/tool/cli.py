@@ -4,7 +4,6 @@
 """
 
 import argparse
-from functools import partial
 from math import isfinite, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +18,10 @@ from robocal_ros.cli.main import (
     Document,
     describe_robot,
     positive,
+    print_output,
+    print_text,
+    print_verdict,
+    spaced,
     text,
     three_numbers,
     warn,
@@ -48,12 +51,7 @@ from robocal_ros.tool.files import (
     touch_document,
 )
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
-from robocal_ros.tool.laser_frame import (
-    LaserFile,
-    calibrate_laser,
-    read_laser_for,
-    write_laser,
-)
+from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
 from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
 
 if TYPE_CHECKING:
@@ -108,27 +106,23 @@ def run_beams(args: argparse.Namespace) -> CliResult:
         document["reach_mm"] = dict(zip("xy", (laser.reach * 1e3).tolist(), strict=True))
     document["output"] = None
     if args.output is not None:
-        warnings: list[str] = []
-        arm = describe_robot(args.robot, warnings).arm
+        robot, warnings = describe_robot(args.robot)
+        arm = robot.arm
         warn(warnings)
         write_laser(args.output, LaserFile(laser, args.station, arm.name, arm.model_hash))
         document["output"] = str(args.output)
-    return CliResult(document, partial(_show_beams, document=document))
+    return CliResult(document, _show_beams)
 
 
 def _show_beams(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    x, y, z = document["origin_mm"]
-    console.print(f"The beams cross at {x:.3f} {y:.3f} {z:.3f} mm in base")
+    console.print(f"The beams cross at {spaced(document['origin_mm'], 3)} mm in base")
     console.print(
         f"at {document['beam_angle_deg']:.3f} deg, the y-beam {document['gap_mm']:+.4f} mm above "
         "the x-beam."
     )
     for name, axis in zip("xyz", document["axes"], strict=True):
-        console.print(f"{name} axis in base: {' '.join(f'{value:.6f}' for value in axis)}")
-    if document["output"]:
-        console.print(Text(f"Written: {document['output']}"), soft_wrap=True)
+        console.print(f"{name} axis in base: {spaced(axis, 6)}")
+    print_output(console, document)
 
 
 def add_frame_options(parser: "argparse._ActionsContainer", tip: str, turn: str) -> None:
@@ -194,8 +188,8 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
         raise InputError(
             f"a whole run needs --joints, --robot and --laser: {missing[0]} is missing"
         )
-    warnings: list[str] = []
-    arm = describe_robot(args.robot, warnings).arm
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
     laser = read_laser_for(args.laser, arm).laser
     given = given_frame(args)
     taught = arm.T_flange_tool if given is None else given
@@ -210,16 +204,13 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
         known = KnownTool.measured(found)
         document = run_document(known, found, circles, judge_run(found, ToolLimits()))
     document["warnings"] = warnings
-    warn(warnings)
-    return CliResult(document, partial(_show_tool, document=document))
+    return CliResult(document, _show_tool)
 
 
 def _show_tool(console: "Console", document: Document) -> None:
     from rich.text import Text
 
-    verdict = document["verdict"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
+    print_verdict(console, document)
     sigma = document["sigma_mm"] or [None] * 3
     tip = ", ".join(
         f"{value:.3f}" + ("" if spread is None else f" ± {spread:.3f}")
@@ -228,7 +219,7 @@ def _show_tool(console: "Console", document: Document) -> None:
     console.print(f"Tip in the flange frame, mm: {tip}")
     for name, key in (("Axis", "axis"), ("Orientation, quaternion x y z w", "quat_xyzw")):
         if document.get(key) is not None:
-            console.print(f"{name}: {' '.join(f'{value:.6f}' for value in document[key])}")
+            console.print(f"{name}: {spaced(document[key], 6)}")
     for radius in document.get("tool_radius_mm") or ():
         console.print(Text(f"Tool radius on {radius['circle']}: {radius['x']:.3f} mm as the x-beam "
                            f"sees it, {radius['y']:.3f} mm as the y-beam"))  # fmt: skip
@@ -311,7 +302,7 @@ def run_crossed(args: argparse.Namespace) -> CliResult:
     )
     edges = debounced(read_edges(args.events, rule.sigma_s), rule.debounce_s)
     document = circle_document(fit_circle(motion, edges, args.method, latency_s=args.latency_s))
-    return CliResult(document, partial(_show_crossed, document=document))
+    return CliResult(document, _show_crossed)
 
 
 def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
@@ -324,10 +315,7 @@ def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
 
 
 def _show_crossed(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    verdict = document["verdict"]
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style="bold green"))
+    print_verdict(console, document)
     if document["tool_radius_mm"] is not None:
         x, y = document["tool_radius_mm"].values()
         console.print(f"Tool radius: {x:.3f} mm as the x-beam sees it, {y:.3f} mm as the y-beam")
@@ -358,7 +346,7 @@ def run_points(args: argparse.Namespace) -> CliResult:
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
     document: Document = {"method": args.method}
     document |= touch_document(fit(read_flange_poses(args.data), sigma_m))
-    return CliResult(document, partial(_show_tool, document=document))
+    return CliResult(document, _show_tool)
 
 
 def add_parallel(parser: argparse.ArgumentParser) -> None:
@@ -394,19 +382,14 @@ def run_parallel(args: argparse.Namespace) -> CliResult:
     beams = ParallelBeams(args.up_mm * 1e-3, args.down_mm * 1e-3)
     x_m = None if args.x_mm is None else args.x_mm * 1e-3
     fit = fit_parallel(beams, x_m, read_sweeps(args.data))
-    document: Document = parallel_document(fit.axis, fit.tip)
-    return CliResult(document, partial(_show_parallel, document=document))
+    return CliResult(parallel_document(fit.axis, fit.tip), _show_parallel)
 
 
 def _show_parallel(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    verdict = document["verdict"]
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style="bold green"))
-    console.print(f"Axis: {' '.join(f'{value:.6f}' for value in document['axis'])}")
+    print_verdict(console, document)
+    console.print(f"Axis: {spaced(document['axis'], 6)}")
     if document["tcp_mm"] is not None:
-        tip = ", ".join(f"{value:.3f}" for value in document["tcp_mm"])
-        console.print(f"Tip in the flange frame, mm: {tip}")
+        console.print(f"Tip in the flange frame, mm: {spaced(document['tcp_mm'], 3, ', ')}")
 
 
 FORMATS = ("urdf", "kuka", "abb", "fanuc", "ur")
@@ -432,24 +415,17 @@ def run_export(args: argparse.Namespace) -> CliResult:
     T_flange_tool = given_frame(args)
     if T_flange_tool is None:
         raise InputError("give the tool: --tool, or --xyz-mm and --rpy-deg")
+    load = None
+    if args.mass_kg is not None or args.cog_mm is not None:
+        if args.format != "abb":
+            raise InputError(f"--mass-kg and --cog-mm are for --format abb, not for {args.format}")
+        if args.mass_kg is None or args.cog_mm is None:
+            raise InputError("--mass-kg and --cog-mm go together: a load has both")
+        x, y, z = args.cog_mm
+        load = Load(args.mass_kg, (x * 1e-3, y * 1e-3, z * 1e-3))
     document: Document = {
         "format": args.format,
-        "text": exported(T_flange_tool, args.format, _load(args)),
+        "text": exported(T_flange_tool, args.format, load),
         "T_flange_tool": transform_document(T_flange_tool),
     }
-    return CliResult(document, partial(_show_export, document=document))
-
-
-def _load(args: argparse.Namespace) -> "Load | None":
-    if args.mass_kg is None and args.cog_mm is None:
-        return None
-    if args.format != "abb":
-        raise InputError(f"--mass-kg and --cog-mm are for --format abb, not for {args.format}")
-    if args.mass_kg is None or args.cog_mm is None:
-        raise InputError("--mass-kg and --cog-mm go together: a load has both")
-    x, y, z = args.cog_mm
-    return Load(args.mass_kg, (x * 1e-3, y * 1e-3, z * 1e-3))
-
-
-def _show_export(console: "Console", document: Document) -> None:
-    console.out(document["text"], highlight=False)
+    return CliResult(document, print_text)

@@ -20,10 +20,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import (
-    RankDeficientError,
-    ResidualError,
-)
+from robocal_ros.ground.errors import RankDeficientError, ResidualError
 from robocal_ros.ground.frames import Array
 from robocal_ros.tool.edges import BEAMS, FEWEST_EDGES, BeamEdge, BeamError, StepKind, edges_of
 from robocal_ros.tool.laser_frame import (
@@ -342,11 +339,9 @@ def estimate_tool(
     Raises `BeamError` when edges are missing, doubled or out of order; `RankDeficientError` when a
     motion is missing; the message names it; `ResidualError` when no tool explains the edges.
 
-    Parameters
-    ----------
-    T_flange_tool : (4, 4) the taught tool: where the search begins, and the turn about the axis.
-    taper : growth of the radius per length above the tip; only matters while the tool is tilted.
-    held : what the steps need not determine, with its sigma about the taught tool.
+    ``T_flange_tool`` (4, 4): the taught tool: where the search begins, and the turn about the axis.
+    ``taper``: growth of the radius per length above the tip; only matters while the tool is tilted.
+    ``held``: what the steps need not determine, with its sigma about the taught tool.
     """
     noise, held = noise or RobotNoise(), held or Held()
     kinds = {step.kind for step in steps}

@@ -26,18 +26,8 @@ from robocal_ros.kinematics.tables import (
 )
 from robocal_ros.tool.circle import CircleFit
 from robocal_ros.tool.crossed_model import BeamStep, ToolEstimate
-from robocal_ros.tool.edges import (
-    BEAMS,
-    Beam,
-    BeamEdge,
-    StepKind,
-    debounced,
-)
-from robocal_ros.tool.judging import (
-    KnownTool,
-    QuickCheck,
-    ToolChange,
-)
+from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge, StepKind, debounced
+from robocal_ros.tool.judging import KnownTool, QuickCheck, ToolChange
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, first_rotation
 from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height, TouchFit
 

@@ -16,13 +16,7 @@ from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.tool.crossed_model import (
-    BeamStep,
-    Held,
-    RobotNoise,
-    ToolEstimate,
-    estimate_tool,
-)
+from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
 from robocal_ros.tool.laser_frame import FlangePath, LaserFrame, minimal_rotation
 
 Cause = Literal["tool", "station", "doubt"]
@@ -89,12 +83,10 @@ class Witness:
 def bend_or_station(change: Array, covariance: Array, rule: BendRule, small_m: float) -> Witness:
     """Tell a bend from a knocked station by the tilt that belongs to a shift.
 
-    Parameters
-    ----------
-    change : (5,) of the tip along the tool's x, y, z, m, and of its axis along x and y, rad.
-    covariance : (5, 5) of it.
-    small_m : what the tip's change is since a tool whose cause was known; up to `SMALL_M` the tool
-        may have it without proof: more harm it cannot do.
+    ``change`` (5,): of the tip along the tool's x, y, z, m, and of its axis along x and y, rad.
+    ``covariance`` (5, 5): of it.
+    ``small_m``: what the tip's change is since a tool whose cause was known; up to `SMALL_M` the
+    tool may have it without proof: more harm it cannot do.
 
     Notes
     -----
@@ -538,12 +530,7 @@ def sideways_check(
 SIDEWAYS, EVERY_WAY = np.diag([1.0, 1.0, 0.0]), np.eye(3)  # what a comparison looks at, tool axes
 
 
-def _compared(
-    found: ToolEstimate,
-    stored: KnownTool,
-    rule: CheckRule,
-    ways: Array,
-) -> QuickCheck:
+def _compared(found: ToolEstimate, stored: KnownTool, rule: CheckRule, ways: Array) -> QuickCheck:
     from scipy.special import ndtr
 
     R = stored.T_flange_tool[:3, :3]

@@ -31,11 +31,7 @@ from robocal_ros.tool.edges import (
     debounced,
 )
 from robocal_ros.tool.judging import BendRule, CheckRule, ToolLimits
-from robocal_ros.tool.laser_frame import (
-    JointPath,
-    LaserFrame,
-    upright_pose,
-)
+from robocal_ros.tool.laser_frame import JointPath, LaserFrame, upright_pose
 
 Mode = Literal["full", "quick"]
 STEPS: Mapping[Mode, tuple[str, ...]] = {

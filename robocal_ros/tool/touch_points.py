@@ -235,13 +235,12 @@ def parallel_tip(
     Raises `ResidualError` when the re-sweep shows a tool that still leans; `RankDeficientError`
     when both sweeps have one orientation.
 
-    Parameters
-    ----------
-    x_beam_m : place of both beams along x_b, m.
-    T_straight : two flange rotations (3, 3) with the axis down, one turned by 90 deg about z.
-    x_straight : flange x_b at break and restore, of the upper and the lower beam, at each of them.
-    z_first_break_m : flange height at the first break of the upper beam, driving down: the tip is
-        D = z - h_up below the flange (eq. 4-7).
+    ``x_beam_m``: place of both beams along x_b, m.
+    ``T_straight``: two flange rotations (3, 3) with the axis down, one turned by 90 deg about z.
+    ``x_straight``: flange x_b at break and restore, of the upper and the lower beam, at each of
+    them.
+    ``z_first_break_m``: flange height at the first break of the upper beam, driving down: the tip
+    is D = z - h_up below the flange (eq. 4-7).
     """
     rows, right = [np.array([0.0, 0.0, 1.0])], [beams.up_m - z_first_break_m]
     frame = T_straight[0]
@@ -293,11 +292,9 @@ def fit_parallel(beams: ParallelBeams, x_beam_m: float | None, edges: Edges) -> 
     the flange is turned otherwise than methods say, or the place of the beams is missing;
     `ResidualError` or `RankDeficientError` as `parallel_tip`.
 
-    Parameters
-    ----------
-    x_beam_m : place of both beams along x_b, m; needed for the tip.
-    edges : flange poses T_base_flange (m, 4, 4) at the edges, by sweep and beam: break and restore,
-        or several of both; ``plunge`` of the upper beam has its first break.
+    ``x_beam_m``: place of both beams along x_b, m; needed for the tip.
+    ``edges``: flange poses T_base_flange (m, 4, 4) at the edges, by sweep and beam: break and
+    restore, or several of both; ``plunge`` of the upper beam has its first break.
     """
     more = [name for name, _ in edges if name not in FIRST]
     _require(edges, [*FIRST, *AGAIN] if more else FIRST)

@@ -6,7 +6,10 @@ import pytest
 from bench.measured_runs import NO_NOISE, PERFECT
 from robocal_ros.cell_sim.beams import (
     BeamStation,
+    Circle,
+    Plunge,
     RoundTool,
+    Sweep,
     TrueBeam,
     TrueInput,
     TrueNoise,
@@ -14,7 +17,6 @@ from robocal_ros.cell_sim.beams import (
     bent,
     reported,
 )
-from robocal_ros.cell_sim.tool_cell import Circle, Plunge, Sweep
 from robocal_ros.ground import frames
 
 UPRIGHT = frames.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.15])

@@ -8,10 +8,9 @@ from beam_cell import SILENT, make_cell
 from cell_plans import ARM, Q_START, TRUTH, driven, measured, plan_of
 
 from bench.measured_runs import T_BASE_LASER, TAUGHT, laser_of, point_sigma
-from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise
+from robocal_ros.cell_sim.beams import CYLINDER_M, RoundTool, TrueInput, TrueNoise
 from robocal_ros.cell_sim.cell import SimulatedCell, known_laser
 from robocal_ros.cell_sim.sensors import TICK_S
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M
 from robocal_ros.cell_sim.trajectory_controller import CYCLE_S
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.tool.crossed_model import RobotNoise

@@ -9,11 +9,11 @@ from joint_errors import with_joint_errors
 from bench.measured_shifts import ShiftPlan, drifting_cell, poses, simulate
 from bench.thermal import SEEDS
 from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.beams import SmoothPath, readings
 from robocal_ros.cell_sim.gears import BacklashPlay, GearErrors, gear_errors, ur10_gears
 from robocal_ros.cell_sim.kr150 import UNCORRECTED
 from robocal_ros.cell_sim.robot import Effects, FlexibleBody, TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import SphereSensor
-from robocal_ros.cell_sim.tool_cell import SmoothPath, readings
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.joint_functions import JointFunctions
 from robocal_ros.kinematics.robots import load_robot

@@ -184,14 +184,16 @@ class TestOutcomes:
         assert "ZeroDivisionError: oh" in err
 
     def test_nan_never_leaves(self, monkeypatch, capsys):
-        with_command(monkeypatch, lambda args: CliResult({"x": float("nan")}, lambda console: None))
+        with_command(
+            monkeypatch, lambda args: CliResult({"x": float("nan")}, lambda console, document: None)
+        )
         assert frame.main(["probe", "--json"]) == 1
         assert json.loads(capsys.readouterr().out)["error"]["code"] == "NONE"
 
     def test_exit_code_and_noise(self, monkeypatch, capsys):
         def run(args):
             print("a library speaks")
-            return CliResult({"x": 1}, lambda console: console.print("one"), exit_code=3)
+            return CliResult({"x": 1}, lambda console, document: console.print("one"), exit_code=3)
 
         with_command(monkeypatch, run)
         assert frame.main(["--json", "probe"]) == 3
@@ -204,7 +206,8 @@ class TestOutcomes:
     def test_negative_values(self, monkeypatch):
         seen = []
         with_command(
-            monkeypatch, lambda args: seen.append(args.at) or CliResult({}, lambda c: None)
+            monkeypatch,
+            lambda args: seen.append(args.at) or CliResult({}, lambda *_: None),
         )
         probe = frame.import_module("")
         probe.add_probe = lambda parser: parser.add_argument("--at")
@@ -227,7 +230,7 @@ def run(args):
     if args.wait:
         print("ready", file=sys.stderr, flush=True)
         time.sleep(30)
-    lines = lambda console: [console.print("line") for _ in range(9999)]
+    lines = lambda console, document: [console.print("line") for _ in range(9999)]
     return CliResult({"x": "y" * 1000}, lines)
 frame.COMMANDS = {"probe": frame.CliCommand("test:probe", "")}
 frame.import_module = lambda name: SimpleNamespace(
@@ -276,7 +279,7 @@ def test_piped_tables_stay_whole(monkeypatch):
     stream = io.StringIO()
     from robocal_ros.cli.main import show
 
-    show(CliResult({}, lambda console: console.print("x" * 150)), stream)
+    show(CliResult({}, lambda console, document: console.print("x" * 150)), stream)
     assert stream.getvalue() == "x" * 150 + "\n"
 
 

@@ -28,7 +28,7 @@ from tool_runs import (
 )
 from tool_tables import POINT_COLUMNS, touch_rows, write
 
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M
+from robocal_ros.cell_sim.beams import CYLINDER_M
 from robocal_ros.cli.main import main
 
 CYLINDER_MM = 1e3 * CYLINDER_M

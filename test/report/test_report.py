@@ -12,19 +12,19 @@ import pytest
 from robocal_ros.report import figures
 from robocal_ros.report.figures import (
     CellCourse,
+    ShiftErrors,
     accuracy_by_cycle,
     cell_drawn,
     thermal_figures,
     tool_figures,
 )
-from robocal_ros.report.page import page
-from robocal_ros.report.validation import (
-    ShiftErrors,
+from robocal_ros.report.page import (
     bags_table,
     cycles_table,
     decisions_table,
     figures_of,
     hours_table,
+    page,
     pooled_rms_mm,
     summary_rows,
 )

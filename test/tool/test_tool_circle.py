@@ -7,8 +7,7 @@ import pytest
 from beam_cell import make_cell
 
 from bench.measured_runs import NO_NOISE, PERFECT, TAUGHT
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, beams_of
-from robocal_ros.cell_sim.tool_cell import Circle, joints_at
+from robocal_ros.cell_sim.beams import BeamStation, Circle, RoundTool, beams_of, joints_at
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, ResidualError, TooFewSamplesError
 from robocal_ros.tool.circle import (

@@ -5,9 +5,8 @@ import pytest
 from driven_robot import LAG_S, PERIOD_S, AheadMotion, Robot
 from tool_driver import TAUGHT, TRUTH
 
-from robocal_ros.cell_sim.beams import bent
+from robocal_ros.cell_sim.beams import bent, joints_at
 from robocal_ros.cell_sim.faults import Faults
-from robocal_ros.cell_sim.tool_cell import joints_at
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.motion.plan import MotionLimits

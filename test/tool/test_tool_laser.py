@@ -18,8 +18,15 @@ from bench.measured_runs import (
     laser_of,
     point_sigma,
 )
-from robocal_ros.cell_sim.beams import BeamStation, TrueBeam, TrueInput, TrueNoise, beams_of
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M, laser_points
+from robocal_ros.cell_sim.beams import (
+    CYLINDER_M,
+    BeamStation,
+    TrueBeam,
+    TrueInput,
+    TrueNoise,
+    beams_of,
+    laser_points,
+)
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, WrongRobotError
 from robocal_ros.kinematics.robots import load_robot

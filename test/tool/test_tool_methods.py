@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.cell_sim.beams import RoundTool, TrueBeam, bent, crossings
-from robocal_ros.cell_sim.tool_cell import Sweep
+from robocal_ros.cell_sim.beams import RoundTool, Sweep, TrueBeam, bent, crossings
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,

@@ -5,8 +5,7 @@ import pytest
 from beam_cell import make_cell
 
 from bench.measured_runs import TAUGHT
-from robocal_ros.cell_sim.beams import RoundTool, bent
-from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.cell_sim.beams import RoundTool, bent, joints_at
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, ResidualError
 from robocal_ros.tool.circle import classic_from_path, classic_tool, driven_circle

@@ -230,7 +230,7 @@ def test_a_robot_moved_by_hand_in_between_is_refused(history):
         shifted = replace(driver.cell.station, beams=tuple(
             replace(b, start=b.start + moved, end=b.end + moved) for b in driver.cell.station.beams
         ))  # fmt: skip
-        from robocal_ros.cell_sim.tool_cell import step_move
+        from robocal_ros.cell_sim.beams import step_move
 
         move = step_move(step, edges[0].time_s - 0.55, 0.0, 0.0)
         return shifted.edges(driver.program.tool, move, move.window, np.random.default_rng(5))

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
 
-from robocal_ros.cell_sim.beams import RoundTool
-from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.cell_sim.beams import RoundTool, joints_at
 from robocal_ros.cell_sim.trajectory_controller import JointMotion
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.motion.cell import DrivingConfig, Housing, ToolBody

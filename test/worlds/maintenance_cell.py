@@ -12,7 +12,7 @@ from shift import warmed
 from tool_driver import TAUGHT, noisy_cell
 from tool_driver import config_of as tool_config
 
-from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.cell_sim.beams import joints_at
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.arm import model_document

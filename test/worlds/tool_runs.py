@@ -8,16 +8,18 @@ from tool_tables import write
 
 from bench.measured_runs import MeasuredRun, ToolCell, point_sigma
 from robocal_ros.cell_sim.beams import (
+    CYLINDER_M,
     BeamStation,
     RoundTool,
+    Sweep,
     TrueBeam,
     TrueInput,
     TrueNoise,
     beams_of,
     bent,
     crossings,
+    laser_points,
 )
-from robocal_ros.cell_sim.tool_cell import CYLINDER_M, Sweep, laser_points
 from robocal_ros.ground import frames
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import BeamStep, RobotNoise

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.measured_runs import NO_NOISE, PERFECT
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, beams_of
-from robocal_ros.cell_sim.tool_cell import Circle
+from robocal_ros.cell_sim.beams import BeamStation, Circle, RoundTool, beams_of
 from robocal_ros.ground import frames
 
 PUBLISHED_MM = {  # thesis table 5-3
