@@ -87,7 +87,8 @@ def soak(seconds: float) -> Table:
     arm = load_robot("kr150_r3100")
     probe = Probe()
     with tempfile.TemporaryDirectory() as folder:
-        command = [EXECUTABLES / "joint_correction_node"]
+        robot = ("--ros-args", "-p", f"robot:={arm.name}")
+        command = [EXECUTABLES / "joint_correction_node", *robot]
         subject = Subject("corrected", "joint_correction_node", command, Path(folder))
         try:
             stream, watch = Stream(probe, subject, arm.joint_names), Watch(arm)

@@ -19,7 +19,7 @@ from robocal_ros.kinematics.robots import (
 )
 from robocal_ros.motion.driver import HARD_STOP
 from robocal_ros.ros.base import NO_SERIAL
-from robocal_ros.ros.parameters import Setting, advanced, given_pose, pose_settings
+from robocal_ros.ros.parameters import ROBOT, Setting, advanced, given_pose, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ SAME = ("stream_gap_s", "joint_state_age_s", "flange_frame", "model_age_s", "fre
 
 
 SETTINGS = (
-    Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
+    ROBOT,
     Setting(
         "reference",
         NOMINAL,

@@ -40,6 +40,7 @@ from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.graph import FrameWatch
 from robocal_ros.ros.parameters import (
+    ROBOT,
     STANDSTILL,
     Setting,
     advanced,
@@ -66,7 +67,7 @@ def _range_fault(values: list[float]) -> str | None:
 
 
 SETTINGS = (
-    Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
+    ROBOT,
     STATE_DIR,
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),

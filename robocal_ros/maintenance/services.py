@@ -29,7 +29,14 @@ from robocal_ros.ros.endpoints import (
     trigger_text,
 )
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S
-from robocal_ros.ros.parameters import Setting, advanced, given_pose, number, pose_settings
+from robocal_ros.ros.parameters import (
+    ROBOT,
+    Setting,
+    advanced,
+    given_pose,
+    number,
+    pose_settings,
+)
 from robocal_ros.ros.session_node import STATE_DIR, TWIN, AddOutput, SessionEvents
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
@@ -361,7 +368,7 @@ def _silence_fault(silent_s: float) -> str | None:
 
 
 SETTINGS = (
-    Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
+    ROBOT,
     STATE_DIR,
     Setting("base_frame", "base", "Name of the robot's base frame, for stamps"),
     *pose_settings(

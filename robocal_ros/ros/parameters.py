@@ -230,6 +230,7 @@ class ParameterTable:
             self.changed()
 
 
+ROBOT = Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file")
 ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 
 

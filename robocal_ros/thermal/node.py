@@ -45,6 +45,7 @@ from robocal_ros.ros.conversions import MM, joint_poses, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.parameters import (
     ORIGIN,
+    ROBOT,
     STANDSTILL,
     Setting,
     advanced,
@@ -100,7 +101,7 @@ def _field_fault(field: list[float]) -> str | None:
 
 
 SETTINGS = (
-    Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
+    ROBOT,
     STATE_DIR,
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("measuring_frame", "", "Frame of the measurements; empty: that of the first one used"),

@@ -25,7 +25,14 @@ from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
-from robocal_ros.ros.parameters import Setting, advanced, given_pose, number, pose_settings
+from robocal_ros.ros.parameters import (
+    ROBOT,
+    Setting,
+    advanced,
+    given_pose,
+    number,
+    pose_settings,
+)
 from robocal_ros.ros.session_node import STATE_DIR, DecisionServices, SessionNode, trigger_answer
 from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.tool.crossed_model import RobotNoise
@@ -48,7 +55,7 @@ PROGRAM, TRAJECTORY = "program", "trajectory"
 
 
 SETTINGS = (
-    Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
+    ROBOT,
     STATE_DIR,
     *pose_settings(
         "taught",

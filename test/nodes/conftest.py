@@ -33,6 +33,8 @@ from domains import free_domain  # noqa: E402
 from trajectory_controllers import missing_packages  # noqa: E402
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
+# The arm of most tests' worlds, where a test names none.
+ROBOTS = {name: {"robot": "kr150_r3100"} for name in ("thermal_node", "joint_correction_node")}
 NO_CALL = SimpleNamespace(id="")  # of a test without parameters
 DEADLINE_S = 30.0  # of what takes a second, on a machine that is busy otherwise
 ENDS_WITHIN_S = 10.0
@@ -129,7 +131,8 @@ class Graph:
     ) -> Any:
         """Start a house node in this process, as ``run`` would."""
         self._forget_clients()
-        overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
+        given = ROBOTS.get(getattr(node_class, "NAME", ""), {}) | (parameters or {})
+        overrides = [Parameter(name, value=value) for name, value in given.items()]
         node = node_class(
             context=self.context,
             parameter_overrides=overrides,
@@ -148,9 +151,13 @@ class Graph:
         remap: dict[str, str] | None = None,
         *arguments: str,
     ) -> Executable:
-        """Start an executable of the install tree (or a script); it is ended with the test."""
+        """Start an executable of the install tree (or a script); it is ended with the test.
+
+        ``arguments``: given as they are, a parameter file with the robot among them.
+        """
         self._forget_clients()
-        ros = [f"-p{name}:={value}" for name, value in (parameters or {}).items()]
+        given = ({} if arguments else ROBOTS.get(str(executable), {})) | (parameters or {})
+        ros = [f"-p{name}:={value}" for name, value in given.items()]
         ros += [f"-r{old}:={new}" for old, new in (remap or {}).items()]
         ros_arguments = [item for pair in ros for item in (pair[:2], pair[2:])]
         program = (

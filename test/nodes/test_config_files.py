@@ -129,7 +129,7 @@ def test_a_node_takes_the_file(graph, tmp_path):
     state = graph.call(GetState, "/thermal_node/get_state")
     assert state.current_state.label == "active", process.output
     graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
-    assert "active: robot kr150_r3100, serial R7" in process.output
+    assert "active: robot ur10, serial R7" in process.output
 
 
 @pytest.mark.parametrize("node", [ThermalNode, TcfNode], ids=lambda node: node.NAME)
