@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.cell_sim.gears import GearErrors
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 5.0
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.cell_sim.faults import BALL_KNOCK, Faults
 from robocal_ros.cell_sim.robot import Draws, Effects, Stream
-from robocal_ros.ground.frames import Array, Index
+from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.cell_setup import SensorField
 
@@ -203,9 +203,6 @@ def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
             crosses = (a[1] > z) != (b[1] > z)
             odd ^= crosses & (y < a[0] + (z - a[1]) * (b[0] - a[0]) / (b[1] - a[1]))
     return odd
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

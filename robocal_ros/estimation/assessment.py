@@ -6,10 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, TooFewSamplesError
-from robocal_ros.ground.frames import Document
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from robocal_ros.ground.frames import Array, Document, Index
 
 SAME_POSE_RAD = 1e-3
 FEWEST_GROUPS = 5

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.ground.frames import Array
 
 # ---- what a descent minimises: squared residuals, robust or plain, and a Gaussian prior ---------
 
 
-Array = NDArray[np.float64]
 S = TypeVar("S")
 
 MOST_ROUNDS = 50

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from robocal_ros.estimation.surfaces import (
@@ -27,17 +26,9 @@ from robocal_ros.estimation.surfaces import (
     surfaces,
 )
 from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
-
-# ---- profile noise ------------------------------------------------------------------------------
-
-
-Array = NDArray[np.float64]
-
+from robocal_ros.ground.frames import Array, Mask
 
 # ---- the corners of a staircase, from one profile -----------------------------------------------
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

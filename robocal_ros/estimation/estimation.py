@@ -22,11 +22,10 @@ from robocal_ros.estimation.descent import (
     rows_of,
 )
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 
 # ---- what data determine: rank, condition, and the directions they leave open, in words ---------
 
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-8  # of the largest singular value, columns scaled to unit length
 _CLEAR = 1e-10  # squared singular value above which normal equations, being quicker, suffice

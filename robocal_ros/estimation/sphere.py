@@ -30,6 +30,7 @@ from robocal_ros.estimation.surfaces import (
     smoothed,
 )
 from robocal_ros.ground.errors import InputError, ResidualError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.frames import Array, Mask
 from robocal_ros.ground.samples import (
     DEFAULT_TARGET,
     SPHERE_CLOUD,
@@ -46,8 +47,6 @@ from robocal_ros.ground.samples import (
 # over the points near them (Chum, Matas and Kittler 2003) and judged again. Nothing is drawn at
 # random.
 
-
-Array = NDArray[np.float64]
 
 SMALLEST_SHARE, LARGEST_SHARE = 0.2, 1.5  # radius of a circle, of the sphere's
 _FLAT_SHARE = 4.0  # what was thought a circle grows beyond this where it is a piece of a plane
@@ -160,8 +159,6 @@ def _improved_circle(circle: Array, points: Array, limit: float) -> Array:
 
 # ---- the circle in which a laser plane cuts a reference sphere, from one profile ----------------
 
-
-Mask = NDArray[np.bool_]
 
 _NEAR = 3.5  # standard deviations of a point near a start
 _NEAR_M = 2e-5

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.ground.frames import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 OPPOSITE = {False: "towards", True: "away"}  # what to set where ``towards`` is wrong

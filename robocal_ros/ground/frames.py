@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Document = dict[str, Any]
 
 GIMBAL_LOCK = 1e-8  # cosine of the pitch below which roll and yaw are one

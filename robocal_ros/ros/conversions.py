@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, Transform, TransformStamped
-from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, CalibrationSummary, KinematicModel
 from std_msgs.msg import Header
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import Entry
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import COLUMNS, layer_of
@@ -183,8 +183,6 @@ def pose_message(T: Any) -> Pose:
     message.position.x, message.position.y, message.position.z = T[:3, 3].tolist()
     return message
 
-
-Array = NDArray[np.float64]
 
 MM = 1e-3
 

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.lifecycle import LifecycleNode
@@ -27,6 +26,7 @@ from robocal_msgs.msg import GapOpen
 from std_msgs.msg import Bool, Empty
 
 from robocal_ros.ground import frames
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import JOINTS, UNCORRECTED
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
@@ -309,8 +309,6 @@ class GapSources:
             return f"gap_open of {names} is BEST_EFFORT and not heard: publish it RELIABLE"
         return ""
 
-
-Array = NDArray[np.float64]
 
 MANY_LATCHED = QoSProfile(
     depth=100, reliability=endpoints.LATCHED.reliability, durability=endpoints.LATCHED.durability
