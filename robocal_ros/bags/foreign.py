@@ -301,10 +301,8 @@ def delay_between(
 
     None where too little motion shows it, or the two are not one motion.
 
-    Parameters
-    ----------
-    first, other : (n, 3) positions, or (n, 9) rotation matrices row by row, in whatever frames:
-        speeds are compared. ``first_ns`` (n,), ``other_ns`` (m,): their stamps.
+    ``first``, ``other`` (n, 3): positions, or (n, 9) rotation matrices row by row, in whatever
+    frames: speeds are compared. ``first_ns`` (n,), ``other_ns`` (m,): their stamps.
     """
     at = [_rising(first_ns, first), _rising(other_ns, other)]
     start_ns = max(int(stamps[0]) for stamps, _ in at)

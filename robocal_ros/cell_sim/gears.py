@@ -30,10 +30,9 @@ class GearErrors:
     The sum over k of ``amplitude sin(frequency q + phase)``; and backlash: a joint that turns back
     stays where it is until its reading has gone by its ``lost_motion``.
 
-    Attributes
-    ----------
-    amplitude, frequency, phase : (n, k) rad; periods in a turn, which need not be whole; rad.
-    lost_motion : (n,) rad.
+    ``amplitude``, ``frequency``, ``phase`` (n, k): rad; periods in a turn, which need not be whole;
+    rad.
+    ``lost_motion`` (n,): rad.
     """
 
     amplitude: Array

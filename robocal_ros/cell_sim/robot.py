@@ -120,15 +120,16 @@ class FlexibleBody:
 class TrueRobot:
     """A robot as it is.
 
-    Attributes
-    ----------
-    nominal : the numbers it was designed to; only those are taken from it, never its functions.
-    static_error : (n, 5) true minus nominal d, theta, a, alpha, beta of the cold robot, m and rad.
-    motor_gain, link_gain : (n, 5, n) change of each parameter per kelvin of each motor and link.
-    body : masses and stiffness.
-    eccentricity, phase : (n,) amplitude and phase of each encoder's once-per-turn error, rad.
-    repeatability : standard deviation of the joint values at rest, rad.
-    gears : their errors; None: none.
+    ``nominal``: the numbers it was designed to; only those are taken from it, never its functions.
+    ``static_error`` (n, 5): true minus nominal d, theta, a, alpha, beta of the cold robot, m and
+    rad.
+    ``motor_gain``, ``link_gain`` (n, 5, n): change of each parameter per kelvin of each motor and
+    link.
+    ``body``: masses and stiffness.
+    ``eccentricity``, ``phase`` (n,): amplitude and phase of each encoder's once-per-turn error,
+    rad.
+    ``repeatability``: standard deviation of the joint values at rest, rad.
+    ``gears``: their errors; None: none.
     """
 
     nominal: SerialArm

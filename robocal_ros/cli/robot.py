@@ -198,7 +198,7 @@ def _show_joint_functions(console: "Console", document: Document) -> None:
 
 
 _POSES = 1000
-_UR = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
+_MDH = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
 
 
 def add_import_ur(parser: argparse.ArgumentParser) -> None:
@@ -240,13 +240,11 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
     dh = replace(nominal, mdh=factory_dh(settings[0], settings[1]))
     save_robot(factory, args.output)
     distances = _distances(nominal, factory)
-    factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
-    rows = zip(factory.joint_names, (factory.mdh * factors).tolist(), strict=True)
     document: Document = {
         "robot": name,
         "model_hash": factory.model_hash,
         "output": str(args.output),
-        "joints": [{"name": joint, **dict(zip(_UR, row, strict=True))} for joint, row in rows],
+        "joints": joint_rows(factory),
         "from_nominal": {
             "mean_mm": float(distances.mean() * 1e3),
             "max_mm": float(distances.max() * 1e3),
@@ -257,6 +255,19 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
     return CliResult(document, _show_import_ur)
 
 
+def joint_rows(arm: "SerialArm") -> list[Document]:
+    """Each joint's name and its numbers `_MDH`."""
+    factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
+    rows = zip(arm.joint_names, (arm.mdh * factors).tolist(), strict=True)
+    return [{"name": joint, **dict(zip(_MDH, row, strict=True))} for joint, row in rows]
+
+
+def print_joints(console: "Console", title: str, joints: list[Document]) -> None:
+    """Print them as a table."""
+    rows = [[joint["name"], *(f"{joint[key]:z.4f}" for key in _MDH)] for joint in joints]
+    print_table(console, title, ("joint", *(key.replace("_", " ") for key in _MDH)), rows)
+
+
 def _distances(a: "SerialArm", b: "SerialArm") -> "Array":
     """Distances (m,), m, between the flanges of two arms over the whole joint space."""
     q = np.random.default_rng(0).uniform(a.lower, a.upper, (_POSES, a.n))
@@ -264,9 +275,8 @@ def _distances(a: "SerialArm", b: "SerialArm") -> "Array":
 
 
 def _show_import_ur(console: "Console", document: Document) -> None:
-    rows = [[joint["name"], *(f"{joint[key]:z.4f}" for key in _UR)] for joint in document["joints"]]
     title = f"{document['robot']}, as calibrated by the factory"
-    print_table(console, title, ("joint", *(key.replace("_", " ") for key in _UR)), rows)
+    print_joints(console, title, document["joints"])
     far = document["from_nominal"]
     console.print(
         f"The flange is {far['mean_mm']:.3f} mm (at most {far['max_mm']:.3f} mm) from the nominal "

@@ -1,14 +1,14 @@
 """Robot descriptions of ROS: ``robocal import-urdf`` and ``export-urdf``."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
 
-from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, warn
+from robocal_ros.cli.main import ROBOT_HELP, CliResult, Document, describe_robot, print_output
+from robocal_ros.cli.robot import joint_rows, print_joints
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import read_text, write_text
 from robocal_ros.ground.frames import Array, log_rotation, transform_document
@@ -81,19 +81,11 @@ def run_import_urdf(args: argparse.Namespace) -> CliResult:
         "base": links.base,
         "tip": links.tip,
         "output": str(args.output),
-        "joints": _rows(arm),
+        "joints": joint_rows(arm),
         "conversion_error_mm": _largest_mm(links, arm),
         "warnings": warnings,
     }
-    warn(warnings)
-    return CliResult(document, partial(_show_import, document=document))
-
-
-def _rows(arm: SerialArm) -> list[Document]:
-    keys = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
-    factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
-    rows = zip(arm.joint_names, (arm.mdh * factors).tolist(), strict=True)
-    return [{"name": joint, **dict(zip(keys, row, strict=True))} for joint, row in rows]
+    return CliResult(document, _show_import)
 
 
 def _poses(arm: SerialArm) -> Array:
@@ -109,22 +101,14 @@ def _largest_mm(links: Chain, arm: SerialArm) -> float:
 
 
 def _show_import(console: "Console", document: Document) -> None:
-    from rich.table import Table
-
-    table = Table(title=f"{document['robot']}: {document['base']} to {document['tip']}")
-    table.add_column("joint")
-    for heading in ("d mm", "theta deg", "a mm", "alpha deg", "beta deg"):
-        table.add_column(heading, justify="right")
-    for joint in document["joints"]:
-        table.add_row(
-            *(v if isinstance(v, str) else f"{v:z.4f}" for v in joint.values()),
-        )
-    console.print(table)
+    title = f"{document['robot']}: {document['base']} to {document['tip']}"
+    print_joints(console, title, document["joints"])
     console.print(
         f"The flange differs by {document['conversion_error_mm']:.1e} mm at most from the "
-        f"description's over {_POSES} poses.\nWritten: {document['output']}",
+        f"description's over {_POSES} poses.",
         soft_wrap=True,
     )
+    print_output(console, document)
 
 
 def add_export_urdf(parser: argparse.ArgumentParser) -> None:
@@ -145,8 +129,7 @@ def add_export_urdf(parser: argparse.ArgumentParser) -> None:
 
 def run_export_urdf(args: argparse.Namespace) -> CliResult:
     """Do ``export-urdf``. Raises `RobocalError` for what a user can mend."""
-    warnings: list[str] = []
-    described = describe_robot(args.robot, warnings)
+    described, warnings = describe_robot(args.robot)
     arm = described.arm
     if args.output.exists():
         raise InputError("is there already: name another file", file=str(args.output))
@@ -190,14 +173,14 @@ def run_export_urdf(args: argparse.Namespace) -> CliResult:
         "conversion_error_mm": float(np.abs(geometry - rigid.fk(_poses(arm))).max() * 1e3),
         "warnings": warnings,
     }
-    warn(warnings)
-    return CliResult(document, partial(_show_export, document=document))
+    return CliResult(document, _show_export)
 
 
 def _show_export(console: "Console", document: Document) -> None:
     console.print(
         f"{document['robot']}, {document['base']} to {document['tip']}: the flange differs by "
         f"{document['conversion_error_mm']:.1e} mm at most from the robot file's over {_POSES} "
-        f"poses.\nWritten: {document['output']}",
+        "poses.",
         soft_wrap=True,
     )
+    print_output(console, document)
