@@ -480,7 +480,8 @@ def _cross(
     return (
         count, solved, rate, Goal(rate, 2.0) if drift_alone else None,
         float(np.median(left)) * 1e3, most, Goal(most, 0.04) if drift_alone else None,
-        off * 1e3, Goal(off * 1e3, shift_m * 1e3 + OFF_MM), fastest, Goal(fastest, 10.0 + 1e-6),
+        off * 1e3, Goal(off * 1e3, 0.04 if drift_alone else shift_m * 1e3 + OFF_MM),
+        fastest, Goal(fastest, 2.0 if drift_alone else 10.0 + 1e-6),
     )  # fmt: skip
 
 

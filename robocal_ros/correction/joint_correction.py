@@ -49,6 +49,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.correction import solution
+from robocal_ros.correction.damping import WEIGHT
 from robocal_ros.correction.limiter import step_out
 from robocal_ros.correction.solution import RATE_STEP_S, STEP_AHEAD_S, work_size
 from robocal_ros.ground import frames
@@ -58,10 +59,12 @@ Array = NDArray[np.float64]
 
 
 LARGEST_SHIFT = 1.0
-# Of the shift per unit of a singular value: at 60 deg/s of the joints through a wrist singularity
-# a drift's correction moves by less than 2 deg/s, with each shipped robot; a tool's, which is
-# larger, by more, so that in most postures its turn is corrected too.
+# Of the shift per unit of a singular value: a tool's, which is larger, by more, so that in most
+# postures its turn is corrected too. A drift below the number in the second line (0.24 mm, in units
+# of `damping.LENGTH`) is given up sooner, by so much, as little is lost: see `_drift_slope`.
 DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 60.0, 1.0 / 10.0
+LITTLE_DRIFT, SLOWER = 8e-4, 5.0
+POSTURES, RANGE = 200, 2.0  # in which a drift is looked at, rad (prismatic: m)
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 
 
@@ -262,6 +265,20 @@ class StagedResult:
         return np.asarray(self.arm.position_error_m + rest)
 
 
+def _drift_slope(models: Array) -> float:
+    """The slope of equation 3 for a drift of the arm (2, n + 2, 9 + w), by its size.
+
+    At 60 deg/s of the joints through a wrist singularity the correction of one of up to 0.12 mm
+    moves by less than 2 deg/s, with each shipped robot (`bench/correction.py`); one of 0.5 mm,
+    whose turn would be missed, is corrected in more postures.
+    """
+    n = models.shape[1] - 2
+    q = np.random.default_rng(0).uniform(-RANGE, RANGE, (POSTURES, n))
+    found = JointCorrection(models).correct(q)
+    size = np.hypot(found.tcp_shift_m * WEIGHT, found.tcp_rotation_rad).max()
+    return float(DRIFT_SLOPE / (1.0 + (SLOWER - 1.0) / (1.0 + (size / LITTLE_DRIFT) ** 4)))
+
+
 class StagedCorrection:
     """Correction from a reference model to an actual one, in 1 stage, or 2 with a changed tool.
 
@@ -283,9 +300,8 @@ class StagedCorrection:
         bare = actual.copy()
         bare[-1] = reference[-1]
         self.n, self._free = len(reference) - 2, free_axis
-        self._arm = JointCorrection(
-            np.stack([reference, bare]), arm_largest, free_axis, DRIFT_SLOPE
-        )
+        drift = np.stack([reference, bare])
+        self._arm = JointCorrection(drift, arm_largest, free_axis, _drift_slope(drift))
         self._tool: JointCorrection | None = None
         if not np.array_equal(actual[-1], reference[-1]):
             self._tool = JointCorrection(

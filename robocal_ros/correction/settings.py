@@ -98,36 +98,37 @@ SETTINGS = (
     ),
     Setting("thermal_tcp_deg", 0.1, "and in orientation", "deg", 0.0, 5.0),
     Setting(
-        "thermal_joint_deg",
-        0.3,
-        "and of one joint; near a singularity less is corrected, so that this holds",
-        unit="deg",
-        low=0.001,
-        high=5.0,
-    ),
-    Setting(
         "tool_tcp_mm", 10.0, "Largest change of the tool that is made up for", "mm", 0.0, 100.0
     ),
     Setting("tool_tcp_deg", 4.0, "and in orientation", "deg", 0.0, 30.0),
-    Setting(
-        "tool_joint_deg",
-        5.0,
-        "and by one joint; where more is needed, commands are refused",
-        unit="deg",
-        low=0.001,
-        high=30.0,
-    ),
-    Setting(
-        "offset_deg_s",
-        2.0,
-        "Fastest change of what is added to a joint while the program moves none; its acceleration "
-        "is 10 times that, and in motion both are larger: 5 and 100 times that",
-        unit="deg/s",
-        low=0.01,
-        high=2.0,
-    ),
-    Setting("offset_mm_s", 5.0, "and to a sliding joint", "mm/s", 0.01, 5.0),
     *advanced(
+        Setting(
+            "thermal_joint_deg",
+            0.3,
+            "Largest correction of a joint for the arm's drift; near a singularity less is "
+            "corrected, so that this holds",
+            unit="deg",
+            low=0.001,
+            high=5.0,
+        ),
+        Setting(
+            "tool_joint_deg",
+            5.0,
+            "and for a changed tool; where more is needed, commands are refused",
+            unit="deg",
+            low=0.001,
+            high=30.0,
+        ),
+        Setting(
+            "offset_deg_s",
+            2.0,
+            "Fastest change of what is added to a joint while the program moves none; its "
+            "acceleration is 10 times that, and in motion both are larger: 5 and 100 times that",
+            unit="deg/s",
+            low=0.01,
+            high=2.0,
+        ),
+        Setting("offset_mm_s", 5.0, "and to a sliding joint", "mm/s", 0.01, 5.0),
         Setting(
             "stream_gap_s",
             0.1,

@@ -426,6 +426,7 @@ def test_stages_together_are_the_whole_correction_and_undo_it() -> None:
     start, end = pack_model(reference), pack_model(actual)
     stage = StagedCorrection(start, end, np.full(6, 0.1), np.full(6, 0.5))
     q = HOME + rng.uniform(-0.5, 0.5, (100, 6))
+    q[:, 4] += 0.5  # no direction is weak
     result = stage.correct(q)
     assert np.all(result.whole)
     direct = JointCorrection.between(reference, actual).correct(q)

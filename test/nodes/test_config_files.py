@@ -93,7 +93,10 @@ def test_what_several_nodes_have_may_be_given_to_all():
 
 def test_each_node_takes_over_what_another_one_gives_as_all_is_set():
     """A tool that may be accepted is corrected with; a cycle that is resumed is still open."""
-    tcf, correction, maintenance = map(shipped, (TcfNode, JointCorrectionNode, MaintenanceNode))
+    tcf, correction, maintenance = (
+        {s.name: s.default for s in settings(node)}
+        for node in (TcfNode, JointCorrectionNode, MaintenanceNode)
+    )
     assert tcf["change_limit_mm"] <= correction["tool_tcp_mm"]
     assert tcf["tilt_limit_deg"] <= correction["tool_tcp_deg"] <= correction["tool_joint_deg"]
     assert maintenance["accept_tool_mm"] <= tcf["change_limit_mm"]
