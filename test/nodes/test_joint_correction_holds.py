@@ -13,6 +13,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from joint_correction_live import HOME, NAMES, NODE, NOMINAL, Line, drifted, joints, model_message
+from jumps import no_jump
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.context import Context
@@ -165,12 +166,12 @@ class Moving(Line):
         q = np.array([q[0] for _, q in self.out])
         moves = np.flatnonzero(np.diff(q) > 1e-7)
         assert times[moves[-1] + 1] - began_s < within_s
-        assert np.all(np.diff(q) > -1e-9)
+        no_jump(np.diff(q) > -1e-9, "nothing turns back")
         if self._spline is None:
             self._slows_down(times, q)
             return
         q, times = q[times > began_s], times[times > began_s]
-        assert np.all(np.diff(q) <= 1.15 * SPEED[0] * np.diff(times) + 1e-9)
+        no_jump(np.diff(q) <= 1.15 * SPEED[0] * np.diff(times) + 1e-9, "no faster than the stream")
         assert q[-1] - q[0] > 0.25 * SPEED[0] ** 2 / SLOWING  # half of the way: not cut off
 
     def _slows_down(self, times: np.ndarray, q: np.ndarray) -> None:
@@ -179,14 +180,14 @@ class Moving(Line):
         elapsed = np.diff(when)
         assert len(when) > 3
         assert fast[-1] == 0.0
-        assert np.all(np.diff(fast) >= -SLOWING * (elapsed + BUSY_S))
+        no_jump(np.diff(fast) >= -SLOWING * (elapsed + BUSY_S), "slows down as the joints may")
         assert np.all(np.diff(fast)[:-1] <= -SLOWING * (elapsed[:-1] - BUSY_S))
         evenly = 0.5 * (fast[:-1] ** 2 - fast[1:] ** 2) / SLOWING
         # the last step is shorter than the time that has passed
-        assert np.diff(where) == pytest.approx(evenly, abs=1e-9)
+        no_jump(np.abs(np.diff(where) - evenly) <= 1e-9, "slows down evenly")
         first = int(np.flatnonzero(times == when[0])[0])
         passed = when[0] - times[first - 1] + BUSY_S
-        assert where[0] - q[first - 1] <= FASTEST * passed
+        no_jump(where[0] - q[first - 1] <= FASTEST * passed, "the first step of a slow-down")
         assert self.at[0] == where[-1]
 
     def held(self, words: str, state: int) -> None:

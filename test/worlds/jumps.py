@@ -1,0 +1,18 @@
+"""What fails as an output jumped is never run again: a second try would hide what comes at times.
+
+`make test` reruns node tests, which others on the machine may have starved, except for these.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class JumpError(AssertionError):
+    """An output changed faster, or further, than it may."""
+
+
+def no_jump(is_so: ArrayLike, words: str) -> None:
+    """Raise `JumpError` unless all of it is so."""
+    fine = np.asarray(is_so)
+    if not fine.all():
+        raise JumpError(f"{words}: not so {np.count_nonzero(~fine)} times of {fine.size}")
