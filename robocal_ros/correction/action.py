@@ -6,11 +6,13 @@ callback lets an exception out: in rclpy's events executor one of an action's cl
 process. docs/joint_correction.md tells it to users.
 """
 
+import ctypes
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,9 @@ from rclpy.action import ActionClient, CancelResponse, GoalResponse
 from rclpy.action.client import ClientGoalHandle
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.correction.interface import Reason, RefusedError
+from robocal_ros.correction.interface import MOST_POINTS, Reason, RefusedError
 from robocal_ros.correction.robot_state import SentPath
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import InputError, RobocalError
@@ -35,6 +38,74 @@ Result = FollowJointTrajectory.Result
 ANSWER_S = 5.0  # a controller that has not answered a goal or a cancel by then never will
 WATCH_S = 0.2
 _ABOUT_JOINTS = {Reason.UNKNOWN_JOINT, Reason.DOUBLED_JOINT, Reason.MISSING_JOINT}
+
+
+# Where the number of points stands in the C structure of a goal's request, after goal_id, header,
+# joint_names and a pointer: a sequence is a pointer, its size and its capacity (rosidl_runtime_c).
+POINTS_AT = 16 + 32 + 24 + 8
+
+
+@dataclass(frozen=True)
+class LongGoal:
+    """In the place of a goal whose points are more than are taken."""
+
+    points: int
+
+
+@cache
+def brief_action(most: int) -> Any:
+    """The action, as a server of rclpy takes it, whose goals of more points stay in C.
+
+    rclpy makes an object of each point before it asks anybody: of 100 000 the node would be deaf
+    for seconds. A `LongGoal` stands in place of such a goal. The action itself where messages are
+    not laid out as expected.
+    """
+    whole: Any = FollowJointTrajectory
+    usual, api = type(whole.Impl.SendGoalService.Request), ctypes.pythonapi
+    usual.__import_type_support__()
+    api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
+    api.PyCapsule_GetPointer.restype = ctypes.c_void_p
+    api.PyCapsule_New.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
+    api.PyCapsule_New.restype = ctypes.py_object
+
+    def function(name: str, *types: Any) -> Any:
+        capsule = getattr(usual, name)
+        return ctypes.PYFUNCTYPE(*types)(api.PyCapsule_GetPointer(capsule, None))
+
+    def points(request: int) -> Any:
+        return ctypes.c_size_t.from_address(request + POINTS_AT)
+
+    path = JointTrajectory(points=[JointTrajectoryPoint()] * 3)
+    known = whole.Impl.SendGoalService.Request(goal=whole.Goal(trajectory=path))
+    made = function("_CREATE_ROS_MESSAGE", ctypes.c_void_p)()
+    fill = function("_CONVERT_FROM_PY", ctypes.c_bool, ctypes.py_object, ctypes.c_void_p)
+    as_expected = fill(known, made) and points(made).value == len(path.points)
+    function("_DESTROY_ROS_MESSAGE", None, ctypes.c_void_p)(made)
+    if not as_expected:
+        return whole
+    convert = function("_CONVERT_TO_PY", ctypes.py_object, ctypes.c_void_p)
+
+    def brief(request: int) -> Any:
+        count = points(request)
+        many = count.value
+        if many <= most:
+            return convert(request)
+        count.value = 0
+        goal_id = convert(request).goal_id
+        count.value = many  # which rclpy frees
+        return SimpleNamespace(goal_id=goal_id, goal=LongGoal(many))
+
+    called = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p)(brief)
+    capsule = api.PyCapsule_New(ctypes.cast(called, ctypes.c_void_p), None, None)
+    kind = type("BriefType", (usual,), {"_CONVERT_TO_PY": capsule, "_called": called})
+    request = kind("BriefRequest", (whole.Impl.SendGoalService.Request,), {"__slots__": []})
+
+    class BriefAction(whole):
+        class Impl(whole.Impl):
+            class SendGoalService(whole.Impl.SendGoalService):
+                Request = request
+
+    return BriefAction
 
 
 class ControllerError(RobocalError):
@@ -85,7 +156,7 @@ class TrajectoryProxy:
         self._own_name = node.resolve_topic_name(name)
         self._server = DeferredActionServer(
             node,
-            FollowJointTrajectory,
+            brief_action(MOST_POINTS),
             self._own_name,
             goal_callback=self._safe(self._asked, GoalResponse.REJECT),
             handle_accepted_callback=self._safe(self._begin),
@@ -171,6 +242,8 @@ class TrajectoryProxy:
         why = ""
         if not (self._node.is_active and self.controller):
             why = f"the node is {self._node.state}"
+        elif isinstance(request, LongGoal):
+            why = f"it has {request.points} points, allowed {MOST_POINTS}"
         elif not request.trajectory.points:
             why = "it has no points, which is no stop: cancel the goal that is under way"
         if not why:

@@ -203,50 +203,6 @@ def require_few(points: int) -> None:
         raise RefusedError(Reason.BURST, f"{points}, allowed {MOST_POINTS}")
 
 
-def trajectory_command(message: Any) -> TrajectoryCommand:
-    """Build from a ``trajectory_msgs/JointTrajectory``; one without points is a stop.
-
-    Raises `RefusedError` when numbers differ, a point has no positions, only some points have a
-    rate, or there are too many points.
-    """
-    names = tuple(message.joint_names)
-    points = message.points
-    require_few(len(points))
-    for point in points:
-        _require_finite(point.effort, "an effort")
-    rows = {
-        what: _rows([getattr(point, what) for point in points], len(names), what)
-        for what in ("positions", "velocities", "accelerations")
-    }
-    position = rows["positions"]
-    if position is None:
-        if len(points):
-            raise RefusedError(Reason.NO_POSITION, "a point of the trajectory has none")
-        position = np.empty((0, len(names)))
-    if rows["velocities"] is None and rows["accelerations"] is not None:
-        raise RefusedError(Reason.WRONG_SIZE, "accelerations without velocities")
-    times = [point.time_from_start for point in points]
-    return TrajectoryCommand(
-        names,
-        position,
-        np.array([t.sec + 1e-9 * t.nanosec for t in times], dtype=np.float64),
-        rows["velocities"],
-        rows["accelerations"],
-        stamp_ns(message.header.stamp),
-        str(message.header.frame_id),
-    )
-
-
-def _rows(values: list[Any], k: int, what: str) -> Array | None:
-    if all(len(row) == 0 for row in values):
-        return None
-    for i, row in enumerate(values):
-        if len(row) != k:
-            detail = f"point {i + 1} has {len(row)} {what} for {k} joints"
-            raise RefusedError(Reason.WRONG_SIZE, detail)
-    return np.array(values, dtype=np.float64)
-
-
 def _pose(translation: Any, rotation: Any, reason: Reason) -> Array:
     xyz = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
     quat = np.array([rotation.x, rotation.y, rotation.z, rotation.w], dtype=np.float64)

@@ -1,7 +1,7 @@
 """What goes in and out of the joint correction node as messages.
 
 Joint states and trajectories are read and written as they come over the wire, without a message's
-objects; irregular ones go by way of a message, which is also what names their fault.
+objects; irregular joint states go by way of a message, which is also what names their fault.
 
 Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState`` and
 ``trajectory_msgs/JointTrajectory``: after four bytes of encapsulation a stamp, ``frame_id`` and
@@ -14,7 +14,9 @@ their numbers are is found once.
 import math
 import struct
 from array import array
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -27,12 +29,12 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.correction.interface import (
     Array,
     JointCommand,
+    Reason,
+    RefusedError,
     TrajectoryCommand,
     finite_command,
     joint_command,
     require_few,
-    require_finite,
-    trajectory_command,
 )
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
@@ -42,6 +44,8 @@ HEAD = b"\0\1\0\0"  # plain, little endian
 STAMP, FRAME = len(HEAD), len(HEAD) + 8  # where they begin
 STAMPS = struct.Struct("<iI")
 LEAST_POINT = 4 * FIELDS + 8  # bytes of a point without numbers
+POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
+EFFORTS = FIELDS - 1  # of a point's fields the last
 
 
 def _string(data: bytes, at: int) -> tuple[str, int]:
@@ -84,7 +88,7 @@ def joint_names(data: bytes) -> tuple[str, ...]:
         return ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Layout:
     """Where things are in a message, in bytes."""
 
@@ -93,23 +97,15 @@ class _Layout:
     named: bytes  # the names as they stand there
     counts: tuple[int, ...]  # of positions, velocities, efforts
     places: tuple[int, ...]
-    parts: tuple[slice, ...]  # that are the same in all messages that are laid out so
-    same: list[bytes]
-    fields: tuple[struct.Struct | None, ...]
+    parts: Callable[[bytes], tuple[bytes, ...]]  # that are the same in all messages laid out so
+    same: tuple[bytes, ...]
+    numbers: struct.Struct  # all of them, from the first position on
     size: int
 
-    def fits(self, data: bytes) -> bool:
-        return len(data) == self.size and [data[part] for part in self.parts] == self.same
-
-    def numbers(self, data: bytes, field: int) -> tuple[Array | None, bool]:
-        """Numbers of a field, None where it has none, and whether all are finite."""
-        numbers = self.fields[field]
-        if numbers is None:
-            return None, True
-        place = self.places[field]
-        # for so few numbers this takes a tenth of the time of NumPy's isfinite
-        finite = math.isfinite(sum(numbers.unpack_from(data, place)))
-        return np.frombuffer(data, np.float64, self.counts[field], place).copy(), finite
+    def field(self, numbers: Array, field: int) -> Array | None:
+        """Those of a field; None where it has none."""
+        count, first = self.counts[field], (self.places[field] - self.places[0]) // 8
+        return numbers[first : first + count] if count else None
 
 
 class JointWire:
@@ -124,59 +120,66 @@ class JointWire:
         self.is_finite = True
         self._layout: _Layout | None = None
         self._efforts = 0  # how many go out
-        self._out = bytearray()
-        self._made_for: tuple[_Layout | None, str, tuple[int, ...]] = (None, "", ())
-        self._places: list[int] = []
+        # what goes out, and the places of its numbers
+        self._out, self._effort_at = bytearray(), 0
+        self._position = self._velocity = np.empty(0)
+        self._made_for: tuple[_Layout | None, str, bool, int] = (None, "", False, 0)
 
     def read(self, data: bytes) -> JointCommand | None:
         """The command in a message; None for one that is not regular, finite and whole."""
         layout = self._layout
-        if layout is None or not layout.fits(data):
+        if layout is None or len(data) != layout.size or layout.parts(data) != layout.same:
             layout = self._layout = _layout(data)
             if layout is None:
                 return None
-        position, placed = layout.numbers(data, 0)
-        velocity, moving = layout.numbers(data, 1)
-        _, pushing = layout.numbers(data, 2)
-        self.is_finite = placed and moving and pushing
-        if position is None or not (self.is_finite or (placed and self._is_reading)):
-            return None
-        self._efforts = layout.counts[2] if pushing else 0
+        first = layout.places[0]
+        numbers = np.frombuffer(data, np.float64, layout.numbers.size // 8, first).copy()
+        position, velocity = numbers[: layout.counts[0]], layout.field(numbers, 1)
+        self._efforts = layout.counts[2]
+        # for so few numbers this takes a tenth of the time of NumPy's isfinite
+        self.is_finite = math.isfinite(sum(layout.numbers.unpack_from(data, first)))
+        if not self.is_finite:
+            efforts = layout.field(numbers, 2)
+            if not (self._is_reading and np.isfinite(position).all()):
+                return None
+            if velocity is not None and not np.isfinite(velocity).all():
+                velocity = None
+            if efforts is not None and not np.isfinite(efforts).all():
+                self._efforts = 0
         sec, nanosec = STAMPS.unpack_from(data, STAMP)
-        rates = velocity if moving else None
-        return JointCommand(layout.names, position, rates, sec * NS + nanosec, layout.frame_id)
+        return JointCommand(layout.names, position, velocity, sec * NS + nanosec, layout.frame_id)
 
     def written(self, data: bytes, command: JointCommand) -> bytes:
         """The message read last, ``data``, with the command's values and mark."""
-        layout = self._layout
+        layout, moves, efforts = self._layout, command.velocity is not None, self._efforts
         if layout is None:
             raise ValueError("no message was read")
-        velocity = b"" if command.velocity is None else command.velocity.tobytes()
-        counts = (len(layout.names), len(velocity) // 8, self._efforts)
-        self._make(layout, command.mark, counts)
+        if self._made_for != (layout, command.mark, moves, efforts):
+            self._make(layout, command.mark, moves)
         out = self._out
         out[STAMP:FRAME] = data[STAMP:FRAME]
-        effort = data[layout.places[2] : layout.places[2] + 8 * counts[2]]
-        for at, values in zip(
-            self._places, (command.position.tobytes(), velocity, effort), strict=True
-        ):
-            out[at : at + len(values)] = values
+        self._position[:] = command.position
+        if moves:
+            self._velocity[:] = command.velocity
+        if efforts:
+            place, size = layout.places[2], 8 * efforts
+            out[self._effort_at : self._effort_at + size] = data[place : place + size]
         return bytes(out)
 
-    def _make(self, layout: _Layout, mark: str, counts: tuple[int, ...]) -> None:
+    def _make(self, layout: _Layout, mark: str, moves: bool) -> None:
         """Lay the outgoing message out."""
-        if self._made_for[0] is layout and self._made_for[1:] == (mark, counts):
-            return
-        out = bytearray(HEAD + bytes(8) + _string_bytes(mark))
+        out, places, k = bytearray(HEAD + bytes(8) + _string_bytes(mark)), [], len(layout.names)
         out += layout.named
-        self._places = []
-        for count in counts:
+        for count in (k, k if moves else 0, self._efforts):
             out += bytes(-len(out) % 4) + struct.pack("<I", count)
             if count:
                 out += bytes((len(HEAD) - len(out)) % 8)
-            self._places.append(len(out))
+            places.append(len(out))
             out += bytes(8 * count)
-        self._out, self._made_for = out, (layout, mark, counts)
+        self._out, self._effort_at = out, places[2]
+        self._position = np.frombuffer(out, np.float64, k, places[0])
+        self._velocity = np.frombuffer(out, np.float64, k if moves else 0, places[1])
+        self._made_for = layout, mark, moves, self._efforts
 
 
 def _layout(data: bytes) -> _Layout | None:
@@ -200,24 +203,25 @@ def _layout(data: bytes) -> _Layout | None:
     k = len(names)
     if at > len(data) or not counts[0] == k > 0 or counts[1] not in (0, k):
         return None
-    parts = [slice(0, len(HEAD)), slice(FRAME, begins[0] + 4)]
-    parts += [slice(begin, begin + 4) for begin in begins[1:]]
+    counted = [slice(begin, begin + 4) for begin in begins[1:]]
+    parts = itemgetter(slice(0, len(HEAD)), slice(FRAME, begins[0] + 4), *counted)
+    fields = [f"{c}d" for c in counts if c]  # each begins a number after the end of that before
     return _Layout(
         frame_id=frame_id,
         names=names,
         named=data[names_begin : begins[0]],
         counts=tuple(counts),
         places=tuple(places),
-        parts=tuple(parts),
-        same=[data[part] for part in parts],
-        fields=tuple(struct.Struct(f"<{count}d") if count else None for count in counts),
+        parts=parts,
+        same=parts(data),
+        numbers=struct.Struct("<" + "8x".join(fields)),
         size=len(data),
     )
 
 
 @dataclass(frozen=True)
 class SerializedPath:
-    """A trajectory of m points of k joints, each field in all points or in none."""
+    """A trajectory of m points of k joints."""
 
     stamp_ns: int
     frame_id: str
@@ -231,13 +235,26 @@ class SerializedPath:
         return len(self.times_s)
 
     def rows(self, field: int) -> Array | None:
-        """Numbers (m, k) of a field (0 to 3: positions … efforts); None where it has none."""
-        k = int(self.places[0, field, 1])
-        if k == 0:
+        """Numbers (m, k) of a field (0 to 2: positions …); None where it has none.
+
+        Raises `RefusedError` where a point has others than one for each joint.
+        """
+        counts, k = self.places[:, field, 1], len(self.names)
+        if not counts.any():
             return None
+        for point in np.flatnonzero(counts != k)[:1]:
+            detail = f"point {point + 1} has {counts[point]} {POINT_FIELDS[field]} for {k} joints"
+            raise RefusedError(Reason.WRONG_SIZE, detail)
         out = np.empty((len(self), k))
         gather_rows(self.doubles, self.places[:, field], out)
         return out
+
+    def is_finite(self, first: int = 0) -> bool:
+        """Whether every number of its fields is finite, from ``first`` on."""
+        begins, counts = self.places[:, first:].reshape(-1, 2).T
+        ends = np.cumsum(counts)
+        index = np.arange(ends[-1]) + np.repeat(begins - ends + counts, counts)
+        return bool(np.isfinite(self.doubles[index]).all())
 
     def changed(self, frame_id: str, rows: dict[int, Array]) -> bytes:
         """The message with other numbers (m, k) of fields, and a ``frame_id`` that it `takes`."""
@@ -254,7 +271,7 @@ class SerializedPath:
 
 
 def read_path(data: bytes) -> SerializedPath | None:
-    """Read a serialized trajectory; None for one that is not regular, or no such message at all.
+    """Read a serialized trajectory; None for one without points, or no such message at all.
 
     Raises `RefusedError` for too many points, before they are read.
     """
@@ -274,14 +291,9 @@ def read_path(data: bytes) -> SerializedPath | None:
     doubles = np.zeros(-(-size // 8))
     doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(HEAD))
     places, times = np.empty((count, FIELDS, 2), dtype=np.int64), np.empty(count)
-    whole = point_places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times)
-    if not whole or np.any(places[:, :, 1] != places[0, :, 1]):
+    if not point_places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times):
         return None
     return SerializedPath(sec * NS + nanosec, frame_id, names, times, doubles, size, places)
-
-
-POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
-POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = range(FIELDS)
 
 
 def doubles(values: Array) -> "array[float]":
@@ -394,46 +406,38 @@ def tail_message(command: JointCommand, kind: type, stamp_ns: int) -> Any:
 
 
 class PathMessage:
-    """A trajectory that ``came`` in, its command, and what goes out for it.
+    """A serialized trajectory that came in, its command, and what goes out for it.
 
     Raises `InputError` when it cannot be read.
     """
 
-    def __init__(self, came: bytes | JointTrajectory) -> None:
-        self._came = came
-        self._path: SerializedPath | None = None
-        if isinstance(came, bytes):
-            self._path = read_path(came)
-        self._read: Any = None
-        self.points = len(self._message().points) if self._path is None else len(self._path)
-
-    def _message(self) -> Any:
-        if self._read is None:
-            came = self._came
-            self._read = read_message(came, JointTrajectory) if isinstance(came, bytes) else came
-        return self._read
+    def __init__(self, came: bytes) -> None:
+        self._came, self._path = came, read_path(came)
+        self.points = 0 if self._path is None else len(self._path)
+        if self._path is None and read_message(came, JointTrajectory).points:
+            raise InputError("this JointTrajectory is not laid out as ROS 2 lays it out")
 
     def is_finite(self) -> bool:
         """Whether every number is finite."""
-        if self._path is None:
-            points = self._message().points
-            return all_finite(*(getattr(point, name) for point in points for name in POINT_FIELDS))
-        rows = [self._path.rows(field) for field in range(FIELDS)]
-        return all(bool(np.isfinite(values).all()) for values in rows if values is not None)
+        return self._path is None or self._path.is_finite()
 
     def command(self) -> TrajectoryCommand:
-        """Build the session's command; raises `RefusedError` as `trajectory_command`."""
+        """Build the session's command.
+
+        Raises `RefusedError` when there are no points, numbers differ, a point has no positions,
+        only some points have a rate, or an effort is not finite.
+        """
         path = self._path
         if path is None:
-            return trajectory_command(self._message())
-        position, counts = path.rows(POSITIONS), path.places[0, :, 1]
-        odd = any(count not in (0, len(path.names)) for count in counts[:EFFORTS])
-        if position is None or odd or counts[ACCELERATIONS] > counts[VELOCITIES]:
-            return trajectory_command(self._message())  # says why
-        efforts = path.rows(EFFORTS)
-        if efforts is not None:
-            require_finite(tuple(f"effort {i + 1}" for i in range(efforts.shape[1])), efforts)
-        rates = path.rows(VELOCITIES), path.rows(ACCELERATIONS)
+            raise RefusedError(Reason.NO_POINTS, "a controller drops it and drives on")
+        position, velocity, acceleration = (path.rows(field) for field in range(EFFORTS))
+        if position is None:
+            raise RefusedError(Reason.NO_POSITION, "a point of the trajectory has none")
+        if velocity is None and acceleration is not None:
+            raise RefusedError(Reason.WRONG_SIZE, "accelerations without velocities")
+        if not path.is_finite(EFFORTS):
+            raise RefusedError(Reason.NOT_FINITE, "an effort")
+        rates = velocity, acceleration
         return TrajectoryCommand(
             path.names, position, path.times_s, *rates, path.stamp_ns, path.frame_id
         )
@@ -444,19 +448,13 @@ class PathMessage:
 
     def changed(self, command: TrajectoryCommand) -> Any:
         """What to publish: with the command's positions, rates and mark."""
+        rows = dict(enumerate((command.position, command.velocity, command.acceleration)))
+        given = {field: values for field, values in rows.items() if values is not None}
         if self._path is not None and self._path.takes(command.mark):
-            changed = {
-                POSITIONS: command.position,
-                VELOCITIES: command.velocity,
-                ACCELERATIONS: command.acceleration,
-            }
-            rows = {field: values for field, values in changed.items() if values is not None}
-            return self._path.changed(command.mark, rows)
-        message = self._message()
+            return self._path.changed(command.mark, given)
+        message = read_message(self._came, JointTrajectory)
         message.header.frame_id = command.mark
-        rates = (command.position, command.velocity, command.acceleration)
-        for name, values in zip(POINT_FIELDS, rates, strict=False):
-            if values is not None:
-                for point, row in zip(message.points, values, strict=True):
-                    setattr(point, name, doubles(row))
+        for field, values in given.items():
+            for point, row in zip(message.points, values, strict=True):
+                setattr(point, POINT_FIELDS[field], doubles(row))
         return message

@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
 from sensor_msgs.msg import JointState
@@ -36,6 +37,7 @@ from robocal_ros.correction.messages import (
     JointMessage,
     JointWire,
     PathMessage,
+    read_message,
     tail_message,
 )
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
@@ -379,7 +381,7 @@ class JointCorrectionNode(HouseNode):
 
     def _correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
         """A goal's trajectory, corrected, and its path; as it came in shadow mode."""
-        message = PathMessage(trajectory)
+        message = PathMessage(serialize_message(trajectory))
         try:
             came, command = self._corrected(message, is_goal=True)
         except RefusedError as fault:
@@ -388,8 +390,12 @@ class JointCorrectionNode(HouseNode):
                 raise
             return trajectory, None
         path = None if self._shadow else self._session.output.path
+        if command is came:
+            return trajectory, path
         try:
-            return trajectory if command is came else message.changed(command), path
+            changed = message.changed(command)
+            as_bytes = isinstance(changed, bytes)
+            return read_message(changed, JointTrajectory) if as_bytes else changed, path
         except Exception:
             if path is not None:  # it never goes out
                 self._session.reject(path)

@@ -621,7 +621,7 @@ class RobotTrack:
         was_silent = self._silent(now_s)
         if was_silent:  # what it did meanwhile is not known
             self._track.clear()
-        self._q[self._index] = np.clip(state.position[self._column], -FARTHEST, FARTHEST)
+        self._q[self._index] = state.position[self._column].clip(-FARTHEST, FARTHEST)
         self.velocity[self._index] = np.nan
         if state.velocity is not None and len(state.velocity) == len(state.names):
             self.velocity[self._index] = state.velocity[self._column]
@@ -629,11 +629,11 @@ class RobotTrack:
         self._track.append((now_s, self._q.copy()))
         while len(self._track) > 2 and self._track[1][0] <= now_s - STANDING_S:
             self._track.popleft()
-        if was_silent or not np.all(np.abs(self._q - self._place) < self._near):
+        if was_silent or not (np.abs(self._q - self._place) < self._near).all():
             self._place, self._place_s = self._q.copy(), now_s
 
     def _silent(self, now_s: float) -> bool:
-        return not now_s - float(np.min(self._read_s)) <= self._age_limit_s
+        return not now_s - float(self._read_s.min()) <= self._age_limit_s
 
     def here(self, now_s: float) -> tuple[Array, Array] | None:
         """Joints and speeds (n,) now; None where they were not all read lately.

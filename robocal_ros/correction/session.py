@@ -317,7 +317,7 @@ class CorrectionSession:
         except RefusedError as error:
             raise self._count(error) from None
         self._taught[:] = q
-        return replace(state, position=position, velocity=velocity, mark=TAUGHT)
+        return JointCommand(state.names, position, velocity, state.stamp_ns, TAUGHT)
 
     def taught(
         self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float

@@ -84,6 +84,7 @@ class TargetStream:
         self._came_s = self._beat_s = -np.inf  # it, and the first of its burst
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self.period_s, self._as_usual = np.nan, 0  # and so many intervals since it was found
+        self._step_period_s = LONGEST_STEP_S  # it, or what stands for it before two messages came
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
         self._held_up = False  # and lags since
@@ -125,25 +126,20 @@ class TargetStream:
         usual = max(len(lengths) - STALLS, 1)
         lengths[usual:] = [lengths[usual - 1]] * (len(lengths) - usual)
         sums = list(accumulate(lengths))
-        self.period_s = lengths[bisect_right(sums, 0.5 * sums[-1])]
+        self.period_s = self._step_period_s = lengths[bisect_right(sums, 0.5 * sums[-1])]
 
     def _gap_s(self) -> float:
         """A longer silence is a pause."""
         period = self.period_s
         return max(self._config.stream_gap_s, 2.0 * period if period > 0.0 else 0.0)
 
-    def _step_period_s(self) -> float:
-        """The period, or what stands for it before two messages have come."""
-        period = self.period_s
-        return period if period > 0.0 else LONGEST_STEP_S
-
     def is_due(self, now_s: float, periods: float) -> bool:
         """Whether its last message came so long ago."""
-        return now_s - self._came_s > periods * self._step_period_s()
+        return now_s - self._came_s > periods * self._step_period_s
 
     def _holds(self, elapsed_s: float) -> bool:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
-        return elapsed_s > HELD_PERIODS * self._step_period_s()
+        return elapsed_s > HELD_PERIODS * self._step_period_s
 
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
@@ -163,7 +159,7 @@ class TargetStream:
             self._intervals.clear()
             self._way.clear()
             self._sent.clear()
-            self.period_s, self._beat_s = np.nan, now_s
+            self.period_s, self._step_period_s, self._beat_s = np.nan, LONGEST_STEP_S, now_s
         self._note_interval(now_s)
         if index is not self._index or self.phase is StreamPhase.IDLE:
             new = index[self._active[index] == 0.0]
@@ -226,8 +222,8 @@ class TargetStream:
         self.come_to_rest(now_s)
         elapsed = longest = max(now_s - output.out_s, 0.0)
         if self._holds(elapsed):  # a robot that stands makes no longer step
-            longest = min(elapsed, self._step_period_s())
-        before, window = output.out.copy(), max(SENT_S, SENT_PERIODS * self._step_period_s())
+            longest = min(elapsed, self._step_period_s)
+        before, window = output.out.copy(), max(SENT_S, SENT_PERIODS * self._step_period_s)
         if longest < elapsed:  # the time in which the robot stood is no part of its motion
             self._sent.clear()
         self._note(self._sent, before, now_s - longest, window)
@@ -260,7 +256,7 @@ class TargetStream:
         self, way: deque[tuple[float, Array]], q: Array, now_s: float, window_s: float
     ) -> None:
         """Keep places (n,); of several in a burst the last one, at the time of the first."""
-        if way and now_s - way[-1][0] < 0.5 * self._step_period_s():
+        if way and now_s - way[-1][0] < 0.5 * self._step_period_s:
             way[-1] = way[-1][0], q
         else:
             way.append((now_s, q))
@@ -308,7 +304,7 @@ class TargetStream:
 
         Messages that were late or early share their time, but none uses more than a period.
         """
-        period = self._step_period_s()
+        period = self._step_period_s
         credit = longest_s if longest_s < elapsed_s else self._credit_s + elapsed_s
         usable = min(credit, period)
         self._credit_s = min(credit, 1.5 * period) - usable
@@ -379,7 +375,7 @@ class TargetStream:
             slowdown = np.where(np.isfinite(slowdown), slowdown, self._pace() / END_S)
         lasts = np.max(np.abs(speed) / slowdown[index], initial=0.0)
         self.lag_s = 0.0
-        if not self._step_period_s() < lasts < np.inf:  # what takes one step is none
+        if not self._step_period_s < lasts < np.inf:  # what takes one step is none
             self.phase = StreamPhase.IDLE
             return
         self.phase, self._lasts_s, self._slowed_s = StreamPhase.ENDING, float(lasts), 0.0

@@ -31,7 +31,6 @@ from robocal_ros.correction.interface import (
     TrajectoryCommand,
     finite_command,
     joint_command,
-    trajectory_command,
 )
 from robocal_ros.correction.session import CorrectionSession
 
@@ -212,10 +211,6 @@ def test_targets_are_built_from_messages() -> None:
 def test_efforts_that_are_not_finite_do_not_go_out(bad: float) -> None:
     target = SimpleNamespace(header=header(), name=["a"], position=[1.0], velocity=[], effort=[bad])
     refused(Reason.NOT_FINITE, finite_command, target)
-    moved = point(0.0, [1.0], [], [])
-    moved.effort = [bad]
-    path = SimpleNamespace(header=header(), joint_names=["a"], points=[moved])
-    refused(Reason.NOT_FINITE, trajectory_command, path)
 
 
 def test_readings_of_foreign_joints_that_are_not_finite_are_refused() -> None:
@@ -223,29 +218,3 @@ def test_readings_of_foreign_joints_that_are_not_finite_are_refused() -> None:
         header=header(), name=["a", "gripper"], position=[1.0, np.nan], velocity=[], effort=[]
     )
     refused(Reason.NOT_FINITE, joint_command, state)
-
-
-def point(t: float, q: list[float], v: list[float], a: list[float]) -> SimpleNamespace:
-    duration = SimpleNamespace(sec=int(t), nanosec=round(t % 1 * 1e9))
-    return SimpleNamespace(
-        time_from_start=duration, positions=q, velocities=v, accelerations=a, effort=[]
-    )
-
-
-def test_trajectories_are_built_from_messages() -> None:
-    points = [point(0.0, [1.0, 2.0], [0.0, 0.0], []), point(1.5, [3.0, 4.0], [0.0, 1.0], [])]
-    message = SimpleNamespace(header=header(), joint_names=["a", "b"], points=points)
-    command = trajectory_command(message)
-    assert command.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
-    assert command.time_from_start_s.tolist() == [0.0, 1.5]
-    assert command.acceleration is None
-    assert len(trajectory_command(SimpleNamespace(**vars(message) | {"points": []}))) == 0
-    points[1].velocities = []
-    refused(Reason.WRONG_SIZE, trajectory_command, message)
-    points[0].velocities, points[0].accelerations = [], [0.0, 0.0]
-    points[1].accelerations = [0.0, 0.0]
-    refused(Reason.WRONG_SIZE, trajectory_command, message)
-    points[1].positions = [1.0]
-    refused(Reason.WRONG_SIZE, trajectory_command, message)
-    points[0].positions = points[1].positions = []
-    refused(Reason.NO_POSITION, trajectory_command, message)

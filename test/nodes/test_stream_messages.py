@@ -92,21 +92,6 @@ def test_a_path_that_is_not_finite_is_seen(field: str, ragged: bool) -> None:
         if ragged:
             path.points[0].effort = []
         assert PathMessage(serialize_message(path)).is_finite() == finite
-        assert PathMessage(path).is_finite() == finite
-
-
-def test_a_path_may_be_a_message() -> None:
-    path = a_path()
-    message = PathMessage(path)
-    command = message.command()
-    assert message.points == 2
-    assert message.unchanged() is path
-    out = message.changed(replace(command, position=command.position + 1.0, mark=CORRECTED))
-    expected = a_path()
-    expected.header.frame_id = CORRECTED
-    for point in expected.points:
-        point.positions = [2.0, 3.0]
-    assert out == expected
 
 
 def test_an_array_has_the_configured_joints() -> None:

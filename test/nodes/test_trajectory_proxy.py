@@ -19,12 +19,15 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
+from rclpy.serialization import deserialize_message, serialize_message
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from unique_identifier_msgs.msg import UUID
 
 from robocal_ros.correction import action as trajectory_proxy
+from robocal_ros.correction.interface import MOST_POINTS
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.kinematics import SerialArm
@@ -258,6 +261,40 @@ def test_a_goal_without_points_is_rejected_and_disturbs_nothing(cell: Any) -> No
     assert not empty.handle.accepted
     assert cell.robot.goals[-1].trajectory.points
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_goal_of_too_many_points_is_rejected_and_disturbs_nothing(cell: Any) -> None:
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=2.0).moves()
+    many = Sent(cell, goal_of(*np.linspace(HOME, MOVED, MOST_POINTS + 1), lasts_s=100.0))
+    cell.graph.spin_until(lambda: many.handle, "the answer")
+    assert not many.handle.accepted
+    sent.ends(GoalStatus.STATUS_SUCCEEDED)
+    assert len(cell.robot.goals[-1].trajectory.points) == 2
+
+
+def test_of_a_long_goal_nothing_but_its_id_becomes_python() -> None:
+    """So its many points keep the node from nothing; of a goal that is taken all arrive."""
+    usual = FollowJointTrajectory.Impl.SendGoalService.Request
+    brief = trajectory_proxy.brief_action(1000).Impl.SendGoalService.Request
+    goal_id = UUID(uuid=range(16))
+    for count in (1, 1000, 1001):
+        goal = goal_of(*[HOME] * count)
+        goal.trajectory.header.frame_id = "world"
+        goal.trajectory.points[-1].velocities = [1.0] * 6
+        data = serialize_message(usual(goal_id=goal_id, goal=goal))
+        took = deserialize_message(data, brief)
+        assert took.goal_id == goal_id
+        assert took.goal == (goal if count <= 1000 else trajectory_proxy.LongGoal(count))
+    data = serialize_message(usual(goal_id=goal_id, goal=goal_of(*[HOME] * 20_000)))
+
+    def cpu_s(kind: Any) -> float:
+        begin_s = time.process_time()
+        deserialize_message(data, kind)
+        return time.process_time() - begin_s
+
+    # what is left is the middleware's own part
+    assert min(cpu_s(brief) for _ in range(3)) < 0.3 * min(cpu_s(usual) for _ in range(3))
 
 
 def slows_down(points: Any) -> bool:
