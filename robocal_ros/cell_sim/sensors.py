@@ -216,6 +216,10 @@ class ProfileSensor:
     ``flattest_rad``: angle from the surface's normal, of light or view, beyond which nothing is
     seen.
     ``noise_m``: standard deviation of z.
+    ``towards``: whether z is told as a height over the middle of the range, not as a distance.
+    ``linearity_m``: amplitudes of a smooth error of z over the field, m: of second degree across
+    it, of the product, and of second degree along the beam; as real sensors have it.
+    ``ends``: columns at both ends of what is seen in a row that are off by up to ``spike_m``.
     ``quantum_m``: step of z; 0 without.
     ``spikes``, ``spike_m``: share of speckled columns, and how far at most they are off along z.
     ``dropouts``: share of columns without a return.
@@ -231,6 +235,9 @@ class ProfileSensor:
     baseline_m: float = 0.09
     flattest_rad: float = float(np.radians(80.0))
     noise_m: float = 3.7e-5
+    towards: bool = False
+    linearity_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ends: int = 0
     quantum_m: float = 0.0
     spikes: float = 0.0
     spike_m: float = 2e-3
@@ -266,7 +273,11 @@ class ProfileSensor:
             taken = lit & np.isfinite(share) & (rng.random(self.columns) < self.ghosts)
             xz[taken] = there[taken]
         n = self.columns
-        xz[:, 1] += self.noise_m * rng.standard_normal(n)
+        xz[:, 1] += self.noise_m * rng.standard_normal(n) + self._nonlinear(xz)
+        if self.ends:
+            near = np.convolve(np.isnan(xz[:, 1]), np.ones(2 * self.ends + 1), "same") > 0.0
+            near[[0, -1]] = True
+            xz[:, 1] += np.where(near, rng.uniform(-self.spike_m, self.spike_m, n), 0.0)
         speckled = rng.random(n) < self.spikes
         xz[:, 1] += np.where(speckled, rng.uniform(-self.spike_m, self.spike_m, n), 0.0)
         if self.quantum_m > 0.0:
@@ -277,7 +288,17 @@ class ProfileSensor:
         with np.errstate(invalid="ignore"):
             out = ~((xz[:, 1] >= self.near_m) & (xz[:, 1] <= self.far_m))
         xz[lost | out] = np.nan
+        if self.towards:
+            xz[:, 1] = 0.5 * (self.near_m + self.far_m) - xz[:, 1]
         return np.asarray(xz)
+
+    def _nonlinear(self, xz: Array) -> Array:
+        """Error of z (n,) of points (n, 2), m."""
+        middle, half = 0.5 * (self.near_m + self.far_m), 0.5 * (self.far_m - self.near_m)
+        u = xz[:, 0] / (self.far_m * np.tan(self.half_angle_rad))
+        w = (xz[:, 1] - middle) / half
+        shapes = [0.5 * (3.0 * u**2 - 1.0), u * w, 0.5 * (3.0 * w**2 - 1.0)]
+        return np.asarray(np.array(self.linearity_m) @ shapes)
 
     def _faces(self, normal: Array, toward: Array) -> Mask:
         return np.asarray(np.sum(normal * toward, axis=1) > np.cos(self.flattest_rad))

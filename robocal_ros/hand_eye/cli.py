@@ -369,6 +369,13 @@ def show_mount(console: "Console", document: Document) -> None:
     console.print(
         f"Samples from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
     )
+    if (own := document.get("linearity")) is not None:
+        console.print(
+            f"The sensor's own linearity, taken out: rms {own['rms_um']:.0f} um, largest "
+            f"{own['max_um']:.0f}; profiles differ from circles by {own['residual_um']:.0f} um, "
+            f"with it {own['left_out_um']:.0f}; what is not known of it makes "
+            f"{own['working_error_mm']:.3f} mm rms in the field of view"
+        )
     every = document.get("spread")
     if every is not None and every["n"] > len(residual["per_sample"]):
         console.print(
@@ -473,7 +480,8 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
     if judges is not None:
         if result.place is None:
             raise ValueError("a result of one target has its place")
-        seen = held_out(task, judges.data, result.T_flange_sensor, result.place)
+        X, linearity = result.T_flange_sensor, result.linearity
+        seen = held_out(task, judges.data, X, result.place, linearity)
         result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
     return CliResult(hand_eye_document(result), show_mount)
 

@@ -41,7 +41,8 @@ SETTLED = 0.02  # relative change of the noise, and of the state in standard dev
 UNSETTLED = (
     f"mount and noise of the poses had not settled after {ROUNDS} rounds: measure more often"
 )
-OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
+OPEN_M = 0.02  # expected error of a direction from which a plan counts it as not seen
+ARBITRARY_RAD = 0.17  # a turn so uncertain is arbitrary: its covariance no longer tells of it
 
 CLEARLY = 0.4  # of the misfit as given: below it the undone data may be the right ones
 FITS_M = 5e-4  # misfit of data that are right
@@ -263,7 +264,10 @@ def _solved(
 
 
 def require_seen(fit: MountFit) -> None:
-    """Refuse a direction that the poses, even of a good robot, show no better than `OPEN_M`.
+    """Refuse a direction of which the poses, even of a good robot, tell something arbitrary.
+
+    That is `OPEN_M`, or a turn of `ARBITRARY_RAD` and the shift that goes with it. What they show
+    better is an answer with its sigma, weak as it may be.
 
     Turns count at the distance at which the targets were seen.
 
@@ -277,19 +281,23 @@ def require_seen(fit: MountFit) -> None:
     covariance = np.asarray(np.linalg.pinv(J.T @ J + problem.prior()))
     seen = np.concatenate([view.sightings.value[:, :2] for view in fit.views])
     reach_m = np.linalg.norm(seen, axis=1).mean()
-    words = open_directions(at_origin(covariance[:6, :6], problem.pivot), float(reach_m), T)
+    covariance = at_origin(covariance[:6, :6], problem.pivot)
+    limit_m = max(OPEN_M, ARBITRARY_RAD * float(reach_m))
+    words = open_directions(covariance, float(reach_m), T, limit_m)
     if words:
         raise RankDeficientError(f"not determined: {joined(words)}", words)
 
 
-def open_directions(covariance: Array, reach_m: float, T_base_flange: Array) -> list[str]:
+def open_directions(
+    covariance: Array, reach_m: float, T_base_flange: Array, limit_m: float = OPEN_M
+) -> list[str]:
     """Directions in words that a covariance (6, 6) at the sensor's origin leaves as good as open.
 
-    ``reach_m``: distance at which turns count.
+    ``reach_m``: distance at which turns count; ``limit_m``: of the standard deviation.
     """
     size = np.repeat([1.0, reach_m], 3)
     values, vectors = np.linalg.eigh(covariance * np.outer(size, size))
-    open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > OPEN_M]
+    open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > limit_m]
     return [describe_motion(direction / size, T_base_flange) for direction in open_ones.T]
 
 

@@ -328,11 +328,11 @@ def _places(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     return place
 
 
-def _wanted(sensor: SensorDescription, x: str, z: str) -> dict[str, str]:
+def _wanted(sensor: SensorDescription, x: str, z: str, y: str = "") -> dict[str, str]:
     """What columns stand for, and their names, of the description or as they are without."""
-    names = {"z": sensor.z or z, "intensity": sensor.intensity, "row": sensor.row}
-    if not sensor.x_pitch_mm:
-        names["x"] = sensor.x or x
+    told = "" if sensor.x_pitch_mm else sensor.x or x
+    names = {"x": told, "y": y, "z": sensor.z or z}
+    names |= {"intensity": sensor.intensity, "row": sensor.row}
     return {what: name for what, name in names.items() if name}
 
 
@@ -345,11 +345,9 @@ def cloud_profile(message: Any, sensor: SensorDescription = DEFAULT) -> Profile:
     `TooFewSamplesError` when nearly nothing was seen.
     """
     fields = [field.name for field in message.fields]
-    wanted = _wanted(sensor, "x", "z")
-    if "y" in fields and "y" not in wanted.values():
-        wanted["y"] = "y"
-    elif not sensor.x:
-        wanted["y"] = "y"  # a cloud of x, y and z is expected: its absence is told
+    # A cloud of x, y and z is expected: that y is missing is told, unless other fields are named.
+    plane = "y" if "y" not in (sensor.x, sensor.z) and ("y" in fields or not sensor.x) else ""
+    wanted = _wanted(sensor, "x", "z", plane)
     read = dict(zip(wanted, cloud_columns(message, list(wanted.values())).T, strict=True))
     width = int(message.width) if int(message.height) > 1 else 0
     unit_m = UNITS[sensor.cloud_unit]
@@ -369,9 +367,8 @@ def file_profile(path: Path, sensor: SensorDescription, name: str) -> Profile:
     try:
         if suffix in CLOUDS:
             every, width = (_ply if suffix == ".ply" else _pcd)(read_bytes(path, "profile"))
-            wanted = _wanted(sensor, "x", "z")
-            if "y" in every and "y" not in wanted.values():
-                wanted["y"] = "y"
+            plane = "y" if "y" in every and "y" not in (sensor.x, sensor.z) else ""
+            wanted = _wanted(sensor, "x", "z", plane)
             for column in wanted.values():
                 if column not in every:
                     raise InputError(f"has no {quoted(column)}, but {', '.join(every)}")

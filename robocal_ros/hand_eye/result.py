@@ -12,6 +12,7 @@ from robocal_ros.estimation.assessment import Verdict, summarise, verdict_docume
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.frames import Document, transform_document
+from robocal_ros.hand_eye.linearity import SensorLinearity
 
 Array = NDArray[np.float64]
 Method = Literal["best", "classic"]
@@ -90,6 +91,7 @@ class HandEyeResult:
     the same as the target's model has it, where there is one.
     ``working_error_m``: rms error to expect of a point at the working distance; None if not known.
     ``more``: further entries of the document, such as ``point_residual_mm``.
+    ``linearity``: of the sensor, where it was taken out of the profiles.
     """
 
     kind: TargetKind
@@ -109,6 +111,7 @@ class HandEyeResult:
     parent: Literal["flange", "base"] = "flange"
     pivot: Array = field(default_factory=lambda: np.zeros(3))
     place: Array | None = None
+    linearity: SensorLinearity | None = None
 
 
 def increment(T_from: Array, T_to: Array, pivot: Array) -> Array:

@@ -191,7 +191,7 @@ def solved(
     )
     settings = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad, config.limit_m)
     target: Any = target_of(data.target)
-    task = task_of(target, data.feature, towards=config.sensor.towards)
+    task = task_of(target, data.feature, method == "classic", config.sensor.towards)
     return solve_task(task, shots, cast(Method, method), settings)
 
 

@@ -18,6 +18,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Document
+from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
     OPEN_M,
     MountFit,
@@ -37,6 +38,7 @@ from robocal_ros.hand_eye.mount_fit import (
     without,
 )
 from robocal_ros.hand_eye.mount_problem import (
+    COMPONENTS,
     FIRST_NOISE,
     SENSOR_UNKNOWNS,
     MountProblem,
@@ -59,7 +61,7 @@ from robocal_ros.hand_eye.result import (
     judge_residuals,
     shots_of,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, Read, SphereTask, Task
 
 Array = NDArray[np.float64]
 Part = tuple[Task, HandEyeData]
@@ -90,6 +92,7 @@ def solve_task(
     read = features(task, data)
     near, doubt = looked(task, data, read)
     fit = fit_mount((read.view,), near, settings.noise())
+    fit, read = _with_linearity(fit, read, settings.noise())
     fit = replace(fit, doubt=fit.doubt or doubt)
     require_radius(fit, (read.view,))
     require_seen(fit)
@@ -107,6 +110,11 @@ def _result_of(
 ) -> HandEyeResult:
     """The result of a fit to one target or several, judged."""
     field, pivot = field_of(data), pivot_of(fit.views)
+    bent = next((read for read in reads if read.linearity is not None), None)
+    of_it = np.zeros_like(fit.covariance)
+    if bent is not None and bent.linearity is not None:
+        _, of_it = _bent(fit, bent, bent.linearity)
+    fit = replace(fit, covariance=fit.covariance + of_it)
     error_m = float(expected_error_m(fit.covariance[:6, :6], field - pivot))
     shots = len(data.names)
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
@@ -117,6 +125,11 @@ def _result_of(
         "robot_sigma_mm": fit.noise.sigma_m * 1e3,
         "working_distance_mm": float(field[0, 2]) * 1e3,
     }
+    linearity = None if bent is None else bent.linearity
+    if linearity is not None:
+        own_m = float(expected_error_m(of_it[:6, :6], field - pivot))
+        more["linearity"] = linearity.document() | {"working_error_mm": own_m * 1e3}
+        error_m = float(np.hypot(error_m, linearity.rms_m))  # of points as the sensor tells them
     found: Document = {}
     for task, view, place, read in zip(tasks, fit.views, fit.state.places, reads, strict=True):
         rejected |= swapped(fit, read.view, place, data.names)
@@ -124,6 +137,8 @@ def _result_of(
         state = replace(fit.state, places=(place,))
         more |= task.more(replace(fit, views=(view,), state=state), read)
     alone = len(tasks) == 1
+    verdict = judge(fit, shots, shots - _shots(fit.views), error_m, settings)
+    uncertain = verdict.code is Code.POSES_NOT_INFORMATIVE and error_m > settings.limit_m
     return HandEyeResult(
         kind=tasks[0].kind if alone else "joint",
         method="best",
@@ -137,9 +152,53 @@ def _result_of(
         working_error_m=error_m,
         pivot=pivot,
         place=fit.state.places[0] if alone else None,
-        verdict=judge(fit, shots, shots - _shots(fit.views), error_m, settings),
+        linearity=linearity,
+        unobservable=tuple(weak_directions(fit, settings.limit_m) if uncertain else ()),
+        verdict=verdict,
         more=more,
     )
+
+
+def _bent(fit: MountFit, read: Read, linearity: SensorLinearity) -> tuple[Array, Array]:
+    """What mount and linearity say of each other, linearised at a fit.
+
+    The step (n,) of the coefficients to where both are likeliest: the circles' own form tells them
+    with their covariance, the mount's residuals the rest. Then what is left unknown of them in the
+    covariance (k, k) of the fit's unknowns: that of both together less that where they are known.
+    """
+    nothing = np.zeros((COMPONENTS, len(linearity.covariance)))
+    pull = np.array([read.pulled.get(name, nothing) for name in fit.names])
+    problem = MountProblem(fit.views, fit.noise, fit.state)
+    linear = problem.linear(fit.state)
+    both = np.concatenate([linear.jacobian, pull], axis=2)
+    residual, jacobian = problem.whitened(replace(linear, jacobian=both))
+    J, P = np.split(jacobian.reshape(-1, both.shape[2]), [len(problem.names)], axis=1)
+    r, prior = residual.ravel(), problem.prior()
+    known = np.linalg.pinv(J.T @ J + prior, hermitian=True)
+    moved = known @ J.T @ P  # how the unknowns follow the coefficients
+    own = P.T @ P - P.T @ J @ moved + np.linalg.pinv(linearity.covariance, hermitian=True)
+    values, vectors = np.linalg.eigh(own)
+    seen = values > 0.0
+    spread = vectors[:, seen] / np.sqrt(values[seen])
+    slope = P.T @ r - moved.T @ (J.T @ r + prior @ problem.deviation(fit.state))
+    step = -spread @ (spread.T @ slope)
+    return np.asarray(step), np.asarray((moved @ spread) @ (moved @ spread).T)
+
+
+def _with_linearity(fit: MountFit, read: Read, given: PoseNoise | None) -> tuple[MountFit, Read]:
+    """The fit, and the features without the linearity as mount and circles together have it."""
+    if (linearity := read.linearity) is None:
+        return fit, read
+    step, _ = _bent(fit, read, linearity)
+    own = replace(linearity, coefficients=linearity.coefficients + step)
+    s = read.view.sightings
+    moved = np.array([read.pulled[name] @ step for name in s.names])
+    read = replace(
+        read,
+        linearity=own,
+        view=replace(read.view, sightings=replace(s, value=s.value - moved)),
+    )
+    return fit_mount((read.view,), fit.state, given), read
 
 
 def field_of(data: HandEyeData) -> Array:
@@ -199,8 +258,9 @@ def judge(
     figures = f"a point in the field of view is expected to be off by {error_m * 1e3:.3f} mm rms"
     if error_m > settings.limit_m:
         words = (
-            f"{figures} (allowed {settings.limit_m * 1e3:g} mm), most by a {_weakest(fit)}; "
-            "measure more often; check-plan proposes poses"
+            f"{figures} (allowed {settings.limit_m * 1e3:g} mm), most by a "
+            f"{weak_directions(fit, settings.limit_m)[0]}; measure more often; check-plan proposes "
+            "poses"
         )
         return Verdict(Code.POSES_NOT_INFORMATIVE, words)
     rms = float(np.sqrt(np.mean(far_m**2)))
@@ -210,16 +270,21 @@ def judge(
     return Verdict(Code.ACCEPT, words)
 
 
-def _weakest(fit: MountFit) -> str:
-    """The direction that is known least, by how much, and the motion that would show it."""
+def weak_directions(fit: MountFit, limit_m: float) -> list[str]:
+    """What is known worse than a limit, the worst first: by how much, and what would show it."""
     seen = np.concatenate([view.sightings.value[:, :2] for view in fit.views])
     T = np.concatenate([view.sightings.T_base_flange for view in fit.views])
     size = np.repeat([1.0, max(float(np.ptp(seen, axis=0).max()), OPEN_M)], 3)  # of a turn
     values, vectors = np.linalg.eigh(fit.covariance[:6, :6] * np.outer(size, size))
-    v, w = np.split(vectors[:, -1] / size, 2)
-    open_one = np.concatenate([v - np.cross(w, pivot_of(fit.views)), w])
-    what, _, remedy = describe_motion(open_one, T).partition(": ")
-    return f"{what}, known to {np.sqrt(values[-1]) * 1e3:.2f} mm there: {remedy}"
+    found: list[str] = []
+    for variance, direction in zip(values[::-1], vectors.T[::-1], strict=True):
+        sigma_m = float(np.sqrt(variance))
+        if sigma_m > limit_m or not found:
+            v, w = np.split(direction / size, 2)
+            open_one = np.concatenate([v - np.cross(w, pivot_of(fit.views)), w])
+            what, _, remedy = describe_motion(open_one, T).partition(": ")
+            found.append(f"{what}, known to {sigma_m * 1e3:.2f} mm there: {remedy}")
+    return found
 
 
 def _too_few(fit: MountFit, settings: HandEyeSettings) -> Verdict | None:
@@ -395,13 +460,21 @@ class Verification(HeldOut):
     verdict: Verdict
 
 
-def held_out(task: Task, data: HandEyeData, T_flange_sensor: Array, place: Array) -> HeldOut:
+def held_out(
+    task: Task,
+    data: HandEyeData,
+    T_flange_sensor: Array,
+    place: Array,
+    linearity: SensorLinearity | None = None,
+) -> HeldOut:
     """How far other shots of the same target, which has not moved, are off.
 
-    ``place``: of the target, as `HandEyeResult` holds it.
+    ``place``, ``linearity``: as `HandEyeResult` holds them.
 
     Raises `TooFewSamplesError` when no shot shows the target.
     """
+    if isinstance(task, SphereTask):  # what it was solved with
+        task = replace(task, linearity=linearity, plain=linearity is None)
     read = task.read(data, T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     return HeldOut(read.view.sightings.names, distances((read.view,), state), read.rejected)
@@ -527,7 +600,8 @@ def solve_joint(
     if not checks:
         return result
     shots = sum(len(data.names) for data in checks.values())
-    return judged(result, _held_out(tasks, fit.state, checks), shots, settings)
+    seen = _held_out(tasks, fit.state, checks, result.linearity)
+    return judged(result, seen, shots, settings)
 
 
 def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read], Array]:
@@ -564,7 +638,9 @@ def _together(parts: Sequence[Part], reads: Sequence[Read]) -> tuple[HandEyeData
         )
         rejected = {f"{task.kind}/{name}": why for name, why in read.rejected.items()}
         points = {f"{task.kind}/{name}": points for name, points in read.points.items()}
-        named.append(Read(replace(read.view, sightings=s), rejected, points))
+        pulled = {f"{task.kind}/{name}": pull for name, pull in read.pulled.items()}
+        view = replace(read.view, sightings=s)
+        named.append(Read(view, rejected, points, read.linearity, pulled))
         first += len(data.names)
     together = HandEyeData(
         tuple(f"{task.kind}/{name}" for task, data in parts for name in data.names),
@@ -575,7 +651,10 @@ def _together(parts: Sequence[Part], reads: Sequence[Read]) -> tuple[HandEyeData
 
 
 def _held_out(
-    tasks: Sequence[Task], state: MountState, checks: Mapping[TargetKind, HandEyeData]
+    tasks: Sequence[Task],
+    state: MountState,
+    checks: Mapping[TargetKind, HandEyeData],
+    linearity: SensorLinearity | None,
 ) -> HeldOut:
     """How far all other shots are off."""
     names: list[str] = []
@@ -583,7 +662,7 @@ def _held_out(
     rejected: dict[str, str] = {}
     for task, place in zip(tasks, state.places, strict=True):
         if task.kind in checks:
-            one = held_out(task, checks[task.kind], state.T_flange_sensor, place)
+            one = held_out(task, checks[task.kind], state.T_flange_sensor, place, linearity)
             names += [f"{task.kind}/{name}" for name in one.samples]
             far.append(one.distance_m)
             rejected |= {f"{task.kind}/{name}": why for name, why in one.rejected.items()}

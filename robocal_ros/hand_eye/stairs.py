@@ -154,8 +154,8 @@ class StepTask(Task):
         return [MountState(best, (self.target.T_base_user,))]
 
     def classic(self, view: TargetView, near: MountState) -> MountState:
-        """The closed form of all corners."""
-        X = closed_corners(view.sightings.value, _in_flange(view))
+        """The nine unknowns of all corners, as published."""
+        X = nine_unknowns(view.sightings.value, _in_flange(view))
         return MountState(X, (self.target.T_base_user,))
 
     def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
@@ -227,6 +227,22 @@ def closed_corners(value: Array, p_flange: Array) -> Array:
     return X
 
 
+def nine_unknowns(value: Array, p_flange: Array) -> Array:
+    """X (4, 4) from corners (m, 3) = (x, z, .) at flange points (m, 3), as published.
+
+    p = x r1 + z r3 + t by linear least squares (step-target paper, eqs. 12 to 15), then the second
+    column r2 = r3 x r1 (its eq. 16 has them the other way round, which is left-handed) and the
+    rotation nearest to the three.
+
+    Raises as `closed_corners`.
+    """
+    closed_corners(value, p_flange)  # refuses what is not determined
+    A = np.column_stack([value[:, :2], np.ones(len(value))])
+    r1, r3, t = np.linalg.lstsq(A, p_flange, rcond=None)[0]
+    R = frames.nearest_rotation(np.column_stack([r1, np.cross(r3, r1), r3]))
+    return frames.transform(R, t)
+
+
 def _closed(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Closed forms X (..., 4, 4) of corners (..., m, 3), and whether these show them at all."""
     own = in_plane(value)
@@ -290,7 +306,7 @@ def task_of(
     ``classic``: corners and edges in the published form; ``towards``: z grows towards the sensor.
     """
     if isinstance(target, SphereTarget):
-        return SphereTask(target, towards)
+        return SphereTask(target, towards, plain=classic)
     if isinstance(target, StepTarget):
         return StepTask(target, CornerRule(towards, classic=classic))
     kind: Kind = "groove" if feature == "groove" else "edge"

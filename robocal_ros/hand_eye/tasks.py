@@ -14,7 +14,7 @@ from robocal_ros.estimation.edge import (
     fit_edge,
 )
 from robocal_ros.estimation.estimation import solve
-from robocal_ros.estimation.sphere import ArcRule, LargeArcError, fit_arc
+from robocal_ros.estimation.sphere import ArcFit, ArcRule, LargeArcError, fit_arc
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     InputError,
@@ -23,6 +23,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Document
+from robocal_ros.hand_eye.linearity import SeenArc, SensorLinearity, fit_linearity
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.mount_problem import (
     LineModel,
@@ -95,11 +96,15 @@ class Read:
 
     ``view``: of the features; ``rejected``: which shots gave none, and why.
     ``points``: profile points (n, 2) that each feature rests on, where they are on the target.
+    ``linearity``: of the sensor, where it was found and taken out; ``pulled``: how each feature
+    (3, k) moves with its coefficients.
     """
 
     view: TargetView
     rejected: Mapping[str, str]
     points: Mapping[str, Array] = field(default_factory=dict)
+    linearity: SensorLinearity | None = None
+    pulled: Mapping[str, Array] = field(default_factory=dict)
 
 
 class Task(ABC):
@@ -201,11 +206,14 @@ class SphereTask(Task):
     A circle tells the sphere's centre but for the side: y = +-sqrt(R^2 - r^2). The sides are found
     with the pose: of all patterns of a few profiles, the right one agrees best (with rotation
     columns that are a rotation; the mirrored pattern has the determinant -1). ``towards``: see
-    `ArcRule`.
+    `ArcRule`. ``plain``: circles as they are seen, as published; else the sensor's ``linearity`` is
+    taken out, where it is known, or the profiles show it.
     """
 
     target: SphereTarget
     towards: bool = False
+    plain: bool = False
+    linearity: SensorLinearity | None = None
 
     kind = "sphere"
     fewest = FEWEST_SPHERES
@@ -216,6 +224,18 @@ class SphereTask(Task):
         # An arc that is a little too large is kept: together they tell that the radius is wrong.
         rule = ArcRule(radius_m, radius_tolerance_m=TOO_LARGE * radius_m, towards=self.towards)
         arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
+        linearity = None if self.plain else self.linearity or self._linearity(data, arcs)
+        if linearity is not None:
+            data = replace(
+                data,
+                profiles=[
+                    replace(one, points=linearity.corrected(one.points))
+                    if isinstance(one, Profile)
+                    else one
+                    for one in data.profiles
+                ],
+            )
+            arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
         rejected = {name: str(error) for name, error in errors.items()}
         wrong = [error for error in errors.values() if isinstance(error, InputError)]
         if wrong and not arcs:
@@ -224,15 +244,21 @@ class SphereTask(Task):
         if len(large) > 1:
             raise ResidualError(f"in {len(large)} of {len(data.names)} profiles: {large[0]}")
         usable(arcs, rejected, self.fewest if T_flange_sensor is None else 1, "the sphere")
-        points, names = {}, [data.names[i] for i in arcs]
-        for (i, arc), name in zip(arcs.items(), names, strict=True):
-            profile = data.profiles[i]
-            if isinstance(profile, Profile):
-                points[name] = profile.points[arc.used]
+        names = [data.names[i] for i in arcs]
+        shown = dict(zip(names, _on_circles(data, arcs), strict=True))
+        points = {name: one.points for name, one in shown.items()}
+        pulled = {}
+        if linearity is not None:
+            pulled = {name: linearity.pull(one, self.towards) for name, one in shown.items()}
         value = np.array([[*arc.centre, arc.radius_m] for arc in arcs.values()])
         covariance = np.array([arc.covariance for arc in arcs.values()])
         sightings = sightings_of(data, arcs, names, value, covariance)
-        return Read(TargetView(SphereModel(radius_m), sightings), rejected, points)
+        view = TargetView(SphereModel(radius_m), sightings)
+        return Read(view, rejected, points, linearity, pulled)
+
+    def _linearity(self, data: HandEyeData, arcs: Mapping[int, ArcFit]) -> SensorLinearity | None:
+        poses = same_pose(data.T_base_flange)[list(arcs)]
+        return fit_linearity(_on_circles(data, arcs), poses, self.towards)
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Circles depend neither on poses nor on the radius."""
@@ -326,6 +352,17 @@ class SphereTask(Task):
             base = np.outer(x, T[:3, 0]) + np.outer(z, T[:3, 2]) + T[:3, 3]
             far.append(np.linalg.norm(base - centre, axis=1) - self.target.radius_m)
         return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
+
+
+def _on_circles(data: HandEyeData, arcs: Mapping[int, ArcFit]) -> list[SeenArc]:
+    """Points of each profile on its circle."""
+    found = []
+    for i, arc in arcs.items():
+        profile = data.profiles[i]
+        if isinstance(profile, Profile):
+            circle = np.append(arc.centre, arc.radius_m)
+            found.append(SeenArc(profile.points[arc.used], circle))
+    return found
 
 
 def _linear_mounts(T_base_flange: Array, centres: Array) -> tuple[Array, Array]:

@@ -21,8 +21,12 @@ from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
+from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import HandEyeSettings
-from robocal_ros.hand_eye.session import HandEyeConfig
+from robocal_ros.hand_eye.session import HandEyeConfig, solved
+from robocal_ros.hand_eye.solve import solve_task
+from robocal_ros.hand_eye.stairs import task_of
+from robocal_ros.hand_eye.tasks import HandEyeData
 from robocal_ros.history.history_records import THERMAL, hand_eye_kind
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
@@ -170,3 +174,29 @@ def test_a_result_beyond_the_limit_is_kept_but_cannot_be_accepted(history):
     refused = driver.ask(events.ACCEPT, id=outcome.calibration_id, by="me")
     assert refused.status is Code.POSES_NOT_INFORMATIVE
     assert driver.session.in_force.revision == 0
+
+
+def test_classic_is_the_same_in_a_session_and_in_the_command(history):
+    """Features and solver of the source, bit for bit."""
+    driver = driver_of(history)
+    target, shoot, scene, count = TARGETS["edge"]
+    wide = ProfileSensor(near_m=0.17, far_m=0.26, half_angle_rad=0.25)
+    cell = replace(sphere_set()[0], sensor=wide)
+    shots = shoot(cell, scene, count, np.random.default_rng(1))
+    driver.robot.rest(0.1)
+    assert driver.ask(events.START, **(SPHERE | target | {"method": "classic"})).done
+    for q, points in zip(shots.q, shots.profiles, strict=True):
+        driver.robot.move(q, 0.1)
+        driver.robot.rest(0.1)
+        assert driver.ask(events.CAPTURE).done
+        driver.robot.rest(0.7, lambda stamp_ns, points=points: profile(stamp_ns, points))
+    samples = driver.session.data.chosen([])
+    poses = ARM.fk(np.array([sample.q for sample in samples]))
+    found = solved(driver.session.data, samples, poses, "classic", driver.session.config)
+    names = tuple(str(sample.handle) for sample in samples)
+    seen = [Profile(sample.values, name) for sample, name in zip(samples, names, strict=True)]
+    task = task_of(None, "edge", classic=True)
+    by_command = solve_task(task, HandEyeData(names, poses, seen), "classic", HandEyeSettings())
+    assert np.array_equal(found.T_flange_sensor, by_command.T_flange_sensor)
+    best = solved(driver.session.data, samples, poses, "best", driver.session.config)
+    assert not np.array_equal(found.residual_m, best.residual_m)

@@ -1,5 +1,6 @@
 """Sphere, stairs, edge and groove from profiles: recovered, or refused with what is wrong."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -39,9 +40,10 @@ from robocal_ros.ground.errors import (
     RobocalError,
 )
 from robocal_ros.hand_eye.mount_fit import fit_mount
+from robocal_ros.hand_eye.mount_problem import in_plane
 from robocal_ros.hand_eye.result import HandEyeSettings, point_covariance
 from robocal_ros.hand_eye.solve import features, held_out, look, solve_joint, solve_task, verify
-from robocal_ros.hand_eye.stairs import StepTask, task_of
+from robocal_ros.hand_eye.stairs import StepTask, nine_unknowns, task_of
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
 
@@ -176,6 +178,19 @@ class TestMistakes:
         self.refused(sphere_data(5, 15, cell), "translation", "turn the flange about two axes",
                      error=RankDeficientError)  # fmt: skip
 
+    def test_a_weak_direction_is_told_with_its_sigma_and_what_would_show_it(self):
+        """Poses that tilt by 0.3 deg: millimetres along the beam, and all else is known."""
+        data = sphere_data(5, 15, replace(CELL, tilt_rad=float(np.radians(0.3))))
+        found = solve(data)
+        assert found.verdict.code is Code.POSES_NOT_INFORMATIVE
+        (words,) = found.unobservable
+        assert "tilt the flange about another axis" in words
+        sigma_mm = float(re.search(r"known to ([\d.]+) mm", words).group(1))
+        assert sigma_mm > 3.0
+        assert found.working_error_m * 1e3 == pytest.approx(sigma_mm, rel=0.5)
+        assert chi_square(found, TRUE) < FAR_OFF
+        assert found.leave_one_out_m is not None
+
 
 class TestStep:
     def shots(self, seed, count=5, **more):
@@ -198,6 +213,17 @@ class TestStep:
         found, exact = solve_step(shots, known), solve_step(shots)
         assert chi_square(found, TRUE) < FAR_OFF
         assert np.trace(found.covariance[:3, :3]) > 2.0 * np.trace(exact.covariance[:3, :3])
+
+    def test_classic_has_nine_unknowns_and_a_right_handed_frame(self):
+        """Exact corners give the sensor; r2 = r3 x r1 of such that are off is no mirror image."""
+        rng = np.random.default_rng(12)
+        value = np.column_stack([rng.uniform(-0.03, 0.03, (9, 2)), np.zeros(9)])
+        there = frames.apply(TRUE, in_plane(value))
+        assert nine_unknowns(value, there) == pytest.approx(TRUE, abs=1e-12)
+        off = nine_unknowns(value, there + 1e-3 * rng.standard_normal((9, 3)))
+        assert np.linalg.det(off[:3, :3]) == pytest.approx(1.0)
+        with pytest.raises(RankDeficientError, match="one line"):
+            nine_unknowns(value * [1.0, 0.0, 0.0], there)
 
     def test_a_left_handed_target_file(self):
         drawn = stairs_target()

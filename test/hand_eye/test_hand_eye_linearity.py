@@ -1,0 +1,98 @@
+"""The sensor's own linearity is found from a sphere's profiles, taken out, and told in um."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from bench.hand_eye_cell import HandEyeCell, PoseRobot
+from bench.hand_eye_shots import SETTINGS, sphere_set
+from bench.hand_eye_worlds import RADIUS_M, X
+from robocal_ros.cell_sim.sensors import ProfileSensor
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.profiles import Profile
+from robocal_ros.hand_eye.solve import solve_task
+from robocal_ros.hand_eye.targets import SphereTarget
+from robocal_ros.hand_eye.tasks import SphereTask
+
+BENT_M = (3e-5, -2e-5, 4e-5)  # as real sensors: 20 to 100 um over the field
+RUNS = 6
+SPHERE = SphereTarget(RADIUS_M)
+# A robot that errs by less than the sensor, so that this one is what is seen.
+# A height counts from the middle of the range: the sensor's frame is turned about x, and there.
+T_DISTANCE_HEIGHT = np.diag([1.0, -1.0, -1.0, 1.0])
+T_DISTANCE_HEIGHT[2, 3] = 0.2
+
+
+def bent(linearity_m=BENT_M):
+    return ProfileSensor(noise_m=7e-6, towards=True, linearity_m=linearity_m, ends=2)
+
+
+def shot_with(sensor, seed):
+    cell = HandEyeCell(sensor=sensor, robot=PoseRobot(5e-6))
+    return sphere_set(cell, np.random.default_rng([33, seed]))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    found = []
+    for seed in range(RUNS):
+        data = shot_with(bent(), seed).data
+        tasks = [SphereTask(SPHERE, True, plain) for plain in (False, True)]
+        found.append((data, *(solve_task(task, data, "best", SETTINGS) for task in tasks)))
+    return found
+
+
+def test_the_field_is_recovered_within_what_is_told_of_it(runs):
+    for data, result, _ in runs:
+        own = result.linearity
+        points = shown(data, own)
+        distance = points * [1.0, -1.0] + [0.0, 0.2]
+        truth = -bent()._nonlinear(distance)  # a height errs the other way
+        off = points[:, 1] - own.corrected(points)[:, 1] - truth
+        affine = np.column_stack([np.ones(len(points)), points])  # the mount's and the maker's
+        off -= affine @ np.linalg.lstsq(affine, off, rcond=None)[0]
+        # Of k numbers with this covariance; 1e-3 is the chance of a miss, six runs.
+        sigma_m = np.sqrt(np.trace(own.covariance))
+        assert np.sqrt(np.mean(off**2)) < sigma_m * np.sqrt(chi2.ppf(1.0 - 1e-3 / RUNS, 1))
+        assert own.left_out_m < own.residual_m
+
+
+def shown(data, own):
+    """Points (n, 2) of all profiles, within the field in which the error was found."""
+    points = np.concatenate([p.points for p in data.profiles if isinstance(p, Profile)])
+    return points[np.all((points >= own.low) & (points <= own.high), axis=1)]
+
+
+def landed_m(result, points):
+    """Rms distance of points, corrected where that is known, from where they truly are."""
+    true = points.copy()
+    true[:, 1] += bent()._nonlinear(points * [1.0, -1.0] + [0.0, 0.2])
+    told = points if result.linearity is None else result.linearity.corrected(points)
+    there, found = (
+        frames.apply(T, np.insert(p, 1, 0.0, axis=1))
+        for T, p in ((X @ T_DISTANCE_HEIGHT, true), (result.T_flange_sensor, told))
+    )
+    return np.sqrt(np.mean(np.sum((there - found) ** 2, axis=1)))
+
+
+def test_points_land_where_they_are_and_better_than_without(runs):
+    squares = []
+    for data, best, plain in runs:
+        points = shown(data, best.linearity)
+        told_m2 = best.working_error_m**2 - best.linearity.rms_m**2  # of corrected points
+        squares.append([landed_m(best, points) ** 2, landed_m(plain, points) ** 2, told_m2])
+    with_it, without, told = np.mean(squares, axis=0)
+    assert with_it < without
+    # A mean square of six runs, most of each of one direction at worst: chi^2 of 6.
+    assert with_it < told * chi2.ppf(1.0 - 1e-3, RUNS) / RUNS
+
+
+def test_of_a_straight_sensor_nothing_is_found():
+    """At most one in twelve: three degrees, each with a chance of some 0.2 %."""
+    found = [solve_straight(seed).linearity is not None for seed in range(3)]
+    assert sum(found) <= 1
+
+
+def solve_straight(seed):
+    data = shot_with(bent((0.0, 0.0, 0.0)), seed).data
+    return solve_task(SphereTask(SPHERE, True), data, "best", SETTINGS)
