@@ -17,8 +17,11 @@ from shift import arm, nominal  # noqa: E402, F401
 
 from robocal_ros.history.calibrations import CalibrationHistory  # noqa: E402
 
-# Cores are shared with other tests: how long an example takes tells nothing of it.
-settings.register_profile("shared", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# Cores are shared with other tests: how long an example takes tells nothing of it. Each run draws
+# other examples, so that runs together try far more of them than one does.
+settings.register_profile(
+    "shared", max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("shared")
 
 # Without rclpy (make test-floor) what needs a node cannot even be imported.

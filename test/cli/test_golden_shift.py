@@ -1,4 +1,4 @@
-"""The cell in closed loop, and the golden shift's excerpt through ``robocal replay``."""
+"""A commissioning as the golden shift's script records it, and the shift's excerpt, replayed."""
 
 import csv
 import io
@@ -12,21 +12,18 @@ import pytest
 from command import robocal_json
 
 from bench.closed_loop import setting
-from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord, run_shift
+from bench.closed_loop.plant import equipped
 from robocal_ros.bags.bags import BagReader, bag_info
 from robocal_ros.bags.replay import NOT_BITS
-from robocal_ros.ground.errors import Code
+from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import TOOL
-from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.judging import KnownTool
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "golden_excerpt.mcap"
 SCHEMAS = {"thermal_node": "replay.json", "tcf_node": "replay.tool.json"}
-BENT = ShiftPlan(
-    hours=0.1, first_s=60.0, every_s=150.0, points=500, incidents=(Incident(0.0, "collision", 2.0),)
-)
 
 
 @pytest.fixture(scope="module")
@@ -40,48 +37,31 @@ def script() -> Any:
 
 
 @pytest.fixture(scope="module")
-def shift(script, tmp_path_factory) -> tuple[ShiftRecord, Path]:
-    """Commissioning, a collision, a pass of the programme, and one after each of two gaps."""
+def made(script, tmp_path_factory) -> tuple[SimulatedCell, Path]:
+    """The commissioning, and its bag."""
     path = tmp_path_factory.mktemp("golden") / "made.mcap"
-    with script.recorder(path, (-np.inf, np.inf)) as recorder:
-        record = run_shift(BENT, seed=3, record=recorder.record, watch=recorder.watch)
-    return record, path
+    nominal = load_robot("kr150_r3100")
+    cell = SimulatedCell(kr150_cell(nominal, 3, points=500))
+    with (
+        script.recorder(path, (-np.inf, np.inf)) as recorder,
+        equipped(nominal, cell, recorder.record) as (plant, _),
+    ):
+        recorder.watch(plant)
+        plant.commission()
+        assert plant.refused == []
+    return cell, path
 
 
-def test_a_bent_tool_is_seen_in_the_first_gap_and_right_after_the_second(shift):
-    record, _ = shift
-    first, second = (gap.result for gap in record.gaps)
-    assert (first.code, first.tool_answer) == (Code.ACCEPT, "recalibrate")
-    assert first.left == ("tool measurement (full)",)
-    assert second.code is Code.ACCEPT
-    assert len(second.accepted) >= 1
-    before, after = ([p for p in record.passes if p.cycle == cycle] for cycle in (1, 2))
-    for one in before:
-        assert np.linalg.norm(one.error, axis=1).min() > 1.5e-3
-        assert one.accuracy.level is AccuracyLevel.DEGRADED
-        assert one.accuracy.error.bound_m > 1.5e-3
-    for one in after:
-        assert np.linalg.norm(one.error, axis=1).max() < setting.TOLERANCE_M
-        assert one.accuracy.level is AccuracyLevel.OK
-        # what is told is a bound of 95 %: near the wrist's singularity a bent tool stays in part
-        assert np.quantile(np.linalg.norm(one.error, axis=1), 0.95) < one.accuracy.error.bound_m
-    assert len(before) == len(after) == 1
-
-
-def test_no_gap_is_overrun_and_nothing_is_refused(shift):
-    """Nor does the correction refuse the pass before the first gap."""
-    record, _ = shift
-    assert [(gap.over_s, gap.fault) for gap in record.gaps] == [(0.0, "")] * 2
-    assert [one.cycle for one in record.passes] == [0, 1, 2]
-    assert record.refused == []
-    assert record.drive_faults == 0
-    assert 0.0 < record.peak_share < 1.0  # counted at all, and within the drives' speed
+def test_the_drives_take_all_that_the_suite_sends(made):
+    motion = made[0].motion
+    assert motion.faults == 0
+    assert 0.0 < motion.peak_share < 1.0  # counted at all, and within the drives' speed
 
 
 @pytest.mark.parametrize("node", SCHEMAS)
-def test_a_replay_equals_the_loop_bit_for_bit(shift, node):
+def test_a_replay_equals_the_loop_bit_for_bit(made, node):
     """Made here: only on one machine are results equal to the last bit."""
-    document = replayed(shift[1], node)
+    document = replayed(made[1], node)
     assert document["differs"] == []
     assert document["commands"]
 

@@ -251,7 +251,7 @@ class Watched:
         assert cell.state not in BUSY
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     services,
     st.booleans(),
@@ -278,7 +278,7 @@ def test_nothing_that_must_not_be(broken, right, gap, scene):
         watched.let_it_end()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     st.sampled_from([None, 10.0, 200.0]),
     st.floats(0.1, 6.0),

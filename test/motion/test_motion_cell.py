@@ -35,7 +35,7 @@ places = st.tuples(st.floats(-0.08, 0.08), st.floats(-0.08, 0.08), st.floats(-0.
 
 
 @given(start=places, end=places, radius=st.floats(1e-3, 0.02), seed=st.integers(0, 9))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_what_counts_as_clear_has_no_point_in_the_housing(start, end, radius, seed):
     start, end = np.array(start), np.array(end)
     cut = float(HOUSING.cut_by(start[None], end[None], radius)[0])

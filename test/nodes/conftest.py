@@ -193,8 +193,8 @@ class Graph:
             # that wait, and comes to nothing else.
             self.executor.spin_once(timeout_sec=min(left, 0.05))
 
-    def call(self, kind: type, name: str, within_s: float = DEADLINE_S, **fields: Any) -> Any:
-        """Call a service, waiting for it to appear, and return its response."""
+    def client(self, kind: type, name: str, within_s: float = DEADLINE_S) -> Any:
+        """A client of a service that is there and has discovered it."""
         client = self._clients.get(name)
         if client is None:
             client = self._clients[name] = self.probe.create_client(kind, name)
@@ -202,7 +202,11 @@ class Graph:
             # A server drops its answer to a client that it has not discovered itself yet.
             self.spin_for(DISCOVERY_S)
         self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
-        future = client.call_async(kind.Request(**fields))
+        return client
+
+    def call(self, kind: type, name: str, within_s: float = DEADLINE_S, **fields: Any) -> Any:
+        """Call a service, waiting for it to appear, and return its response."""
+        future = self.client(kind, name, within_s).call_async(kind.Request(**fields))
         self.spin_until(future.done, f"service {name} answers", within_s)
         return future.result()
 
@@ -280,11 +284,9 @@ class Graph:
         self.context.try_shutdown()
 
 
-@pytest.fixture
-def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
-    """A private graph, with its own domain and its own state folder (``ROBOCAL_STATE``)."""
-    state = tmp_path / "state"
-    monkeypatch.setenv("ROBOCAL_STATE", str(state))
+@contextlib.contextmanager
+def private_graph(state: Path) -> Iterator[Graph]:
+    """A graph with its own domain; nodes of other processes keep their state in the folder."""
     with free_domain() as domain:
         graph = Graph(domain, state)
         try:
@@ -293,6 +295,27 @@ def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
             graph.close()
             del graph
             gc.collect()  # what of DDS is held in a cycle ends now, when nobody discovers anything
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
+    """A private graph, with its own domain and its own state folder (``ROBOCAL_STATE``)."""
+    state = tmp_path / "state"
+    monkeypatch.setenv("ROBOCAL_STATE", str(state))
+    with private_graph(state) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def next_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], Graph]]:
+    """Makes a graph for several tests of a module; the one before it ends."""
+    with contextlib.ExitStack() as last:
+
+        def begin() -> Graph:
+            last.close()
+            return last.enter_context(private_graph(tmp_path_factory.mktemp("state")))
+
+        yield begin
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -144,7 +144,7 @@ def test_with_the_file_for_replays_no_input_loses_anything(graph, tmp_path, node
     assert given.pop("use_sim_time")
     assert set(given) <= {s.name for s in node.SETTINGS}
     settings = {"laser": written_laser(tmp_path, noisy_cell())} if node is TcfNode else None
-    graph.start(node.NAME, settings, None, "--ros-args", "--params-file", str(path))
+    graph.add(node, settings, cli_args=["--ros-args", "--params-file", str(path)])
 
     def reliability(topic: str) -> list[ReliabilityPolicy]:
         infos = graph.probe.get_subscriptions_info_by_topic(topic)
@@ -177,7 +177,5 @@ def test_a_replay_never_opens_the_history_of_the_robot(graph, tmp_path, node, se
         CONFIG / "replay_history.yaml",
     ]
     words = [word for part in parts for word in ("--params-file", str(part))]
-    graph.start(node.NAME, None, None, "--ros-args", *words)
-    kept = graph.state.glob
-    graph.spin_until(lambda: list(kept("*.sqlite")), "a history", 30.0)
-    assert {path.stem for path in kept("*.sqlite")} == {"REPLAY"}
+    graph.add(node, cli_args=["--ros-args", *words])
+    assert {path.stem for path in graph.state.glob("*.sqlite")} == {"REPLAY"}

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from maintenance_live import HOME_DEG, LiveCell
+from maintenance_live import LiveCell
 from robocal_msgs.msg import MaintenanceStatus
-from robocal_msgs.srv import Acknowledge, GetMaintenance, RunMaintenanceCycle
+from robocal_msgs.srv import GetMaintenance, RunMaintenanceCycle
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -29,7 +28,7 @@ pytestmark = pytest.mark.cell
 GAP_S = 120.0  # a tool that is found bent is measured in the same gap
 AHEAD_S = 2.0  # until stamps have passed those of a clock that was ahead
 WITHIN_S = 45.0
-SHORT = "clock_jump beams_dead joints_silent station_knocked"
+SHORT = "joints_silent station_knocked"  # one that breaks the gap off, one that its check sees
 WANTED = os.environ.get("ROBOCAL_FAULTS", SHORT).split()
 ALL = [fault for fault, code in RIGHT.items() if code is not Code.SENSOR_OR_ROBOT_MOVED]
 # the collision last: its candidate waits for a person
@@ -47,10 +46,14 @@ class FaultCell:
         self.graph, self.cell = graph, LiveCell(graph, folder)
         self.truths = graph.collect(String, TRUTH, endpoints.LATCHED)
         self.until(lambda: self.told("/tcf_node/arm", SetBool, data=True), "armed")
-        self.until(lambda: self.told("/tcf_node/measure_reference_trigger"), "it measures")
-        self.until(lambda: " NONE " not in self.result(), "the healthy tool is measured")
+        for _ in range(3):  # one that a busy machine breaks off is asked for again
+            self.until(lambda: self.told("/tcf_node/measure_reference_trigger"), "it measures")
+            self.until(lambda: " NONE " not in self.result(), "the healthy tool is measured")
+            self.cell.drive_home()
+            if " ACCEPT " in self.result():
+                break
+            self.until(lambda: self.told("/tcf_node/arm", SetBool, data=True), "armed again")
         assert " ACCEPT " in self.result(), self.result()
-        self.drive_home()
 
     def result(self) -> str:
         return str(self.graph.call(Trigger, "/tcf_node/result_trigger").message)
@@ -88,20 +91,9 @@ class FaultCell:
         set_fault(self.graph.call, "none")
         self.graph.spin_for(AHEAD_S)
         if faulty:
-            self.drive_home()
-            self.until(self.acknowledged, f"{fault} is acknowledged")
+            self.cell.drive_home()
         print(f"{fault}: {code.name}, {end}: {result.message} {state.fault}")
         return code, end
-
-    def acknowledged(self) -> bool:
-        return bool(self.graph.call(Acknowledge, "/maintenance_node/acknowledge", by="me").success)
-
-    def drive_home(self) -> None:
-        """A person does."""
-        self.until(lambda: self.cell.stands(0.5), "the robot rests")
-        self.cell.drive_between(self.cell.q, np.radians(HOME_DEG))
-        self.until(self.cell.at_home, "at home")
-        self.graph.spin_for(0.5)
 
 
 def test_each_fault_has_its_code_within_one_cycle(graph: Any, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from maintenance_live import HOME_DEG, ROBOT, SERIAL, LiveCell
 from robocal_msgs.msg import CorrectionStatus, MaintenanceStatus
-from robocal_msgs.srv import RunMaintenanceCycle
+from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import SetBool, Trigger
 from test_correction_graph import Process
 from test_maintenance_calls import HOME_DEG as STANDING_DEG
@@ -20,6 +20,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
 
 PROGRAM = "/program/joint_trajectory"
+GAP_S = 150.0
 STRANGER = f"/planner publishes {ROBOT}"
 
 
@@ -48,7 +49,25 @@ def test_two_maintenance_nodes_of_two_hosts_refuse_until_one_is_gone(
     graph.spin_until(lambda: plc.run("c2").success, "the one that is left works")
 
 
-def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -> None:
+CALLS = {
+    "run": (RunMaintenanceCycle, {"cycle_id": "c1", "gap_s": GAP_S}, Code.ACCEPT),
+    "accept": (Decide, {"id": 99}, Code.BAD_INPUT),
+    "reject": (Decide, {"id": 99}, Code.BAD_INPUT),
+    "rollback": (Decide, {"id": 99}, Code.BAD_INPUT),
+    "acknowledge": (Acknowledge, {"by": "plc"}, Code.ACCEPT),
+}
+TRIGGERS = {
+    "run_trigger": "0 ACCEPT cycle 'c1' runs already",
+    "status_trigger": "0 NONE ",
+    "accept_trigger": "0 CONFLICT one candidate must wait",
+    "rollback_trigger": "0 BAD_INPUT nothing was accepted",
+    "acknowledge_trigger": "0 ACCEPT there is no fault",
+}
+
+
+def test_the_program_waits_while_the_cell_measures_and_calls_do_not(
+    graph: Any, tmp_path: Path
+) -> None:
     cell = LiveCell(graph, tmp_path)
     settings = {"robot": "ur10", "serial": SERIAL}
     graph.start(
@@ -70,7 +89,10 @@ def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -
 
     becomes(CorrectionStatus.OFF, 30.0)
     to_program = graph.publisher(JointTrajectory, PROGRAM)
-    cell.begin("c1", 150.0)
+    kinds = {name: kind for name, (kind, _, _) in CALLS.items()} | dict.fromkeys(TRIGGERS, Trigger)
+    for name, kind in (kinds | {"status": GetMaintenance, "cancel_trigger": Trigger}).items():
+        graph.client(kind, f"/maintenance_node/{name}")  # so that calls take no time later
+    cell.begin("c1", GAP_S)
     becomes(CorrectionStatus.LEASED)
     graph.spin_until(lambda: "/maintenance_node: cycle 'c1'" in said[-1].lease, "who holds it")
     graph.spin_until(lambda: len(cell.goals) == 2, "the first circle", within_s=30.0)
@@ -78,10 +100,20 @@ def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -
     graph.spin_until(lambda: sum(said[-1].refused) == 1, "it is refused")
     assert said[-1].refused_reasons == ["the robot is leased for a measurement"]
     assert cell.on_topic == []
+    for name, (kind, fields, code) in CALLS.items():
+        answer = graph.call(kind, f"/maintenance_node/{name}", **fields)
+        assert answer.status == code, (name, answer.message)
+    for name, words in TRIGGERS.items():
+        answer = graph.call(Trigger, f"/maintenance_node/{name}")
+        assert answer.message.startswith(words), answer.message
+    running = graph.call(GetMaintenance, "/maintenance_node/status", cycle_id="c1")
+    assert running.result.code == Code.NONE  # it measures on: the calls waited for nothing
     assert graph.call(Trigger, "/maintenance_node/cancel_trigger").success
     becomes(CorrectionStatus.OFF, 60.0)
     assert not said[-1].lease
-    assert cell.at_home()
+    graph.spin_until(cell.at_home, "readings at home, which may come after the status", 2.0)
+    graph.spin_until(lambda: cell.statuses[-1].state == MaintenanceStatus.IDLE, "it has ended")
+    assert cell.statuses[-1].last.code == Code.CONFLICT
     to_program.publish(motion)
     graph.spin_until(lambda: len(cell.on_topic) == 1, "the program's motion goes out")
     graph.spin_until(lambda: np.max(np.abs(cell.q - target)) < 1e-3, "the robot is there")
@@ -97,20 +129,27 @@ def error(said: list[DiagnosticArray], node: str, words: str) -> bool:
 
 
 @pytest.mark.cell
-@pytest.mark.parametrize("driver", ["tcf_node", "maintenance_node"])
 def test_who_else_commands_the_robot_stops_what_moves_it_and_lets_nothing_begin(
-    graph: Any, tmp_path: Path, driver: str
+    graph: Any, tmp_path: Path
 ) -> None:
+    """The tool node's motion; then one of the maintenance node, on its way home."""
     cell = LiveCell(graph, tmp_path)
     said = graph.collect(DiagnosticArray, "/diagnostics")
-    handle = cell.begin("c1", 150.0)
-    ended = handle.get_result_async()
-    graph.spin_until(lambda: len(cell.goals) == 2, "the first circle", within_s=30.0)
-    if driver == "maintenance_node":  # on its way home
-        assert graph.call(Trigger, "/maintenance_node/cancel_trigger").success
-        graph.spin_until(lambda: cell.statuses[-1].doing == "on its way home", "its way", 30.0)
-        graph.spin_until(lambda: not cell.stands(0.1), "the robot moves")
-    before, planner = len(cell.goals), Process(graph.domain, "planner")
+    ended = cell.measures("c1", GAP_S)
+    stopped_by_planner(cell, ended, said)
+    cell.drive_home()
+    ended = cell.measures("c2", GAP_S)
+    assert graph.call(Trigger, "/maintenance_node/cancel_trigger").success
+    graph.spin_until(lambda: cell.statuses[-1].doing == "on its way home", "its way", 30.0)
+    graph.spin_until(lambda: not cell.stands(0.1), "the robot moves")
+    stopped_by_planner(cell, ended, said)
+
+
+def stopped_by_planner(cell: LiveCell, ended: Any, said: list[DiagnosticArray]) -> None:
+    """A planner that can command the robot ends the motion; it is gone at the end."""
+    graph, before = cell.graph, len(cell.goals)
+    said.clear()
+    planner = Process(graph.domain, "planner")
     try:
         planner.node.create_publisher(JointTrajectory, ROBOT, 10)
         graph.spin_until(lambda: len(cell.goals) > before, "the stop", within_s=2.0)

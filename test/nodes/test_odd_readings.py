@@ -72,7 +72,7 @@ class Corrected:
         return int(ended.result().status)
 
 
-@pytest.mark.parametrize("missing", [1.0, 6.0, -2.0])
+@pytest.mark.parametrize("missing", [1.0, -2.0])
 def test_velocities_of_another_number_than_positions_are_none(
     graph: Any, tmp_path: Path, missing: float
 ) -> None:
@@ -91,11 +91,10 @@ def test_velocities_of_another_number_than_positions_are_none(
     own.arrive()
 
 
-@pytest.mark.parametrize("missing", [1.0, 6.0, -2.0])
-def test_feedback_of_another_number_of_velocities_ends_no_goal_that_is_corrected(
-    graph: Any, tmp_path: Path, missing: float
+def test_feedback_without_velocities_ends_no_goal_that_is_corrected(
+    graph: Any, tmp_path: Path
 ) -> None:
-    controller = simulated(graph, tmp_path, True, fault="odd_lengths", fault_size=missing)
+    controller = simulated(graph, tmp_path, True, fault="odd_lengths", fault_size=6.0)
     controller.wait()
     corrected = Corrected(controller)
     assert corrected.ends(corrected.go(HOME + 0.1)) == GoalStatus.STATUS_SUCCEEDED

@@ -141,7 +141,7 @@ def test_a_stop_has_no_points():
     assert path.unchanged() == data
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_damaged_bytes_do_no_harm(data):
     whole = serialize_message(a_path(points=2))

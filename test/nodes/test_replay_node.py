@@ -201,7 +201,7 @@ def test_a_thermal_node_takes_all_of_a_fast_replay(graph, tmp_path):
             topic = "/joint_states" if joints else "/measured_point"
             kind = "sensor_msgs/msg/JointState" if joints else "geometry_msgs/msg/PointStamped"
             bag.write(topic, kind, message_of(sample), sample.stamp_ns)
-    cell = Cell(graph)
+    cell = Cell(graph, apart=True)
     bag, wait = tmp_path / "visit.mcap", "[/joint_states,/measured_point]"
     player = graph.start(
         "replay_node",

@@ -39,14 +39,18 @@ def robot() -> Robot:
     return Robot()
 
 
-@pytest.fixture
-def cell(graph, robot) -> Cell:
+def commissioned(graph: Any, robot: Robot, *, apart: bool = False) -> Cell:
     """A node with a cold reference."""
-    made = Cell(graph)
+    made = Cell(graph, apart=apart)
     made.play(robot.visit())
     captured = made.call("capture_reference")
     assert captured.success, captured.message
     return made
+
+
+@pytest.fixture
+def cell(graph, robot) -> Cell:
+    return commissioned(graph, robot)
 
 
 def end(cell: Cell, cycle_id: str = "") -> Any:
@@ -165,8 +169,9 @@ def test_a_clock_that_jumps(cell, robot):
     assert end(cell, "c2").visited == POSES
 
 
-def test_a_full_disk(cell, robot):
+def test_a_full_disk(graph, robot):
     """Nothing is lost, nothing is half-written, and the same call works once there is room."""
+    cell = commissioned(graph, robot, apart=True)
     production(cell, robot)
     cell.call("begin_cycle", cycle_id="c1")
     cell.play(robot.visit(WARM_K))
@@ -182,8 +187,9 @@ def test_a_full_disk(cell, robot):
     assert [c.kind for c in listed] == ["thermal", "reference"]
 
 
-def test_a_restart_in_mid_cycle(cell, robot):
+def test_a_restart_in_mid_cycle(graph, robot):
     """Killed: what is in force stays, the rest of the cycle is used, what was ended is known."""
+    cell = commissioned(graph, robot, apart=True)
     cell.play(robot.visit(WARM_K, after_h=2.0))
     first = end(cell, "c1")
     assert cell.call("accept", id=first.candidate_id).success
@@ -191,7 +197,7 @@ def test_a_restart_in_mid_cycle(cell, robot):
     cell.play(robot.visit(WARM_K, slice(2)))
     cell.process.kill()
     cell.accuracies.clear()
-    cell.process = cell.start()
+    cell.start()
     assert cell.models[-1].revision == 1
     cell.play(robot.visit(WARM_K, slice(2, None)))
     second = end(cell, "c2")
@@ -201,12 +207,13 @@ def test_a_restart_in_mid_cycle(cell, robot):
     accuracy(cell, AccuracyState.OK)
 
 
-def test_a_start_before_any_clock(cell, graph):
+def test_a_start_before_any_clock(graph, robot):
     """Simulated time that has not begun, a reference, no model: told, and the node lives on."""
+    cell = commissioned(graph, robot, apart=True)
     cell.process.kill()
     cell.accuracies.clear()
     cell.parameters = cell.parameters | {"use_sim_time": True}
-    cell.process = cell.start()
+    cell.start()
     graph.spin_until(lambda: len(cell.accuracies) > 1, "accuracy is told")
     assert np.isfinite(cell.accuracies[-1].predicted_error_mm)
     assert cell.process.process.poll() is None

@@ -13,7 +13,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 
 POSES = 10
-FIELD_MM = "[1500.0,1500.0,2000.0,500.0,4000.0]"
+FIELD_MM = [1500.0, 1500.0, 2000.0, 500.0, 4000.0]
 
 
 def placed(graph, method: str = ""):

@@ -210,13 +210,7 @@ def stops(cell: Cell, how: str) -> None:
         graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
 
 
-FAULTS = {
-    "lost_edge": "an edge between was lost",
-    "frozen_clock": "joint states are silent",
-}
-
-
-def test_the_robots_program_drives_what_is_announced_and_faults_are_refused_in_their_words(
+def test_the_robots_program_drives_what_is_announced_and_a_fault_is_refused_in_its_words(
     graph: Any, tmp_path: Path
 ) -> None:
     cell = Cell(graph, tmp_path, "program")
@@ -224,13 +218,12 @@ def test_the_robots_program_drives_what_is_announced_and_faults_are_refused_in_t
     names = [s.name for s in cell.steps if s.kind]
     assert names == ["low", "high", "upright", "plunge_1", "plunge_2"]
     graph.spin_for(2.5)  # the program drives its motion to the end
-    for fault, words in FAULTS.items():
-        set_fault(graph.call, fault)
-        result = cell.measure()
-        assert not result.success, fault
-        assert words in result.message, fault
-        graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
-        graph.spin_for(2.5)  # the program drives its motion to the end
+    set_fault(graph.call, "lost_edge")
+    result = cell.measure()
+    assert not result.success
+    assert "an edge between was lost" in result.message
+    graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
+    graph.spin_for(2.5)  # the program drives its motion to the end
     set_fault(graph.call, "none")
     graph.spin_for(1.0)
     ended = cell.begin(MeasureTool.Goal.FULL).get_result_async()

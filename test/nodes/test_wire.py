@@ -79,7 +79,7 @@ def test_what_is_not_regular_is_left_to_the_message(message):
     assert JointWire().read(serialize_message(message)) is None
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_damaged_bytes_do_no_harm(data):
     wire, whole = JointWire(), serialize_message(a_state(NAMES[1], effort=3))

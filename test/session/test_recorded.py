@@ -230,7 +230,7 @@ def commands_at(marks: list[tuple[int, int]], name: str, arguments: Any) -> list
     ]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(streams(), SIZES, MARKS)
 def test_a_desk_knows_the_same(samples, sizes, marks):
     ends = []

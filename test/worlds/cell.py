@@ -23,6 +23,7 @@ from robocal_ros.ground.samples import REFERENCE_SPHERE, JointSample, PointSampl
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.session_node import EVENTS
+from robocal_ros.thermal.node import ThermalNode
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 DEEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
@@ -65,10 +66,12 @@ def message_of(sample: JointSample | PointSample) -> JointState | PointStamped:
 
 
 class Cell:
-    """A thermal node as its own process, and everything it says."""
+    """A thermal node, and what it says; ``apart``: a process of its own, which can be killed."""
 
-    def __init__(self, graph: Any, serial: str = "s1", **parameters: Any) -> None:
-        self.graph = graph
+    def __init__(
+        self, graph: Any, serial: str = "s1", *, apart: bool = False, **parameters: Any
+    ) -> None:
+        self.graph, self.apart = graph, apart
         self.serial = serial
         self.parameters = {"serial": serial, "command_timeout_s": 0.3} | LOSSLESS | parameters
         self.events = graph.collect(SessionEvent, "/thermal_node/session_events", EVENTS)
@@ -93,14 +96,16 @@ class Cell:
             f"{name}_trigger": probe.create_client(Trigger, f"/thermal_node/{name}_trigger")
             for name in SERVICES
         }
-        self.sent = 0
-        self.process = self.start()
+        self.start()
 
-    def start(self) -> Any:
-        """Start the executable and wait until it is all there."""
+    def start(self) -> None:
+        """Start the node and wait until it is all there."""
         self.models.clear()
         self.sent = 0
-        process = self.graph.start("thermal_node", self.parameters)
+        if self.apart:
+            self.process = self.graph.start("thermal_node", self.parameters)
+        else:
+            self.graph.add(ThermalNode, self.parameters)
         publishers = (self.joints, self.points, self.poses, self.fixed)
         self.graph.spin_until(
             lambda: (
@@ -110,7 +115,6 @@ class Cell:
             ),
             "the thermal node is there",
         )
-        return process
 
     def call(self, name: str, **fields: Any) -> Any:
         client = self.clients[name]

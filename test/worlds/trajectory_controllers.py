@@ -204,7 +204,7 @@ class Controlled:
 
 def simulated(graph: Any, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
     """The cell's robot, without a lag, as mock hardware has none."""
-    given = {"velocities": str(velocities).lower(), "lag_ms": 0.0, "rate_hz": 250.0} | parameters
+    given = {"velocities": str(velocities).lower(), "lag_ms": 0.0} | parameters
     controlled = Controlled(graph)
     remap = {"__node": NODE, "joint_trajectory": f"{NODE}/joint_trajectory"}
     graph.start("cell_sim_node", given, remap)
