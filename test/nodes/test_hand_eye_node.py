@@ -108,6 +108,45 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     assert late[-1].transforms == []
 
 
+@pytest.mark.parametrize("told", [{"z_grows": "towards"}, {"sensor": "lmi-gocator"}])
+def test_heights_of_a_make_are_calibrated_and_replayed_alike(
+    graph: Any, tmp_path: Path, told: dict[str, str]
+) -> None:
+    """Two profiles in each cloud, as of a sensor that believes to move; z towards the sensor."""
+    live = graph.collect(SessionEvent, f"{NAME}/session_events", EVENTS)
+    sensor = LiveSensor(graph, tmp_path, **told)
+    truth = sphere_set()[0].T_flange_sensor @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert sensor.start().success
+    for (q, _), points in list(zip(SHOTS, sphere_set()[1].profiles, strict=False))[:10]:
+        sensor.robot.move(q, 0.2)
+
+        def shot(stamp_ns: int, seen: np.ndarray = points * [1.0, -1.0]) -> Recorded:
+            one, fields = profile(stamp_ns, seen), dict(profile(stamp_ns, seen, y=0.01).fields)
+            fields["data"] = one.fields["data"] + fields["data"]
+            fields["width"] *= 2
+            fields["row_step"] *= 2
+            return Recorded(one.kind, stamp_ns, fields)
+
+        assert sensor.capture(shot).state == HandEyeSample.CAPTURED
+    result = sensor.calibrate()
+    assert result.success, result.message
+    away_m = np.linalg.norm(((matrix(result.sensor) - truth) @ [0.0, 0.0, -0.2, 1.0])[:3])
+    assert away_m < 2e-4  # as of distances, above
+    graph.spin_until(lambda: len(live) > 1 + 2 * 10 + 1, "all events, and the configuration")
+    path = tmp_path / "live.mcap"
+    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
+        now_ns = 0
+        for message in sensor.sent:
+            now_ns = max(now_ns, message.stamp_ns)
+            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
+        for event in live:
+            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
+    document = robocal_json("replay.hand_eye.json", "replay", path)
+    assert document["differs"] == []
+    found_mm = document["calibrations"][0]["T_flange_sensor"]["xyz_mm"]
+    assert found_mm == pytest.approx(1e3 * matrix(result.sensor)[:3, 3], abs=1e-12)
+
+
 def test_a_moving_robot_is_not_captured_and_a_sample_is_removed(graph: Any, tmp_path: Path) -> None:
     sensor = LiveSensor(graph, tmp_path, capture_timeout_s=2.0)
     (q, shot), (other, _) = SHOTS[:2]
