@@ -26,6 +26,7 @@ from bench.hand_eye_worlds import (
 from bench.measured_runs import Q_NEAR
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.cell import rigid_robot
+from robocal_ros.cell_sim.gears import ur10_gears
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
@@ -116,7 +117,7 @@ class Effect:
     machining_m: float = 0.0
 
 
-def arm(rng: np.random.Generator, eccentric_rad: float = 0.0) -> Robot:
+def arm(rng: np.random.Generator, eccentric_rad: float = 0.0) -> ArmRobot:
     """A UR10 with errors of its geometry, which hang together from pose to pose."""
     true = rigid_robot(load_robot("ur10"), GEOMETRY_M, rng)
     true.static_error[-1] = 0.0  # nobody can tell it from a shift of the sensor
@@ -129,6 +130,15 @@ def arm(rng: np.random.Generator, eccentric_rad: float = 0.0) -> Robot:
     return ArmRobot(true, Q_NEAR)
 
 
+def with_gears(rng: np.random.Generator) -> Robot:
+    """The same arm with gears as a real UR10's, each set elsewhere on them, and backlash."""
+    robot = arm(rng)
+    gears, true = ur10_gears(), robot.true
+    gears = replace(gears, phase=rng.uniform(-np.pi, np.pi, gears.phase.shape))
+    effects = replace(true.effects, gears=True)
+    return replace(robot, true=replace(true, gears=gears, effects=effects))
+
+
 EFFECTS = (
     Effect("as modelled"),
     Effect(
@@ -137,6 +147,7 @@ EFFECTS = (
     Effect("mirrored light, 2 % of columns", ProfileSensor(ghosts=0.02)),
     Effect("UR10, geometry off by 0.05 mm and 0.05 mrad", robot=arm),
     Effect("the same, encoders eccentric by 20 urad", robot=lambda rng: arm(rng, ECCENTRIC_RAD)),
+    Effect("UR10, its gears as identified, with backlash", robot=with_gears),
     Effect("stairs machined to 0.033 mm", machining_m=MACHINING_M),
 )
 
