@@ -11,6 +11,7 @@ from hand_eye_sets import (
     FAR_OFF,
     LINE,
     RADIUS_M,
+    REAL_CELL,
     SPHERE,
     STAIRS,
     T_BASE_USER,
@@ -280,6 +281,26 @@ class TestLine:
         data = data_of(SimulatedShots(reported, reported, profiles, [""] * 20, None))
         with pytest.raises(RankDeficientError, match=words):
             solve_task(LineTask(LINE, EdgeRule()), data, "best", SETTINGS)
+
+
+REAL = {
+    "sphere": (SphereTask(SPHERE), lambda rng: sphere_shots(REAL_CELL, CENTRE, RADIUS_M, 15, rng)),
+    "stairs": (StepTask(stairs_target()), lambda rng: step_shots(REAL_CELL, STAIRS, 8, rng)),
+    "edge": (
+        LineTask(None, EdgeRule()), lambda rng: edge_shots(REAL_CELL, T_BASE_USER, 20, rng),
+    ),
+    "known edge": (
+        LineTask(LINE, EdgeRule()), lambda rng: edge_shots(REAL_CELL, T_BASE_USER, 20, rng),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REAL)
+def test_what_real_sensors_add_is_in_the_covariance(what):
+    """A bent field, wrong points at the ends, outliers and lost points, at the scatter of one."""
+    task, shoot = REAL[what]
+    found = solve_task(task, data_of(shoot(np.random.default_rng(3))), "best", SETTINGS)
+    assert chi_square(found, TRUE) < FAR_OFF
 
 
 @pytest.mark.parametrize("share", [0.98, 1.02, 1.2])

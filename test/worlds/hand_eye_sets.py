@@ -3,6 +3,7 @@
 import numpy as np
 
 from bench.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots, TrueStairs
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.profiles import profile_of
@@ -11,6 +12,11 @@ from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, St
 from robocal_ros.hand_eye.tasks import HandEyeData
 
 POSE_M = 1e-4 / np.sqrt(3.0)  # along each axis: 0.1 mm in space
+# As real sensors are: bent by some 20 um, with wrong points where what is seen ends, and outliers.
+SENSOR = ProfileSensor(
+    noise_m=1.5e-5, linearity_m=(2e-5, -1e-5, 2e-5), ends=2, spikes=0.003, dropouts=0.02
+)
+REAL_CELL = HandEyeCell(sensor=SENSOR, robot=PoseRobot(POSE_M))
 CELL = HandEyeCell(robot=PoseRobot(POSE_M))
 CENTRE, RADIUS_M = np.array([0.9, 0.1, 0.3]), 0.02
 T_BASE_USER = frames.transform(frames.exp_rotation([0.0, 0.0, 0.3]), [0.9, 0.1, 0.3])
