@@ -299,8 +299,8 @@ class Mover:
         return self.lasts_s(worst_s - driven_s)
 
     def lasts_s(self, planned_s: float) -> float:
-        """How long the robot takes for what is planned, at the present speed scaling."""
-        return planned_s / max(self.watch.scaling, 1e-3)
+        """How long the robot takes for what is planned, at the newest speed scaling but 0."""
+        return planned_s / max(self.watch.unpaused, 1e-3)
 
     def arrived(self, now_s: float) -> bool:
         """Whether the route is over, with the robot at its end."""

@@ -399,12 +399,16 @@ class CellInterface(Asking):
     def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[DriverAnswer]:
         """Let the armed driver measure, for a limited time; a longer run is broken off.
 
+        The time is that of the robot's clock, which a speed scaling that is told stretches.
+
         Raises `SilentError` when it did not end in time, and not after it was broken off either.
         """
         number = self._measuring = self.expect(Measure, mode, cycle_id)
-        until_s = self.now_s + limit_s
-        while self._waiting[number] is None and self.now_s < until_s:
+        before_s = self.now_s
+        while self._waiting[number] is None and limit_s > 0.0:
             yield
+            limit_s -= (self.now_s - before_s) * self.robot.watch.scaling
+            before_s = self.now_s
         if self._waiting[number] is None:
             self.disengage()
         return (yield from self.waited_for(number, self.config.times.answer_s, f"tool, {mode}"))

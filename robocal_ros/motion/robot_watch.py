@@ -96,7 +96,8 @@ class RobotWatch:
 
     ``driving``: how far the robot may be beside its plan, and how fast its joints are.
     ``silence``: how long no new reading came. ``scaling``: how fast the controller's clock runs, 1
-    as planned; 1 where nobody tells it lately. ``held_s``: when a controller that pauses was last
+    as planned; 1 where nobody tells it lately; ``unpaused``: the newest but 0, as a pause tells
+    nothing of what comes after it. ``held_s``: when a controller that pauses was last
     seen to give up a motion, as `StatedController` has it.
     """
 
@@ -104,7 +105,7 @@ class RobotWatch:
         self._arm, self._driving = arm, driving
         self._fastest = driving.limits.of_joints(arm)[0]
         self.silence = Silence()
-        self.scaling, self.held_s = 1.0, -np.inf
+        self.scaling, self.unpaused, self.held_s = 1.0, 1.0, -np.inf
         self._scaled_s = -np.inf  # when that was told
         self._heard_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
@@ -123,7 +124,8 @@ class RobotWatch:
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,); ``stamp_s`` on their own clock."""
         if self.scaling != 1.0 and not self.scaling_known(now_s):
-            self._driven_s, self._at_s, self.scaling = self.driven_s(now_s), now_s, 1.0
+            self._driven_s, self._at_s = self.driven_s(now_s), now_s
+            self.scaling = self.unpaused = 1.0
         if self._readings and stamp_s <= self._readings[-1][0]:
             if stamp_s > self._readings[-1][0] - BACK_S:
                 return  # a clock that stands still is heard as silence
@@ -138,6 +140,7 @@ class RobotWatch:
             return
         self._driven_s, self._at_s = self.driven_s(now_s), now_s
         self.scaling, self._scaled_s, self._away = factor, now_s, None
+        self.unpaused = factor or self.unpaused
 
     def controller(self, q: Array, qd: Array, now_s: float) -> None:
         """Where the controller is on its trajectory: joints and unscaled velocities (n,)."""

@@ -17,7 +17,7 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalEr
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance.accuracy import AcceptBounds
+from robocal_ros.maintenance.accuracy import AcceptBounds, Times
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.drift_following import ThermalConfig
@@ -76,8 +76,13 @@ def history(captured, tmp_path):
 def warm(history, captured):
     """Makes the cell with a bent tool after three hours of work; takes bounds."""
 
-    def made(kelvin: float = KELVIN, poses: np.ndarray = POSES, **bounds: Any) -> MaintainedCell:
-        config = {"poses": poses, "bounds": AcceptBounds(**bounds)}
+    def made(
+        kelvin: float = KELVIN,
+        poses: np.ndarray = POSES,
+        times: Times = Times(),  # noqa: B008 (frozen)
+        **bounds: Any,
+    ) -> MaintainedCell:
+        config = {"poses": poses, "bounds": AcceptBounds(**bounds), "times": times}
         cell = MaintainedCell(history, TRUTH, from_s=captured.now_s, **config)
         cell.production(3.0, kelvin)
         return cell
@@ -128,6 +133,58 @@ def test_one_call_makes_a_warm_robot_with_a_bent_tool_accurate(warm):
     said = cell.accuracy()
     assert said.level is AccuracyLevel.OK, said.reason
     assert np.all(after < said.error.bound_m), (after, said.error)
+
+
+PAUSE_S = 10.0
+
+
+@pytest.mark.parametrize("tells", [True, False])
+@pytest.mark.parametrize("speed", [0.1, 0.5])
+def test_a_cycle_at_any_speed_ends_as_at_full_speed(warm, speed, tells):
+    """Ways between taught poses, to the beams, through them and home; model and tool are right."""
+    slow = Times() if tells else Times(check_s=15.0 / speed, full_s=30.0 / speed)
+    cell = warm(automatic=True, tool_m=0.01, tool_rad=0.1, times=slow)
+    cell.speed, cell.tells = speed, tells
+    source = cell.cell.station.input  # whose delay does not go by the robot's speed
+    source = replace(
+        source,
+        latency_s=speed * source.latency_s,
+        sample_period_s=speed * source.sample_period_s,
+    )
+    cell.cell.station = replace(cell.cell.station, input=source)
+    cell.run(1.0)
+    result = cell.maintain("c1", GAP_S / speed)
+    assert result.complete, result.message
+    assert (result.thermal_code, result.tool_code) == (Code.ACCEPT, Code.ACCEPT), result.message
+    assert result.tool_answer == "pass"
+    assert np.all(true_error_m(cell) < cell.accuracy().error.bound_m)
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_a_pause_of_ten_seconds_in_each_motion_of_a_cycle_is_waited_for(warm, tells):
+    slow = Times() if tells else Times(check_s=60.0, full_s=200.0)
+    cell = warm(automatic=True, tool_m=0.01, tool_rad=0.1, times=slow)
+    cell.tells = tells
+    step, paused = cell.step, set()
+
+    def pausing() -> None:
+        step()
+        since_s = cell.now_s - cell.sent[-1][0] if cell.sent else 0.0
+        if 0.3 < since_s < PAUSE_S and len(cell.sent) not in paused:
+            paused.add(len(cell.sent))
+            cell.speed, until_s = 0.0, cell.now_s + PAUSE_S
+            while cell.now_s < until_s:
+                step()
+            cell.speed = 1.0
+
+    cell.step = pausing
+    result = cell.maintain("c1", 900.0)
+    assert result.complete, result.message
+    assert result.tool_answer == "pass"
+    long = [number for number, (_, plan) in enumerate(cell.sent, 1) if plan.duration_s > 0.4]
+    assert paused >= set(long)
+    assert len(long) > 7 + 10 + 4  # poses and home, full measurement, checks
+    assert np.all(true_error_m(cell) < cell.accuracy().error.bound_m)
 
 
 def test_gaps_that_hold_half_of_the_poses_complete_a_cycle_as_all_is_set(history, captured):

@@ -68,6 +68,23 @@ def test_a_mandrel_is_driven_through_the_beams_and_tells_of_a_knock(history):
     assert np.all(np.abs(off_mm) < 4.0 * np.array(found.document["sigma_mm"]))
 
 
+@pytest.mark.parametrize("tells", [True, False])
+def test_a_mandrel_is_measured_by_a_robot_that_is_slow_and_pauses(history, tells):
+    robot = with_mandrel(history, MANDREL)
+    robot.speed, robot.tells = 0.5, tells
+    robot.driver.arm(robot.now_s)
+    robot.measure("witness reference")
+    for phase in (DrivePhase.APPROACH, DrivePhase.MEASURE):
+        robot.run(100.0, until=lambda p=phase: robot.driver.phase is p)
+        robot.run(0.4)
+        robot.speed = 0.0
+        robot.run(10.0)
+        assert robot.driver.phase is phase
+        robot.speed = 1.0
+    robot.run(100.0, until=robot.at_rest)
+    assert robot.outcomes[-1].status is Code.ACCEPT, robot.outcomes[-1].message
+
+
 @pytest.mark.parametrize("mode", ["full", "witness reference"])
 def test_what_hangs_beside_what_is_measured_must_be_clear_of_the_housing(history, mode):
     """Straight down, 80 mm beside the tool: the other one would go into the housing's wall."""

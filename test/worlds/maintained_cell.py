@@ -93,6 +93,8 @@ class MaintainedCell(Robot):
         still = np.max(np.abs(self.q - before)) < 1e-9
         self.rests_s = self.rests_s + PERIOD_S if still else 0.0
         self.thermal.add(JointSample(self.ns(self.now_s), self.arm.joint_names, self.q))
+        if self.tells:
+            self.maintenance.robot.watch.scaled(self.speed, self.now_s)
         if self.now_s >= self.beat_s + BEAT_S:
             self.beat_s = self.now_s
             beat = self.maintenance.beat(self.now_s)
