@@ -247,6 +247,8 @@ class ToolDriver:
         self._beams: Counter[bool] = Counter()
         self._kind = ""  # of the last step that was driven
         self._driven = NO_RUN
+        self._said_s = 0.0  # when the awaited step was said to begin
+        self._patience_s = 0.5 * session.config.step_timeout_s
         self._failed = ""  # of the last stop, as it was acted upon
 
     def arm(self, now_s: float) -> None:
@@ -364,6 +366,8 @@ class ToolDriver:
         at_end = self.robot.at_end(now_s)
         if self.phase is DrivePhase.APPROACH and at_end:
             self._measure(now_s)
+        elif self.phase is DrivePhase.APPROACH and now_s - self._said_s > self._patience_s:
+            self._say_begins(now_s)  # a long or slow way is no step without edges
         elif self.phase is DrivePhase.MEASURE and at_end and self._number() != self._driven:
             self.phase = DrivePhase.IDLE
         if self.phase is DrivePhase.IDLE and self.armed and self._number() != self._driven:
@@ -388,7 +392,7 @@ class ToolDriver:
         step = self._session.awaited
         if q is None or step is None:
             return
-        self._driven = self._number()
+        self._driven, self._said_s = self._number(), now_s
         if self._session.run is None:
             raise ConflictError("no run is open")
         tool = self._session.current.tool.T_flange_tool
@@ -402,8 +406,13 @@ class ToolDriver:
             return
         plan = measuring(self._cell, step, q)
         self._kind = step.kind
-        self._ask(Command(STEP_BEGINS, {"step": step.name, "number": step.number}))
+        self._say_begins(now_s)
         self._start(plan, self._cell, DrivePhase.MEASURE, now_s)
+
+    def _say_begins(self, now_s: float) -> None:
+        self._said_s = now_s
+        if (step := self._session.awaited) is not None:
+            self._ask(Command(STEP_BEGINS, {"step": step.name, "number": step.number}))
 
     def _start(self, plan: JointPlan, cell: MotionCell, phase: DrivePhase, now_s: float) -> None:
         self._beams.clear()

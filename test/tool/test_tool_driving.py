@@ -70,6 +70,7 @@ def test_a_mandrel_is_driven_through_the_beams_and_tells_of_a_knock(history):
 
 @pytest.mark.parametrize("tells", [True, False])
 def test_a_mandrel_is_measured_by_a_robot_that_is_slow_and_pauses(history, tells):
+    """On a way of 23 s as it is planned: longer than a step may have no edge."""
     robot = with_mandrel(history, MANDREL)
     robot.speed, robot.tells = 0.5, tells
     robot.driver.arm(robot.now_s)
