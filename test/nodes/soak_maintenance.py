@@ -62,10 +62,10 @@ def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
     for _ in range(2):
         answer = graph.call(Decide, "/maintenance_node/accept", id=result.tool_id, by="plc")
         assert (answer.success, answer.revision) == (True, 1), answer.message
-    count = len(cell.sent)
+    count = len(cell.goals)
     repeated = cell.run("c1", GAP_S)
     assert repeated == first
-    assert len(cell.sent) == count
+    assert len(cell.goals) == count
     begin = time.monotonic()
     second = cell.run("c2", GAP_S)  # verifies the tool that was accepted
     print(f"second gap: {time.monotonic() - begin:.1f} s: {second.message}")
@@ -110,9 +110,9 @@ def test_calls_do_their_work_in_time(graph: Any, tmp_path: Path) -> None:
         base = proposed(history, 0)
         assert graph.call(Decide, "/maintenance_node/accept", id=base).success
         for number in range(COUNT):
-            sent = len(cell.sent)
+            sent = len(cell.goals)
             timed(RunMaintenanceCycle, "run", cycle_id=f"c{number}", gap_s=GAP_S)
-            graph.spin_until(lambda sent=sent: len(cell.sent) > sent, "a motion", within_s=30.0)
+            graph.spin_until(lambda sent=sent: len(cell.goals) > sent, "a motion", within_s=30.0)
             graph.spin_until(lambda: not cell.at_home(), "it moves")
             timed(GetMaintenance, "status")
             in_force = history.head().revision
