@@ -24,27 +24,13 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array
-from robocal_ros.tool.laser_frame import minimal_rotation
 
-EulerConvention = Literal["zxz", "zyx", "zyz"]
 FEWEST_TOUCHES = 4
 SHORTEST_MOVE_M = 1e-2
 LARGEST_RESIDUAL_M = 1e-3  # rms: the methods' class is 0.5 mm
 SMALLEST_ANGLE_RAD = float(np.radians(45.0))
 NAMES = ("tip_x", "tip_y", "tip_z", "point_x", "point_y", "point_z")
 LEAST_SPREAD = 0.05  # smallest over largest singular value: orientations too much alike
-
-
-def pose_from_euler(xyz: ArrayLike, angles_rad: ArrayLike, convention: EulerConvention) -> Array:
-    """T_base_flange (..., 4, 4) of controller poses: (..., 3) m and (..., 3) rad, moving axes.
-
-    ``zxz`` thesis eq. 4-3; ``zyx`` KUKA A, B, C; ``zyz`` Kawasaki O, A, T.
-    """
-    from scipy.spatial.transform import Rotation
-
-    angles = np.array(angles_rad, dtype=np.float64)
-    R = Rotation.from_euler(convention.upper(), angles.reshape(-1, 3)).as_matrix()
-    return frames.transform(R.reshape(*angles.shape[:-1], 3, 3), xyz)
 
 
 @dataclass(frozen=True)
@@ -216,11 +202,6 @@ def sweep_axis(
     turned = _middle(turned_up, "upper beam, turned") - _middle(turned_down, "lower beam, turned")
     v = np.array([-lean, turned, beams.up_m - beams.down_m])
     return np.asarray(v / np.linalg.norm(v))
-
-
-def straighten(R_base_flange: Array, v_flange: Array) -> Array:
-    """R_base_flange (3, 3) that sets the axis straight down, by the smallest turn."""
-    return np.asarray(minimal_rotation(R_base_flange @ v_flange, [0.0, 0.0, -1.0]) @ R_base_flange)
 
 
 def parallel_tip(

@@ -12,13 +12,12 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
+from robocal_ros.tool.laser_frame import minimal_rotation
 from robocal_ros.tool.touch_points import (
     ParallelBeams,
     fit_four,
     fit_seven,
     parallel_tip,
-    pose_from_euler,
-    straighten,
     sweep_axis,
 )
 
@@ -115,24 +114,6 @@ def test_moves_that_give_no_axes_are_refused():
         fit_seven(turned)
 
 
-def test_controllers_angles():
-    """Thesis eq. 4-3 written out; KUKA's A, B, C turn about z, y, x."""
-    A, B, C = 0.3, -0.7, 1.1
-    ca, sa, cb, sb, cc, sc = np.cos(A), np.sin(A), np.cos(B), np.sin(B), np.cos(C), np.sin(C)
-    printed = [
-        [ca * cc - sa * cb * sc, -ca * sc - sa * cb * cc, sa * sb],
-        [sa * cc + ca * cb * sc, -sa * sc + ca * cb * cc, -ca * sb],
-        [sb * sc, sb * cc, cb],
-    ]
-    T = pose_from_euler([1.0, 2.0, 3.0], [A, B, C], "zxz")
-    assert pytest.approx(np.array(printed)) == T[:3, :3]
-    assert T[:3, 3].tolist() == [1.0, 2.0, 3.0]
-    one = [np.array([0, 0, A]), np.array([0, B, 0]), np.array([C, 0, 0])]
-    turns = [frames.exp_rotation(v) for v in one]
-    R = pose_from_euler(np.zeros((2, 3)), [[A, B, C]] * 2, "zyx")[1, :3, :3]
-    assert pytest.approx(turns[0] @ turns[1] @ turns[2]) == R
-
-
 BEAMS = ParallelBeams(0.40, 0.36)
 X_BEAM = 0.8
 R_FIRST = np.column_stack([[-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])  # y_e along y_b, z_e down
@@ -158,7 +139,7 @@ def test_parallel_beams_find_axis_and_tip():
     turned_up, turned_down = sweep(tool, R_TURNED, 0.53)
     v = sweep_axis(BEAMS, up, down, turned_up, turned_down)
     assert v == pytest.approx(truth[:3, 2], abs=1e-9)
-    straight = straighten(R_FIRST, v)
+    straight = minimal_rotation(R_FIRST @ v, [0.0, 0.0, -1.0]) @ R_FIRST
     quarter = frames.exp_rotation([0.0, 0.0, np.pi / 2.0])
     pair = (straight, quarter @ straight)
     middles = tuple(sweep(tool, R, 0.53) for R in pair)
