@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.interface import Array, OfferedModel, OfferedTool, Reason, RefusedError
+from robocal_ros.correction.interface import OfferedModel, OfferedTool, Reason, RefusedError
 from robocal_ros.correction.joint_correction import (
     CorrectionResult,
     JointCorrection,
@@ -34,6 +34,7 @@ from robocal_ros.correction.limiter import (
 )
 from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
 from robocal_ros.ground import frames
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import payload_note
 

@@ -9,10 +9,10 @@ from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
@@ -81,9 +81,6 @@ class RefusedError(RobocalError):
         self.reason, self.detail = reason, detail
         self.code = _CODES.get(reason, Code.BAD_INPUT)
 
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 MOST_POINTS = 10_000  # of a trajectory: within 50 ms, so that nothing else waits longer
 TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE

@@ -53,10 +53,8 @@ from robocal_ros.correction.damping import WEIGHT
 from robocal_ros.correction.limiter import step_out
 from robocal_ros.correction.solution import RATE_STEP_S, STEP_AHEAD_S, work_size
 from robocal_ros.ground import frames
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
-
 
 LARGEST_SHIFT = 1.0
 # Of the shift per unit of a singular value: a tool's, which is larger, by more, so that in most

@@ -27,7 +27,6 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.correction.interface import (
-    Array,
     JointCommand,
     Reason,
     RefusedError,
@@ -37,6 +36,7 @@ from robocal_ros.correction.interface import (
     require_few,
 )
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.ros.conversions import NS, header
 

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.serialization import serialize_message
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
@@ -60,8 +59,6 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode, run
 from robocal_ros.ros.endpoints import Health, trigger_text
 from robocal_ros.ros.graph import ACTION, TRAJECTORY, SourceGuard, beside
-
-Array = NDArray[np.float64]
 
 TARGETS = "joint_targets"
 COMMANDS = "joint_commands"

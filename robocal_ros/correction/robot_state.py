@@ -8,8 +8,6 @@ import numpy as np
 
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import (
-    Array,
-    Index,
     JointCommand,
     Reason,
     RefusedError,
@@ -28,6 +26,7 @@ from robocal_ros.correction.limiter import (
     OffsetLimiter,
 )
 from robocal_ros.correction.solution import ordinary
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.kinematics import SerialArm
 
 # A robot follows what it was sent within this: drives lag, messages travel, s.

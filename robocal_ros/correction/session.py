@@ -17,9 +17,7 @@ import numpy as np
 from robocal_ros.correction import joint_correction, limiter
 from robocal_ros.correction.bounds import CorrectionConfig, CorrectionGate, DesiredOffset
 from robocal_ros.correction.interface import (
-    Array,
     CorrectionStatus,
-    Index,
     JointCommand,
     OfferedModel,
     OfferedTool,
@@ -40,6 +38,7 @@ from robocal_ros.correction.limiter import (
 from robocal_ros.correction.robot_state import Output, RobotState, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.kinematics import SerialArm

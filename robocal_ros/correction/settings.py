@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.limiter import OffsetLimits
 from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import (
     FULL_SPEED_IN_S,
@@ -21,8 +21,6 @@ from robocal_ros.motion.driver import HARD_STOP
 from robocal_ros.ros.base import NO_SERIAL
 from robocal_ros.ros.parameters import ROBOT, Setting, advanced, given_pose, pose_settings
 from robocal_ros.ros.session_node import STATE_DIR
-
-Array = NDArray[np.float64]
 
 NOMINAL = "nominal"
 # Parameters that go to the session as they are.

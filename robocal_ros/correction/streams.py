@@ -14,7 +14,7 @@ from robocal_ros.correction.bounds import (
     DesiredOffset,
     require_limits,
 )
-from robocal_ros.correction.interface import Array, Index, JointCommand, Reason, RefusedError
+from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
     ADDS,
     DESIRED,
@@ -26,6 +26,7 @@ from robocal_ros.correction.limiter import (
     VELOCITY,
 )
 from robocal_ros.correction.robot_state import Output, RobotState, hold_speeds
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 

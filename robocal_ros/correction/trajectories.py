@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset, require_limits
 from robocal_ros.correction.interface import (
-    Array,
-    Index,
     Reason,
     RefusedError,
     TrajectoryCommand,
@@ -45,6 +43,7 @@ from robocal_ros.correction.robot_state import (
     spline,
     spline_terms,
 )
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits, stop

@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import InputError, LimitError
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
 
 # ---- names and choice of the identifiable model parameters --------------------------------------
 
-
-Array = NDArray[np.float64]
 
 COLUMNS = ("d", "theta", "a", "alpha", "beta")
 D, THETA, A, ALPHA, BETA = range(5)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.files import nearest, quoted, read_text, share_folders, write_text
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics.arm import SerialArm
 from robocal_ros.kinematics.joint_functions import STANDARD_GRAVITY, ArmLoad, JointFunctions
 
@@ -169,8 +170,6 @@ def _kind(value: Any) -> str:
 
 # ---- robot files (YAML), described in docs/files.md, and where the shipped ones are --------
 
-
-Array = NDArray[np.float64]
 
 CONVENTIONS = ("dh", "mdh")
 TYPES = ("revolute", "prismatic")

@@ -16,11 +16,10 @@ from scipy.spatial.transform import Rotation
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import nearest, quoted, read_text, shortened, write_text
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE
-
-Array = NDArray[np.float64]
 
 LARGEST = 1e9  # in any unit: beyond it squares lose what is left of a measurement
 DIGITS = ".12g"  # 1e-9 mm in a metre, and no trailing noise of binary fractions

@@ -208,10 +208,8 @@ def _numbers(text: str, count: int, place: str, file: str) -> Array:
 def chain(urdf: Urdf, base: str = "", tip: str = "") -> Chain:
     """The joints between two links.
 
-    Parameters
-    ----------
-    base, tip : links; empty: ``base`` and ``tool0`` (or ``flange``) as REP-199 calls them, else the
-        root and the only link that carries none.
+    ``base``, ``tip``: links; empty: ``base`` and ``tool0`` (or ``flange``) as REP-199 calls them,
+    else the root and the only link that carries none.
 
     Raises `InputError` when there are no such links, nothing tells the tip, or a joint on the way
     moves otherwise than about or along one axis.
