@@ -16,7 +16,7 @@ from bench.tables import Cell, Goal, Table
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel, identify
-from robocal_ros.identification.solve import CellProblem, make_layout
+from robocal_ros.identification.cell_model import CellProblem, make_layout
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.universal_robots import link_transform
@@ -229,7 +229,7 @@ def _by_scipy(
     layout = make_layout(
         arm, names, geometry=arm.parameters.names, base=False, tool=False, orientation=False
     )
-    problem = CellProblem(layout, data, names, np.ones(SAMPLES), 0.0, arm.mdh)
+    problem = CellProblem(layout, data, names, np.ones(SAMPLES), 0.0, arm)
     index = data.target_index(names)
 
     def our_residual(x: Array) -> Array:

@@ -16,6 +16,7 @@ from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
     Document,
+    count,
     describe_robot,
     parts,
     print_output,
@@ -33,15 +34,30 @@ from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.full_model import FullIdentification
 from robocal_ros.identification.judged import (
     CYCLES,
+    contradicted,
     explain_mismatch,
     identification_document,
     read_positions,
     repeated,
     require_match,
 )
+from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import save_robot
-from robocal_ros.kinematics.tables import beyond_limits, read_measurements
+from robocal_ros.kinematics.tables import (
+    ANGLE_UNITS,
+    LENGTH_UNITS,
+    NUMBERS,
+    POSITION,
+    QUATERNION,
+    WORDS,
+    beyond_limits,
+    check_plain,
+    joint_texts,
+    read_cells,
+    read_measurements,
+    write_cells,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -87,6 +103,11 @@ def show_identification(console: "Console", document: Document) -> None:
     print_output(console, document)
 
 
+_JOINT_HEADS = (
+    "joint", "measured from", "to", "not covered", "own function, rms", "its sigma", "compliance",
+)  # fmt: skip
+
+
 def _show_errors(console: "Console", document: Document) -> None:
     models = {"nominal model": document["nominal"]}
     if document["in_force"] != document["nominal"]:
@@ -98,6 +119,10 @@ def _show_errors(console: "Console", document: Document) -> None:
     ]
     predicted = document["calibrated"]["predicted"]["total_rms_mm"]
     rows.append(["  predicted by its covariance", "", f"{predicted:.3f}", "", ""])
+    if document["held_out_rejected"] and "held_out_robust" in document["calibrated"]:
+        errors = document["calibrated"]["held_out_robust"]
+        left = f"  without the {len(document['held_out_rejected'])} that no model fits"
+        rows.append([left, *(f"{errors[f'{figure}_mm']:.3f}" for figure in _FIGURES)])
     print_table(console, "Errors at held-out measurements, mm", ("", *_FIGURES), rows)
 
 
@@ -112,14 +137,16 @@ def _show_joints(console: "Console", document: Document) -> None:
             shown = [f"{function[f'{name}_{micro}']:.0f} {micro}" for name in ("rms", "sigma")]
         load = f"{bends * 1e6:.2f} {micro}/{'N m' if unit == 'deg' else 'N'}" if bends else "none"
         lower, upper = row[f"measured_{unit}"]
-        rows.append([row["name"], f"{lower:.0f}", f"{upper:.0f} {unit}", *shown, load])
-    head = ("joint", "measured from", "to", "own function, rms", "its sigma", "compliance")
-    print_table(console, "Joints", head, rows)
-    if document["check_outside"]:
+        away = f"{row['check_outside']:.1%}" if row["check_outside"] else ""
+        rows.append([row["name"], f"{lower:.0f}", f"{upper:.0f} {unit}", away, *shown, load])
+    print_table(console, "Joints", _JOINT_HEADS, rows)
+    if part := document["coverage"]["not_covered"]:
         there = ", and its function is zero there" if document["model"] == "full" else ""
+        after, before = (part[name]["mean_mm"] for name in ("calibrated", "in_force"))
         console.print(
-            f"Not covered: {document['check_outside']:.1%} of the check poses have a joint outside "
-            f"of where it was measured{there}.",
+            f"Not covered, {part['code']}: {document['check_outside']:.1%} of the check poses have "
+            f"a joint where it was not measured{there}; mean {after:.3f} mm there instead of "
+            f"{before:.3f} mm.",
             soft_wrap=True,
         )
     console.print()
@@ -157,7 +184,7 @@ def _show_doubts(console: "Console", document: Document) -> None:
             print_words(console, f"  {words}")
     for key, words in (
         ("rejected", f"Rejected, {len(document['rejected'])} of {document['samples']} samples"),
-        ("held_out_rejected", "Left out of the judgement, no model fits them"),
+        ("held_out_rejected", "In the figures, but not in the verdict, no model fits them"),
     ):
         if samples := document[key]:
             more = " …" if len(samples) > MOST_LISTED else ""
@@ -171,28 +198,19 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``identify``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
-        "--data", required=True, type=Path, metavar="CSV", help="measurements to solve from"
-    )
-    judging = parser.add_mutually_exclusive_group()
-    judging.add_argument(
-        "--check", type=Path, metavar="CSV", help="measurements to judge on, none of them in --data"
-    )
-    judging.add_argument(
-        "--hold-out",
-        type=share,
-        metavar="SHARE",
-        help=f"without --check: share of the poses of --data to judge on, default {_HOLD_OUT}",
+        "--data",
+        type=Path,
+        metavar="CSV",
+        help="measurements to solve from; for --plan poses that the robot may be driven to, "
+        "default: random ones within its joint limits",
     )
     parser.add_argument(
-        "--seed", type=seed, metavar="N", help="which poses are held out, default 0"
+        "--plan",
+        type=count,
+        metavar="N",
+        help="measure nothing: say which N poses to measure, for --output",
     )
-    parser.add_argument(
-        "--check-refit",
-        type=parts,
-        default=(),
-        metavar="PARTS",
-        help="base,tool: place them anew from the check data, which come from another set-up",
-    )
+    _add_judging(parser)
     parser.add_argument(
         "--fit",
         type=parts,
@@ -223,13 +241,38 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
         "--output",
         type=Path,
         metavar="FILE",
-        help="write the identified robot file, only if the verdict accepts it",
+        help="write the identified robot file, only if the verdict accepts it; of --plan the poses",
+    )
+
+
+def _add_judging(parser: argparse.ArgumentParser) -> None:
+    judging = parser.add_mutually_exclusive_group()
+    judging.add_argument(
+        "--check", type=Path, metavar="CSV", help="measurements to judge on, none of them in --data"
+    )
+    judging.add_argument(
+        "--hold-out",
+        type=share,
+        metavar="SHARE",
+        help=f"without --check: share of the poses of --data to judge on, default {_HOLD_OUT}",
+    )
+    parser.add_argument(
+        "--seed", type=seed, metavar="N", help="which poses are held out, default 0"
+    )
+    parser.add_argument(
+        "--check-refit",
+        type=parts,
+        default=(),
+        metavar="PARTS",
+        help="base,tool: place them anew from the check data, which come from another set-up",
     )
 
 
 def run_identify(args: argparse.Namespace) -> CliResult:
     """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
+    if args.plan is not None:
+        return _planned(args)
 
     robot, warnings = describe_robot(args.robot)
     judged, document = _identified(robot.arm, args, warnings)
@@ -248,6 +291,8 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         document["output"] = str(args.output)
     elif args.output is not None:
         warnings.append(f"{args.output} is not written: the verdict is {verdict.code.name}")
+    if words := contradicted(judged.identification):
+        warnings.append(f"{args.data}: {words}")
     document |= {"figures": None, "warnings": warnings}
     result = judged.identification
     if args.figures is not None and isinstance(result, FullIdentification):
@@ -265,6 +310,11 @@ def run_identify(args: argparse.Namespace) -> CliResult:
 
 def _require_sense(args: argparse.Namespace) -> None:
     """Refuse options that contradict each other before any file is read."""
+    if args.data is None and args.plan is None:
+        raise InputError("--data is missing: the measurements to solve from (or --plan N)")
+    judging = (args.check, args.hold_out, args.seed, args.figures, args.check_refit or None)
+    if args.plan is not None and any(option is not None for option in judging):
+        raise InputError("--plan comes before measuring: there is nothing to judge or to draw yet")
     if args.check is None and args.check_refit:
         raise InputError("--check-refit is about the check data: give them with --check")
     if args.check is not None and args.seed is not None:
@@ -273,6 +323,71 @@ def _require_sense(args: argparse.Namespace) -> None:
         raise InputError("--check-refit: the geometry is what is checked; only base and tool")
     if args.output is not None and not args.output.parent.is_dir():
         raise InputError("no such folder for --output", file=str(args.output.parent))
+
+
+CANDIDATES, MOST_WORKING = 1500, 400
+
+
+def _planned(args: argparse.Namespace) -> CliResult:
+    """Say which poses to measure."""
+    from robocal_ros.identification.planning import plan_poses
+
+    robot, warnings = describe_robot(args.robot)
+    arm = robot.arm
+    if args.data is None:
+        candidates = random_postures(arm, CANDIDATES)
+        warnings.append("collisions are not known here: look at the poses before you drive them")
+    else:
+        candidates = _candidates(args.data, arm)
+    working = np.random.default_rng(0).permutation(len(candidates))[:MOST_WORKING]
+    plan = plan_poses(arm, candidates, candidates[working], args.plan)
+    columns = joint_texts(plan.q, arm)
+    names = [f"p{i}" for i in range(1, len(plan.q) + 1)]
+    if args.output is not None:
+        write_cells(args.output, {"sample": names} | columns)
+    poses = [
+        {"pose": name, "joints": [float(cell) for cell in cells]}
+        for name, *cells in zip(names, *columns.values(), strict=True)
+    ]
+    document: Document = {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "columns": list(columns),
+        "plan": poses,
+        "predicted_mm": (plan.predicted_rms_m * 1e3).tolist(),
+        "random_mm": plan.random_rms_m * 1e3,
+        "candidates": len(candidates),
+        "output": None if args.output is None else str(args.output),
+        "warnings": warnings,
+    }
+    return CliResult(document, _show_plan)
+
+
+def _candidates(path: Path, arm: SerialArm) -> np.ndarray:
+    """Joints (m, n) of a table of poses, measured or not."""
+    units = ["mm" if slides else "deg" for slides in arm.prismatic]
+    columns = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
+    others = (*WORDS, *NUMBERS, *POSITION["mm"], *QUATERNION)
+    table = read_cells(path, lambda header, file: check_plain(header, file, columns, others))
+    factors = [LENGTH_UNITS["mm"] if slides else ANGLE_UNITS["deg"] for slides in arm.prismatic]
+    return np.column_stack([table.numbers(name) for name in columns]) * factors
+
+
+def _show_plan(console: "Console", document: Document) -> None:
+    predicted, poses = document["predicted_mm"], document["plan"]
+    print_words(
+        console,
+        f"Error of the full model to expect after these {len(poses)} poses: {predicted[-1]:.3f} mm "
+        f"rms; after as many random ones {document['random_mm']:.3f} mm. The first k poses are the "
+        "plan of k.",
+    )
+    rows = [
+        [pose["pose"], *(f"{value:.2f}" for value in pose["joints"]), f"{error:.3f}"]
+        for pose, error in zip(poses, predicted, strict=True)
+    ]
+    heads = ("pose", *document["columns"], "error then, mm")
+    print_table(console, "Poses, the one that tells most first", heads, rows)
+    print_output(console, document)
 
 
 _OTHER_SET_UP = (
@@ -299,7 +414,8 @@ def _identified(
     else:
         train, check = data, read(args.check)
         warnings += _compared(train, check, args)
-    require_match(arm, data, base="base" in args.fit, tool="tool" in args.fit, file=str(args.data))
+    base, tool = "base" in args.fit, "tool" in args.fit
+    require_match(arm, data, base=base, tool=tool, hold=True, file=str(args.data))
     refit = args.check_refit
     try:
         judged = identify_and_judge(
@@ -316,7 +432,7 @@ def _identified(
         # The mistake in check data that miss the identified model, as for training data.
         cell = judged.identification.cell
         if frozenset(refit) >= {"base", "tool"}:
-            require_match(cell.arm, check, base=True, tool=True, file=file)
+            require_match(cell.arm, check, base=True, tool=True, hold=True, file=file)
         elif not refit and (mistake := explain_mismatch(cell.arm, check, cell.residual)):
             raise InputError(mistake, file=file)
         if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not refit:

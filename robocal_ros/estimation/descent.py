@@ -53,7 +53,8 @@ class Freedom:
         share, turn = np.linalg.eigh(root.T @ data @ root)
         V = root @ turn
         shown = np.clip(share, 0.0, 1.0) if pinned else np.ones(len(data))
-        return cls(count, np.sum(V * (told @ V), axis=0), shown, unit)
+        tells = np.where(shown > ROUNDING, np.sum(V * (told @ V), axis=0), 0.0)
+        return cls(count, tells, shown, unit)
 
     @classmethod
     def flat(cls, count: int, unknowns: int) -> "Freedom":
@@ -204,7 +205,8 @@ def _lengths(rows: Array) -> Array:
 FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
 MOST_ITERATIONS = 50
 OVERSHOT = 0.5  # slope behind a step, of that before it: then whole steps take too many to settle
-DAMPINGS = (0.0, *(10.0**power for power in range(-4, 7)))
+# weak directions curve long before the others do: damped as little as will do
+DAMPINGS = (0.0, *(10.0**power for power in range(-10, 7)))
 SOUND_FIT = 0.999  # residuals beyond this quantile say that given sigmas are too small
 CLEAR_STRETCH = 1.6  # beyond the scatter of a median of six samples
 STEP_TOLERANCE = 1e-4  # of a standard deviation
@@ -248,6 +250,7 @@ class Descent(Generic[S]):
         """
         k = run.jacobian.shape[2]
         left = self._left(run.jacobian, keep)  # hardly changes on the way
+        first = 0  # of the dampings that a step tries: two below the last that would do
         for _ in range(MOST_ITERATIONS):
             scale_of = self._plain_scale if huber is None else self._robust_scale
             scale = scale_of(run.residual[keep], left)
@@ -260,11 +263,12 @@ class Descent(Generic[S]):
                 near = run.residual + run.jacobian @ step  # exact enough so near
                 state = self.problem.retract(run.state, step)
                 return DescentState(state, near, run.jacobian, run.iterations + 1, True)
-            for damping in DAMPINGS:
+            for number, damping in enumerate(DAMPINGS[first:], first):
                 if damping:
                     step = _damped_step(information, gradient, damping)
                 trial = self._moved(run, step)
                 if loss.at(trial.state, trial.residual) <= here:
+                    first = max(0, number - 2)
                     break
             else:  # no step of any length helps: trusted only where all of it is far below a sigma
                 return replace(run, converged=to_go < FIRST_TOLERANCE**2 * k)
@@ -402,4 +406,8 @@ def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
     scaled = normal * np.outer(scale, scale)
     scaled[np.diag_indices_from(scaled)] += damping
-    return np.asarray(np.linalg.solve(scaled, -gradient * scale) * scale)
+    try:
+        step = np.linalg.solve(scaled, -gradient * scale)
+    except np.linalg.LinAlgError:  # nothing shows a direction: it is left alone
+        step = np.linalg.lstsq(scaled, -gradient * scale, rcond=None)[0]
+    return np.asarray(step * scale)

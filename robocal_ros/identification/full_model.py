@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import CellModel, CellProblem, UnknownLayout
 from robocal_ros.identification.joint_functions import (
     EVIDENCE_NEEDED,
     FunctionPrior,
@@ -22,15 +23,7 @@ from robocal_ros.identification.joint_functions import (
     JointTerms,
     Posterior,
 )
-from robocal_ros.identification.solve import (
-    CellModel,
-    CellProblem,
-    Identification,
-    Method,
-    Part,
-    UnknownLayout,
-    identify,
-)
+from robocal_ros.identification.solve import Identification, Method, Part, identify
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import THETA, D
 from robocal_ros.kinematics.joint_functions import JointFunctions
@@ -44,7 +37,9 @@ _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry 
 # these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
 SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
-_ROUNDS = 4  # of solving, and judging the samples anew
+GAP_LENGTHS, GAP_SPACINGS = 2.0, 3.0
+_FREE_ROUNDS = 2  # in which a rejected sample may come back
+_ROUNDS, SETTLED = 12, 0.05  # of solving and judging the samples anew; share of the noise
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class FullIdentification(Identification):
     prior : length and amplitude (n,) that the evidence chose for each function.
     gain : (n,) evidence for each joint's function, natural logarithm.
     all_covariance : (k, k) of all unknowns, those of ``layout`` first.
-    measured : (n, 2) smallest and largest reading of each joint, rad (prismatic: m).
+    readings : (m, n) readings of each joint, rad (prismatic: m), sorted by size.
     left_out_rms_m : rms error at measured poses, each left out in turn.
     """
 
@@ -65,8 +60,24 @@ class FullIdentification(Identification):
     prior: FunctionPrior
     gain: Array
     all_covariance: Array
-    measured: Array
+    readings: Array
     left_out_rms_m: float
+
+    def uncovered(self, q: Array) -> Mask:
+        """Which joints (m, n) have a function that was not measured near readings (m, n).
+
+        Beyond the readings by half of its length, or in a gap that is wide beside the length and
+        the usual distance of two readings: there a function is zero, give or take its prior.
+        """
+        found = np.zeros(q.shape, dtype=np.bool_)
+        for joint in np.flatnonzero(self.terms.count):
+            x, own, length = q[:, joint], self.readings[:, joint], self.prior.length[joint]
+            at = np.clip(np.searchsorted(own, x), 1, len(own) - 1)
+            away = np.minimum(np.abs(x - own[at - 1]), np.abs(x - own[at]))
+            gap = max(GAP_LENGTHS * length, GAP_SPACINGS * (own[-1] - own[0]) / len(own))
+            beyond = (x < own[0] - 0.5 * length) | (x > own[-1] + 0.5 * length)
+            found[:, joint] = beyond | (away > gap)
+        return found
 
     def predicted_variance(self, q: Array, target: Index, without: Collection[Part] = ()) -> Array:
         """Covariance (m, 3, 3), m^2, of the predicted target positions.
@@ -75,7 +86,7 @@ class FullIdentification(Identification):
         """
         from robocal_ros.identification import row_kernels
 
-        rows = _rows(self.layout, self.cell, self.terms, np.ascontiguousarray(q), target)
+        rows = sparse_rows(self.layout, self.cell, self.terms, np.ascontiguousarray(q), target)
         J, by_turn = np.ascontiguousarray(rows.J[:, :3]), rows.by_turn[:, :3]
         covariance, own = self.all_covariance, np.flatnonzero(self._columns(without))
         if len(own):  # what is solved anew takes up what it can of every other error
@@ -142,9 +153,10 @@ def _with_turns(layout: UnknownLayout, arm: SerialArm) -> tuple[UnknownLayout, I
     return replace(layout, slots=slots, names=names), slots[range(arm.n), kinds]
 
 
-def _rows(
+def sparse_rows(
     layout: UnknownLayout, cell: CellModel, terms: JointTerms, q: Array, target: Index
 ) -> _Rows:
+    """What poses (m, n) of targets (m,) see of all unknowns."""
     wide, turns = _with_turns(layout, cell.arm)
     T, J = wide.jacobian(cell, q, target)
     by_turn = J[:, :, turns] * cell.arm.sign
@@ -164,12 +176,18 @@ def _sparse(
 
 @dataclass(frozen=True)
 class _Solution:
-    """Where the rounds stand."""
+    """Where the rounds stand, and the residuals (m, c) that a linear model would have there."""
 
     cell: CellModel
     terms: JointTerms
     prior: FunctionPrior
     posterior: Posterior | None = None
+    linear: Array | None = None
+
+    def settled(self, residual: Array) -> bool:
+        """Whether residuals (m, c) are those of the linear model, but for a part of the noise."""
+        assert self.linear is not None
+        return bool(np.std(residual - self.linear) < SETTLED * self.prior.noise)
 
 
 class _FullProblem:
@@ -180,9 +198,7 @@ class _FullProblem:
         self.layout = start.layout
         sigma = np.ones(len(data)) if data.sigma is None else data.sigma
         wide, self.turns = _with_turns(start.layout, start.nominal)
-        self.problem = CellProblem(
-            wide, data, start.cell.targets, sigma, lever_m, start.nominal.mdh
-        )
+        self.problem = CellProblem(wide, data, start.cell.targets, sigma, lever_m, start.nominal)
 
     def linearise(self, cell: CellModel, terms: JointTerms) -> tuple[Array, _Rows]:
         residual, J = self.problem.linearise(cell)
@@ -191,7 +207,7 @@ class _FullProblem:
         return residual, _sparse(terms, cell.arm, self.data.q, residual, dense, by_turn)
 
     def values(self, cell: CellModel, terms: JointTerms) -> Array:
-        """All unknowns (k,), from the mean of their prior; of base and targets zeros."""
+        """All unknowns (k,), from the mean of their prior; of the base zeros."""
         away = self.problem.deviation(cell)[: len(self.layout.names)]
         return np.concatenate([away, terms.values(cell.arm.functions)])
 
@@ -203,6 +219,8 @@ class _FullProblem:
         return replace(cell, arm=arm.with_model(arm.mdh, terms.functions(values), arm.load))
 
     def evidence(self, at: _Solution, residual: Array, rows: _Rows, weight: Array) -> JointEvidence:
+        from scipy.linalg import block_diag
+
         from robocal_ros.identification import row_kernels
 
         k = at.terms.size
@@ -212,10 +230,15 @@ class _FullProblem:
         squares = float(weight @ np.sum(residual**2, axis=1) + 2.0 * pull @ x + x @ normal @ x)
         flat = np.zeros(k, dtype=np.bool_)
         flat[: at.terms.before] = True
+        start = self.start
         fixed: Array = np.zeros((0, 0))
-        if self.start.prior_covariance is not None:
-            fixed = np.asarray(np.linalg.cholesky(self.start.prior_covariance))
+        if start.prior_covariance is not None:
+            fixed = np.asarray(np.linalg.cholesky(start.prior_covariance))
             flat[: len(fixed)] = False
+        if start.target_reach_m is not None:
+            place = start.layout.tool_places
+            fixed = block_diag(fixed, start.target_reach_m * np.eye(len(place)))
+            flat[place] = False
         return JointEvidence(
             terms=at.terms,
             normal=normal,
@@ -375,7 +398,7 @@ def identify_full(
         rival = min(
             problem, _FullProblem(held, data, held.lever_m), key=_FullProblem.geometric_left_out
         )
-    if 3.0 * len(data) < FEWEST_NUMBERS * before:
+    if 3.0 * len(data) < FEWEST_NUMBERS * before or start.estimate.creeping:
         return rival.start
     at = _Solution(
         start.cell,
@@ -395,13 +418,15 @@ def identify_full(
     amplitude = np.where(functions, 0.0, at.prior.amplitude)
     rigid = replace(at.cell, arm=bare(at.cell.arm))
     at = _Solution(rigid, terms, replace(at.prior, amplitude=amplitude))
-    for _ in range(_ROUNDS):
+    for attempt in range(_ROUNDS):
         residual, rows = problem.linearise(at.cell, at.terms)
         weight = keep * problem.visit_share(residual, keep.astype(np.float64))
         at = _round(problem, at, residual, rows, weight)
         residual, rows = problem.linearise(at.cell, at.terms)
         last, keep = keep, problem.inliers(*problem.left_out(residual, rows, at, weight))
-        if np.array_equal(last, keep):
+        if attempt >= _FREE_ROUNDS:  # a sample at the limit must not come and go for ever
+            keep &= last
+        if np.array_equal(last, keep) and at.settled(residual):
             break
     full = _reported(problem, at, last, weight)
     needed = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
@@ -415,7 +440,9 @@ def _round(
     prior = evidence.maximise(at.prior)
     posterior = evidence.posterior(prior)
     cell = problem.moved(at.cell, at.terms, posterior.mean)
-    return _Solution(cell, at.terms, prior, posterior)
+    step = np.append(posterior.mean - problem.values(at.cell, at.terms), 0.0)  # of column -1
+    linear = residual + np.einsum("mch,mh->mc", rows.J, step[rows.column])
+    return _Solution(cell, at.terms, prior, posterior, linear)
 
 
 def _unwanted(at: _Solution) -> tuple[Mask, Mask]:
@@ -466,12 +493,15 @@ def _reported(
         "rejected": tuple(data.sample[i] for i in np.flatnonzero(~keep)),
         "noise_m": noise * sigma,
     }
+    if data.sigma is not None:
+        used = weight @ np.sum(residual[:, :3] ** 2, axis=1)
+        plain["sigma_ratio"] = float(np.sqrt(used / max(at.posterior.left, 1.0)))
     return FullIdentification(
         **plain,
         terms=at.terms,
         prior=at.prior,
         gain=at.posterior.gain,
         all_covariance=covariance,
-        measured=np.column_stack([data.q.min(axis=0), data.q.max(axis=0)]),
+        readings=np.sort(data.q, axis=0),
         left_out_rms_m=problem.rms(error),
     )

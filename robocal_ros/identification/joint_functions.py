@@ -179,6 +179,16 @@ def _correlation(count: int, step: float, length: float) -> tuple[Array, Array]:
     return toeplitz((1.0 + d + d * d / 3.0) * decay), toeplitz(decay * d * d * (1.0 + d) / 3.0)
 
 
+def prior_covariance(terms: JointTerms, prior: FunctionPrior) -> Array:
+    """Covariance (k, k) of all unknowns before the data: of the functions; of others zeros."""
+    covariance = np.zeros((terms.size, terms.size))
+    for joint in np.flatnonzero(terms.count):
+        block, count = terms.block(int(joint)), int(terms.count[joint])
+        K, _ = _correlation(count, float(terms.step[joint]), float(prior.length[joint]))
+        covariance[block, block] = prior.amplitude[joint] ** 2 * K
+    return covariance
+
+
 @dataclass(frozen=True)
 class Posterior:
     """Mean (k,) and covariance (k, k) of all unknowns under a prior.

@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import (
+    FEWEST_GROUPS,
     SPREAD_POSES,
+    ErrorSummary,
     Judgement,
     Verdict,
+    errors_document,
     gross,
     hold_out,
     judge,
@@ -22,19 +25,17 @@ from robocal_ros.estimation.assessment import (
     too_narrow,
     verdict_document,
 )
-from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
-from robocal_ros.ground.frames import Document, log_rotation, transform_document
+from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import Document, invert, log_rotation, transform_document
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
-from robocal_ros.identification.full_model import FullIdentification, identify_full
-from robocal_ros.identification.solve import (
+from robocal_ros.identification.cell_model import (
     CellModel,
-    Identification,
-    Method,
-    Part,
-    identify,
+    carried,
     linear_start,
-    still_joints,
+    place_base_and_points,
 )
+from robocal_ros.identification.full_model import FullIdentification, identify_full
+from robocal_ros.identification.solve import Identification, Method, Part, identify, still_joints
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document, parameters_document
 from robocal_ros.kinematics.tables import POSITION, check_plain, read_cells
@@ -52,11 +53,18 @@ _DEGREE = float(np.pi / 180.0)
 
 
 def require_match(
-    arm: SerialArm, data: Measurements, *, base: bool, tool: bool, file: str | None = None
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    base: bool,
+    tool: bool,
+    hold: bool = False,
+    file: str | None = None,
 ) -> None:
     """Refuse data that miss the nominal arm as no robot does, where the mistake can be named.
 
-    ``base``, ``tool``: whether they are placed from the data or known (see ``linear_start``).
+    ``base``, ``tool``: whether they are placed from the data or known; ``hold``: poses may hardly
+    turn the flange (see ``linear_start``).
 
     Raises
     ------
@@ -67,7 +75,7 @@ def require_match(
     """
 
     def residual(measured: Measurements) -> Array:
-        return linear_start(arm, measured, base=base, tool=tool).residual(measured)
+        return linear_start(arm, measured, base=base, tool=tool, hold=hold).residual(measured)
 
     if mistake := explain_mismatch(arm, data, residual):
         raise InputError(mistake, file=file)
@@ -97,7 +105,25 @@ def explain_mismatch(
                 f"{words}: as given, the data miss the robot by {found * 1e3:.3g} mm (median), "
                 f"with that undone by {after * 1e3:.3g} mm"
             )
+    if (after := _median(_seen_from_flange(arm, data))) < clear:
+        return (
+            "the targets stand still and the sensor sits on the flange: taken as targets on the "
+            f"flange they miss the robot by {found * 1e3:.3g} mm (median), so by "
+            f"{after * 1e3:.3g} mm; measure targets on the flange by a sensor that stands still"
+        )
     return ""
+
+
+def _seen_from_flange(arm: SerialArm, data: Measurements) -> Array:
+    """Errors (m, 3) of points that stand still, as a sensor on the flange would see them."""
+    T, index = invert(arm.fk(data.q)), data.target_index(data.targets)
+    try:
+        T_sensor_flange, points = place_base_and_points(
+            T, data.position, index, len(data.targets), np.zeros(3)
+        )
+    except (TooFewSamplesError, RankDeficientError):
+        return np.full((1, 3), np.inf)
+    return carried(T_sensor_flange @ T, points[index]) - data.position
 
 
 def _median(residual: Array) -> float:
@@ -141,6 +167,8 @@ def _mistakes(arm: SerialArm, data: Measurements) -> Iterator[tuple[str, Measure
 
 
 CURVE = 300  # points of a joint's function
+MOST_UNCOVERED = 0.05  # of the check poses, from where on the verdict's reason says so
+CONTRADICTED = 2.0  # residuals over their sigmas: no choice of weights explains more
 LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
 
 
@@ -153,13 +181,23 @@ class JudgedIdentification(Judgement):
 
     Attributes
     ----------
+    robust : of nominal, in_force and calibrated without the rows that do not decide.
     measured : (n, 2) smallest and largest reading of each joint that it was made from.
-    check_outside : share of the check poses that have a joint outside of these.
+    away : (m, n) which check poses have which joints where these were not measured.
+    parts : errors of in_force and calibrated at the check poses that are covered, and at those
+        that are not, where there are such.
     """
 
     identification: Identification
+    robust: dict[str, ErrorSummary]
     measured: Array
-    check_outside: float
+    away: NDArray[np.bool_]
+    parts: dict[str, dict[str, ErrorSummary]]
+
+    @property
+    def check_outside(self) -> float:
+        """Share of the check poses that are not covered."""
+        return float(np.mean(np.any(self.away, axis=1)))
 
 
 def identify_and_judge(
@@ -174,6 +212,8 @@ def identify_and_judge(
     in_force: SerialArm | None = None,
 ) -> JudgedIdentification:
     """Identify from ``train`` and compare with the model in force on ``check``.
+
+    Figures count every row of ``check``; rows that no model fits do not decide.
 
     Parameters
     ----------
@@ -195,37 +235,87 @@ def identify_and_judge(
         before = _check_error(_set_up(in_force, train, set_up), check, check_refit)
     after = _check_error(result.cell, check, check_refit)
     predicted, total = _predicted(result, check, check_refit)
-    doubt = still_joints(arm, train) and still_joints(arm, check)
-    # a row counts unless it misses the model in force, too, as no robot does
+    # a row decides unless it misses the model in force, too, as no robot does
     sound = ~(gross(before, after) & gross(before, before))
-    current, workspace_m = (
-        summarise(before[sound]),
-        result.workspace_rms(result.estimate.covariance),
-    )
+    measured = np.column_stack([train.q.min(axis=0), train.q.max(axis=0)])
+    away = (check.q < measured[:, 0]) | (check.q > measured[:, 1])
+    if isinstance(result, FullIdentification):
+        away = result.uncovered(check.q)
+    workspace_m = result.workspace_rms(result.estimate.covariance)
+    doubt = still_joints(arm, train) and still_joints(arm, check)
     doubt = doubt or result.estimate.creeping
     if not doubt:
         change_m = result.workspace_change(in_force or arm)
-        doubt = too_narrow(workspace_m, change_m, current.rms_m, SPREAD_POSES)
-    verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
-    if "geometry" not in fit and verdict.code in (
-        Code.WORSE_THAN_CURRENT, Code.NO_SIGNIFICANT_GAIN
-    ):  # fmt: skip  # base and targets alone were fitted: the model cannot have changed
-        why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
-        verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
-    measured = np.column_stack([train.q.min(axis=0), train.q.max(axis=0)])
-    outside = np.any((check.q < measured[:, 0]) | (check.q > measured[:, 1]), axis=1)
+        doubt = too_narrow(workspace_m, change_m, summarise(before[sound]).rms_m, SPREAD_POSES)
+    inside = ~np.any(away, axis=1)
+    verdict = _decided(result, fit, before, after, pose_groups(check.q), doubt, sound, inside)
+    if isinstance(result, FullIdentification) and (elsewhere := _not_covered(arm, away)):
+        verdict = replace(verdict, reason=f"{verdict.reason}; {elsewhere}")
+    errors = {"nominal": plain, "in_force": before, "calibrated": after}
     return JudgedIdentification(
         identification=result,
+        robust={name: summarise(error[sound]) for name, error in errors.items()},
         measured=measured,
-        check_outside=float(np.mean(outside)),
-        nominal=summarise(plain[sound]),
-        current=current,
-        candidate=summarise(after[sound]),
+        away=away,
+        parts={
+            name: {key: summarise(errors[key][part]) for key in ("in_force", "calibrated")}
+            for name, part in (("covered", inside), ("not_covered", ~inside))
+            if np.any(part)
+        },
+        nominal=summarise(plain),
+        current=summarise(before),
+        candidate=summarise(after),
         predicted_rms_m=predicted,
         predicted_total_rms_m=total,
         workspace_rms_m=workspace_m,
         held_out_rejected=tuple(check.sample[i] for i in np.flatnonzero(~sound)),
         verdict=verdict,
+    )
+
+
+def _decided(
+    result: Identification, fit: Collection[Part], before: Array, after: Array,
+    pose: NDArray[np.int64], doubt: str, sound: NDArray[np.bool_], inside: NDArray[np.bool_],
+) -> Verdict:  # fmt: skip
+    """Judge by the ``sound`` rows (m,), and by those ``inside`` of what was measured alone."""
+    verdict = judge(before[sound], after[sound], pose[sound], doubt)
+    known = sound & inside
+    covers = isinstance(result, FullIdentification) and not np.all(inside)
+    if verdict.accept and covers and len(np.unique(pose[known])) >= FEWEST_GROUPS:
+        verdict = judge(before[known], after[known], pose[known])  # where it was measured
+    if verdict.accept and result.sigma_ratio > CONTRADICTED:
+        return Verdict(Code.RESIDUAL_TOO_LARGE, f"{contradicted(result)}; {verdict.reason}")
+    if "geometry" not in fit and verdict.code in (
+        Code.WORSE_THAN_CURRENT, Code.NO_SIGNIFICANT_GAIN
+    ):  # fmt: skip  # base and targets alone were fitted: the model cannot have changed
+        why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
+        return Verdict(Code.NO_SIGNIFICANT_GAIN, why)
+    return verdict
+
+
+def _not_covered(arm: SerialArm, away: NDArray[np.bool_]) -> str:
+    """Say which check poses have joints (m, n) where they were not measured; empty for few."""
+    share = float(np.mean(np.any(away, axis=1)))
+    if share <= MOST_UNCOVERED:
+        return ""
+    shares = np.mean(away, axis=0)
+    joints = [f"{arm.joint_names[i]} ({shares[i]:.0%})" for i in np.flatnonzero(shares)]
+    return (
+        f"{share:.0%} of the check poses are not covered, with joints where they were not "
+        f"measured: {', '.join(joints)}; there the model is geometry and compliance alone: "
+        "measure there too"
+    )
+
+
+def contradicted(result: Identification) -> str:
+    """Say that residuals contradict the sigmas that were given; empty where they do not."""
+    ratio = result.sigma_ratio
+    if 1.0 / CONTRADICTED <= ratio <= CONTRADICTED:
+        return ""
+    stated_mm = result.noise_m / max(ratio, 1.0) * 1e3
+    return (
+        f"the residuals are {ratio:.2g} times what sigma_mm says ({stated_mm:.3g} mm): state what "
+        "robot and sensor scatter together, or leave the column out, and it is found"
     )
 
 
@@ -264,7 +354,7 @@ def identify_and_hold_out(
         When the data cannot answer.
     """
     held = hold_out(pose_groups(data.q), share, seed)
-    require_match(arm, data, base=True, tool=True)
+    require_match(arm, data, base=True, tool=True, hold=True)
     train, check = data.take(~held), data.take(held)
     return identify_and_judge(arm, train, check, method=method, model=model, in_force=in_force)
 
@@ -275,9 +365,10 @@ def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellM
 
 
 def _check_error(cell: CellModel, check: Measurements, refit: Collection[Part]) -> Array:
-    if refit:
-        # What is not refitted is kept; with both refitted nothing of the old set-up counts.
-        start = None if frozenset(refit) >= {"base", "tool"} else cell
+    if refit:  # what is not refitted is kept
+        start = linear_start(
+            cell.arm, check, base="base" in refit, tool="tool" in refit, known=cell, hold=True
+        )
         cell = identify(cell.arm, check, fit=refit, method="map", start=start).cell
     return np.asarray(np.linalg.norm(cell.residual(check), axis=1))
 
@@ -292,6 +383,7 @@ def _predicted(
     model = float(np.mean(np.trace(variance, axis1=1, axis2=2)))
     sigma = check.sigma
     noise = result.noise_m if sigma is None else float(np.sqrt(np.mean(sigma**2)))
+    model = max(model, 0.0)  # of weak directions rounding is left
     return float(np.sqrt(model)), float(np.sqrt(model + 3.0 * noise**2))
 
 
@@ -333,6 +425,7 @@ def joints_document(judged: JudgedIdentification) -> list[Document]:
             {
                 "name": name,
                 f"measured_{unit}": (judged.measured[joint] * factor).tolist(),
+                "check_outside": float(np.mean(judged.away[:, joint])),
                 "function": function,
                 "compliance": 0.0 if functions is None else float(functions.compliance[joint]),
             }
@@ -347,7 +440,7 @@ def _function_document(result: FullIdentification, joint: int) -> Document:
     unit, micro, factor = ("deg", "urad", float(np.degrees(1.0)))
     if arm.prismatic[joint]:
         unit, micro, factor = "mm", "um", 1e3
-    lower, upper = result.measured[joint].tolist()
+    lower, upper = result.readings[[0, -1], joint].tolist()
     q = np.zeros((CURVE, arm.n))
     q[:, joint] = np.linspace(lower, upper, CURVE)
     value, sigma = arm.functions.delta(q)[:, joint], result.function_sigma(q)[:, joint]
@@ -358,10 +451,24 @@ def _function_document(result: FullIdentification, joint: int) -> Document:
     }
 
 
+def _coverage_document(judged: JudgedIdentification) -> Document:
+    """Errors at check poses that are covered and that are not, each with its code."""
+    found: Document = {"covered": None, "not_covered": None}
+    for name, part in judged.parts.items():
+        code = judged.verdict.code if name == "covered" else Code.POSES_NOT_INFORMATIVE
+        found[name] = {"code": code.name} | {
+            key: errors_document(errors) for key, errors in part.items()
+        }
+    return found
+
+
 def identification_document(judged: JudgedIdentification) -> Document:
     """The ``identify`` document: errors before and after, parameters, rank, verdict."""
     result = judged.identification
     seen = result.estimate.observability
+    errors = judged_errors_document(judged)
+    for name, robust in judged.robust.items():
+        errors[name]["held_out_robust"] = errors_document(robust)
     return {
         "robot": result.nominal.name,
         "model_hash": result.nominal.model_hash,
@@ -369,15 +476,17 @@ def identification_document(judged: JudgedIdentification) -> Document:
         "model": "full" if isinstance(result, FullIdentification) else "geometric",
         "joints": joints_document(judged),
         "check_outside": judged.check_outside,
-        **judged_errors_document(judged),
+        "coverage": _coverage_document(judged),
+        **errors,
         "parameters": parameters_document(result.nominal, result.cell.arm, result.sigma()),
         **cell_document(result.cell),
         "noise_mm": result.noise_m * 1e3,
+        "noise_over_sigma": result.sigma_ratio,
         "samples": len(result.estimate.rejected),
         "rank": seen.rank,
         "unknowns": len(result.layout.names) + len(result.held),
         "condition": seen.condition,
-        "unobservable": list(result.unobservable),
+        "unobservable": [*result.unobservable, *result.weak],
         "held": list(result.held),
         "rejected": list(result.rejected),
         "held_out_rejected": list(judged.held_out_rejected),

@@ -1,11 +1,7 @@
-"""A robot, where it stands in the measuring frame, and the targets on its flange: its model.
-
-Base, targets and model parameters from measurements: least squares or maximum a posteriori.
-"""
+"""Base, targets and model parameters from measurements: least squares or maximum a posteriori."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -15,290 +11,22 @@ from robocal_ros.estimation import estimation
 from robocal_ros.estimation.descent import require_told
 from robocal_ros.estimation.estimation import describe, observability
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import (
+    ADVICE,
+    TARGET_REACH_M,
+    TYPICAL_ERROR_M,
+    WEAK_TARGET_M,
+    CellModel,
+    CellProblem,
+    UnknownLayout,
+    linear_start,
+    make_layout,
+)
 from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class CellModel:
-    """A measured robot: ``T_frame_target = T_frame_base T_base_flange(q) T_flange_target``.
-
-    Attributes
-    ----------
-    arm : the arm with its model parameters.
-    T_frame_base : (4, 4) robot base in the measuring frame.
-    targets, T_flange_target : names and (t, 4, 4) poses of the targets on the flange.
-    """
-
-    arm: SerialArm
-    T_frame_base: Array
-    targets: tuple[str, ...]
-    T_flange_target: Array
-
-    @cached_property
-    def T_frame_root(self) -> Array:
-        """The first joint's frame (4, 4) in the measuring frame."""
-        return self.T_frame_base @ self.arm.T_base_root
-
-    def predict(self, q: Array, target: Index) -> Array:
-        """T_frame_target (m, 4, 4) at joint vectors (m, n), ``target`` (m,) by index."""
-        from robocal_ros.kinematics import kernels
-
-        T = np.empty((len(q), 4, 4))
-        kernels.fk_batch(self.arm.turned(q), self.arm.links, self.T_frame_root, T)
-        return np.asarray(T @ self.T_flange_target[target])
-
-    def residual(self, data: Measurements) -> Array:
-        """Predicted minus measured position (m, 3), m, in the measuring frame."""
-        T = self.predict(data.q, data.target_index(self.targets))
-        return np.asarray(T[:, :3, 3] - data.position)
-
-
-@dataclass(frozen=True)
-class UnknownLayout:
-    """Which increments are unknown, and their columns.
-
-    Order: the model parameters ``slots`` (n, 5), six of the base from ``base`` (translation of
-    the root, turn about it, measuring axes), then per target from ``tool`` (t,) three of
-    position and, with orientation, three of turn (flange axes). -1 where held.
-    """
-
-    names: tuple[str, ...]
-    slots: Index
-    base: int
-    tool: Index
-    tool_size: int
-
-    @cached_property
-    def to_display(self) -> Array:
-        """Factors (k,) from SI to the unit in each name."""
-        return np.array([1e3 if name.endswith("_mm") else np.degrees(1.0) for name in self.names])
-
-    @cached_property
-    def geometry(self) -> tuple[Index, Index, Index]:
-        """Joint, parameter column and place in the increment of each free model parameter."""
-        joint, column = np.nonzero(self.slots >= 0)
-        return joint, column, self.slots[joint, column]
-
-    def jacobian(self, state: CellModel, q: Array, target: Index) -> tuple[Array, Array]:
-        """T_frame_target (m, 4, 4) and its twist [v; w] by the unknowns (m, tool_size, k)."""
-        from robocal_ros.kinematics import kernels
-
-        T = np.empty((len(q), 4, 4))
-        J = np.zeros((len(q), self.tool_size, len(self.names)))
-        arm = state.arm
-        kernels.parameter_batch(
-            arm.turned(q), arm.links, state.T_frame_root, state.T_flange_target, target,
-            self.slots, self.base, self.tool, T, J,
-        )  # fmt: skip
-        return T, J
-
-    def retract(self, state: CellModel, step: Array) -> CellModel:
-        """Move a cell model by an increment (k,)."""
-        arm, T_frame_base, tools = state.arm, state.T_frame_base, state.T_flange_target
-        joint, column, place = self.geometry
-        if len(place):
-            mdh = arm.mdh.copy()
-            mdh[joint, column] += step[place]
-            arm = arm.with_mdh(mdh)
-        if self.base >= 0:
-            shift, turn = step[self.base : self.base + 3], step[self.base + 3 : self.base + 6]
-            root = state.T_frame_root
-            moved = frames.transform(frames.exp_rotation(turn) @ root[:3, :3], root[:3, 3] + shift)
-            T_frame_base = moved @ frames.invert(arm.T_base_root)
-        if self.tool[0] >= 0:
-            tools = tools.copy()
-            block = step[self.tool[0] :].reshape(len(self.tool), self.tool_size)
-            tools[:, :3, 3] += block[:, :3]
-            if self.tool_size == 6:
-                tools[:, :3, :3] = frames.exp_rotation(block[:, 3:]) @ tools[:, :3, :3]
-        return CellModel(arm, T_frame_base, state.targets, tools)
-
-
-_BASE = ("base_x_mm", "base_y_mm", "base_z_mm", "base_rx_deg", "base_ry_deg", "base_rz_deg")
-_AXES = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
-
-
-def make_layout(
-    arm: SerialArm,
-    targets: tuple[str, ...],
-    *,
-    geometry: tuple[str, ...],
-    base: bool,
-    tool: bool,
-    orientation: bool,
-) -> UnknownLayout:
-    """Lay out the unknowns: the model parameters of these names, the base, the targets."""
-    chosen = arm.parameters.subset(geometry)
-    size = 6 if orientation else 3
-    first_tool = len(chosen) + (6 if base else 0)
-    names = chosen.names + (_BASE if base else ())
-    if tool:
-        names += tuple(f"{target}_{axis}" for target in targets for axis in _AXES[:size])
-    columns = np.arange(len(targets), dtype=np.int64) * size + first_tool
-    return UnknownLayout(
-        names=names,
-        slots=chosen.slots(arm.n),
-        base=len(chosen) if base else -1,
-        tool=columns if tool else np.full(len(targets), -1, dtype=np.int64),
-        tool_size=size,
-    )
-
-
-@dataclass(frozen=True)
-class CellProblem:
-    """Residuals of measurements against a cell model, for ``estimation.solve``.
-
-    Attributes
-    ----------
-    sigma : (m,) of each position coordinate, m (ones where unknown).
-    lever_m : length, m, by which a turn in rad counts as a position error; 0: positions only.
-    prior_mdh : (n, 5) mean of the model parameters' prior.
-    """
-
-    layout: UnknownLayout
-    data: Measurements
-    targets: tuple[str, ...]
-    sigma: Array
-    lever_m: float
-    prior_mdh: Array
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names (k) of the increments."""
-        return self.layout.names
-
-    @property
-    def scale_components(self) -> int:
-        """Positions tell the noise; orientations are weighted against them by ``lever_m``."""
-        return 3
-
-    @cached_property
-    def _target(self) -> Index:
-        return self.data.target_index(self.targets)
-
-    @cached_property
-    def _q(self) -> Array:
-        return np.ascontiguousarray(self.data.q, dtype=np.float64)
-
-    def linearise(self, state: CellModel) -> tuple[Array, Array]:
-        """Whitened residual (m, c) and Jacobian (m, c, k), c = 3 or 6."""
-        T, J = self.layout.jacobian(state, self._q, self._target)
-        residual = T[:, :3, 3] - self.data.position
-        if self.data.rotation is not None and self.layout.tool_size == 6:
-            turn = frames.log_rotation(T[:, :3, :3] @ np.swapaxes(self.data.rotation, 1, 2))
-            J[:, 3:] = self.lever_m * (frames.left_jacobian_inverse(turn) @ J[:, 3:])
-            residual = np.hstack([residual, self.lever_m * turn])
-        J /= self.sigma[:, None, None]
-        return residual / self.sigma[:, None], J
-
-    def retract(self, state: CellModel, step: Array) -> CellModel:
-        """Move the cell model by an increment (k,)."""
-        return self.layout.retract(state, step)
-
-    def deviation(self, state: CellModel) -> Array:
-        """Model parameters' distance (k,) from the prior's mean; base and targets have none."""
-        away = np.zeros(len(self.names))
-        joint, column, place = self.layout.geometry
-        away[place] = state.arm.mdh[joint, column] - self.prior_mdh[joint, column]
-        return away
-
-
-# ---- closed-form start of base and targets, from the nominal arm --------------------------------
-
-
-_SMALLEST_SPREAD = 1e-6  # of the largest singular value: below it a direction is not seen
-_ADVICE = "turn the flange about a second axis between the samples, or give base or target as known"
-
-
-def linear_start(
-    arm: SerialArm, data: Measurements, *, base: bool = False, tool: bool = False
-) -> CellModel:
-    """Solve base and targets linearly with the arm's present parameters.
-
-    ``R^T p = p_base + c - R_flange p_target`` is linear in R^T (nine numbers), c and p_target;
-    the rotation is then projected to SO(3).
-
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the samples cannot give them.
-    """
-    targets = data.targets
-    index = data.target_index(targets)
-    T_base_flange = arm.fk(data.q)
-    tools = np.broadcast_to(arm.T_flange_tool, (len(targets), 4, 4)).copy()
-    T_frame_base = np.eye(4)
-    if base and tool:
-        T_frame_base, points = _base_and_points(T_base_flange, data.position, index, len(targets))
-        tools[:, :3, 3] = points
-    elif base:
-        T = T_base_flange @ tools[index]
-        T_frame_base = _aligned(T[:, :3, 3], data.position)
-    elif tool:
-        homogeneous = np.hstack([data.position, np.ones((len(data), 1))])
-        p = (frames.invert(T_base_flange) @ homogeneous[..., None])[:, :3, 0]
-        for t in range(len(targets)):
-            tools[t, :3, 3] = p[index == t].mean(axis=0)
-    if tool and data.rotation is not None:
-        relative = np.swapaxes(T_frame_base[:3, :3] @ T_base_flange[:, :3, :3], 1, 2)
-        for t in range(len(targets)):
-            mean = (relative @ data.rotation)[index == t].mean(axis=0)
-            tools[t, :3, :3] = frames.nearest_rotation(mean)
-    return CellModel(arm, T_frame_base, targets, tools)
-
-
-def _base_and_points(
-    T_base_flange: Array, measured: Array, index: NDArray[np.int64], count: int
-) -> tuple[Array, Array]:
-    m = len(measured)
-    unknowns = 12 + 3 * count
-    if 3 * m < unknowns:
-        raise TooFewSamplesError(
-            f"{m} samples cannot place base and {count} target(s): at least "
-            f"{-(-unknowns // 3)} are needed"
-        )
-    centre = measured.mean(axis=0)
-    size = max(float(np.abs(measured - centre).max()), 1e-9)
-    A = np.zeros((m, 3, unknowns))
-    for axis in range(3):
-        A[:, axis, 3 * axis : 3 * axis + 3] = (measured - centre) / size
-        A[:, axis, 9 + axis] = 1.0
-    for t in range(count):
-        A[index == t, :, 12 + 3 * t : 15 + 3 * t] = -T_base_flange[index == t, :3, :3]
-    rows = A.reshape(3 * m, unknowns)
-    x, _, _, s = np.linalg.lstsq(rows, T_base_flange[:, :3, 3].ravel(), rcond=None)
-    if s[-1] < _SMALLEST_SPREAD * s[0]:
-        rank = int(np.sum(s >= _SMALLEST_SPREAD * s[0]))
-        raise RankDeficientError(
-            f"base and targets together: rank {rank} of {unknowns}; {_ADVICE}", (_ADVICE,)
-        )
-    R_base_frame = frames.nearest_rotation(x[:9].reshape(3, 3))
-    points = x[12:].reshape(count, 3)
-    in_base = T_base_flange[:, :3, 3] + np.einsum(
-        "mij,mj->mi", T_base_flange[:, :3, :3], points[index]
-    )
-    R = R_base_frame.T
-    return frames.transform(R, centre - R @ in_base.mean(axis=0)), np.asarray(points)
-
-
-def _aligned(points: Array, measured: Array) -> Array:
-    """Rigid transform (4, 4) that carries points (m, 3) onto measured ones (Kabsch)."""
-    if len(points) < 3:
-        raise TooFewSamplesError(f"{len(points)} samples cannot place the base: 3 are needed")
-    p, y = points - points.mean(axis=0), measured - measured.mean(axis=0)
-    s = np.linalg.svd(p, compute_uv=False)
-    if s[1] < _SMALLEST_SPREAD * np.linalg.norm(points):
-        raise RankDeficientError(
-            "the points lie on one line and leave the base free to turn about it",
-            ("base turns about the line of points: move off the line",),
-        )
-    R = frames.nearest_rotation(y.T @ p)
-    return frames.transform(R, measured.mean(axis=0) - R @ points.mean(axis=0))
 
 
 # ---- how far parameters may lie from the nominal ones -------------------------------------------
@@ -348,6 +76,7 @@ def fitted_prior(arm: SerialArm, found: Array, covariance: Array) -> Array:
 Part = Literal["base", "tool", "geometry"]
 Method = Literal["map", "lsq"]
 
+_NAMED_TARGET_M = 0.01  # from here on what is known of a held target is said
 _STILL_RAD = float(np.radians(5.0))
 _STILL_M = 0.01
 _ORIENTATION_SHARE = 0.25
@@ -366,7 +95,10 @@ class Identification:
     held : model parameters kept at their start because base or targets (or other parameters)
         have the same effect on every measurement.
     unobservable : directions, in words, that the data leave to the prior or to ``held``.
+    weak : what is known of targets that were held because the flange hardly turned, in words.
     prior_covariance : (g, g), SI, of the model parameters before the data, or None.
+    target_reach_m : standard deviation of the held targets' prior about the arm's tool, else None.
+    sigma_ratio : found noise over given sigmas; 1 where none were given.
     noise_m : standard deviation of a measured coordinate, as given or as found.
     lever_m : length by which a turn in rad counted as a position error.
     """
@@ -377,7 +109,10 @@ class Identification:
     method: Method
     estimate: estimation.Estimate[CellModel]
     held: tuple[str, ...]
+    weak: tuple[str, ...]
     prior_covariance: Array | None
+    target_reach_m: float | None
+    sigma_ratio: float
     unobservable: tuple[str, ...]
     rejected: tuple[str, ...]
     noise_m: float
@@ -405,7 +140,7 @@ class Identification:
         another base or target would explain does not count: it belongs to the set-up.
         """
         rows = self._workspace_rows()[..., : len(covariance)]
-        return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+        return float(np.sqrt(max(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows)), 0.0)))
 
     def workspace_change(self, arm: SerialArm) -> float:
         """Rms target displacement, m, over the same postures from ``arm``'s model to this one."""
@@ -468,7 +203,9 @@ def identify(
     """
     parts = frozenset(fit)
     base, tool = "base" in parts, "tool" in parts
-    initial = linear_start(arm, data, base=base, tool=tool) if start is None else start
+    initial = start
+    if initial is None:
+        initial = linear_start(arm, data, base=base, tool=tool, hold=True)
     names = arm.parameters.names if "geometry" in parts else ()
     orientation = data.rotation is not None
 
@@ -484,20 +221,66 @@ def identify(
     covariance = prior_covariance if by_prior else None
     if by_prior and covariance is None:
         covariance = np.diag(default_prior(arm))
+    hold = base and tool and (by_prior or not names) and _hardly_turns(arm, data, initial)
+
+    def solved(state: CellModel) -> tuple[estimation.Estimate[CellModel], float]:
+        prior = np.zeros((len(layout.names),) * 2)
+        if covariance is not None:
+            prior[: len(names), : len(names)] = np.linalg.inv(covariance)
+        if hold:
+            prior[layout.tool_places, layout.tool_places] = TARGET_REACH_M**-2
+        return _solve(arm, data, layout, state, prior, robust)
+
     try:
-        estimate, lever = _solve(arm, data, layout, initial, covariance, robust)
+        estimate, lever = solved(initial)
         if by_prior and prior_covariance is None:
             count, found = len(names), arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
             variances = fitted_prior(arm, found, estimate.covariance[:count, :count])
             covariance = np.diag(variances)
-            estimate, lever = _solve(arm, data, layout, estimate.state, covariance, robust)
-    except RankDeficientError as error:
-        still = still_joints(arm, data)
+            estimate, lever = solved(estimate.state)
+    except (RankDeficientError, np.linalg.LinAlgError) as error:
+        words = [str(error), still_joints(arm, data)]
+        if hold:
+            words.append(ADVICE)
         raise RankDeficientError(
-            f"{error}; {still}" if still else f"{error}", error.directions
+            "; ".join(filter(None, words)), getattr(error, "directions", ())
         ) from error
     result = _report(arm, data, estimate, layout, complete, method, held, lever)
+    if hold:
+        result = replace(
+            result, target_reach_m=TARGET_REACH_M, weak=_weak_targets(estimate, layout, data)
+        )
     return replace(result, prior_covariance=covariance)
+
+
+def _hardly_turns(arm: SerialArm, data: Measurements, cell: CellModel) -> bool:
+    """Whether poses leave the place of a target on the flange open, as they hardly turn it."""
+    layout = make_layout(arm, cell.targets, geometry=(), base=True, tool=True, orientation=False)
+    _, J = layout.jacobian(cell, np.ascontiguousarray(data.q), data.target_index(cell.targets))
+    rows = J.reshape(-1, J.shape[2])
+    prior = np.zeros(J.shape[2])
+    prior[layout.tool_places] = (TYPICAL_ERROR_M / TARGET_REACH_M) ** 2
+    covariance = np.linalg.pinv(rows.T @ rows + np.diag(prior), hermitian=True)
+    place = layout.tool_places.reshape(-1, 3)
+    variance = np.stack([covariance[np.ix_(p, p)] for p in place])
+    return float(np.linalg.eigvalsh(variance).max()) > (WEAK_TARGET_M / TYPICAL_ERROR_M) ** 2
+
+
+def _weak_targets(
+    estimate: estimation.Estimate[CellModel], layout: UnknownLayout, data: Measurements
+) -> tuple[str, ...]:
+    """What is known of targets that were held, in words."""
+    words = []
+    for name, place in zip(data.targets, layout.tool_places.reshape(-1, 3), strict=True):
+        variance, axes = np.linalg.eigh(estimate.covariance[np.ix_(place, place)])
+        for sigma, axis in zip(np.sqrt(np.maximum(variance, 0.0)), axes.T, strict=True):
+            if sigma > _NAMED_TARGET_M:
+                along = ", ".join(frames.fixed(axis, 2))
+                words.append(
+                    f"{name} along ({along}) of the flange, against the base: known to "
+                    f"{sigma * 1e3:.0f} mm; turn the flange about axes across it"
+                )
+    return tuple(words)
 
 
 def _solve(
@@ -505,10 +288,12 @@ def _solve(
     data: Measurements,
     layout: UnknownLayout,
     initial: CellModel,
-    prior_covariance: Array | None,
+    prior: Array,
     robust: bool,
 ) -> tuple[estimation.Estimate[CellModel], float]:
     """Solve; orientations settle what positions leave open and weigh little beside them.
+
+    Sigmas that are clearly too small for the residuals only weigh samples against each other.
 
     Unmodelled bending and eccentricity shift and tilt the flange together, so orientations add
     less than their fine noise suggests: a turn counts as a quarter of what it moves over the
@@ -517,25 +302,21 @@ def _solve(
     sigma = np.ones(len(data)) if data.sigma is None else data.sigma
     reach = float(np.linalg.norm(initial.T_flange_target[:, :3, 3], axis=1).mean())
     most = max(_ORIENTATION_SHARE * reach, _SHORTEST_LEVER_M)
-    prior = None
-    if prior_covariance is not None:
-        count = len(prior_covariance)
-        prior = np.zeros((len(layout.names), len(layout.names)))
-        prior[:count, :count] = np.linalg.inv(prior_covariance)
     lever = most
     if data.rotation is not None:
-        unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm.mdh)
+        unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm)
         lever = _lever(unit.linearise(initial)[0] * sigma[:, None], 1.0, most)
-    state = initial
+    state, known = initial, data.sigma is not None
     for _ in range(_LEVER_ROUNDS):
-        problem = CellProblem(layout, data, initial.targets, sigma, lever, arm.mdh)
+        problem = CellProblem(layout, data, initial.targets, sigma, lever, arm)
         estimate = estimation.solve(
-            problem,
-            state,
-            prior_information=prior,
-            noise_known=data.sigma is not None,
-            robust=robust,
+            problem, state, prior_information=prior, noise_known=known, robust=robust
         )
+        if known and estimate.scale > 1.0:
+            known = False
+            estimate = estimation.solve(
+                problem, estimate.state, prior_information=prior, noise_known=known, robust=robust
+            )
         if data.rotation is None:
             break
         used = (estimate.residual * sigma[:, None])[~estimate.rejected]
@@ -605,11 +386,13 @@ def _report(
     seen = estimate.observability
     if held:
         sigma = np.ones(len(data)) if data.sigma is None else data.sigma
-        problem = CellProblem(complete, data, estimate.state.targets, sigma, lever, arm.mdh)
+        problem = CellProblem(complete, data, estimate.state.targets, sigma, lever, arm)
         _, J = problem.linearise(estimate.state)
         seen = observability(J[~estimate.rejected].reshape(-1, J.shape[2]))
     words = tuple(describe(column, complete.names, complete.to_display) for column in seen.null.T)
     known = data.sigma
+    used = estimate.residual[~estimate.rejected][:, :3]
+    told = min(max(estimate.freedom, 1.0), used.size)
     return Identification(
         nominal=arm,
         cell=estimate.state,
@@ -617,7 +400,10 @@ def _report(
         method=method,
         estimate=estimate,
         held=held,
+        weak=(),
         prior_covariance=None,
+        target_reach_m=None,
+        sigma_ratio=1.0 if known is None else float(np.sqrt(np.sum(used**2) / told)),
         unobservable=words,
         rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
         noise_m=estimate.scale * (1.0 if known is None else float(np.sqrt(np.mean(known**2)))),

@@ -181,7 +181,7 @@ def joint_functions_figure(found: FullIdentification) -> Figure:
         rows = figure.subplots(max(1, len(shown)), squeeze=False)[:, 0]
         for axes, joint in zip(rows, shown, strict=False):
             q = np.zeros((1000, arm.n))
-            lower, upper = found.measured[joint]
+            lower, upper = found.readings[[0, -1], joint]
             q[:, joint] = np.linspace(lower, upper, len(q))
             assert arm.functions is not None
             value = 1e6 * arm.functions.delta(q)[:, joint]

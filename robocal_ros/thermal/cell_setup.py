@@ -31,8 +31,9 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import CellModel, linear_start
 from robocal_ros.identification.judged import require_match
-from robocal_ros.identification.solve import CellModel, identify, linear_start, random_postures
+from robocal_ros.identification.solve import identify, random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_made, write_made
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots

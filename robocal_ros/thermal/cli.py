@@ -26,7 +26,7 @@ from robocal_ros.cli.main import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import write_text
-from robocal_ros.identification.solve import CellModel
+from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import read_measurements
 from robocal_ros.report.figures import draw_rounds

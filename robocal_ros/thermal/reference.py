@@ -15,8 +15,9 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, ResidualError
 from robocal_ros.ground.frames import Array, Document, Index
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import CellModel, make_layout
 from robocal_ros.identification.judged import require_match
-from robocal_ros.identification.solve import CellModel, identify, make_layout
+from robocal_ros.identification.solve import identify
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of, model_document
 from robocal_ros.kinematics.tables import measurements_of, read_table

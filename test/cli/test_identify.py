@@ -117,6 +117,34 @@ class TestAnswer:
         assert document["error"]["file"] == str(check)
         assert "--check-refit" in document["error"]["message"]
 
+    def test_another_target_is_placed_as_the_message_advises(
+        self, data: Path, folder: Path, identify
+    ) -> None:
+        check = table(folder / "peg.csv", measured(60, 9, targets=("peg",)))
+        status, document = identify("--data", data, "--check", check)
+        assert status == 2
+        assert "--check-refit tool" in document["error"]["message"]
+        status, document = identify("--data", data, "--check", check, "--check-refit", "tool")
+        assert (status, document["verdict"]["code"]) == (0, "ACCEPT")
+        assert document["calibrated"]["held_out"]["mean_mm"] < 0.12
+
+    def test_a_sigma_that_is_too_small_is_told(self, folder: Path, identify) -> None:
+        fine = replace(measured(100), sigma=np.full(100, 0.1 * NOISE_M))
+        status, document = identify("--data", table(folder / "fine.csv", fine))
+        assert (status, document["verdict"]["code"]) == (0, "RESIDUAL_TOO_LARGE")
+        assert document["noise_over_sigma"] == pytest.approx(10.0, rel=0.2)
+        assert any("sigma_mm" in words for words in document["warnings"])
+
+    def test_a_ball_seen_from_the_flange(self, folder: Path, identify) -> None:
+        q = measured(60).q
+        seen = np.linalg.inv(true_arm().fk(q)) @ np.array([1.5, 0.4, 0.6, 1.0])
+        ball = replace(measured(60, q=q), position=seen[:, :3])
+        for sigma in (None, np.full(60, NOISE_M)):
+            path = table(folder / "flange.csv", replace(ball, sigma=sigma))
+            status, document = identify("--data", path)
+            assert status == 2
+            assert "the sensor sits on the flange" in document["error"]["message"]
+
     def test_another_set_up_unsaid_is_no_calibration_error(
         self, data: Path, folder: Path, identify
     ) -> None:
@@ -206,6 +234,34 @@ class TestAnswer:
         _, document = identify("--data", path)
         (words,) = document["warnings"]
         assert "joint 2 (joint_a2): 1 of 60 readings beyond -140" in words
+
+
+class TestPlan:
+    def test_poses_to_measure_are_written(self, folder: Path, identify) -> None:
+        """From poses that the robot may be driven to; the table takes what is measured then."""
+        source, path = table(folder / "all.csv", measured(120)), folder / "plan.csv"
+        status, document = identify("--plan", 30, "--data", source, "--output", path)
+        assert (status, document["candidates"], len(document["plan"])) == (0, 120, 30)
+        lines = path.read_text().splitlines()
+        assert lines[0] == "sample,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
+        written = np.radians([[float(cell) for cell in line.split(",")[1:]] for line in lines[1:]])
+        away = np.abs(written[:, None] - measured(120).q).max(axis=2)
+        assert away.min(axis=1).max() < 1e-9
+        assert np.all(np.diff(document["predicted_mm"]) < 0.0)
+        status, again = identify("--plan", 30, "--data", path)
+        assert (status, again["candidates"]) == (0, 30)
+
+    def test_without_a_table_poses_are_within_the_limits(self, identify) -> None:
+        status, document = identify("--plan", 5, robot="ur10")
+        assert (status, len(document["plan"])) == (0, 5)
+        assert "collisions" in document["warnings"][0]
+
+    def test_there_is_nothing_to_judge(self, data: Path, identify) -> None:
+        for options in (("--check", data), ("--hold-out", "0.5"), ("--seed", 1)):
+            status, document = identify("--plan", 5, *options)
+            assert (status, document["error"]["code"]) == (2, "BAD_INPUT")
+        status, document = identify()
+        assert (status, document["error"]["code"]) == (2, "BAD_INPUT")
 
 
 class TestOutput:

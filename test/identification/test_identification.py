@@ -9,7 +9,7 @@ from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.identification import CellModel, identify, identify_and_judge
-from robocal_ros.identification.solve import CellProblem, linear_start, make_layout
+from robocal_ros.identification.cell_model import CellProblem, linear_start, make_layout
 
 # the sliding arm's limits depend on what was bought
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
@@ -119,7 +119,7 @@ def test_jacobian_is_the_derivative_of_the_residual(make_cell, robot, poses):
         arm, data.targets, geometry=arm.parameters.names, base=True, tool=True, orientation=poses
     )
     sigma = rng.uniform(0.5, 2.0, len(data))
-    problem = CellProblem(layout, data, data.targets, sigma, 0.3, arm.mdh)
+    problem = CellProblem(layout, data, data.targets, sigma, 0.3, arm)
     _, jacobian = problem.linearise(state)
     h = 1e-5
     for k in range(len(layout.names)):

@@ -7,8 +7,8 @@ import pytest
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import linear_start
 from robocal_ros.identification.judged import explain_mismatch
-from robocal_ros.identification.solve import linear_start
 from robocal_ros.kinematics import SerialArm
 
 T_FRAME_BASE = frames.transform(frames.exp_rotation(np.array([0.3, -0.2, 1.0])), [2.0, 1.0, -0.5])

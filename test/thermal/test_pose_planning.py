@@ -9,7 +9,7 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError, TooFewSamplesError
-from robocal_ros.identification.solve import CellModel
+from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.cell_setup import (
     Design,

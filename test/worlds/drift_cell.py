@@ -7,7 +7,7 @@ import numpy as np
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification.solve import CellModel
+from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.kinematics import SerialArm
 
 SIGMA = 3e-5
