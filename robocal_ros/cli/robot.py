@@ -167,8 +167,8 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
                 "unit": unit,
                 "from": float(shown[used[0]]) if len(used) else None,
                 "to": float(shown[used[-1]]) if len(used) else None,
-                "rms_micro": float(np.sqrt(np.mean(micro[used] ** 2))) if len(used) else 0.0,
-                "largest_micro": float(np.max(np.abs(micro))),
+                f"rms_{small}": float(np.sqrt(np.mean(micro[used] ** 2))) if len(used) else 0.0,
+                f"largest_{small}": float(np.max(np.abs(micro))),
                 "compliance_micro": float(1e6 * functions.compliance[i]),
             }
         )
@@ -189,7 +189,8 @@ def _show_joint_functions(console: "Console", document: Document) -> None:
     for joint in document["joints"]:
         ends = (joint["from"], joint["to"])
         span = ["" if end is None else f"{end:.1f} {joint['unit']}" for end in ends]
-        numbers = [f"{joint[name]:.1f}" for name in ("rms_micro", "largest_micro")]
+        small = "um" if joint["unit"] == "mm" else "urad"
+        numbers = [f"{joint[f'{name}_{small}']:.1f}" for name in ("rms", "largest")]
         rows.append([joint["name"], *span, *numbers, f"{joint['compliance_micro']:.4f}"])
     title = f"{document['robot']}: what joints turn besides what is read"
     head = ("joint", "from", "to", "rms µrad", "largest µrad", "compliance µrad/(N m)")

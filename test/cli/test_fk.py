@@ -174,7 +174,7 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     np.testing.assert_allclose(elbow[:, 1], 1e6 * arm.functions.delta(q)[:, 2], atol=1e-3)
     np.testing.assert_allclose(elbow[:, 2], arm.functions.slope(q)[:, 2], atol=2e-8)
     told = document["joints"][2]
-    assert told["largest_micro"] == pytest.approx(np.max(np.abs(elbow[:, 1])), abs=1e-3)
+    assert told["largest_urad"] == pytest.approx(np.max(np.abs(elbow[:, 1])), abs=1e-3)
     np.testing.assert_allclose((told["from"], told["to"]), elbow[[0, -1], 0], atol=1e-6)
     assert told["compliance_micro"] == pytest.approx(1e6 * arm.functions.compliance[2])
     assert main(command) == 0
