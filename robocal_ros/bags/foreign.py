@@ -8,15 +8,14 @@ much from the motion, `Averaged` makes single measurements of what stands still.
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from heapq import merge
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag1 import ReaderError as Ros1Error
 from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.rosbag2 import ReaderError as Ros2Error
 from rosbags.typesys import Stores, get_typestore
 
 from robocal_ros.bags.bags import BagInfo, BagMessage, BagReader, TopicInfo
@@ -73,7 +72,7 @@ class ForeignBagReader(BagReader):
                 reader = Ros1Reader(file) if file.suffix == ROS1 else Ros2Reader(file)
                 self._stack.enter_context(reader)
                 self._readers.append(reader)
-        except (Ros1Error, Ros2Error, OSError) as error:
+        except Exception as error:  # whatever rosbags makes of damaged bytes
             self._stack.close()
             raise InputError(
                 f"cannot be read as a bag: {error}; 'rosbag reindex' (ROS 1) or 'ros2 bag reindex' "
@@ -110,25 +109,35 @@ class ForeignBagReader(BagReader):
 
         Raises `InputError` when a type is not known, or a message cannot be decoded.
         """
-        for reader in sorted(self._readers, key=lambda one: one.start_time):
-            wanted = [c for c in reader.connections if topics is None or c.topic in topics]
-            if not wanted:
-                continue
-            for connection in wanted:
-                definition = connection.msgdef
-                register_schema(
-                    self._store, connection.msgtype, "ros2msg" if definition.data else "",
-                    definition.data, str(self._path),
-                )  # fmt: skip
-            ros1 = isinstance(reader, Ros1Reader)
-            decode = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
-            for connection, log_time_ns, data in reader.messages(wanted):
-                try:
-                    message = data if raw else decode(data, connection.msgtype)
-                except Exception as error:  # whatever bytes of another's recorder make of it
-                    words = f"a message of {connection.topic} cannot be decoded: {error}"
-                    raise InputError(words, file=str(self._path)) from error
-                yield BagMessage(connection.topic, connection.msgtype, log_time_ns, message)
+        read = (self._messages(reader, topics, raw) for reader in self._readers)
+        yield from merge(*read, key=lambda recorded: recorded.log_time_ns)
+
+    def _messages(
+        self, reader: Ros1Reader | Ros2Reader, topics: Collection[str] | None, raw: bool
+    ) -> Iterator[BagMessage]:
+        wanted = [c for c in reader.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        for connection in wanted:
+            definition = connection.msgdef
+            register_schema(
+                self._store, connection.msgtype, "ros2msg" if definition.data else "",
+                definition.data, str(self._path),
+            )  # fmt: skip
+        ros1 = isinstance(reader, Ros1Reader)
+        decode = self._store.deserialize_ros1 if ros1 else self._store.deserialize_cdr
+        messages = reader.messages(wanted)
+        while True:
+            place = "a message cannot be read"
+            try:
+                connection, log_time_ns, data = next(messages)
+                place = f"a message of {connection.topic} cannot be decoded"
+                message = data if raw else decode(data, connection.msgtype)
+            except StopIteration:
+                return
+            except Exception as error:  # whatever bytes of another's recorder make of it
+                raise InputError(f"{place}: {error!r}", file=str(self._path)) from error
+            yield BagMessage(connection.topic, connection.msgtype, log_time_ns, message)
 
 
 # ---- streams and their clocks -------------------------------------------------------------------

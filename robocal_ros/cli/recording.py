@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.bags.bags import BagMessage, BagReader, TopicInfo
+from robocal_ros.bags.bags import BagInfo, BagMessage, BagReader, TopicInfo
 from robocal_ros.bags.replay import (
     EVENTS,
     first_configuration,
@@ -37,7 +37,7 @@ from robocal_ros.ground.samples import (
     TEMPERATURES,
     stamp_ns,
 )
-from robocal_ros.hand_eye.data import SHOTS
+from robocal_ros.hand_eye.data import IMAGE, PROFILE, SHOTS, TARGET_POSE
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_folders
 from robocal_ros.session.events import Command
@@ -59,6 +59,11 @@ TYPES = {  # of the messages that an input is read from, where others may look l
     MEASURED_POSE: _POSES,
     SPHERE_CLOUD: ("sensor_msgs/msg/PointCloud2",),
     TEMPERATURES: ("sensor_msgs/msg/Temperature",),
+    EDGES: ("robocal_msgs/msg/BeamEvent",),
+    PROFILE: ("sensor_msgs/msg/PointCloud2",),
+    TARGET_POSE: ("geometry_msgs/msg/PoseStamped",),
+    IMAGE: ("sensor_msgs/msg/Image",),
+    EVENTS: ("robocal_msgs/msg/SessionEvent",),
 }
 
 
@@ -145,7 +150,7 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
                 f"{', '.join(TYPES[kind])}{_others(kind, info.topics)}",
                 file=info.path,
             )
-    told = [topic for topic in info.topics if topic_kind(topic) == EVENTS]
+    told = event_topics(info)
     if EVENTS in given:
         told = [given[EVENTS]]
     elif len(told) > 1:
@@ -167,6 +172,15 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
     start_ns = _first_joint_stamp(reader, inputs)
     configured, commands = read_events(reader.messages(told), start_ns)
     return BagOverview(reader, event_topic, inputs, configured, commands, start_ns)
+
+
+def event_topics(info: BagInfo) -> list[str]:
+    """Topics of session events."""
+    return [
+        topic
+        for topic, held in info.topics.items()
+        if topic_kind(topic) == EVENTS and _fits(EVENTS, held.msgtype)
+    ]
 
 
 def _fits(kind: str, msgtype: str) -> bool:

@@ -29,6 +29,7 @@ from robocal_ros.cli.recording import (
     CheckPoints,
     above,
     begin_ns,
+    event_topics,
     find_robot,
     finite,
     is_simulated,
@@ -146,7 +147,7 @@ def _recordings(
     skipped: dict[str, str] = {}
     others: dict[str, list[Document]] = {}
     begin = begin_ns(reader)
-    for topic in (topic for topic in reader.info.topics if topic_kind(topic) == EVENTS):
+    for topic in event_topics(reader.info):
         configured = first_configuration(reader.messages([topic]))
         if session_kind(configured):
             recording = open_recording(reader, {EVENTS: topic})

@@ -137,6 +137,47 @@ def test_a_topic_of_another_type_with_an_inputs_name_is_none(recorded, tmp_path,
     assert "no joint states; it has /joint_states" in document["error"]["message"]
 
 
+def test_events_are_those_of_their_type(recorded, tmp_path, capsys):
+    odd = [(at, "/n/session_events" if t == BODY_TOPIC else t, kind, fields)
+           for at, t, kind, fields in recorded[:500]]  # fmt: skip
+    path = write_ros1(tmp_path / "odd.bag", odd)
+    status, document = replayed(capsys, path, "--robot", "kr150_r3100", "--auto")
+    assert status == 2
+    assert "no measurement at standstill" in document["error"]["message"]
+    given = f"session_events:={JOINT_TOPIC}"
+    status, document = replayed(capsys, path, "--robot", "kr150_r3100", "--auto", "--topic", given)
+    assert status == 2
+    assert "is read from robocal_msgs/msg/SessionEvent" in document["error"]["message"]
+
+
+def test_files_that_were_recorded_side_by_side_come_in_one_order(recorded, tmp_path):
+    some = recorded[:1000]
+    for name in (JOINT_TOPIC, BODY_TOPIC):
+        write_ros1(tmp_path / f"{name[1:4]}.bag", [one for one in some if one[1] == name])
+    with open_bag(tmp_path) as bag:
+        found = [(one.log_time_ns, one.topic) for one in bag.messages()]
+    assert sorted(found) == sorted((at, topic) for at, topic, _, _ in some)
+    stamps = [at for at, _ in found]
+    assert stamps == sorted(stamps)
+
+
+def test_damage_within_a_bag_is_told(recorded, tmp_path):
+    data = write_ros1(tmp_path / "whole.bag", recorded[:300]).read_bytes()
+    rng, refused = np.random.default_rng(4), 0
+    for _ in range(30):
+        damaged = bytearray(data)
+        for place in rng.integers(4200, len(data), 20):
+            damaged[place] = rng.integers(256)
+        path = tmp_path / "damaged.bag"
+        path.write_bytes(bytes(damaged))
+        try:
+            with open_bag(path) as bag:
+                assert len(list(bag.messages())) <= 300
+        except InputError:
+            refused += 1
+    assert refused
+
+
 @pytest.mark.parametrize("name", ["cut.bag", "none.bag", "cut.db3"])
 def test_what_is_no_bag_is_told(ros1, tmp_path, name):
     path = tmp_path / name
