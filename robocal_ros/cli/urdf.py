@@ -89,7 +89,8 @@ def run_import_urdf(args: argparse.Namespace) -> CliResult:
 
 
 def _poses(arm: SerialArm) -> Array:
-    low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+    low = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(arm.upper - 1.0, -np.pi))
+    high = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(arm.lower + 1.0, np.pi))
     return np.random.default_rng(0).uniform(low, high, (_POSES, arm.n))
 
 

@@ -150,20 +150,33 @@ def read_urdf(text: str, file: str) -> Urdf:
         if missing := {joint.parent, joint.child} - links.keys():
             words = f"joint '{joint.name}': no link {', '.join(sorted(missing))}"
             raise InputError(words, file=file)
-    if len(roots) != 1 or len(joints) != len(found):
+    carried, parents = set(roots), {joint.child: joint.parent for joint in found}
+    for _ in found:
+        carried |= {child for child, parent in parents.items() if parent in carried}
+    if len(roots) != 1 or len(joints) != len(found) or len(carried) != len(links):
         words = f"is no tree of links with one root: {', '.join(roots) or 'none'}"
         raise InputError(words, file=file)
+    names = [joint.name for joint in found]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"has two joints '{twice[0]}'", file=file)
     masses = {}
     for name, element in links.items():
         inertial = element.find("inertial")
         if inertial is not None and (mass := inertial.find("mass")) is not None:
             centre = _origin(inertial, f"link '{name}'", file)[:3, 3]
-            masses[name] = float(mass.get("value", "0")), centre
+            value = _number(mass, "value", 0.0, f"link '{name}'", file)
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"link '{name}' has the mass {value:g}", file=file)
+            masses[name] = value, centre
     return Urdf(str(top.get("name", "robot")), file, roots[0], joints, masses)
 
 
 def _joint(element: ElementTree.Element, file: str) -> UrdfJoint:
-    name, kind = str(element.get("name")), str(element.get("type"))
+    name, kind = str(element.get("name", "")), str(element.get("type"))
+    if not name:
+        raise InputError("has a joint without a name", file=file)
+    if element.find("mimic") is not None:
+        kind = "a mimic of another joint"
     ends = [element.find(end) for end in ("parent", "child")]
     if None in ends:
         raise InputError(f"joint '{name}' lacks its parent or child", file=file)
@@ -177,12 +190,14 @@ def _joint(element: ElementTree.Element, file: str) -> UrdfJoint:
         raise InputError(f"joint '{name}' has an axis of no length", file=file)
     lower, upper, velocity = -np.inf, np.inf, np.nan
     if limit is not None:
-        velocity = float(limit.get("velocity", "nan"))
-        if kind != "continuous":
-            lower, upper = (float(limit.get(side, "0")) for side in ("lower", "upper"))
+        place = f"joint '{name}'"
+        velocity = _number(limit, "velocity", np.nan, place, file)
+        if kind in ("revolute", "prismatic"):
+            lower, upper = (_number(limit, end, 0.0, place, file) for end in ("lower", "upper"))
     return UrdfJoint(
         name, kind, parent, child, _origin(element, f"joint '{name}'", file),
-        axis / length if length else axis, lower, upper, velocity if velocity > 0.0 else np.nan,
+        axis / length if length else axis, lower, upper,
+        velocity if 0.0 < velocity < np.inf else np.nan,
     )  # fmt: skip
 
 
@@ -193,6 +208,14 @@ def _origin(element: ElementTree.Element, place: str, file: str) -> Array:
     xyz = _numbers(origin.get("xyz", "0 0 0"), 3, place, file)
     turn = _numbers(origin.get("rpy", "0 0 0"), 3, place, file)
     return transform(rotation_from_rpy(turn), xyz)
+
+
+def _number(element: ElementTree.Element, key: str, default: float, place: str, file: str) -> float:
+    text = element.get(key)
+    try:
+        return default if text is None else float(text)
+    except ValueError:
+        raise InputError(f"{place}: {key} '{text}' is no number", file=file) from None
 
 
 def _numbers(text: str, count: int, place: str, file: str) -> Array:
@@ -231,6 +254,10 @@ def chain(urdf: Urdf, base: str = "", tip: str = "") -> Chain:
     odd = next((joint for joint in after if not joint.moves and joint.kind != "fixed"), None)
     if odd is not None:
         raise InputError(f"joint '{odd.name}' is {odd.kind}, which no arm's is", file=urdf.file)
+    odd = next((joint for joint in after if joint.moves and not joint.lower < joint.upper), None)
+    if odd is not None:
+        words = f"joint '{odd.name}' has the limits {odd.lower:g} and {odd.upper:g}: it cannot move"
+        raise InputError(words, file=urdf.file)
     if not any(joint.moves for joint in after):
         raise InputError(f"no joint moves '{tip or ends[0]}' against '{base}'", file=urdf.file)
     T_base_start = invert(reduce(np.matmul, side, np.eye(4)))

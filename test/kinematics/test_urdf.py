@@ -232,6 +232,13 @@ def test_a_kinematics_yaml_is_the_nominal_arm():
     assert np.allclose(lengths, np.sort([0.1625, 0.425, 0.3922, 0.1333, 0.0997, 0.0996]), atol=1e-9)
 
 
+RING = (
+    '<link name="a"/><link name="b"/>'
+    '<joint name="ab" type="fixed"><parent link="a"/><child link="b"/></joint>'
+    '<joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
+)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -245,6 +252,12 @@ def test_a_kinematics_yaml_is_the_nominal_arm():
         (DESCRIPTION.replace('"turn" type="revolute"', '"turn" type="floating"'), "floating"),
         (DESCRIPTION.replace('link name="base_link"', 'link name="other"'), "no link base_link"),
         (DESCRIPTION.replace("</robot>", '<link name="loose"/></robot>'), "one root"),
+        (DESCRIPTION.replace("</robot>", RING), "one root"),
+        (DESCRIPTION.replace('velocity="', 'velocity="fast'), "velocity 'fast.*' is no number"),
+        (DESCRIPTION.replace(' lower="-', ' lower="'), "it cannot move"),
+        (DESCRIPTION.replace('<mass value="', '<mass value="-'), "has the mass -"),
+        (DESCRIPTION.replace('<axis xyz="0 0 -1"/>', '<mimic joint="a"/>'), "mimic"),
+        (DESCRIPTION.replace('joint name="turn"', "joint"), "without a name"),
     ],
 )
 def test_what_is_no_arm_is_named(text, words):
