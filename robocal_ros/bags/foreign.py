@@ -161,8 +161,8 @@ class StreamTiming:
 
     ``rate_hz``: of its messages. ``clock_ns``: its clock ahead of the joints' clock, 0 where both
     are one. ``latency_s``, ``latency_sigma_s``: how late it is behind the joints by that clock,
-    with its standard deviation; None: too little motion shows it. ``burst``: most messages that
-    came within a hundredth of a second.
+    with its standard deviation; None: too little motion shows it, or it is another. ``burst``:
+    most messages that came within a hundredth of a second.
     """
 
     rate_hz: float
@@ -182,7 +182,10 @@ class StreamTiming:
         if self.clock_ns:
             parts.append(f"its clock is {self.clock_ns * 1e-9:+.3f} s from the joints', taken out")
         if self.latency_s is None:
-            parts.append("the recording has too little motion to show its delay, taken as 0")
+            parts.append(
+                f"no delay of less than {LATEST_S:g} s makes its motion that of the joints, so that "
+                "0 is taken: too little motion, or it follows something else"
+            )
         else:
             parts.append(
                 f"measured {self.latency_s:.3f} s before its stamps say "

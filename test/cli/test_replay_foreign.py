@@ -216,6 +216,7 @@ def test_motions_that_are_not_one_have_no_delay():
     walks = [np.cumsum(np.repeat(rng.normal(size=(300, 3)), 10, axis=0), axis=0) for _ in range(2)]
     assert delay_between(at_ns, walks[0], at_ns, walks[1]) is None
     assert delay_between(at_ns, np.zeros((3000, 3)), at_ns, np.zeros((3000, 3))) is None
+    assert "follows something else" in StreamTiming(50.0).words("/ball")
 
 
 def test_a_second_of_a_stream_is_one_measurement_without_what_was_lost():
