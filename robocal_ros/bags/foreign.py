@@ -183,8 +183,8 @@ class StreamTiming:
             parts.append(f"its clock is {self.clock_ns * 1e-9:+.3f} s from the joints', taken out")
         if self.latency_s is None:
             parts.append(
-                f"no delay of less than {LATEST_S:g} s makes its motion that of the joints, so that "
-                "0 is taken: too little motion, or it follows something else"
+                f"no delay of less than {LATEST_S:g} s makes its motion that of the joints, so 0 "
+                "is taken: too little motion, or it follows something else"
             )
         else:
             parts.append(

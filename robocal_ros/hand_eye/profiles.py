@@ -194,6 +194,8 @@ def _read_description(path: Path) -> SensorDescription:
     for key in top.values:
         if key in ("x", "z", "intensity", "row"):
             value = top.values[key]
+            if str(value) == "0":
+                top.fail("is 0: columns count from 1", key)
             told[key] = str(value) if type(value) is int and value > 0 else top.text(key)
         elif key in ("lines", "ordered"):
             if not isinstance(top.values[key], bool):
@@ -204,7 +206,8 @@ def _read_description(path: Path) -> SensorDescription:
         elif key in ("unit", "cloud_unit"):
             told[key] = top.choice(key, tuple(UNITS))
         elif key == "no_return":
-            told[key] = tuple(top.row(key))
+            several = isinstance(top.values[key], list)
+            told[key] = tuple(top.row(key)) if several else (top.number(key),)
         elif key in ("x_pitch_mm", "z_step_mm", "width_mm", "noise_mm"):
             told[key] = top.positive(key)
         elif key != "preset":
@@ -263,7 +266,9 @@ def columns_profile(
         middle_mm = -0.5 * (count - 1) * sensor.x_pitch_mm
         start_mm = middle_mm if sensor.x_start_mm is None else sensor.x_start_mm
         x = np.asarray(1e-3 * (start_mm + sensor.x_pitch_mm * place))
-    seen = np.isfinite(x) & np.isfinite(z) & ~np.isin(told, sensor.no_return)
+    none = np.asarray(sensor.no_return, dtype=np.float32)  # clouds tell numbers no finer
+    with np.errstate(over="ignore"):
+        seen = np.isfinite(x) & np.isfinite(z) & ~np.isin(told.astype(np.float32), none)
     if "intensity" in columns:
         seen &= columns["intensity"] >= sensor.least_intensity
     rows, size = np.unique(numbers[seen], return_counts=True)
@@ -349,9 +354,14 @@ def cloud_profile(message: Any, sensor: SensorDescription = DEFAULT) -> Profile:
     plane = "y" if "y" not in (sensor.x, sensor.z) and ("y" in fields or not sensor.x) else ""
     wanted = _wanted(sensor, "x", "z", plane)
     read = dict(zip(wanted, cloud_columns(message, list(wanted.values())).T, strict=True))
-    width = int(message.width) if int(message.height) > 1 else 0
+    width = _width(int(message.width), int(message.height))
     unit_m = UNITS[sensor.cloud_unit]
     return columns_profile(read, width, sensor, unit_m, f"at {stamp_ns(message.header.stamp)} ns")
+
+
+def _width(width: int, height: int) -> int:
+    """Length of the rows of an organised cloud, each a profile; 0 of one that is not."""
+    return width if height > 1 and width > 1 else 0
 
 
 # ---- files of the makers ------------------------------------------------------------------------
@@ -486,8 +496,12 @@ def _pcd(data: bytes) -> tuple[Columns, int]:
         if words and not line.startswith("#"):
             head[words[0]] = words[1:]
     try:
-        names, sizes, types = head["FIELDS"], head["SIZE"], head["TYPE"]
+        # "_" is padding, of which there may be several
+        names = [f"_{i}" if name == "_" else name for i, name in enumerate(head["FIELDS"])]
+        sizes, types = head["SIZE"], head["TYPE"]
         each = [int(word) for word in head.get("COUNT", ["1"] * len(names))]
+        if min(each, default=0) < 1:
+            raise ValueError("a COUNT below 1")
         width, height = int(head["WIDTH"][0]), int(head["HEIGHT"][0])
         kinds = [
             (name, f"<{kind.lower()}{size}", (number,))
@@ -497,7 +511,7 @@ def _pcd(data: bytes) -> tuple[Columns, int]:
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise InputError(f"has a PCD header that cannot be read: {error}") from error
     form, body = match.group(1).decode("ascii", errors="replace"), data[match.end() :]
-    organised = width if height > 1 else 0
+    organised = _width(width, height)
     if form == "ascii":
         every = [name for name, number in zip(names, each, strict=True) for _ in range(number)]
         return _ascii_columns(body, every, width * height), organised
@@ -512,15 +526,16 @@ def _ascii_columns(body: bytes, names: Sequence[str], count: int) -> Columns:
     whole = [row for row in rows if row is not None and len(row) == len(names)]
     if not names or len(whole) != count:
         raise InputError(f"holds {len(whole)} rows of {len(names)} numbers, not {count}")
-    return dict(zip(names, np.array(whole).T, strict=True))
+    return dict(zip(names, np.array(whole).reshape(-1, len(names)).T, strict=True))
 
 
 def _binary_columns(body: bytes, kinds: Sequence[Any], count: int) -> Columns:
-    kind = np.dtype(list(kinds))
-    if not kinds or not 0 < count * kind.itemsize <= len(body):
+    try:
+        kind = np.dtype(list(kinds))
+    except ValueError as error:
+        raise InputError(f"has fields that cannot be read: {error}") from error
+    if not kinds or not 0 <= count * kind.itemsize <= len(body):
         raise InputError(f"holds {len(body)} bytes, not {count} points of {kind.itemsize}")
     table = np.frombuffer(body, dtype=kind, count=count)
-    return {
-        name: np.asarray(table[name], dtype=np.float64).reshape(count, -1)[:, 0]
-        for name in kind.names or ()
-    }
+    columns = {name: np.asarray(table[name], dtype=np.float64) for name in kind.names or ()}
+    return {name: one if one.ndim == 1 else one[:, 0] for name, one in columns.items()}

@@ -203,9 +203,72 @@ def test_the_order_of_an_unorganised_cloud_does_not_matter(seed, by_y):
     assert found == pytest.approx(TRUTH, abs=1e-15)
 
 
+def test_a_column_of_points_is_one_profile():
+    message = cloud(np.insert(TRUTH, 1, 0.0, axis=1), height=len(TRUTH))
+    assert cloud_profile(message).points == pytest.approx(TRUTH, abs=1e-15)
+
+
+def test_what_stands_for_no_return_is_known_in_32_bits():
+    """-99.9999 in a cloud of 32 bits is another number than in a description."""
+    points = np.insert(TRUTH, 1, 0.0, axis=1)
+    points[::5, 2] = float(np.float32(TRUTH[0, 1] + 1e-4))
+    sensor = SensorDescription(no_return=(TRUTH[0, 1] + 1e-4,))
+    assert len(cloud_profile(cloud(points), sensor).points) == np.sum(
+        np.arange(len(points)) % 5 > 0
+    )
+
+
+def test_padding_in_a_pcd_is_passed_over(tmp_path):
+    """As PCL writes its types with normals and intensity."""
+    kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("a", "u1", (4,)), ("i", "<f4"),
+            ("b", "u1", (12,))]  # fmt: skip
+    table = np.zeros(len(TRUTH), np.dtype(kind))
+    table["x"], table["z"] = TRUTH.T
+    head = (
+        f"FIELDS x y z _ intensity _\nSIZE 4 4 4 1 4 1\nTYPE F F F U F U\nCOUNT 1 1 1 4 1 12\n"
+        f"WIDTH {len(TRUTH)}\nHEIGHT 1\nDATA binary\n"
+    )
+    path = tmp_path / "p.pcd"
+    path.write_bytes(head.encode() + table.tobytes())
+    found = read_profile(path, "p", SensorDescription(unit="m"))
+    assert found.points == pytest.approx(TRUTH, abs=1e-7)
+
+
+PLY_HEAD = "ply\nformat {}\nelement vertex 0\nproperty float x\nproperty float z\nend_header\n"
+PCD_HEAD = "FIELDS x z\nSIZE 4 4\nTYPE F F\nCOUNT {}\nWIDTH 0\nHEIGHT 1\nDATA {}\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.ply", PLY_HEAD.format("ascii 1.0")),
+        ("b.ply", PLY_HEAD.format("binary_little_endian 1.0")),
+        ("a.pcd", PCD_HEAD.format("1 1", "ascii")),
+        ("b.pcd", PCD_HEAD.format("1 1", "binary")),
+    ],
+)
+def test_a_cloud_without_points_is_a_shot_that_saw_nothing(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(TooFewSamplesError, match="has 0 points"):
+        read_profile(tmp_path / name, "p")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.ply", PLY_HEAD.format("binary_little_endian 1.0").replace(" z", " x")),
+        ("a.pcd", PCD_HEAD.format("1 0", "binary")),
+    ],
+)
+def test_fields_that_cannot_be_are_refused(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_profile(tmp_path / name, "p")
+
+
 XZ = SensorDescription(x="X", z="Z")
 REFUSED = {
-    "no such column": ("a,b\n1,2", XZ, "no line names the columns Z, X"),
+    "no such column": ("a,b\n1,2", XZ, "no line names the columns X, Z"),
     "nothing seen": ("X,Z\n" + "1,\n" * 20, XZ, "has 0 points"),
     "no numbers": ("X,Z\nx,z\n", XZ, "holds numbers"),
     "another unit": ("X,Z\n" + rows(X_MM, Z_MM), replace(XZ, unit="um"), "too small"),
@@ -241,6 +304,8 @@ def test_a_description_is_read_and_kept_by_a_recording(tmp_path):
         PRESETS["lmi-gocator"], x="1", z="2", unit="um", near_mm=12.0, far_mm=-12.5, ordered=False
     )
     assert sensor_of(str(path), "away") == replace(found, z_grows="away")
+    path.write_text("no_return: -5\n")
+    assert sensor_of(str(path)).no_return == (-5.0,)
     config = HandEyeConfig(sensor=found)
     assert HandEyeConfig.of_document(json.loads(json.dumps(asdict(config)))) == config
     before = json.loads(json.dumps(asdict(HandEyeConfig())))  # of a version without descriptions
@@ -264,6 +329,8 @@ def test_a_description_is_read_and_kept_by_a_recording(tmp_path):
         ("unit: cm", "unit is 'cm'"),
         ("x_pitch_mm: 0", "must be above 0"),
         ("ordered: 1", "ordered must be true or false"),
+        ("x: 0\nz: 1", "columns count from 1"),
+        ("no_return: none", "no_return is 'none', not a number"),
     ],
 )
 def test_half_a_description_is_refused(tmp_path, text, words):
