@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.files import quoted, read_bytes
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import cloud_columns, stamp_ns
@@ -393,11 +393,21 @@ def file_profile(path: Path, sensor: SensorDescription, name: str) -> Profile:
 def _text(data: bytes, sensor: SensorDescription) -> tuple[Columns, int]:
     """Columns of a table whose header, if any, names them; what stands before it is passed over.
 
-    Cells are separated by ``;``, else tabs, else commas, else blanks; but for commas a decimal
-    mark may be one.
+    Cells are separated by ``;``, else tabs, else commas, else blanks, the first with which columns
+    and numbers are found; but for commas a decimal mark may be one.
     """
     text = data.decode("utf-8-sig", errors="replace")
-    mark = next((m for m in ";\t," if m in text), None)
+    first: RobocalError | None = None
+    for mark in (*(m for m in ";\t," if m in text), None):
+        try:
+            return _separated(text, mark, sensor)
+        except (InputError, TooFewSamplesError) as error:
+            first = first or error
+    assert first is not None
+    raise first
+
+
+def _separated(text: str, mark: str | None, sensor: SensorDescription) -> tuple[Columns, int]:
     lines = [
         [cell.strip().strip('"') for cell in line.split(mark)]
         for line in text.splitlines()

@@ -146,6 +146,23 @@ FILES = {
 }
 
 
+def preamble(path):
+    path.write_text("Scan of 3 May, line 2; by hand\nX,Z\n" + rows(X_MM, Z_MM))
+    return SensorDescription(x="X", z="Z")
+
+
+def blanks(path):
+    text = rows(X_MM, Z_MM).replace(",", " ").replace(".", ",")
+    path.write_text("Scan of 3 May, line 2\n" + text)
+    return SensorDescription(x="1", z="2")
+
+
+FILES |= {
+    "a preamble with other marks": (preamble, ".csv"),
+    "blanks and decimal commas": (blanks, ".txt"),
+}
+
+
 @pytest.mark.parametrize("what", FILES)
 def test_what_is_written_is_read(tmp_path, what):
     write, suffix = FILES[what]
