@@ -404,12 +404,16 @@ def automatic_commands(
     if not observations:
         raise InputError("no measurement at standstill in this recording")
 
+    def near(a: Observation, b: Observation) -> bool:
+        return bool(np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD)
+
     def same(a: list[Observation], b: list[Observation]) -> bool:
-        return bool(np.max(np.abs(a[0].q - b[0].q)) < SAME_VISIT_RAD)
+        targets = {one.sample.target for one in a} & {one.sample.target for one in b}
+        return near(a[0], b[0]) and bool(targets)
 
     visits: list[list[Observation]] = []  # of a pose, however much was measured there
     for one in observations:
-        if visits and same(visits[-1], [one]):
+        if visits and near(visits[-1][0], one):
             visits[-1].append(one)
         else:
             visits.append([one])

@@ -19,6 +19,7 @@ from robocal_ros.ground.samples import (
     MEASURED_POSE,
     JointBlock,
     JointSample,
+    PointSample,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Proposal
@@ -32,6 +33,7 @@ from robocal_ros.session.events import (
     read_command,
 )
 from robocal_ros.thermal.drift_following import ThermalConfig
+from robocal_ros.thermal.observations import Observation
 from robocal_ros.thermal.session import (
     ThermalSession,
     automatic_commands,
@@ -320,6 +322,24 @@ def test_cycles_are_found_where_no_command_was_recorded(nominal, visits, tmp_pat
     report = replay(session_in(tmp_path / "real", nominal), samples, commands, None, take_message)
     assert [o.samples for o in report.outcomes] == [POSES] * 3
     assert [o.status for o in report.outcomes] == [Code.ACCEPT] * 3
+
+
+def test_a_cycle_may_bring_a_second_target_to_the_same_poses():
+    """Poses with one target, then the same poses with another: both are one cycle."""
+
+    def cycle(start_s):
+        places = [(target, pose) for target in ("ball", "cube") for pose in range(5)]
+        for i, (target, pose) in enumerate(places):
+            at_ns = (start_s + i) * 1_000_000_000
+            for again in range(2):  # measured twice in a row
+                sample = PointSample(at_ns + again, "hall", target, np.zeros(3))
+                yield Observation(sample, np.full(6, 0.1 * pose), at_ns + again)
+
+    found = [one for start_s in (0, 100, 200) for one in cycle(start_s)]
+    commands = [command for command, _ in automatic_commands(found)]
+    assert [c.name for c in commands] == ["capture_reference", "identify", "identify"]
+    starts = [c.arguments["from_ns"] for c in commands]
+    assert starts == [start * 1_000_000_000 for start in (0, 100, 200)]
 
 
 def test_poses_that_never_recur_are_one_calibration(nominal, visits, tmp_path):
