@@ -315,6 +315,8 @@ def _require_sense(args: argparse.Namespace) -> None:
     judging = (args.check, args.hold_out, args.seed, args.figures, args.check_refit or None)
     if args.plan is not None and any(option is not None for option in judging):
         raise InputError("--plan comes before measuring: there is nothing to judge or to draw yet")
+    if args.plan is not None and (args.fit, args.method, args.model) != (PARTS, "map", "full"):
+        raise InputError("--plan is for the full model: --fit, --method and --model say nothing")
     if args.check is None and args.check_refit:
         raise InputError("--check-refit is about the check data: give them with --check")
     if args.check is not None and args.seed is not None:
@@ -339,6 +341,11 @@ def _planned(args: argparse.Namespace) -> CliResult:
         warnings.append("collisions are not known here: look at the poses before you drive them")
     else:
         candidates = _candidates(args.data, arm)
+        beyond = np.any((candidates < arm.lower) | (candidates > arm.upper), axis=1)
+        if np.any(beyond):
+            words = f"{args.data}: {np.sum(beyond)} poses are beyond the joint limits, left out"
+            warnings.append(words)
+            candidates = candidates[~beyond]
     working = np.random.default_rng(0).permutation(len(candidates))[:MOST_WORKING]
     plan = plan_poses(arm, candidates, candidates[working], args.plan)
     columns = joint_texts(plan.q, arm)

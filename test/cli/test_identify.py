@@ -256,6 +256,21 @@ class TestPlan:
         assert (status, len(document["plan"])) == (0, 5)
         assert "collisions" in document["warnings"][0]
 
+    def test_poses_beyond_the_limits_are_none_to_drive_to(self, folder: Path, identify) -> None:
+        q = measured(60).q.copy()
+        q[3, 1] = 0.1
+        source = table(folder / "beyond.csv", measured(60, q=q))
+        status, document = identify("--plan", 59, "--data", source)
+        assert (status, document["candidates"]) == (0, 59)
+        assert "1 poses are beyond the joint limits" in document["warnings"][0]
+        status, document = identify("--plan", 60, "--data", source)
+        assert (status, document["error"]["code"]) == (3, "TOO_FEW_SAMPLES")
+
+    def test_a_plan_is_for_the_full_model(self, identify) -> None:
+        for option in (("--model", "geometric"), ("--fit", "base"), ("--method", "lsq")):
+            status, document = identify("--plan", 5, *option)
+            assert (status, document["error"]["code"]) == (2, "BAD_INPUT")
+
     def test_there_is_nothing_to_judge(self, data: Path, identify) -> None:
         for options in (("--check", data), ("--hold-out", "0.5"), ("--seed", 1)):
             status, document = identify("--plan", 5, *options)
