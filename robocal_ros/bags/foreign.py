@@ -151,6 +151,7 @@ WINDOW = 10  # of the grid, from which a speed is taken: receipt in bursts makes
 LATEST_S = 1.5  # a stream lags behind the joints, or they behind it, by no more
 OTHER_CLOCK_S = 1.0  # stamps further from their receipt than the joints' are of another clock
 BLOCK_S = 1.0  # of a standstill become one measurement
+SILENCE_S = 2.0  # after which a stream has ended, for now
 LIKENESS = 0.6  # six sigma: two motions that are not one scatter by 0.1 in a hundred windows
 SAME_MOTION_S = 20.0  # of motion that a delay is found from, at a time
 
@@ -395,7 +396,13 @@ class StreamAverage:
         What cannot be read comes too, so that it is counted where it would have been used.
         """
         blocks: dict[tuple[str, str, str], list[PointSample]] = {}
+        came_ns: dict[tuple[str, str, str], int] = {}
         for recorded in messages:
+            # Of what ended, before its joints are forgotten.
+            ended_ns = recorded.log_time_ns - round(SILENCE_S * 1e9)
+            for key in [key for key, log_ns in came_ns.items() if log_ns < ended_ns]:
+                del came_ns[key]
+                yield _single(key[0], recorded.log_time_ns, blocks.pop(key))
             if (timing := self.timing.get(recorded.topic)) is None:
                 yield recorded
                 continue
@@ -405,13 +412,19 @@ class StreamAverage:
                 yield recorded
                 continue
             sample = replace(sample, stamp_ns=sample.stamp_ns - timing.later_ns)
-            block = blocks.setdefault((recorded.topic, sample.frame, sample.target), [])
+            key = recorded.topic, sample.frame, sample.target
+            block = blocks.setdefault(key, [])
             if block and not 0 <= sample.stamp_ns - block[0].stamp_ns < BLOCK_S * 1e9:
-                yield recorded._replace(message=_mean(block))
+                yield _single(key[0], recorded.log_time_ns, block)
                 block.clear()
             block.append(sample)
-        for (topic, _, _), block in blocks.items():
-            yield BagMessage(topic, "", block[-1].stamp_ns, _mean(block))
+            came_ns[key] = recorded.log_time_ns
+        for key, block in blocks.items():
+            yield _single(key[0], came_ns[key], block)
+
+
+def _single(topic: str, log_time_ns: int, block: list[PointSample]) -> BagMessage:
+    return BagMessage(topic, "", log_time_ns, _mean(block))
 
 
 def _mean(block: list[PointSample]) -> PointSample:

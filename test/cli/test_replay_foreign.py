@@ -233,3 +233,20 @@ def test_a_second_of_a_stream_is_one_measurement_without_what_was_lost():
     assert np.abs(one.message.position_m - true).max() < 5 * sigma_m / np.sqrt(99)
     assert one.message.sigma_m == pytest.approx(sigma_m / np.sqrt(99), rel=0.3)
     assert abs(one.message.stamp_ns - (5.5 * NS)) < 0.01 * NS
+
+
+def test_what_was_measured_before_a_stream_ended_comes_soon_after():
+    """Not when it goes on, minutes later: nobody knows any more where the joints were then."""
+    ball = [
+        BagMessage("/ball", "", at_ns, PointSample(at_ns, "hall", "ball", np.zeros(3)))
+        for at_ns in range(10 * NS, 10 * NS + NS // 2, NS // 100)
+    ]
+    joints = [BagMessage("/joints", "", i * NS // 10, i) for i in range(300)]
+    messages = sorted(ball + joints, key=lambda one: one.log_time_ns)
+    average = StreamAverage({"/ball": "measured_point"}, {"/ball": StreamTiming(100.0)})
+    found = list(average.of(messages))
+    place = [one.topic for one in found].index("/ball")
+    assert found[place].message.stamp_ns == pytest.approx(10.245 * NS)
+    assert found[place - 1].log_time_ns <= 13 * NS
+    assert [one.message for one in found if one.topic == "/joints"] == list(range(300))
+    assert len(found) == 301
