@@ -46,6 +46,8 @@ def open_bag(path: str | Path) -> BagReader:
     Raises `InputError` when it is no such bag, or broke off before any message.
     """
     path = Path(path)
+    if path.suffix in (ROS1, SQLITE) and not path.exists():
+        raise InputError("there is no such file or folder", file=str(path))
     files = [path]
     if path.is_dir():
         files = sorted(path.glob(f"*{ROS1}"))
