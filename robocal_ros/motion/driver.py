@@ -416,7 +416,7 @@ class MotionDriver:
         self._scaling, self._rejected = SpeedScaling(), False
         self._first = self._newest = 0  # what was sent of the present motion, or stop
         self._stop: Callable[[], JointTrajectory] | None = None  # that may have been lost
-        self._copies = 0
+        self._copies, self._until_s = 0, 0.0
         # It goes on where a node that sent a stop is deactivated.
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._repeats = node.create_timer(COPY_S, guarded(node, self._repeat), clock=clock)
@@ -476,10 +476,12 @@ class MotionDriver:
         by_action = self._send(first, {})
         if stamped or by_action:
             self._stop, self._copies = (lambda: first) if stamped else message, 1
+            self._until_s = begin_s + COPIES * COPY_S
             self._repeats.reset()
 
     def _repeat(self) -> None:
-        if self._stop is not None and self._copies < COPIES:
+        in_time = self._now() <= self._until_s
+        if self._stop is not None and self._copies < COPIES and in_time:
             self._copies += 1
             self._send(self._stop(), {})
         else:
@@ -515,7 +517,9 @@ class MotionDriver:
         handle: Any = future.result()
         if number >= self._first:
             self._repeats.cancel()
-            if not handle.accepted:
+            if handle.accepted:
+                self._first = self._newest + 1  # a copy that comes too late is rejected
+            else:
                 self._rejected = True
                 words = "the controller rejected the motion"
                 self._reported(MotionReport(failed=True, words=words))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
-from rclpy.action import ActionServer
+from rclpy.action import ActionServer, GoalResponse
 from std_msgs.msg import Float64
 from test_correction_graph import Process
 from trajectory_controllers import HOME as Q_UR10
@@ -17,7 +17,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceDriver
 from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import MotionDriver
+from robocal_ros.motion.driver import COPY_S, MotionDriver
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
@@ -103,6 +103,50 @@ def test_each_motion_goes_by_the_action_that_is_there_when_it_begins(graph: Any)
     assert controller.stop() == 0
     graph.spin_until(lambda: not actions_beside(node, path), "the controller is gone")
     assert sent(stop=False) == "topic"
+    motion.close()
+    graph.executor.remove_node(node)
+    node.destroy_node()
+
+
+def test_a_stop_is_not_sent_again_too_late_and_a_copy_that_is_rejected_is_no_fault(
+    graph: Any,
+) -> None:
+    """Finding: 0.2 s late it began at time 0 at its end; one that was lost stepped back there."""
+    held_up_s, asked, reports = [0.0], [], []
+    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
+    graph.executor.add_node(node)
+    motion = MotionDriver(
+        node, load_robot("ur10").joint_names, ACTION, "", {}, reports.append, lambda: None,
+        lambda: time.monotonic() + held_up_s[0],
+    )  # fmt: skip
+    node.trigger_configure()
+    node.trigger_activate()
+
+    def taken(goal: Any) -> GoalResponse:
+        asked.append(goal.trajectory)
+        return GoalResponse.REJECT if len(asked) > 1 else GoalResponse.ACCEPT
+
+    def ends(goal: Any) -> Any:
+        goal.succeed()
+        return FollowJointTrajectory.Result()
+
+    controller = ActionServer(graph.probe, FollowJointTrajectory, ACTION, ends, goal_callback=taken)
+    rest = np.zeros((2, 6))
+    plan = JointPlan(np.array([0.0, 0.12]), rest + Q_UR10, rest, rest)
+    graph.spin_until(lambda: motion._client.server_is_ready(), "the controller")
+    motion.send(plan, stop=True)
+    held_up_s[0] = 0.2
+    time.sleep(2.0 * COPY_S)
+    graph.spin_until(lambda: asked, "the stop")
+    graph.spin_for(0.1)
+    assert len(asked) == 1
+    asked.clear()
+    motion.send(plan, stop=True)
+    motion._repeat()
+    graph.spin_until(lambda: len(asked) > 1, "the stop and its copy")
+    graph.spin_for(0.1)
+    assert not any(report.failed for report in reports)
+    controller.destroy()
     motion.close()
     graph.executor.remove_node(node)
     node.destroy_node()
