@@ -85,15 +85,24 @@ def brief_action(most: int) -> Any:
         return whole
     convert = function("_CONVERT_TO_PY", ctypes.py_object, ctypes.c_void_p)
 
-    def brief(request: int) -> Any:
+    def briefly(request: int) -> Any:
         count = points(request)
         many = count.value
         if many <= most:
             return convert(request)
         count.value = 0
-        goal_id = convert(request).goal_id
-        count.value = many  # which rclpy frees
+        try:
+            goal_id = convert(request).goal_id
+        finally:
+            count.value = many  # which rclpy frees
         return SimpleNamespace(goal_id=goal_id, goal=LongGoal(many))
+
+    def brief(request: int) -> Any:
+        try:
+            return briefly(request)
+        except BaseException:  # ctypes would return what lay in memory, which rclpy then frees
+            traceback.print_exc()
+            return None
 
     called = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p)(brief)
     capsule = api.PyCapsule_New(ctypes.cast(called, ctypes.c_void_p), None, None)

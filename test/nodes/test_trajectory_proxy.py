@@ -297,6 +297,19 @@ def test_of_a_long_goal_nothing_but_its_id_becomes_python() -> None:
     assert min(cpu_s(brief) for _ in range(3)) < 0.3 * min(cpu_s(usual) for _ in range(3))
 
 
+def test_a_long_goal_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finding: rclpy got a pointer to any object that lay there, and freed it."""
+    kind = trajectory_proxy.brief_action(1).Impl.SendGoalService.Request
+    goal = goal_of(HOME, HOME)
+    data = serialize_message(FollowJointTrajectory.Impl.SendGoalService.Request(goal=goal))
+
+    def no_memory(points: int) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(trajectory_proxy, "LongGoal", no_memory)
+    assert deserialize_message(data, kind) is None
+
+
 def slows_down(points: Any) -> bool:
     """Lines, for a robot whose states have no velocities, each slower than the one before."""
     times = np.array([p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points])
