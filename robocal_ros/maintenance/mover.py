@@ -299,7 +299,7 @@ class Mover:
         return self.lasts_s(worst_s - driven_s)
 
     def lasts_s(self, planned_s: float) -> float:
-        """How long the robot takes for what is planned, at the newest speed scaling but 0."""
+        """How long the robot takes for what is planned, at its speed but for pauses."""
         return planned_s / max(self.watch.unpaused, 1e-3)
 
     def arrived(self, now_s: float) -> bool:

@@ -64,6 +64,7 @@ APART_S = 0.00375  # instants of the plan that a reading is compared with
 REFERENCE_S = 0.1  # a controller's place that is older is none
 JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
 UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
+PACE_S = 0.5  # ur_robot_driver's scaling comes out of a pause by 0.01 in each of its cycles of 2 ms
 PAUSED_S = 15.0  # a robot that stands on its path is waited for so long where no scaling is known
 LAG_S = 0.03  # of drives behind their controller; what is later began later
 NEARLY_S = 0.5  # before its end a plan may bend back to where it has been
@@ -96,9 +97,10 @@ class RobotWatch:
 
     ``driving``: how far the robot may be beside its plan, and how fast its joints are.
     ``silence``: how long no new reading came. ``scaling``: how fast the controller's clock runs, 1
-    as planned; 1 where nobody tells it lately; ``unpaused``: the newest but 0, as a pause tells
-    nothing of what comes after it. ``held_s``: when a controller that pauses was last
-    seen to give up a motion, as `StatedController` has it.
+    as planned; 1 where nobody tells it lately; ``unpaused``: the same but for pauses, which tell
+    nothing of what comes after them, and ramps into and out of them: a slower one counts once it
+    was so for `PACE_S`. ``held_s``: when a controller that pauses was last seen to give up a
+    motion, as `StatedController` has it.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
@@ -107,6 +109,7 @@ class RobotWatch:
         self.silence = Silence()
         self.scaling, self.unpaused, self.held_s = 1.0, 1.0, -np.inf
         self._scaled_s = -np.inf  # when that was told
+        self._paced_s = -np.inf  # when it was last 0, or no slower than `unpaused`
         self._heard_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
         self._reference: tuple[Array, Array] | None = None
@@ -140,7 +143,10 @@ class RobotWatch:
             return
         self._driven_s, self._at_s = self.driven_s(now_s), now_s
         self.scaling, self._scaled_s, self._away = factor, now_s, None
-        self.unpaused = factor or self.unpaused
+        if factor == 0.0 or factor >= self.unpaused:
+            self.unpaused, self._paced_s = factor or self.unpaused, now_s
+        elif now_s - self._paced_s >= PACE_S:
+            self.unpaused = factor
 
     def controller(self, q: Array, qd: Array, now_s: float) -> None:
         """Where the controller is on its trajectory: joints and unscaled velocities (n,)."""

@@ -175,6 +175,9 @@ def test_a_pause_of_ten_seconds_in_each_motion_of_a_cycle_is_waited_for(warm, te
             cell.speed, until_s = 0.0, cell.now_s + PAUSE_S
             while cell.now_s < until_s:
                 step()
+            while tells and cell.speed < 1.0:  # as ur_robot_driver comes out of a pause
+                cell.speed = min(cell.speed + 0.05, 1.0)
+                step()
             cell.speed = 1.0
 
     cell.step = pausing

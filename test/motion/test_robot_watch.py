@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing, MotionCell, ToolBody, joint_way
 from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, MotionLimits, stop
-from robocal_ros.motion.robot_watch import LEAST, TOLD_S, RobotWatch, SpeedScaling
+from robocal_ros.motion.robot_watch import LEAST, PACE_S, TOLD_S, RobotWatch, SpeedScaling
 
 ARM = load_robot("kr150_r3100")
 LIMITS = MotionLimits()
@@ -138,6 +138,18 @@ def test_a_scaling_that_is_not_told_again_is_as_planned():
         watch.reading(begin_s + 0.008 * count, HOME, begin_s + 0.008 * count)
         assert watch.scaling == float(0.008 * count > 1.0)
     assert watch.driven_s(begin_s + 3.2) - watch.driven_s(begin_s + 2.2) == pytest.approx(1.0)
+
+
+def test_the_ways_into_a_pause_and_out_of_it_are_no_speed() -> None:
+    """Finding: a cycle ended by the first 0.01 after a pause, for "slower than planned"."""
+    watch, paced = RobotWatch(ARM, DRIVING), []
+    times = 0.002 * np.arange(5000)
+    knots = [0.0, 1.0, 1.3, 5.0, 5.2, 6.0, 6.0, 10.0], [1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.3, 0.3]
+    for at_s, factor in zip(times, np.interp(times, *knots), strict=True):
+        watch.scaled(float(factor), float(at_s))
+        paced.append(watch.unpaused)
+    assert np.all(np.array(paced)[times < 6.0] == 1.0)
+    assert np.all(np.array(paced)[times > 6.0 + PACE_S + 0.003] == 0.3)
 
 
 def test_what_is_not_told_again_is_forgotten() -> None:
