@@ -125,7 +125,8 @@ def test_a_drift_crosses_a_wrist_singularity_at_less_than_2_deg_s(name: str) -> 
         assert rate <= 2.0
         # where the joints cannot move the tool's position in one direction, nothing can be done
         least = np.linalg.svd(jacobian(taught, q)[:, :3], compute_uv=False)[:, 2].min()
-        assert off <= 0.04e-3 or least < 0.1
+        uncorrected = np.linalg.norm(place(actual, q) - place(taught, q), axis=1).max()
+        assert off <= 0.04e-3 or (least < 0.1 and off <= uncorrected)
     for _, actual, q, _ in sorted(found, key=lambda one: -one[0])[:3]:
         assert asked(taught, actual, q, streamed(taught, actual, q))[0] <= 2.0
 
