@@ -130,7 +130,7 @@ def _subjects(folder: Path) -> "Iterator[tuple[Probe, list[Stream]]]":
 
     arm = load_robot("kr150_r3100")
     relay = [sys.executable, Path(__file__).with_name("bare_relay.py")]
-    node = [EXECUTABLES / "joint_correction_node", "--ros-args", "-p", f"robot:={arm.name}"]
+    node = [EXECUTABLES / "joint_correction_node", "--ros-args", "-p", "robot:=kr150_r3100"]
     given = {
         NODE: ("joint_correction_node", node),
         RELAY: ("relay", [*relay, "events"]),

@@ -87,7 +87,7 @@ def soak(seconds: float) -> Table:
     arm = load_robot("kr150_r3100")
     probe = Probe()
     with tempfile.TemporaryDirectory() as folder:
-        robot = ("--ros-args", "-p", f"robot:={arm.name}")
+        robot = ("--ros-args", "-p", "robot:=kr150_r3100")
         command = [EXECUTABLES / "joint_correction_node", *robot]
         subject = Subject("corrected", "joint_correction_node", command, Path(folder))
         try:
