@@ -2,7 +2,7 @@
 
 A tracker streams: it measures while the robot moves too, its stamps are often those of its
 receipt, late and in bursts, and its computer's clock may be another. `stream_timing` finds by how
-much from the motion, `Averaged` makes single measurements of what stands still.
+much from the motion, `StreamAverage` makes single measurements of what stands still.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -200,7 +200,7 @@ class StreamTiming:
 
 
 def stream_timing(
-    reader: BagReader, inputs: Mapping[str, str], arm: SerialArm, target: str = ""
+    reader: BagReader, inputs: Mapping[str, str], arm: SerialArm
 ) -> dict[str, StreamTiming]:
     """Find how each stream of measurements stands to the joints' clock, by topic.
 
@@ -217,9 +217,7 @@ def stream_timing(
     return {
         topic: timing
         for topic in seen.stamp_ns
-        if topic != seen.joints
-        and _rate_hz(np.array(seen.log_ns[topic])) > STREAMS_HZ
-        and (timing := _timing(seen, topic)) is not None
+        if topic != seen.joints and (timing := _timing(seen, topic)) is not None
     }
 
 
@@ -270,26 +268,24 @@ def _rate_hz(log_ns: NDArray[np.int64]) -> float:
     if len(log_ns) < 20:
         return 0.0
     steps = np.diff(log_ns) * 1e-9
-    following = steps[steps < 2.0]
+    following = steps[steps < SILENCE_S]
     return len(following) / float(following.sum()) if 2 * len(following) > len(steps) else 0.0
 
 
 def _timing(seen: _Seen, topic: str) -> StreamTiming | None:
-    """The timing of what streams; None of what is measured at standstill alone."""
+    """The timing of what streams; None of what comes seldom, or is measured at standstill alone."""
     log_ns = np.array(seen.log_ns[topic])
-    lead_ns = [
+    rate_hz = _rate_hz(log_ns)
+    if rate_hz <= STREAMS_HZ or seen.joints not in seen.stamp_ns:
+        return None
+    lead_ns, joints_lead_ns = (
         float(np.median(np.array(seen.stamp_ns[name]) - np.array(seen.log_ns[name])))
         for name in (topic, seen.joints)
-        if name in seen.stamp_ns
-    ]
-    apart_ns = round(lead_ns[0] - lead_ns[1]) if len(lead_ns) == 2 else 0
+    )
+    apart_ns = round(lead_ns - joints_lead_ns)
     clock_ns = apart_ns if abs(apart_ns) > OTHER_CLOCK_S * 1e9 else 0
     ends = np.searchsorted(log_ns, log_ns + 10_000_000, side="right")
-    timing = StreamTiming(
-        _rate_hz(log_ns), clock_ns, burst=int(np.max(ends - np.arange(len(log_ns))))
-    )
-    if seen.joints not in seen.stamp_ns:
-        return timing
+    timing = StreamTiming(rate_hz, clock_ns, burst=int(np.max(ends - np.arange(len(log_ns)))))
     samples: list[PointSample] = seen.values[topic]
     joint_ns, q = np.array(seen.stamp_ns[seen.joints]), np.array(seen.values[seen.joints])
     measured_ns = np.array(seen.stamp_ns[topic]) - clock_ns
@@ -365,10 +361,11 @@ def _delay_s(flange: Array, target: Array) -> float | None:
     if len(flange) < 4 * most:
         return None
     middle = flange[most:-most]
-    likeness = [
-        float(np.corrcoef(middle, target[most + lag : len(target) - most + lag])[0, 1])
-        for lag in range(-most, most + 1)
-    ]
+    with np.errstate(divide="ignore", invalid="ignore"):  # what stands still is like nothing
+        likeness = [
+            float(np.corrcoef(middle, target[most + lag : len(target) - most + lag])[0, 1])
+            for lag in range(-most, most + 1)
+        ]
     best = int(np.argmax(likeness))
     if not likeness[best] >= LIKENESS or best in (0, 2 * most):
         return None

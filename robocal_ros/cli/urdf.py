@@ -1,6 +1,7 @@
 """Robot descriptions of ROS: ``robocal import-urdf`` and ``export-urdf``."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,30 +76,33 @@ def run_import_urdf(args: argparse.Namespace) -> CliResult:
         )
     comment = f"From {args.urdf.name}, {links.base} to {links.tip}, by robocal import-urdf."
     save_robot(arm, args.output, description, comment)
-    document: Document = {
+    document = _document(links, arm, args.output, np.eye(4)) | {"joints": joint_rows(arm)}
+    return CliResult(document | {"warnings": warnings}, _show_import)
+
+
+def _document(links: Chain, arm: SerialArm, output: Path, T_tip_flange: Array) -> Document:
+    """What both commands tell: in it the largest difference of the flange over the joints' ranges.
+
+    Of an element of its pose, mm, or its like in rad at a metre.
+    """
+    q = _poses(arm)
+    there = np.array([links.fk(row) @ T_tip_flange for row in q])
+    return {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "base": links.base,
         "tip": links.tip,
-        "output": str(args.output),
-        "joints": joint_rows(arm),
-        "conversion_error_mm": _largest_mm(links, arm),
-        "warnings": warnings,
+        "output": str(output),
+        "conversion_error_mm": float(
+            np.abs(there - replace(arm, functions=None).fk(q)).max() * 1e3
+        ),
     }
-    return CliResult(document, _show_import)
 
 
 def _poses(arm: SerialArm) -> Array:
     low = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(arm.upper - 1.0, -np.pi))
     high = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(arm.lower + 1.0, np.pi))
     return np.random.default_rng(0).uniform(low, high, (_POSES, arm.n))
-
-
-def _largest_mm(links: Chain, arm: SerialArm) -> float:
-    """Largest difference, mm, or its like in rad at a metre, over the joints' ranges."""
-    q = _poses(arm)
-    there = np.array([links.fk(row) for row in q])
-    return float(np.abs(there - arm.fk(q)).max() * 1e3)
 
 
 def _show_import(console: "Console", document: Document) -> None:
@@ -159,21 +163,8 @@ def run_export_urdf(args: argparse.Namespace) -> CliResult:
             f"kinematics.yaml has no place: add ({xyz}) mm and that turn to the tool, or use a URDF"
         )
     write_text(args.output, text)
-    geometry = np.array([links.fk(row) @ beyond for row in _poses(arm)])
-    rigid = SerialArm(
-        arm.name, arm.joint_names, arm.mdh, arm.sign, arm.prismatic, arm.lower, arm.upper,
-        arm.T_base_root,
-    )  # fmt: skip
-    document: Document = {
-        "robot": arm.name,
-        "model_hash": arm.model_hash,
-        "base": links.base,
-        "tip": links.tip,
-        "output": str(args.output),
-        "T_tip_flange": transform_document(beyond),
-        "conversion_error_mm": float(np.abs(geometry - rigid.fk(_poses(arm))).max() * 1e3),
-        "warnings": warnings,
-    }
+    document = _document(links, arm, args.output, beyond)
+    document |= {"T_tip_flange": transform_document(beyond), "warnings": warnings}
     return CliResult(document, _show_export)
 
 

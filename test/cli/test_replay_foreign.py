@@ -95,8 +95,10 @@ def test_the_visits_of_a_stream_are_its_cycles_and_its_clock_is_found(shift):
     assert timing["burst"] > 10
     for candidate in shift["candidates"]:
         assert candidate["verdict"]["accept"]
-        errors = candidate["calibrated"]["held_out"]["rms_mm"], candidate["in_force"]["held_out"]
-        assert errors[0] < 0.2 * errors[1]["rms_mm"]
+        found = candidate["calibrated"]
+        # Some thirty coordinates: their rms is not twice what it is expected to be.
+        assert found["held_out"]["rms_mm"] < 2.0 * found["predicted"]["total_rms_mm"]
+        assert found["held_out"]["rms_mm"] < candidate["in_force"]["held_out"]["rms_mm"]
 
 
 def test_reasons_have_their_numbers(shift):
@@ -232,7 +234,7 @@ def test_a_second_of_a_stream_is_one_measurement_without_what_was_lost():
     average = StreamAverage({"/ball": "measured_point"}, {"/ball": StreamTiming(100.0, 5 * NS)})
     (one,) = average.of(BagMessage("/ball", "", s.stamp_ns, s) for s in samples)
     assert np.abs(one.message.position_m - true).max() < 5 * sigma_m / np.sqrt(99)
-    assert one.message.sigma_m == pytest.approx(sigma_m / np.sqrt(99), rel=0.3)
+    assert one.message.sigma_m == pytest.approx(sigma_m / np.sqrt(99), rel=0.2)
     assert abs(one.message.stamp_ns - (5.5 * NS)) < 0.01 * NS
 
 
