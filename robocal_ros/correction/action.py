@@ -43,6 +43,9 @@ _ABOUT_JOINTS = {Reason.UNKNOWN_JOINT, Reason.DOUBLED_JOINT, Reason.MISSING_JOIN
 # Where the number of points stands in the C structure of a goal's request, after goal_id, header,
 # joint_names and a pointer: a sequence is a pointer, its size and its capacity (rosidl_runtime_c).
 POINTS_AT = 16 + 32 + 24 + 8
+_CONVERTERS = (
+    "_CREATE_ROS_MESSAGE", "_CONVERT_FROM_PY", "_CONVERT_TO_PY", "_DESTROY_ROS_MESSAGE",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -58,11 +61,14 @@ def brief_action(most: int) -> Any:
 
     rclpy makes an object of each point before it asks anybody: of 100 000 the node would be deaf
     for seconds. A `LongGoal` stands in place of such a goal. The action itself where messages are
-    not laid out as expected.
+    not laid out, or not converted, as expected.
     """
     whole: Any = FollowJointTrajectory
-    usual, api = type(whole.Impl.SendGoalService.Request), ctypes.pythonapi
+    usual = type(whole.Impl.SendGoalService.Request)
     usual.__import_type_support__()
+    if not all(getattr(usual, name, None) for name in _CONVERTERS):
+        return whole
+    api = ctypes.PyDLL(None)  # with argument types of its own, unlike ctypes.pythonapi
     api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
     api.PyCapsule_New.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
