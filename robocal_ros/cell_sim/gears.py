@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from robocal_ros.ground.frames import Array
 
 # 1 minute of arc between the extremes is what makers of gears for robots allow; of some sines the
 # extremes are 5.4 standard deviations apart.

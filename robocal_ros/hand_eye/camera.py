@@ -16,7 +16,7 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,
     STEP_S,
@@ -46,8 +46,6 @@ from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings, apart, j
 
 # ---- camera mistakes ----------------------------------------------------------------------------
 
-
-Array = NDArray[np.float64]
 
 FEWEST_PAIRS = 3
 LEAST_TURN_RAD = float(np.radians(1.0))  # rms about a second axis

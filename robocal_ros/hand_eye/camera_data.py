@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics.robots import read_fields
 
 # ---- pairs of a robot's pose and of what a camera (or a tracker) saw from there -----------------
 
 
-Array = NDArray[np.float64]
 Mount = Literal["in-hand", "to-hand"]
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.hand_eye.camera_data import Placement, PosePairs, Shared, plain
 from robocal_ros.hand_eye.camera_kernels import (
     advance,
@@ -22,7 +23,6 @@ from robocal_ros.hand_eye.camera_kernels import (
 # ---- pairs of a robot's pose and of what a camera (or a tracker) saw from there -----------------
 
 
-Array = NDArray[np.float64]
 _NEARLY_BACK = -0.9
 
 
@@ -219,8 +219,6 @@ def _rotations(matrix: Array) -> Array:
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     return np.asarray(U @ Vt)
 
-
-Index = NDArray[np.int64]
 
 SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data solvable
 POSITION, TURN, TILT, ROLL, DEPTH, EXCESS = range(6)

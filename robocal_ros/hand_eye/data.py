@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import (
     JOINTS,
     JointStream,
@@ -33,8 +33,6 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
 from robocal_ros.session.events import GAP_NS, Command, Ignored
-
-Array = NDArray[np.float64]
 
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
 SHOTS = (PROFILE, TARGET_POSE, IMAGE)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_bytes
-from robocal_ros.ground.frames import fixed, urdf_joint, urdf_origin
+from robocal_ros.ground.frames import Array, fixed, urdf_joint, urdf_origin
 from robocal_ros.hand_eye.camera_data import Image, decode_image
 from robocal_ros.hand_eye.profiles import (
     CLOUDS,
@@ -53,7 +53,6 @@ from robocal_ros.kinematics.tables import (
     write_cells,
 )
 
-Array = NDArray[np.float64]
 Parent = Literal["flange", "base"]
 Format = Literal["urdf", "xacro", "yaml", "static-transform"]
 

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import linearised
 from robocal_ros.estimation.surfaces import mirror
-from robocal_ros.ground.frames import Document
-
-Array = NDArray[np.float64]
+from robocal_ros.ground.frames import Array, Document
 
 FEWEST_ARCS = 8  # of poses of their own; more than the terms of the third degree
 DEGREES = (2, 3, 4)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.estimation import Estimate, observability, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.mount_problem import (
     FIRST_NOISE,
     MountProblem,
@@ -20,8 +21,6 @@ from robocal_ros.hand_eye.mount_problem import (
     restricted_noise,
 )
 from robocal_ros.hand_eye.result import ARM_M, PoseNoise, apart, at_origin, increment
-
-Array = NDArray[np.float64]
 
 AXES = ("the laser line (x)", "the laser plane's normal (y)", "the beam (z)")
 ALONG = 0.9  # cosine from which a direction is named after an axis

@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from robocal_ros.ground import frames
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.hand_eye.result import ARM_M, PoseNoise
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 SAME = 2e-4  # m, and rad: readings of a robot at rest differ by less, poses on purpose by more
 COMPONENTS = 3  # of every sighting; a model with fewer leaves the last ones empty

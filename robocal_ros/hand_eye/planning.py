@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.data import DataSet
 from robocal_ros.hand_eye.mount_fit import OPEN_M, joined, open_directions
@@ -44,8 +45,6 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import CalibrationState
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
-
-Array = NDArray[np.float64]
 
 VAGUE = 1.0  # m, rad: what is known without any measurement; an open direction has a large error
 MOST_PROPOSED = 12

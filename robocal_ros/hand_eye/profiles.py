@@ -16,11 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.files import quoted, read_bytes
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import cloud_columns, stamp_ns
 from robocal_ros.kinematics.robots import Fields, read_fields
 
-Array = NDArray[np.float64]
 Columns = Mapping[str, Array]
 
 FEWEST_POINTS = 10

@@ -6,15 +6,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, summarise, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
-from robocal_ros.ground.frames import Document, transform_document
+from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.hand_eye.linearity import SensorLinearity
 
-Array = NDArray[np.float64]
 Method = Literal["best", "classic"]
 TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
 

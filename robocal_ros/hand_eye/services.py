@@ -9,7 +9,6 @@ from urllib.parse import quote
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
-from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import (
@@ -24,6 +23,7 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.files import made_folder_beside
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import joint_sample
 from robocal_ros.hand_eye.data import (
     IN_HAND,
@@ -46,7 +46,6 @@ from robocal_ros.ros.parameters import given_pose
 from robocal_ros.ros.session_node import SessionEvents, answer, twin
 from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 
-Array = NDArray[np.float64]
 AddOutput = Callable[[type, str, QoSProfile], Any]
 Ask = Callable[[Command], Awaitable[Outcome]]
 

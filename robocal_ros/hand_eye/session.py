@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
@@ -18,7 +17,7 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import (
     CLOCK_JUMP_NS,
     JOINTS,
@@ -76,7 +75,6 @@ from robocal_ros.session.events import (
     seeded,
 )
 
-Array = NDArray[np.float64]
 Samples = Sequence[HandEyeSample]
 
 

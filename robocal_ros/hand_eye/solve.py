@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, errors_document, summarise
 from robocal_ros.estimation.estimation import solve
@@ -17,7 +16,7 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
     OPEN_M,
@@ -63,7 +62,6 @@ from robocal_ros.hand_eye.result import (
 )
 from robocal_ros.hand_eye.tasks import HandEyeData, Read, SphereTask, Task
 
-Array = NDArray[np.float64]
 Part = tuple[Task, HandEyeData]
 
 HELD = len(SENSOR_UNKNOWNS)

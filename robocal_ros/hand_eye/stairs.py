@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from robocal_ros.estimation.edge import CornerFit, CornerRule, EdgeRule, Kind, fit_corners
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError, TooFewSamplesError
-from robocal_ros.ground.frames import Document, transform_document
+from robocal_ros.ground.frames import Array, Document, Index, transform_document
 from robocal_ros.hand_eye.mount_fit import MountFit, first_look, misfit
-from robocal_ros.hand_eye.mount_problem import CornerModel, Index, MountState, TargetView, in_plane
+from robocal_ros.hand_eye.mount_problem import CornerModel, MountState, TargetView, in_plane
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.targets import LaserTarget, SphereTarget, StepTarget
 from robocal_ros.hand_eye.tasks import (
@@ -27,8 +27,6 @@ from robocal_ros.hand_eye.tasks import (
     sightings_of,
     usable,
 )
-
-Array = NDArray[np.float64]
 
 Match = tuple[Index, Index]  # corners of a profile (rows of its fit), and the target's they are
 

@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.hand_eye.camera_data import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics
 from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

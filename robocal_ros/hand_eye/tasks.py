@@ -7,7 +7,6 @@ from itertools import product
 from typing import ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.edge import (
     EdgeRule,
@@ -22,7 +21,7 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import Document
+from robocal_ros.ground.frames import Array, Document
 from robocal_ros.hand_eye.linearity import SeenArc, SensorLinearity, fit_linearity
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.mount_problem import (
@@ -40,7 +39,6 @@ from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import PoseNoise, TargetKind
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget
 
-Array = NDArray[np.float64]
 Fit = TypeVar("Fit")
 
 FEWEST_SPHERES = 5  # profiles

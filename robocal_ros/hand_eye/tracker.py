@@ -17,6 +17,7 @@ from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
+from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.mount_problem import moved, tangents
 from robocal_ros.hand_eye.result import (
     HandEyeResult,
@@ -47,8 +48,6 @@ from robocal_ros.hand_eye.tracker_scan import (
     fit_lines,
     solve_classic,
 )
-
-Array = NDArray[np.float64]
 
 FLANGE, SENSOR = slice(0, 6), slice(6, 12)
 REFLECTOR, CENTRE = slice(12, 15), slice(15, 18)

@@ -18,11 +18,10 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
+from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
 
 FACES = ("face_1", "face_2")
 MOVED = 1e-3  # rad or m: a joint that changes by less stands still

@@ -11,7 +11,6 @@ from functools import cached_property
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.estimation.surfaces import MAD
@@ -22,6 +21,7 @@ from robocal_ros.ground.errors import (
     RobocalError,
     TooFewSamplesError,
 )
+from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.hand_eye.mount_problem import tangents
 from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.hand_eye.tracker_data import (
@@ -40,10 +40,6 @@ from robocal_ros.hand_eye.tracker_data import (
     tracked_cube,
     two_axis_frame,
 )
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MOST_PLANES = 4
 TRIPLES = 150

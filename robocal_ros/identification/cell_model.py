@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel, CellProblem, UnknownLayout
 from robocal_ros.identification.joint_functions import (
@@ -27,10 +27,6 @@ from robocal_ros.identification.solve import Identification, Method, Part, ident
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import THETA, D
 from robocal_ros.kinematics.joint_functions import JointFunctions
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry alone
 # The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:

@@ -12,13 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.kinematics.joint_functions import JointFunctions
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Gears and encoders go with tens of periods in a turn: a length of a few degrees. How far length
 # and amplitude may be from these, as factors (standard deviations of their logarithms), is wide

@@ -26,7 +26,7 @@ from robocal_ros.estimation.assessment import (
     verdict_document,
 )
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.ground.frames import Document, invert, log_rotation, transform_document
+from robocal_ros.ground.frames import Array, Document, invert, log_rotation, transform_document
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
 from robocal_ros.identification.cell_model import (
     CellModel,
@@ -42,8 +42,6 @@ from robocal_ros.kinematics.tables import POSITION, check_plain, read_cells
 
 # ---- why data do not fit a robot at all ---------------------------------------------------------
 
-
-Array = NDArray[np.float64]
 
 SUSPICIOUS_M = 0.02  # no robot's nominal model is off by this much at half of the poses
 CLEAR_M = 0.01

@@ -10,9 +10,9 @@ A-optimal design; of such choices Chaloner and Verdinelli, Bayesian experimental
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import DEFAULT_TARGET
 from robocal_ros.identification.cell_model import CellModel, make_layout
 from robocal_ros.identification.full_model import sparse_rows
@@ -23,9 +23,6 @@ from robocal_ros.identification.joint_functions import (
 )
 from robocal_ros.identification.solve import default_prior
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 NOISE_M = 5e-5  # of a coordinate: a tracker, and what a real robot does not repeat
 LEVER_M = (0.1, 0.0, 0.1)  # of a target, where the robot file has no tool

@@ -12,6 +12,7 @@ from robocal_ros.estimation.descent import require_told
 from robocal_ros.estimation.estimation import describe, observability
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import (
     ADVICE,
@@ -25,9 +26,6 @@ from robocal_ros.identification.cell_model import (
     make_layout,
 )
 from robocal_ros.kinematics import SerialArm
-
-Array = NDArray[np.float64]
-
 
 # ---- how far parameters may lie from the nominal ones -------------------------------------------
 
