@@ -288,7 +288,7 @@ def unsettled(fit: PairFit) -> Verdict | None:
     )
 
 
-def verdict(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdict:
+def judge_camera(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdict:
     """Whether a solution may be used; ``size`` (n,) of the residuals used, m."""
     count, total = len(size), len(fit.pairs)
     words = (
@@ -343,7 +343,7 @@ class CameraSettings:
 
     method: str = "best"
     noise: GivenNoise = field(default_factory=GivenNoise)
-    limit_m: float = 2e-3
+    limit_m: float = HandEyeSettings.limit_m
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -488,7 +488,7 @@ def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
         leave_one_out_m=left_out(fit),
         rejected=_reasons(fit),
         working_error_m=error_m,
-        verdict=unsettled(fit) or verdict(fit, size, error_m, how.limit_m),
+        verdict=unsettled(fit) or judge_camera(fit, size, error_m, how.limit_m),
     )
     return result, fit.estimate.state
 

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 BagShots = tuple[HandEyeData, dict[str, str]]
 
 KINDS = ("sphere", "step", "line")
-LIMIT_MM = 1.0
+LIMIT_MM = 1e3 * HandEyeSettings.limit_m
 MOST_NAMED = 5  # samples left out for one reason
 
 

@@ -44,6 +44,7 @@ from robocal_ros.hand_eye.camera_data import (
 )
 from robocal_ros.hand_eye.camera_fit import GivenNoise
 from robocal_ros.hand_eye.cli import (
+    LIMIT_MM,
     add_description,
     add_limit,
     add_limits,
@@ -83,7 +84,7 @@ from robocal_ros.hand_eye.planning import (
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise, hand_eye_document
 from robocal_ros.hand_eye.targets import FARTHEST_MM, TrackerTarget, read_tracker_target
-from robocal_ros.hand_eye.tracker import solve_tracker
+from robocal_ros.hand_eye.tracker import LIMIT_M, solve_tracker
 from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise
 from robocal_ros.kinematics import SerialArm
 
@@ -193,7 +194,6 @@ def _paired(robot: PoseTable, camera: PoseTable, mount: Any) -> tuple[PosePairs,
 # ---- robocal hand-eye camera --------------------------------------------------------------------
 
 
-CAMERA_LIMIT_MM = 2.0
 CAMERA_WHERE = "where the boards were"  # the expected error holds
 
 
@@ -232,7 +232,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     )
     add_robot(parser)
     add_robot_sigma(parser, "default: from the residuals")
-    add_limit(parser, CAMERA_WHERE, CAMERA_LIMIT_MM)
+    add_limit(parser, CAMERA_WHERE, LIMIT_MM)
     parser.add_argument(
         "--check",
         type=Path,
@@ -289,7 +289,6 @@ def _show_camera(console: "Console", document: Document) -> None:
 # ---- ``robocal hand-eye tracker``: a profile sensor on a robot, placed by a laser tracker -------
 
 
-TRACKER_LIMIT_MM = 0.5
 TRACKER_WHERE = "at the working distance"  # the expected error holds
 
 
@@ -330,7 +329,7 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
         ("joint-sigma-mm", "0.02"),
     ):  # fmt: skip
         noise.add_argument(f"--{option}", type=positive, metavar="S", help=f"default {default}")
-    add_limit(parser, TRACKER_WHERE, TRACKER_LIMIT_MM)
+    add_limit(parser, TRACKER_WHERE, 1e3 * LIMIT_M)
 
 
 def run_tracker(args: argparse.Namespace) -> CliResult:

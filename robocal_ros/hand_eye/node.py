@@ -100,7 +100,13 @@ SETTINGS = (
         low=0.0,
         high=1.0,
     ),
-    number("limit_mm", 1.0, "Largest expected error at the working distance", 1e-3, 100.0),
+    number(
+        "limit_mm",
+        1e3 * HandEyeConfig.limit_m,
+        "Largest expected error at the working distance",
+        1e-3,
+        100.0,
+    ),
     *pose_settings(
         "rough",
         "About where the sensor sits on the flange, for check_plan before any calibration",

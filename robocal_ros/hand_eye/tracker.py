@@ -425,7 +425,7 @@ def misfit(estimate: Estimate[TrackerUnknowns]) -> float:
     return float(np.sqrt(np.sum(used**2) / max(used.size - len(estimate.names), 1)))
 
 
-def verdict_of(estimate: Estimate[TrackerUnknowns], working_m: float, limit_m: float) -> Verdict:
+def judge_tracker(estimate: Estimate[TrackerUnknowns], working_m: float, limit_m: float) -> Verdict:
     """Whether a solution may be used; ``working_m``: error to expect at the working distance."""
     over = misfit(estimate)
     what = (
@@ -492,7 +492,7 @@ def solve_tracker(
         "widened_by": estimate.scale,
         "axes_off_nominal": {"angle_deg": float(np.degrees(angle)), "gap_mm": gap_m * 1e3},
     }
-    verdict = verdict_of(estimate, working_m, limit_m)
+    verdict = judge_tracker(estimate, working_m, limit_m)
     best = replace(best, working_error_m=working_m, verdict=verdict, more=more)
     return _classic(data, target, classic, best, limit_m) if method == "classic" else best
 

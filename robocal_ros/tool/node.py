@@ -75,7 +75,13 @@ SETTINGS = (
     ),
     number("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 0.0, 100.0),
     number("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 1e-4, 10.0),
-    number("debounce_ms", 0.5, "Edges nearer than this are one contact", 0.0, 20.0),
+    number(
+        "debounce_ms",
+        1e3 * InputRule.debounce_s,
+        "Edges nearer than this are one contact",
+        0.0,
+        20.0,
+    ),
     number("repeatability_mm", 0.03, "Scatter of a motion in each axis", 0.0, 2.0),
     number("edge_noise_mm", 0.01, "Further scatter of the robot at each edge", 0.0, 2.0),
     number(

@@ -21,6 +21,7 @@ from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
+from robocal_ros.hand_eye.camera import CameraSettings
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import HandEyeSettings
 from robocal_ros.hand_eye.session import HandEyeConfig, solved
@@ -37,7 +38,7 @@ LIMIT_M = 5e-4  # at the working distance
 
 
 def test_nodes_and_commands_accept_alike():
-    assert HandEyeConfig().limit_m == HandEyeSettings().limit_m
+    assert HandEyeConfig().limit_m == HandEyeSettings().limit_m == CameraSettings().limit_m
 
 
 # ---- a whole calibration ------------------------------------------------------------------------
