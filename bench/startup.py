@@ -20,11 +20,12 @@ from bench.tables import Goal, Table
 ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 SIX = "[0.0, -90.0, 90.0, 0.0, 90.0, 0.0]"
+ROBOT = ("-p", "robot:=ur10")
 NODES: dict[str, tuple[str, ...]] = {  # with the parameters that they do not start without
-    "thermal_node": (),
-    "hand_eye_node": (),
-    "joint_correction_node": (),
-    "maintenance_node": ("-p", f"home_deg:={SIX}"),
+    "thermal_node": ROBOT,
+    "hand_eye_node": ROBOT,
+    "joint_correction_node": ROBOT,
+    "maintenance_node": (*ROBOT, "-p", f"home_deg:={SIX}"),
     "recorder_node": (),
     "replay_node": ("-p", "bag:={bag}"),
     "cell_sim_node": (),

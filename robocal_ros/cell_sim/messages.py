@@ -36,9 +36,11 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD, stamp_ns
 from robocal_ros.hand_eye.data import PROFILE
+from robocal_ros.kinematics.urdf import urdf_of
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import NS, header, transform_message
 from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
+from robocal_ros.ros.robot import DESCRIPTION
 from robocal_ros.thermal.screening import THRESHOLD_M
 from robocal_ros.tool.edges import StepKind
 from robocal_ros.tool.run import PlannedStep
@@ -226,11 +228,18 @@ class CellOutputs:
         self._outputs = {
             topic: add_output(kind, topic, endpoints.RELIABLE) for topic, kind in kinds.items()
         }
+        self._description = add_output(String, DESCRIPTION, endpoints.LATCHED)
         self._tool = add_output(TransformStamped, "~/truth", endpoints.LATCHED)
         self._state = add_output(String, "~/truth/state", endpoints.LATCHED)
         self.told = dict.fromkeys(kinds, 0)
         self.commanded: Commanded | None = None
         self.forget()
+
+    def describe(self) -> None:
+        """Say which arm it nominally is, as robot_state_publisher does."""
+        arm = self._cell.plan.arm
+        fastest = np.broadcast_to(self._cell.plan.fastest, arm.n)
+        self._description.publish(String(data=urdf_of(arm, fastest)))
 
     def forget(self) -> None:
         """Tell the truth anew."""

@@ -341,6 +341,7 @@ class CellSimNode(HouseNode):
         self._driven: tuple[int, int] | None = None
         self._fault: tuple[str, float] = ("none", 0.0)
         self._out.forget()
+        self._out.describe()
         self.settings_changed()
 
     def deactivate(self) -> None:

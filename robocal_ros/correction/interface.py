@@ -54,6 +54,7 @@ class Reason(StrEnum):
     LEASED = "the robot is leased for a measurement"
     STOPPED = "stopped"
     NO_SPEED_LIMITS = "the robot has no speed limits"
+    OTHER_ROBOT = "the description on the graph is another robot"
 
 
 _CODES = {
@@ -64,6 +65,7 @@ _CODES = {
     Reason.NOT_SOLVED: Code.LIMIT_EXCEEDED,
     Reason.TOOL_BOUND: Code.LIMIT_EXCEEDED,
     Reason.WRONG_ROBOT: Code.WRONG_ROBOT,
+    Reason.OTHER_ROBOT: Code.WRONG_ROBOT,
     Reason.OLD_REVISION: Code.STALE,
     Reason.STALE_JOINTS: Code.STALE,
     Reason.START_MISMATCH: Code.CONFLICT,

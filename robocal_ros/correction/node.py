@@ -44,9 +44,9 @@ from robocal_ros.correction.robot_state import RobotTrack, SentPath
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
-    arms,
     command_joints,
     joint_limits,
+    reference_arm,
     session_config,
 )
 from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, on_its_path
@@ -56,9 +56,11 @@ from robocal_ros.motion.driver import HardStopService, StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.robot_watch import SpeedScaling
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode, run
+from robocal_ros.ros.base import NO_SERIAL, POLL_S, run
 from robocal_ros.ros.endpoints import Health, trigger_text
 from robocal_ros.ros.graph import ACTION, TRAJECTORY, SourceGuard, beside
+from robocal_ros.ros.parameters import ROBOT
+from robocal_ros.ros.robot import RobotNode
 
 TARGETS = "joint_targets"
 COMMANDS = "joint_commands"
@@ -84,7 +86,7 @@ ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
 
 
-class JointCorrectionNode(HouseNode):
+class JointCorrectionNode(RobotNode):
     """Drives a `CorrectionSession` with live messages."""
 
     NAME = "joint_correction_node"
@@ -100,19 +102,21 @@ class JointCorrectionNode(HouseNode):
 
     def configure(self) -> None:
         """Load the models, then open the topics."""
-        nominal, reference = arms(self.settings)
-        config = session_config(self.settings)
+        super().configure()
+        nominal, reference = self.robot.arm, reference_arm(self.settings, self.robot.arm)
+        config = session_config(self.settings, self.robot)
         serial = self.settings["serial"] or NO_SERIAL
         self._names = command_joints(self.settings, nominal)
         self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
+        self._session.doubt_robot(self.robot_fault)
         load_kernels(reference)  # the first command must not wait for it
-        if self.settings["enable_on_start"]:
+        if self.settings["enable_on_start"] and not self.robot_fault:
             self._session.enable(True)
         near = config.start_near(nominal)
         self._track = RobotTrack(nominal, near, config.joint_state_age_s)
         self._arm_names = names = nominal.joint_names
-        self._controller, fastest = StatedController(), joint_limits(self.settings)
+        self._controller, fastest = StatedController(), joint_limits(self.settings, self.robot)
         self._stopping = RobotStop(
             nominal,
             fastest[1],
@@ -136,7 +140,7 @@ class JointCorrectionNode(HouseNode):
         self._open_topics()
         self._open_action()
         self._report = CorrectionReport(
-            self._session, self.settings, nominal, reference, self._offsets, self._statuses,
+            self._session, self.settings, self.robot, reference, self._offsets, self._statuses,
             self.now_ns,
         )  # fmt: skip
         self._release.append(self._report.log.close)
@@ -204,6 +208,11 @@ class JointCorrectionNode(HouseNode):
         told = (self.resolve_topic_name(LEASE), self.resolve_topic_name(CONTROLLER))
         self._graph = GraphWatch(self, paths | commands, actions, sources, self._leases, *told)
         self._release.append(sources.close)
+
+    def robot_compared(self) -> None:
+        """Another robot than the one on the graph is corrected no more: its offset goes to zero."""
+        self._session.doubt_robot(self.robot_fault)
+        self._tell()
 
     def activate(self) -> None:
         """Look who else is there, and tell at once what is done.
@@ -588,7 +597,7 @@ class JointCorrectionNode(HouseNode):
 
     def _serial(self) -> str:
         """The robot's serial: as configured, else the model's, else the robot's name."""
-        return super()._serial() or self._made_for or str(self.get_parameter("robot").value)
+        return super()._serial() or self._made_for or str(self.get_parameter(ROBOT.name).value)
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""

@@ -23,6 +23,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.history.history_records import CALIBRATED, NOMINAL, CorrectionRecord
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import RobotDescription
 from robocal_ros.ros.base import NO_SERIAL
 from robocal_ros.ros.conversions import header, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health
@@ -52,8 +53,8 @@ class CorrectionLog:
     written, ``damage`` what is wrong with a history that nobody has acknowledged.
     """
 
-    def __init__(self, settings: Mapping[str, Any], nominal: SerialArm) -> None:
-        self._settings, self._nominal = settings, nominal
+    def __init__(self, settings: Mapping[str, Any], robot: RobotDescription) -> None:
+        self._settings, self._robot = settings, robot
         self._last: CorrectionRecord | None = None
         self._noted: queue.SimpleQueue[CorrectionRecord | str] = queue.SimpleQueue()
         self._waiting: deque[CorrectionRecord] = deque(maxlen=MOST_WAITING)
@@ -97,7 +98,7 @@ class CorrectionLog:
                 acknowledge_history(self._settings, ACKNOWLEDGED_BY)
                 self.damage = ""
             if self._waiting:
-                with open_history(self._settings, self._nominal, owner=False)[1] as history:
+                with open_history(self._settings, self._robot, owner=False)[1] as history:
                     while self._waiting:
                         history.note_correction(self._waiting[0])
                         self._waiting.popleft()
@@ -117,13 +118,13 @@ class CorrectionReport:
         self,
         session: CorrectionSession,
         settings: Mapping[str, Any],
-        nominal: SerialArm,
+        robot: RobotDescription,
         reference: SerialArm,
         offsets: Publisher,
         statuses: Publisher,
         now_ns: Callable[[], int],
     ) -> None:
-        self._session, self._now_ns = session, now_ns
+        self._session, self._now_ns, nominal = session, now_ns, robot.arm
         self._offsets, self._statuses = offsets, statuses
         serial, chosen = settings["serial"] or NO_SERIAL, settings["reference"]
         self._joint_names, self._chosen = list(nominal.joint_names), chosen
@@ -144,12 +145,12 @@ class CorrectionReport:
             software=__version__,
             model_hash=nominal.model_hash,
             reference=NOMINAL if is_nominal else CALIBRATED,
-            reference_source=settings["robot"] if is_nominal else chosen,
+            reference_source=(settings["robot"] or str(robot.path)) if is_nominal else chosen,
             reference_name=reference.name,
             reference_hash=reference.model_hash,
             taught_tool=(*T[:3, 3].tolist(), *frames.quat_xyzw(T).tolist()),
         )
-        self.log = CorrectionLog(settings, nominal)
+        self.log = CorrectionLog(settings, robot)
 
     def offset(self, cause: int, now_s: float) -> None:
         """Publish what is added to the taught joints, while somebody subscribes."""

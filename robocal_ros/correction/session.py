@@ -94,7 +94,7 @@ class CorrectionSession:
         self._paths = TrajectoryCorrector(
             reference, config, self._state, self._desired, self.output
         )
-        self._enabled = False
+        self._enabled, self._robot_fault = False, ""
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
         self._held: dict[Reason, str] = {}
@@ -109,8 +109,11 @@ class CorrectionSession:
     def enable(self, on: bool) -> None:
         """Correct from now on, or no more: the offset changes with the next commands.
 
-        Raises `RefusedError` when a robot without speed limits is to be corrected.
+        Raises `RefusedError` when a robot without speed limits, or another one than is described
+        on the graph, is to be corrected.
         """
+        if on and self._robot_fault and not self._config.shadow:
+            self.refuse(Reason.OTHER_ROBOT, self._robot_fault)
         unlimited = np.flatnonzero(~np.isfinite(self._config.velocity_limits))
         without = [self._reference.joint_names[i] for i in unlimited]
         if on and without and not self._config.shadow:
@@ -120,6 +123,12 @@ class CorrectionSession:
             )
         self._enabled = on
         self._want()
+
+    def doubt_robot(self, fault: str) -> None:
+        """Correct no more while the robot is another one than its file says; empty: it is that."""
+        self._robot_fault = fault
+        if fault and not self._config.shadow:
+            self.enable(False)
 
     def acknowledge(self, now_s: float) -> None:
         """End a START_MISMATCH: the next command may begin where the robot stands.

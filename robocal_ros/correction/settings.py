@@ -11,15 +11,16 @@ from robocal_ros.correction.limiter import OffsetLimits
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import (
-    FULL_SPEED_IN_S,
-    load_description,
-    load_robot,
-    robot_file_hash,
-)
+from robocal_ros.kinematics.robots import FULL_SPEED_IN_S, RobotDescription, load_robot
 from robocal_ros.motion.driver import HARD_STOP
 from robocal_ros.ros.base import NO_SERIAL
-from robocal_ros.ros.parameters import ROBOT, Setting, advanced, given_pose, pose_settings
+from robocal_ros.ros.parameters import (
+    ROBOT_SETTINGS,
+    Setting,
+    advanced,
+    given_pose,
+    pose_settings,
+)
 from robocal_ros.ros.session_node import STATE_DIR
 
 NOMINAL = "nominal"
@@ -28,7 +29,7 @@ SAME = ("stream_gap_s", "joint_state_age_s", "flange_frame", "model_age_s", "fre
 
 
 SETTINGS = (
-    ROBOT,
+    *ROBOT_SETTINGS,
     Setting(
         "reference",
         NOMINAL,
@@ -81,8 +82,7 @@ SETTINGS = (
         low=0.0,
         high=1e3,
     ),
-    Setting("flange_frame", "tool0", "Parent frame that tools of the topic tool must have"),
-    Setting("tool_child_frame", "", "Child frame that they must have; empty: any"),
+    Setting("tool_child_frame", "", "Child frame that the tools must have; empty: any"),
     Setting(
         "follow_joint_trajectory",
         "",
@@ -157,9 +157,8 @@ SETTINGS = (
 )
 
 
-def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
-    """The nominal arm, and the reference arm with the taught tool; `InputError` of their files."""
-    nominal = load_robot(settings["robot"])
+def reference_arm(settings: Mapping[str, Any], nominal: SerialArm) -> SerialArm:
+    """The arm that the program was taught with, and its tool; `InputError` of its file."""
     chosen = settings["reference"]
     reference = nominal if chosen == NOMINAL else load_robot(chosen)
     reference = replace(  # a calibrated file does not lift the robot's limits
@@ -168,7 +167,7 @@ def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
         upper=np.minimum(nominal.upper, reference.upper),
     )
     tool = given_pose(settings, "taught")
-    return nominal, reference if tool is None else replace(reference, T_flange_tool=tool)
+    return reference if tool is None else replace(reference, T_flange_tool=tool)
 
 
 def command_joints(settings: Mapping[str, Any], arm: SerialArm) -> tuple[str, ...]:
@@ -192,13 +191,12 @@ def _offset_limits(rate: float) -> OffsetLimits:
     return OffsetLimits(rate, 10.0 * rate, 5.0 * rate, 100.0 * rate)
 
 
-def joint_limits(settings: Mapping[str, Any]) -> tuple[Array, Array]:
+def joint_limits(settings: Mapping[str, Any], robot: RobotDescription) -> tuple[Array, Array]:
     """Speeds and accelerations (n,), rad/s (prismatic: m/s) ...; infinite where none is known.
 
     An acceleration that nobody says is that to full speed in half a second. Raises `InputError`
     when the numbers of joints and of velocity limits differ.
     """
-    robot = load_description(settings["robot"])
     given, count = np.array(settings["velocity_limits"]), robot.arm.n
     if len(given) != count and given.any():
         raise InputError(f"velocity_limits has {len(given)} numbers, the arm {count} joints")
@@ -208,7 +206,7 @@ def joint_limits(settings: Mapping[str, Any]) -> tuple[Array, Array]:
     return speed, np.where(known, robot.max_acceleration, speed / FULL_SPEED_IN_S)
 
 
-def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
+def session_config(settings: Mapping[str, Any], robot: RobotDescription) -> CorrectionConfig:
     """Settings of the session, in SI; raises `InputError` as `joint_limits`."""
 
     def bounds(what: str) -> ShiftBounds:
@@ -217,7 +215,7 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
             settings[f"{what}_tcp_mm"] * 1e-3, *(float(np.radians(x)) for x in degrees)
         )
 
-    speeds, accelerations = joint_limits(settings)
+    speeds, accelerations = joint_limits(settings, robot)
     nameless = settings["serial"] in ("", NO_SERIAL)
     return CorrectionConfig(
         thermal=bounds("thermal"),
@@ -230,6 +228,6 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         policy=Policy(settings["policy"]),
         velocity_limits=speeds,
         acceleration_limits=accelerations,
-        robot_file_hash=robot_file_hash(settings["robot"]) if nameless else "",
+        robot_file_hash=robot.file_hash if nameless else "",
         **{name: settings[name] for name in SAME},
     )

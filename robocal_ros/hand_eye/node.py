@@ -34,13 +34,12 @@ from robocal_ros.hand_eye.session import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Head, hand_eye_kind
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.graph import FrameWatch
 from robocal_ros.ros.parameters import (
-    ROBOT,
+    ROBOT_SETTINGS,
     STANDSTILL,
     Setting,
     advanced,
@@ -67,10 +66,8 @@ def _range_fault(values: list[float]) -> str | None:
 
 
 SETTINGS = (
-    ROBOT,
+    *ROBOT_SETTINGS,
     STATE_DIR,
-    Setting("base_frame", "base", "Name of the robot's base frame"),
-    Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
     Setting("sensor_frame", "sensor", "Name of the sensor's frame, in its messages and on tf"),
     Setting("target", "sphere", "Target where a call names none", choices=tuple(TOPIC_OF)),
     Setting("target_file", "", "File where a call names none; for the target that it describes"),
@@ -178,8 +175,8 @@ class HandEyeNode(SessionNode[HandEyeSession]):
 
     def configure(self) -> None:
         """Read the robot, open the history, then the topics and services."""
+        super().configure()
         settings = self.settings
-        self._nominal = load_robot(settings["robot"])
         self._config = session_config(settings)
         history = self.open_session(sole=False)
         self._kind = hand_eye_kind(self._config.sensor_frame)

@@ -191,6 +191,8 @@ class RobotDescription:
     ``max_acceleration`` (n,): rad/s² (prismatic: m/s²), NaN where neither it nor a speed is given.
     ``acceleration_assumed`` (n,): bool, where the file gives none: it is max_velocity / 0.5 s.
     ``notes``: what the file leaves open, in words.
+    ``file_hash``: SHA-256 of the file's bytes, its first 16 hexadecimal digits: unlike
+    `SerialArm.model_hash` it tells robots of one type apart that have their own files.
     """
 
     arm: SerialArm
@@ -199,6 +201,7 @@ class RobotDescription:
     max_acceleration: Array
     acceleration_assumed: NDArray[np.bool_]
     notes: tuple[str, ...]
+    file_hash: str
 
 
 def load_robot(name: str | Path) -> SerialArm:
@@ -217,7 +220,8 @@ def load_robot(name: str | Path) -> SerialArm:
 def load_description(name: str | Path) -> RobotDescription:
     """Everything that a robot file says; see ``load_robot``."""
     path = find_robot(name)
-    top = Fields(load_yaml(read_text(path, "robot file"), str(path)), str(path), "")
+    text = read_text(path, "robot file")
+    top = Fields(load_yaml(text, str(path)), str(path), "")
     top.only("robot", "convention", "joints", "base", "tool", "load", "functions")
     robot = top.text("robot")
     convention = top.choice("convention", CONVENTIONS)
@@ -258,17 +262,12 @@ def load_description(name: str | Path) -> RobotDescription:
         max_acceleration=np.where(np.isnan(given), velocity / FULL_SPEED_IN_S, given),
         acceleration_assumed=np.isnan(given),
         notes=tuple(notes),
+        file_hash=text_hash(text),
     )
 
 
-def robot_file_hash(name: str | Path) -> str:
-    """SHA-256 of a robot file's bytes, its first 16 hexadecimal digits.
-
-    Unlike `SerialArm.model_hash` it tells robots of one type apart that have their own files.
-
-    Raises `InputError` when there is no such robot.
-    """
-    text = read_text(find_robot(name), "robot file")
+def text_hash(text: str) -> str:
+    """`RobotDescription.file_hash` of a text."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

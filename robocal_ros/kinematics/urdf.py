@@ -9,7 +9,6 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from robocal_ros.ground.frames import (
 )
 from robocal_ros.kinematics.arm import NEARLY_PARALLEL, SerialArm
 from robocal_ros.kinematics.joint_functions import ArmLoad
-from robocal_ros.kinematics.robots import FULL_SPEED_IN_S, RobotDescription
+from robocal_ros.kinematics.robots import FULL_SPEED_IN_S, RobotDescription, text_hash
 from robocal_ros.kinematics.universal_robots import JOINT_NAMES, link_transform
 
 MOVING = ("revolute", "continuous", "prismatic")
@@ -116,17 +115,25 @@ class Chain:
         """Joints that move."""
         return [joint for joint in self.joints if joint.moves]
 
-    def fk(self, q: Array) -> Array:
-        """Pose (4, 4) of the tip in the base at joints (n,), joint by joint as a URDF says it."""
-        T, values = self.T_base_root, iter(q)
+    def frames(self, q: Array) -> list[Array]:
+        """Poses (4, 4) in the base at joints (n,), joint by joint as a URDF says it.
+
+        Of each link that a joint moves, before it does, and of the tip.
+        """
+        T, values, found = self.T_base_root, iter(q), []
         for joint in self.joints:
             T = T @ joint.T_parent_child
             if joint.moves:
+                found.append(T)
                 moved = joint.axis * next(values)
                 slides = joint.kind == "prismatic"
                 step = (np.eye(3), moved) if slides else (exp_rotation(moved), np.zeros(3))
                 T = T @ transform(*step)
-        return T
+        return [*found, T]
+
+    def fk(self, q: Array) -> Array:
+        """Pose (4, 4) of the tip in the base at joints (n,)."""
+        return self.frames(q)[-1]
 
 
 def read_urdf(text: str, file: str) -> Urdf:
@@ -301,6 +308,7 @@ def arm_of(links: Chain, name: str = "") -> RobotDescription:
         max_acceleration=velocity / FULL_SPEED_IN_S,
         acceleration_assumed=np.ones(len(moving), dtype=bool),
         notes=(),
+        file_hash=text_hash(urdf_of(arm, velocity)),  # a xacro's comments name its host's folders
     )
 
 
@@ -419,6 +427,90 @@ def _load(links: Chain, frames: Array) -> ArmLoad | None:
     return ArmLoad(masses, centres)
 
 
+# ---- beside a robot file ------------------------------------------------------------------------
+
+# What the least digits in use make of one arm: 1.5708 for a right angle is 3.7e-6 rad, at each of
+# six joints of a 3 m arm 0.07 mm. A drift is worth correcting from 0.1 mm on: what differs by more
+# would be corrected twice, or against the wrong arm.
+SAME_ARM_M, SAME_ARM_RAD = 1e-4, 1e-4
+AT_PRESENT, AT_MOST = "at the present joints", "at most"
+_COMPARED = 32  # poses over the joints' ranges
+
+
+@dataclass(frozen=True)
+class ModelDifference:
+    """By how much a description is another arm than a robot file says.
+
+    ``flange``: m and rad, AT_PRESENT where the robot stands, AT_MOST over the joints' ranges too.
+    ``where``: up to which joint or link both agree, and what differs then.
+    """
+
+    flange: dict[str, tuple[float, float]]
+    where: str
+
+    def __str__(self) -> str:
+        off = [
+            f"{shift * 1e3:.3f} mm and {np.degrees(turn):.4f} deg {when}"
+            for when, (shift, turn) in self.flange.items()
+        ]
+        return f"its flange is off by {', '.join(off)}; {self.where}" if off else self.where
+
+
+def model_difference(
+    links: Chain, arm: SerialArm, present: Array | None = None
+) -> ModelDifference | None:
+    """Compare a description with an arm's geometry: axis by axis, and the flange; None: the same.
+
+    ``present``: joints (n,) where the robot stands. They alone would not tell a joint that counts
+    the other way from zero on, so poses over the joints' ranges are looked at too.
+    """
+    names = [joint.name for joint in links.moving]
+    if names != list(arm.joint_names):
+        words = f"its joints are {', '.join(names)}, the robot file's {', '.join(arm.joint_names)}"
+        return ModelDifference({}, words)
+    low, high = np.clip(arm.lower, -np.pi, np.pi), np.clip(arm.upper, -np.pi, np.pi)
+    drawn = np.random.default_rng(0).uniform(low, high, (_COMPARED, arm.n))
+    poses = [*([] if present is None else [present]), *drawn]
+    pairs = [(links.frames(q), _moved(arm, q)) for q in poses]
+    apart = np.array([_apart(ours[-1], theirs[-1]) for ours, theirs in pairs])
+    if (apart <= [SAME_ARM_M, SAME_ARM_RAD]).all():
+        return None
+    worst = int(np.argmax((apart / [SAME_ARM_M, SAME_ARM_RAD]).max(axis=1)))
+    flange = {} if present is None else {AT_PRESENT: _apart(pairs[0][0][-1], pairs[0][1][-1])}
+    flange |= {AT_MOST: (float(apart[:, 0].max()), float(apart[:, 1].max()))}
+    return ModelDifference(flange, _begins(links, arm, *pairs[worst]))
+
+
+def _moved(arm: SerialArm, q: Array) -> list[Array]:
+    """Frames (4, 4) that the joints move along or about z, and the flange, at joints (n,)."""
+    rows = arm.mdh.copy()
+    rows[np.arange(arm.n), np.where(arm.prismatic, 0, 1)] += arm.sign * q
+    return [arm.T_base_root, *_frames(arm.T_base_root, rows)]
+
+
+def _apart(T: Array, other: Array) -> tuple[float, float]:
+    R = T[:3, :3].T @ other[:3, :3]
+    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    turn = np.arctan2(sine, np.trace(R) - 1.0)
+    return float(np.linalg.norm(T[:3, 3] - other[:3, 3])), float(turn)
+
+
+def _begins(links: Chain, arm: SerialArm, described: list[Array], filed: list[Array]) -> str:
+    """The first joint whose axis is elsewhere: line from line, near the flange."""
+    before = f"from '{links.base}' on"
+    for i, joint in enumerate(links.moving):
+        axis, ours = arm.sign[i] * filed[i][:3, 2], described[i][:3, :3] @ joint.axis
+        turn = float(np.arctan2(np.linalg.norm(np.cross(axis, ours)), axis @ ours))
+        point = filed[i][:3, 3]
+        rest = point + axis * (axis @ (filed[-1][:3, 3] - point)) - described[i][:3, 3]
+        off = 0.0 if arm.prismatic[i] else float(np.linalg.norm(rest - ours * (ours @ rest)))
+        if off > SAME_ARM_M or turn > SAME_ARM_RAD:
+            shift = f"{off * 1e3:.3f} mm and {np.degrees(turn):.4f} deg"
+            return f"they differ {before}: the axis of '{joint.name}' is {shift} off"
+        before = f"behind '{joint.name}'"
+    return f"they differ {before}: all axes agree, the flange '{links.tip}' does not"
+
+
 # ---- into a URDF --------------------------------------------------------------------------------
 
 
@@ -505,7 +597,10 @@ def origins_of(links: Chain, arm: SerialArm) -> dict[str, Array]:
         )
     last = max(i for i, joint in enumerate(links.joints) if joint.moves)
     if last + 1 == len(links.joints):
-        _no_flange(links)
+        words = (
+            f"link '{links.tip}' is moved by its joint: name a tip behind a fixed joint, as tool0"
+        )
+        raise InputError(words, file=links.urdf.file)
     frames = [arm.T_base_root, *_frames(arm.T_base_root, arm.mdh)]
     found: dict[str, Array] = {}
     was = now = links.T_base_root  # of the parent at zero, in the base
@@ -526,13 +621,6 @@ def origins_of(links: Chain, arm: SerialArm) -> dict[str, Array]:
         else:
             now = now @ joint.T_parent_child
     return found
-
-
-def _no_flange(links: Chain) -> NoReturn:
-    raise InputError(
-        f"link '{links.tip}' is moved by its joint: name a tip behind a fixed joint, as tool0 is",
-        file=links.urdf.file,
-    )
 
 
 def _with_axis(T: Array, axis: Array, wanted: Array, point: Array) -> Array:

@@ -28,7 +28,6 @@ from robocal_ros.ground.samples import (
     stamp_ns,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance import robot_interface as asked
 from robocal_ros.maintenance.robot_interface import DriverAnswer, DriverRequest, Move
 from robocal_ros.maintenance.services import (
@@ -52,9 +51,10 @@ from robocal_ros.motion.driver import (
 )
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import HouseNode, run
+from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, EndpointNode, Health, NotActiveError
 from robocal_ros.ros.graph import CommandPath, GapSources, SourceGuard
+from robocal_ros.ros.robot import RobotNode
 from robocal_ros.ros.session_node import open_history, warn_of_history
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel
@@ -213,7 +213,7 @@ MEASUREMENTS = {
 }
 
 
-class MaintenanceNode(HouseNode):
+class MaintenanceNode(RobotNode):
     """Drives a `MaintenanceSession` with live messages and calls."""
 
     NAME = "maintenance_node"
@@ -229,11 +229,11 @@ class MaintenanceNode(HouseNode):
 
     def configure(self) -> None:
         """Read the robot and the ways, open the history, then the topics, services and clients."""
-        settings = self.settings
-        self._nominal = load_robot(settings["robot"])
+        super().configure()
+        settings, self._nominal = self.settings, self.robot.arm
         self._config = session_config(settings, self._nominal)
         load_motion(self._nominal)
-        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
+        self._serial_in_use, self._history = open_history(settings, self.robot, self.NAME)
         self._history.wait_at_most(HISTORY_S)
         self._keeper = StateFile(self._history.path, "maintenance")
         self._outputs = MaintenanceOutputs(
@@ -253,7 +253,8 @@ class MaintenanceNode(HouseNode):
         self._driver = MaintenanceDriver(self, motion, self._answered, self._moves)
         self._lease = LeaseHolder(self, self._nominal.name, self._serial_in_use)
         path, mine = motion.topic.topic_name, self._outputs.accuracy_topic
-        self._others = CommandPath(self, path, ("motion_lease", CORRECTION), mine)
+        cell = "motion_lease", CORRECTION
+        self._others = CommandPath(self, path, cell, mine, lambda: self.robot_fault)
         self._calls = MaintenanceServices(
             self, self._running, self._looked, self._clocks, self._outputs, default_gap_s
         )

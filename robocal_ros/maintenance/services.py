@@ -30,7 +30,7 @@ from robocal_ros.ros.endpoints import (
 )
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S
 from robocal_ros.ros.parameters import (
-    ROBOT,
+    ROBOT_SETTINGS,
     Setting,
     advanced,
     given_pose,
@@ -368,9 +368,8 @@ def _silence_fault(silent_s: float) -> str | None:
 
 
 SETTINGS = (
-    ROBOT,
+    *ROBOT_SETTINGS,
     STATE_DIR,
-    Setting("base_frame", "base", "Name of the robot's base frame, for stamps"),
     *pose_settings(
         "taught",
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",

@@ -18,6 +18,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import rclpy
@@ -28,13 +29,17 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from robocal_ros.ground.errors import RobocalError
-from robocal_ros.ros.endpoints import ERROR, Diagnostics, EndpointNode, Health
+from robocal_ros.ros.endpoints import ERROR, WARN, Diagnostics, EndpointNode, Health
 from robocal_ros.ros.parameters import ParameterTable, Setting
 
 NO_SERIAL = "unset"  # the history's name where none is set
 POLL_S = 0.5  # between two looks at what others decided in the history
 AUTOSTART = Setting("autostart", True, "Configure and activate at the start")
 SERIAL = Setting("serial", "", "Serial number of the robot; its history is kept under this name")
+
+
+class AwaitedError(RobocalError):
+    """What a node is to be configured with has not come yet: no fault of anybody."""
 
 
 class HouseNode(EndpointNode):
@@ -49,7 +54,7 @@ class HouseNode(EndpointNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(self.NAME, **options)
         self.settings: dict[str, Any] = {}
-        self._failure = ""
+        self._failure: Health | None = None
         self._table = ParameterTable(self, (AUTOSTART, SERIAL, *self.SETTINGS))
         self._table.changed = self._settings_changed
         self._diagnostics = Diagnostics(self, self._full_health, self._serial)
@@ -72,6 +77,10 @@ class HouseNode(EndpointNode):
     def health(self) -> Health:
         """Say how an active node is."""
         return Health()
+
+    def identity(self) -> list[str]:
+        """What an active node works for."""
+        return [f"serial {serial}"] if (serial := self.settings[SERIAL.name]) else []
 
     def autostart(self) -> None:
         """Configure and activate, where the parameter says so; a failure is logged and shown."""
@@ -110,8 +119,7 @@ class HouseNode(EndpointNode):
         super().on_activate(state)
         result = self._attempt("activate", self.activate)
         if result == TransitionCallbackReturn.SUCCESS:
-            names = [name for name in ("robot", SERIAL.name) if self.settings.get(name)]
-            said = ", ".join(f"{name} {self.settings[name]}" for name in names)
+            said = ", ".join(self.identity())
             self.get_logger().info(f"active: {said}" if said else "active")
         else:
             super().on_deactivate(state)
@@ -140,17 +148,21 @@ class HouseNode(EndpointNode):
         # rclpy swallows what is raised in a transition: say it here, in log and diagnostics.
         try:
             step()
-        except RobocalError as error:
-            return self._fail(f"cannot {what}: {error}")
+        except AwaitedError as error:
+            self.get_logger().info(str(error))
+            return self._fail(Health(WARN, str(error)))
         except Exception as error:
-            self.get_logger().error(traceback.format_exc())
-            return self._fail(f"cannot {what}: {type(error).__name__}: {error}")
-        self._failure = ""
+            if not isinstance(error, RobocalError):
+                self.get_logger().error(traceback.format_exc())
+            name = "" if isinstance(error, RobocalError) else f"{type(error).__name__}: "
+            message = f"cannot {what}: {name}{error}"
+            self.get_logger().error(message)
+            return self._fail(Health(ERROR, message))
+        self._failure = None
         return TransitionCallbackReturn.SUCCESS
 
-    def _fail(self, message: str) -> TransitionCallbackReturn:
-        self._failure = message
-        self.get_logger().error(message)
+    def _fail(self, why: Health) -> TransitionCallbackReturn:
+        self._failure = why
         self._diagnostics.publish()
         return TransitionCallbackReturn.FAILURE
 
@@ -176,8 +188,8 @@ class HouseNode(EndpointNode):
         return str(self.get_parameter(SERIAL.name).value)
 
     def _full_health(self) -> Health:
-        if self._failure:
-            health = Health(ERROR, self._failure)
+        if self._failure is not None:
+            health = replace(self._failure)
         elif self.is_active:
             health = self.health()
         else:

@@ -170,11 +170,20 @@ class CommandPath:
     ``topic``: resolved name by which this node commands it.
     ``cell``: topics whose publishers may command it too: each waits while another holds the lease.
     ``mine``: topic that one node of this kind publishes for each robot; empty: `cell` tells all.
-    ``violation``: who else commands the robot; empty: nobody.
+    ``violation``: who else commands the robot, or that it is another; empty: it may be moved.
+    ``other_robot``: why the robot in use is another than the one on the graph; empty: it is that.
     """
 
-    def __init__(self, node: Node, topic: str, cell: Sequence[str], mine: str = "") -> None:
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        cell: Sequence[str],
+        mine: str = "",
+        other_robot: Callable[[], str] = str,
+    ) -> None:
         self._node, self._topic, self._mine = node, topic, mine
+        self._other_robot = other_robot
         self._cell = [node.resolve_topic_name(each) for each in cell]
         self._own = own_endpoint(node)
         self.violation = ""
@@ -197,11 +206,10 @@ class CommandPath:
             )
         cell = [one for each in self._cell for one in publishers(node, each)]
         found += commanding(node, self._own, dict.fromkeys(sorted(topics), 1), actions, cell)
-        self.violation = "; ".join(found)
+        others = "; ".join(found)
         if found:
-            self.violation += (
-                f": nobody else may command the robot while the cell moves it; {KILLED}"
-            )
+            others += f": nobody else may command the robot while the cell moves it; {KILLED}"
+        self.violation = "; ".join(filter(None, (self._other_robot(), others)))
         return self.violation
 
 

@@ -230,7 +230,24 @@ class ParameterTable:
             self.changed()
 
 
-ROBOT = Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file")
+ROBOT = Setting(
+    "robot",
+    "",
+    "Robot type (config/robots) or path of a robot file; empty: that of robot_description on the "
+    "graph, which is waited for",
+)
+BASE_FRAME = Setting(
+    "base_frame",
+    "base",
+    "Name of the robot's base frame; not in robot_description: its root",
+)
+FLANGE_FRAME = Setting(
+    "flange_frame",
+    "tool0",
+    "Name of the flange frame, which is never modified; where robot_description has none, its "
+    "'flange' or only last link",
+)
+ROBOT_SETTINGS = (ROBOT, BASE_FRAME, FLANGE_FRAME)
 ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 
 

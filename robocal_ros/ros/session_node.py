@@ -22,8 +22,8 @@ from robocal_ros.history.history_file import acknowledge, damage_notice, history
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of, layer_of, payload_note
-from robocal_ros.kinematics.robots import robot_file_hash
-from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.kinematics.robots import RobotDescription
+from robocal_ros.ros.base import NO_SERIAL, POLL_S
 from robocal_ros.ros.conversions import summary_message, time_message
 from robocal_ros.ros.endpoints import (
     ERROR,
@@ -35,6 +35,7 @@ from robocal_ros.ros.endpoints import (
 )
 from robocal_ros.ros.graph import SourceGuard
 from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.robot import RobotNode
 from robocal_ros.session.events import (
     ACCEPT,
     CONFIGURE,
@@ -120,7 +121,11 @@ STATE_DIR = Setting(
 
 
 def open_history(
-    settings: Mapping[str, Any], nominal: SerialArm, sole_user: str = "", *, owner: bool = True
+    settings: Mapping[str, Any],
+    robot: RobotDescription,
+    sole_user: str = "",
+    *,
+    owner: bool = True,
 ) -> tuple[str, CalibrationHistory]:
     """The serial in use and its history; ``sole_user``: a node of which a robot has one at most.
 
@@ -130,12 +135,13 @@ def open_history(
     was begun with another robot file: nothing else tells two robots of one type apart.
     """
     serial, state_dir = settings["serial"] or NO_SERIAL, _folder(settings)
+    nominal = robot.arm
     history = CalibrationHistory.open(
         serial, model_hash=nominal.model_hash, state_dir=state_dir, sole_user=sole_user, owner=owner
     )
     if serial == NO_SERIAL:
         try:
-            own = {"robot": nominal.name, "robot_file_hash": robot_file_hash(settings["robot"])}
+            own = {"robot": nominal.name, "robot_file_hash": robot.file_hash}
             kept = StateFile(history.path, "robot_file")
             known = kept.load()
             if known is None:
@@ -294,11 +300,11 @@ class CommandQueue:
 SessionT = TypeVar("SessionT", bound=SessionBase)
 
 
-class SessionNode(HouseNode, Generic[SessionT]):
+class SessionNode(RobotNode, Generic[SessionT]):
     """Drives a session of one robot with live messages and calls.
 
-    A node reads the robot and calls `open_session` in ``configure``, and says what its session is,
-    how that takes a message, what to show, and how it is.
+    A node calls `open_session` in ``configure``, and says what its session is, how that takes a
+    message, what to show, and how it is.
     """
 
     INPUTS: ClassVar[Mapping[str, tuple[type, QoSProfile]]]
@@ -308,6 +314,11 @@ class SessionNode(HouseNode, Generic[SessionT]):
         super().__init__(**options)
         self._session: SessionT | None = None
         self._history: CalibrationHistory | None = None
+
+    def configure(self) -> None:
+        """Find the robot."""
+        super().configure()
+        self._nominal = self.robot.arm
 
     def new_session(self, history: CalibrationHistory) -> SessionT:
         """The session of an active node."""
@@ -341,7 +352,7 @@ class SessionNode(HouseNode, Generic[SessionT]):
         """
         self._payload = -1, ""  # revision of the thermal model, and what is said of it
         self._serial_in_use, self._history = open_history(
-            self.settings, self._nominal, self.NAME if sole else ""
+            self.settings, self.robot, self.NAME if sole else ""
         )
         self._guard = SourceGuard(self, JOINTS)
         self._stamps = StampWatch(self, JOINTS)

@@ -38,14 +38,13 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.conversions import MM, joint_poses, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.parameters import (
     ORIGIN,
-    ROBOT,
+    ROBOT_SETTINGS,
     STANDSTILL,
     Setting,
     advanced,
@@ -101,9 +100,8 @@ def _field_fault(field: list[float]) -> str | None:
 
 
 SETTINGS = (
-    ROBOT,
+    *ROBOT_SETTINGS,
     STATE_DIR,
-    Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("measuring_frame", "", "Frame of the measurements; empty: that of the first one used"),
     Setting("target", DEFAULT_TARGET, "Target where a measurement's frame_id names none"),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
@@ -429,8 +427,8 @@ class ThermalNode(SessionNode[ThermalSession]):
 
     def configure(self) -> None:
         """Open the history, then the topics and services."""
+        super().configure()
         settings = self.settings
-        self._nominal = load_robot(settings["robot"])
         require_parameters(self._nominal, settings["drift_parameters"])
         self._config = session_config(settings, self._nominal)
         history = self.open_session(settings["command_timeout_s"])
@@ -438,7 +436,7 @@ class ThermalNode(SessionNode[ThermalSession]):
             self.add_output,
             self._nominal,
             self._serial_in_use,
-            robot_file_hash(settings["robot"]),
+            self.robot.file_hash,
             settings["base_frame"],
         )
         self._data_clock = DataClock()

@@ -21,12 +21,11 @@ from robocal_ros.ground.samples import JOINTS, Silence
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import TOOL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot, robot_file_hash
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError, trigger_text
 from robocal_ros.ros.parameters import (
-    ROBOT,
+    ROBOT_SETTINGS,
     Setting,
     advanced,
     given_pose,
@@ -55,7 +54,7 @@ PROGRAM, TRAJECTORY = "program", "trajectory"
 
 
 SETTINGS = (
-    ROBOT,
+    *ROBOT_SETTINGS,
     STATE_DIR,
     *pose_settings(
         "taught",
@@ -63,8 +62,6 @@ SETTINGS = (
         "Its orientation: z from flange to tip",
     ),
     Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
-    Setting("base_frame", "base", "Name of the robot's base frame"),
-    Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
     Setting("tool_frame", "tool", "Name of the tool frame, a child of the flange's"),
     Setting("beams", ["x", "y"], "Names of the x- and the y-beam in beam_events"),
     Setting(
@@ -338,8 +335,8 @@ class TcfNode(SessionNode[ToolSession]):
 
     def configure(self) -> None:
         """Read robot and laser, open the history, then the topics, services and the action."""
+        super().configure()
         settings = self.settings
-        self._nominal = load_robot(settings["robot"])
         if not settings["laser"]:
             raise InputError("laser is empty: name the file that 'robocal tool beams' wrote")
         placed = read_laser_for(Path(settings["laser"]), self._nominal)
@@ -352,7 +349,7 @@ class TcfNode(SessionNode[ToolSession]):
             self.add_output,
             self._nominal,
             self._serial_in_use,
-            robot_file_hash(settings["robot"]),
+            self.robot.file_hash,
             frames,
         )
         self._calls = TcfServices(self, self._desk.ask, history)

@@ -30,9 +30,10 @@ from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap, MotionReport
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, transform_message
-from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
+from robocal_ros.ros.endpoints import NotActiveError
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.ros.parameters import number
+from robocal_ros.ros.robot import RobotNode
 from robocal_ros.ros.session_node import AddOutput, SessionEvents
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver
@@ -227,7 +228,7 @@ class TcfMotion:
 
     def __init__(
         self,
-        node: EndpointNode,
+        node: RobotNode,
         settings: Mapping[str, Any],
         ask: Callable[[Command], object],
         arm: SerialArm,
@@ -253,7 +254,9 @@ class TcfMotion:
             self._steady.now_s,
         )
         self._lease = LeaseHolder(node, arm.name, serial)
-        self._others = CommandPath(node, self._motion.topic.topic_name, CELL)
+        self._others = CommandPath(
+            node, self._motion.topic.topic_name, CELL, other_robot=lambda: node.robot_fault
+        )
         self._gap = Gap(stale_s) if (stale_s := settings["gap_stale_s"]) > 0.0 else None
         if self._gap is not None:
             is_bool = settings["gap_bool"]

@@ -12,6 +12,7 @@ import yaml
 from command import conforms
 from drawn_arms import arms
 from hypothesis import given
+from hypothesis import strategies as st
 from joint_errors import with_joint_errors
 
 from robocal_ros.cli.main import main
@@ -22,8 +23,11 @@ from robocal_ros.kinematics.joint_functions import JointFunctions
 from robocal_ros.kinematics.robots import load_description, load_robot, robot_folders
 from robocal_ros.kinematics.universal_robots import JOINT_NAMES, factory_arm, parse_settings
 from robocal_ros.kinematics.urdf import (
+    AT_MOST,
+    AT_PRESENT,
     arm_of,
     chain,
+    model_difference,
     origins_of,
     read_urdf,
     ur_chain,
@@ -189,6 +193,53 @@ def test_an_identified_arm_takes_a_descriptions_links_along_least():
             assert [e.attrib for e in joint] == [e.attrib for e in same]
     assert "<!-- kept -->" in text
     assert 'mass value="8"' in text
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_description_of_the_same_arm_does_not_differ(name):
+    arm = with_joint_errors(load_robot(name), 1)  # what a URDF has no place for
+    assert model_difference(chain(read_urdf(urdf_of(arm), name)), arm, drawn_q(arm, 1)[0]) is None
+
+
+@given(arms(), st.integers(0, 5), st.sampled_from(("d", "a")), st.floats(2e-4, 0.1))
+def test_a_longer_link_is_found_wherever_the_robot_stands(drawn, link, which, by_m):
+    """One length differs: the flange is off by it in each pose, and the axes before it agree."""
+    arm, q = drawn
+    link = link % arm.n
+    mdh = arm.mdh.copy()
+    mdh[link, ["d", "theta", "a"].index(which)] += by_m
+    links = chain(read_urdf(urdf_of(arm.with_mdh(mdh)), "drawn"))
+    found = model_difference(links, arm, q)
+    assert found is not None
+    (off_m, off_rad), (most_m, most_rad) = found.flange[AT_PRESENT], found.flange[AT_MOST]
+    assert (off_m, most_m) == (pytest.approx(by_m, abs=EXACT), pytest.approx(by_m, abs=EXACT))
+    assert max(off_rad, most_rad) < EXACT  # rad: the same at a metre
+    names = [*arm.joint_names, "flange"]
+    behind = [name for name in names[link + 1 :] if f"'{name}'" in found.where]
+    assert behind  # no axis up to it is named as off
+
+
+def test_a_joint_that_counts_the_other_way_differs_where_it_stands_at_zero():
+    """There the flange agrees, and both axes are the same line: their directions are not."""
+    arm = load_robot("ur10")
+    other = replace(arm, sign=np.where(np.arange(6) == 2, -1.0, 1.0))
+    found = model_difference(chain(read_urdf(urdf_of(other), "other")), arm, np.zeros(6))
+    assert found is not None
+    assert found.flange[AT_PRESENT] == pytest.approx((0.0, 0.0), abs=EXACT)
+    # the forearm and the wrist turn about the elbow by up to half a turn the other way
+    assert found.flange[AT_MOST][0] > 0.5
+    assert found.where == (
+        "they differ behind 'shoulder_lift_joint': the axis of 'elbow_joint' is 0.000 mm and "
+        "180.0000 deg off"
+    )
+
+
+def test_other_joints_are_another_robot():
+    arm = load_robot("ur10")
+    left = replace(arm, joint_names=tuple(f"left_{name}" for name in arm.joint_names))
+    found = model_difference(chain(read_urdf(urdf_of(left), "left")), arm)
+    assert found is not None
+    assert str(found).startswith("its joints are left_shoulder_pan_joint, ")
 
 
 UR5E = {  # config/ur5e/default_kinematics.yaml of Universal_Robots_ROS2_Description

@@ -34,7 +34,14 @@ from trajectory_controllers import missing_packages  # noqa: E402
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 # The arm of most tests' worlds, where a test names none.
-ROBOTS = {name: {"robot": "kr150_r3100"} for name in ("thermal_node", "joint_correction_node")}
+ROBOTS = {
+    name: {"robot": robot}
+    for robot, names in {
+        "kr150_r3100": ("thermal_node", "joint_correction_node"),
+        "ur10": ("tcf_node", "hand_eye_node", "maintenance_node"),
+    }.items()
+    for name in names
+}
 NO_CALL = SimpleNamespace(id="")  # of a test without parameters
 DEADLINE_S = 30.0  # of what takes a second, on a machine that is busy otherwise
 ENDS_WITHIN_S = 10.0

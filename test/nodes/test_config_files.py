@@ -127,12 +127,12 @@ def test_the_page_of_motions_names_them_as_the_parameters_do():
 def test_a_node_takes_the_file(graph, tmp_path):
     content = (CONFIG / "thermal_node.yaml").read_text()
     file = tmp_path / "mine.yaml"
-    file.write_text(content.replace('serial: ""', "serial: R7"))
+    file.write_text(content.replace('serial: ""', "serial: R7").replace('robot: ""', "robot: ur10"))
     process = graph.start("thermal_node", None, None, "--ros-args", "--params-file", str(file))
     state = graph.call(GetState, "/thermal_node/get_state")
     assert state.current_state.label == "active", process.output
     graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
-    assert "active: robot ur10, serial R7" in process.output
+    assert "active: robot UR10 of ur10, serial R7" in process.output
 
 
 @pytest.mark.parametrize("node", [ThermalNode, TcfNode], ids=lambda node: node.NAME)
@@ -162,7 +162,7 @@ def test_with_the_file_for_replays_no_input_loses_anything(graph, tmp_path, node
 @pytest.mark.parametrize("node", [ThermalNode, TcfNode], ids=lambda node: node.NAME)
 def test_a_replay_never_opens_the_history_of_the_robot(graph, tmp_path, node, sections):
     """Files in the order of replay.launch.py; sections of the cell's own as one may write them."""
-    given = {"serial": "R7"}
+    given = {"serial": "R7", "robot": "ur10"}
     if node is TcfNode:
         given |= {"laser": written_laser(tmp_path, noisy_cell())}
     names = [section.format(node.NAME) for section in sections.split()]

@@ -193,7 +193,7 @@ def test_damage_that_came_after_what_was_told_is_not_known(graph: Any) -> None:
     graph.state.mkdir(exist_ok=True)
     path = graph.state / "s1.sqlite"
     settings = {"serial": "s1", "state_dir": ""}
-    log = correction_log.CorrectionLog(settings, NOMINAL)
+    log = correction_log.CorrectionLog(settings, load_description("kr150_r3100"))
     told = []
     for _ in range(2):
         path.write_bytes(b"\xff" * 5000)

@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.kinematics.robots import robot_file_hash
+from robocal_ros.kinematics.robots import load_description
 from robocal_ros.ros import conversions, endpoints
 
 PERIOD_S, AHEAD_S = 0.1, 0.3  # of the stream; of its point, from when it is sent
@@ -70,7 +70,7 @@ class Stream:
             model_document(ARM.with_mdh(chosen.add(ARM.mdh, change))),
             serial="s1",
             model_hash=ARM.model_hash,
-            robot_file_hash=robot_file_hash("ur10"),
+            robot_file_hash=load_description("ur10").file_hash,
             revision=1,
             state=KinematicModel.ACCEPTED,
             stamp=Header(frame_id="base"),

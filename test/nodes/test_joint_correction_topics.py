@@ -316,7 +316,7 @@ def test_parameters_become_the_sessions_configuration(graph: Any) -> None:
     given = {"policy": "clamp", "model_age_s": 60.0, "free_axis": True, "joint_state_age_s": 5.0}
     limits = [1.0, 0.0, 2.0, 0.0, 0.0, 3.0]
     line = Line(graph, velocity_limits=limits, **given)
-    config = session_config(line.node.settings)
+    config = session_config(line.node.settings, line.node.robot)
     assert (config.policy.value, config.model_age_s, config.free_axis) == ("clamp", 60.0, True)
     assert config.velocity_limits is not None
     assert list(config.velocity_limits[[0, 2, 5]]) == [1.0, 2.0, 3.0]

@@ -10,13 +10,13 @@ from robocal_msgs.msg import KinematicModel
 from sensor_msgs.msg import JointState
 
 from robocal_ros.ground.errors import WrongRobotError
-from robocal_ros.kinematics.robots import find_robot, load_robot, robot_file_hash
+from robocal_ros.kinematics.robots import find_robot, load_description
 from robocal_ros.ros import endpoints, session_node
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.session_node import open_history
 from robocal_ros.thermal.node import ThermalNode
 
-NAMES = load_robot("kr150_r3100").joint_names
+NAMES = load_description("kr150_r3100").arm.joint_names
 NS = 1_000_000_000
 
 
@@ -95,7 +95,7 @@ def test_velocities_and_efforts_that_are_no_numbers_are_absent_ones(graph: Any) 
 def test_the_model_tells_its_robot_file(graph: Any) -> None:
     reader = Reader(graph)
     graph.spin_until(lambda: reader.models, "the model")
-    assert reader.models[0].robot_file_hash == robot_file_hash("kr150_r3100")
+    assert reader.models[0].robot_file_hash == load_description("kr150_r3100").file_hash
 
 
 def test_two_nameless_robots_of_one_type_share_no_history(tmp_path: Path) -> None:
@@ -104,14 +104,13 @@ def test_two_nameless_robots_of_one_type_share_no_history(tmp_path: Path) -> Non
     text = find_robot("ur10").read_text()
     own.write_text(text)
     other.write_text(text.replace("max_velocity_deg_s: 120", "max_velocity_deg_s: 119"))
-    arm = load_robot(own)
-    assert load_robot(other).model_hash == arm.model_hash
-    settings = {"serial": "", "state_dir": str(tmp_path / "state"), "robot": str(own)}
+    robot, second = load_description(own), load_description(other)
+    assert second.arm.model_hash == robot.arm.model_hash
+    settings = {"serial": "", "state_dir": str(tmp_path / "state")}
     for _ in range(2):  # the same robot comes back
-        serial, history = open_history(settings, arm)
+        serial, history = open_history(settings, robot)
         history.close()
         assert serial == "unset"
     with pytest.raises(WrongRobotError, match="set the serial of each robot"):
-        open_history(settings | {"robot": str(other)}, arm)
-    named = settings | {"robot": str(other), "serial": "right"}
-    open_history(named, arm)[1].close()
+        open_history(settings, second)
+    open_history(settings | {"serial": "right"}, second)[1].close()

@@ -17,7 +17,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.kinematics.robots import load_robot, robot_file_hash
+from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.services import ToolMessages
@@ -39,7 +39,7 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
     fields = {
         "serial": "s1",
         "model_hash": NOMINAL.model_hash,
-        "robot_file_hash": robot_file_hash("kr150_r3100"),
+        "robot_file_hash": load_description("kr150_r3100").file_hash,
         "revision": revision,
         "state": KinematicModel.ACCEPTED,
         "stamp": Header(frame_id="base"),
@@ -49,7 +49,7 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
 
 def tool_message(T: np.ndarray, revision: int = 1, **changes: Any) -> ToolFrame:
     """As tcf_node makes it."""
-    build = ToolMessages(NOMINAL, "s1", robot_file_hash("kr150_r3100"), "tool0", "tool")
+    build = ToolMessages(NOMINAL, "s1", load_description("kr150_r3100").file_hash, "tool0", "tool")
     message = build.frame(KnownTool(T), revision, 0, ToolFrame.ACCEPTED, 0)
     for name, value in changes.items():
         setattr(message, name, value)
