@@ -9,6 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "robocal_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 GROUND = {"ground", "estimation", "kinematics", "identification", "history", "session"}
+MODELS = {"ground", "estimation", "kinematics", "identification"}
 BELOW = GROUND | {"ros", "motion", "bags"}  # the capabilities, which know nothing of each other
 CAPABILITIES = {"thermal", "tool", "hand_eye", "correction"}
 ABOVE = BELOW | CAPABILITIES | {"maintenance"}
@@ -18,6 +19,7 @@ MAY_IMPORT = {
     "estimation": {"ground"},
     "kinematics": {"ground", "estimation"},
     "identification": {"ground", "estimation", "kinematics"},
+    "programs": MODELS,
     "history": {"ground", "estimation", "kinematics"},
     "session": {"ground", "estimation", "kinematics", "history"},
     "ros": GROUND,
@@ -27,7 +29,7 @@ MAY_IMPORT = {
     "maintenance": BELOW | CAPABILITIES,
     "report": ABOVE,
     "cell_sim": ABOVE | {"report"},
-    "cli": ABOVE | {"report", "cell_sim"},
+    "cli": ABOVE | {"report", "cell_sim", "programs"},
 }
 COMMANDS = {"cli", "cli_sensors"}  # files of a room
 ROS_FILES = {

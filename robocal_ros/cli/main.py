@@ -493,6 +493,10 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
             ),
         },
     ),
+    "correct-program": CliCommand(
+        "cli.programs:correct_program",
+        "correct the points of a program (KRL, RAPID, FANUC .ls, URScript) for the robot as it is",
+    ),
     "iso9283": CliCommand(
         "cli.identify:iso9283",
         "position accuracy and repeatability (AP, RP) of single poses as ISO 9283, 7.2, "

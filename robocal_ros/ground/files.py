@@ -73,6 +73,11 @@ def draft_beside(path: Path) -> Path:
 
 
 def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+    """Write a text as UTF-8; see `write_bytes`."""
+    write_bytes(path, text.encode(), durable=durable)
+
+
+def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> None:
     """Write a whole file or nothing: a reader never sees one that is half-written.
 
     ``durable``: on the disk when this returns; not even a power cut loses it.
@@ -81,8 +86,8 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
     """
     draft = draft_beside(path)
     try:
-        with draft.open("w", encoding="utf-8", newline="") as stream:
-            stream.write(text)
+        with draft.open("wb") as stream:
+            stream.write(data)
             if durable:
                 stream.flush()
                 os.fsync(stream.fileno())

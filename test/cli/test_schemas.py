@@ -12,6 +12,7 @@ from hand_eye_bag import hand_eye_bag
 from hand_eye_tables import TRUE, hand_eye_tables
 from joint_errors import with_joint_errors
 from recordings import plain_bag, recorded_bag, shift
+from robot_programs import KUKA_FRAMES, krl, postures
 from tool_runs import run_tables
 from tool_tables import tool_tables
 from tracker_files import SCAN, tracker_files
@@ -53,6 +54,7 @@ PLANNED = ["hand-eye", "check-plan", "--target-kind", "sphere", "--radius-mm", "
 CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
            "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
+CORRECT = ["correct-program", "--robot", ROBOT, "--model", "full.yaml"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -253,6 +255,12 @@ CASES = {
         [*TRACKER, "--radius-mm", "19.05"],
         (3, "RANK_DEFICIENT"),
     ),
+    "correct-program": (
+        "correct-program.json",
+        [*CORRECT, "weld.dat", "--frames", "frames.dat", "--output", "weld_corrected.dat"],
+        [*CORRECT, "weld.urp"],
+        (2, "BAD_INPUT"),
+    ),
     "iso9283": (
         "iso9283.json",
         ["iso9283", "--data", str(ROOT / "docs/examples/positions.csv"), "--commanded", "P1=1,2,3"],
@@ -291,6 +299,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("commands")
     save_robot(with_joint_errors(load_robot(ROBOT), 1), folder / "full.yaml")
     (folder / "arm.urdf").write_text(urdf_of(load_robot(ROBOT)))
+    (folder / "weld.dat").write_text(krl(postures(3, 5), postures(1, 6)), encoding="latin-1")
+    (folder / "frames.dat").write_text(KUKA_FRAMES)
     table(folder / "data.csv", measured(60))
     table(folder / "few.csv", measured(3))
     visits = shift()
@@ -322,7 +332,7 @@ def test_every_command_and_schema_has_a_case() -> None:
 
 def placed(folder: Path, arguments: list[str]) -> list[str]:
     """Names of files, and of folders after an option for one, become paths in the folder."""
-    files = (".csv", ".mcap", ".conf", ".yaml", ".urdf")
+    files = (".csv", ".mcap", ".conf", ".yaml", ".urdf", ".dat", ".urp")
     folders = ("--state", "--report", "--profiles", "--sphere", "--step", "--line")
     return [
         str(folder / word) if word.endswith(files) or before in folders else word

@@ -1,0 +1,1 @@
+"""Programs that a robot's own controller runs: points corrected in the file, frames shifted."""

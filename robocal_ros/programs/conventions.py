@@ -1,0 +1,90 @@
+"""How makers write a pose in numbers: order, units, what their angles turn about, and back.
+
+Each from the frame that is referred to, with its source in docs/programs.md: KUKA A, B, C about z,
+the new y, the new x; FANUC W, P, R about the fixed x, y, z, the same angles in the other order; ABB
+a unit quaternion, real part first; Universal Robots metres and a rotation vector; Kawasaki O, A, T
+about z, the new y, the new z.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
+
+Maker = Literal["kuka", "abb", "fanuc", "ur", "kawasaki"]
+COUNT: dict[Maker, int] = {"kuka": 6, "abb": 7, "fanuc": 6, "ur": 6, "kawasaki": 6}
+MM, DEGREE = 1e-3, np.pi / 180.0
+QUATERNION_TOLERANCE = 1e-3
+
+
+def pose_of(maker: Maker, numbers: Sequence[float]) -> Array:
+    """Transform (4, 4), m, of a pose as this maker writes it, mm and deg (UR: m and rad).
+
+    Raises `InputError` for another count of numbers, and for a quaternion that is none.
+    """
+    if len(numbers) != COUNT[maker]:
+        raise InputError(f"{len(numbers)} numbers, a pose of {maker} has {COUNT[maker]}")
+    place, turn = np.array(numbers[:3]), np.array(numbers[3:])
+    if maker == "ur":
+        return frames.transform(frames.exp_rotation(turn), place)
+    if maker == "abb":
+        length = float(np.linalg.norm(turn))
+        if abs(length - 1.0) > QUATERNION_TOLERANCE:
+            raise InputError(f"the quaternion has length {length:.6g}, not 1")
+        return frames.transform_from_quat(place * MM, turn[[1, 2, 3, 0]])
+    first, second, third = turn * DEGREE
+    if maker == "kawasaki":
+        R = np.linalg.multi_dot([_about_z(first), _about_y(second), _about_z(third)])
+        return frames.transform(R, place * MM)
+    rpy = (first, second, third) if maker == "fanuc" else (third, second, first)
+    return frames.transform(frames.rotation_from_rpy(rpy), place * MM)
+
+
+def numbers_of(maker: Maker, T: Array, near: Sequence[float] | None = None) -> list[float]:
+    """The numbers of a pose (4, 4) as this maker writes it: the inverse of `pose_of`.
+
+    ``near``: numbers of a pose nearby; of those that mean the same rotation the nearest are taken.
+    """
+    place = T[:3, 3] if maker == "ur" else T[:3, 3] / MM
+    choices = _turns(maker, T[:3, :3])
+    turn = choices[0]
+    if near is not None:
+        before = np.array(near[3:])
+        if maker in ("kuka", "fanuc", "kawasaki"):
+            choices = [one + 360.0 * np.round((before - one) / 360.0) for one in choices]
+        turn = min(choices, key=lambda one: float(np.sum((one - before) ** 2)))
+    return [*place.tolist(), *(turn + 0.0).tolist()]
+
+
+def _turns(maker: Maker, R: Array) -> list[Array]:
+    """Numbers of the maker's that mean this rotation (3, 3); the usual ones first."""
+    if maker == "ur":
+        vector = frames.log_rotation(R)
+        angle = float(np.linalg.norm(vector))
+        return [vector] if angle < 1e-9 else [vector, vector * (1.0 - 2.0 * np.pi / angle)]
+    if maker == "abb":
+        quat = frames.quat_xyzw(frames.transform(R, np.zeros(3)))[[3, 0, 1, 2]]
+        return [quat, -quat]
+    if maker == "kawasaki":
+        level = float(np.hypot(R[0, 2], R[1, 2]))
+        a = np.arctan2(level, R[2, 2])
+        if level < frames.GIMBAL_LOCK:  # O and T turn about one axis
+            return [np.array([np.arctan2(-R[0, 1], R[1, 1]), a, 0.0]) / DEGREE]
+        o, t = np.arctan2(R[1, 2], R[0, 2]), np.arctan2(R[2, 1], -R[2, 0])
+        return [np.array(one) / DEGREE for one in ((o, a, t), (o + np.pi, -a, t + np.pi))]
+    roll, pitch, yaw = frames.rpy(R)
+    both = (roll, pitch, yaw), (roll + np.pi, np.pi - pitch, yaw + np.pi)
+    order = slice(None) if maker == "fanuc" else slice(None, None, -1)
+    return [np.array(one[order]) / DEGREE for one in both]
+
+
+def _about_z(angle: float) -> Array:
+    return frames.exp_rotation([0.0, 0.0, angle])
+
+
+def _about_y(angle: float) -> Array:
+    return frames.exp_rotation([0.0, angle, 0.0])

@@ -1,0 +1,159 @@
+"""FANUC teach pendant programs as text (.ls): positions behind /POS, numbers of three decimals.
+
+    P[1:"pick"]{
+       GP1:
+        UF : 1, UT : 2,		CONFIG : 'N U T, 0, 0, 0',
+        X =  1250.500  mm,	Y =   -20.000  mm,	Z =   980.250  mm,
+        W =   180.000 deg,	P =     0.000 deg,	R =   -90.000 deg
+    };
+
+Only group 1 is a robot's. Sources are in docs/programs.md.
+"""
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robocal_ros.ground.frames import Array
+from robocal_ros.programs.conventions import DEGREE
+from robocal_ros.programs.points import (
+    EDGE,
+    Decimals,
+    Dialect,
+    Field,
+    Posture,
+    Program,
+    ProgramPoint,
+    Stance,
+    external_problem,
+    line_of,
+    require_numbers,
+)
+
+TURN_OF = (0, 3, 5)  # joints of the three numbers of turns, counted from 0
+HALF_TURN = np.pi
+
+_POINT = re.compile(r"^P\[\s*(\d+)\s*(?::\s*\"?([^\]\"]*)\"?)?\]\s*\{", re.M)
+_GROUP = re.compile(r"\bGP(\d+)\s*:")
+_FIELD = re.compile(r"\b([XYZWPR]|J\d|E\d)\s*=(\s*[-+.\d*]+)\s*(?:mm|deg)")
+_FRAMES = re.compile(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
+_CONFIG = re.compile(r"CONFIG\s*:\s*'([^']*)'")
+_RELATIVE = re.compile(r"\bP\[\s*(\d+)[^\]]*\][^;\n]*\bINC\b")
+_COMPUTED = re.compile(
+    r"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\][^;\n]*\b(?:Tool_)?Offset\b[^;\n]*", re.I
+)
+
+
+@dataclass(frozen=True)
+class FanucDialect(Dialect):
+    """FANUC: the configuration follows the joints.
+
+    ``j23``: what the controller's J3 counts of J2. It measures J3 against the horizontal: a robot
+    file, as ROS-Industrial's descriptions, counts it from the upper arm, J3 + J2 (``j23`` 1).
+    """
+
+    j23: float = 1.0
+    maker = "fanuc"
+    suffixes = (".ls",)
+    decimals = Decimals(length=3, turn=3, joint=3, fixed=True)
+
+    def read(self, text: str) -> Program:
+        """The points of group 1."""
+        begin = re.search(r"^/POS\b", text, re.M)
+        start = begin.end() if begin else len(text)
+        relative = {int(found[1]) for found in _RELATIVE.finditer(text, 0, start)}
+        points: list[ProgramPoint] = []
+        for found in _POINT.finditer(text, start):
+            end = text.find("};", found.end())
+            end = len(text) if end < 0 else end
+            groups = list(_GROUP.finditer(text, found.end(), end))
+            own = next((group for group in groups if group[1] == "1"), None)
+            name = f"P[{found[1]}]" + (f" {found[2]}" if found[2] else "")
+            line = line_of(text, found.start())
+            if own is None:
+                continue
+            behind = [group.start() for group in groups if group.start() > own.start()]
+            point = _point(text, name, line, own.end(), min([*behind, end]))
+            if int(found[1]) in relative:
+                point = replace(point, problem="is relative to the point before (INC)")
+            points.append(replace(point, order=len(points)))
+        frames = {"UF0": np.eye(4), "UT0": np.eye(4)}
+        computed = tuple(
+            (line_of(text, found.start()), found[0].strip())
+            for found in _COMPUTED.finditer(text, 0, start)
+        )
+        return Program(text, tuple(points), frames, computed)
+
+    def to_arm(self, shown: Array) -> Array:
+        """J3 from the upper arm on."""
+        return self._coupled(shown, self.j23)
+
+    def from_arm(self, q: Array) -> Array:
+        """J3 from the horizontal on."""
+        return self._coupled(q, -self.j23)
+
+    def _coupled(self, q: Array, share: float) -> Array:
+        moved = q.copy()
+        moved[2] += share * q[1]
+        return moved
+
+    def marks(self, point: ProgramPoint, stance: Stance) -> dict[str, str]:
+        """CONFIG with the letters and turns that have changed."""
+        if "CONFIG" not in point.marks:
+            return {}
+        old = point.marks["CONFIG"].text
+        parts = re.split(r"([\s,]+)", old)
+        words = [i for i, part in enumerate(parts) if i % 2 == 0 and part]
+        if len(words) != 6:
+            return {}
+        if abs(stance.q[4]) > EDGE:
+            parts[words[0]] = "N" if stance.q[4] < 0.0 else "F"
+        parts[words[1]], parts[words[2]] = "DU"[stance.above], "TB"[stance.behind]
+        for place, joint in zip(words[3:], TURN_OF, strict=True):
+            turned = stance.q[joint] / (2.0 * HALF_TURN) - int(parts[place])
+            if abs(turned) > 0.5 + EDGE:
+                parts[place] = str(round(stance.q[joint] / (2.0 * HALF_TURN)))
+        text = "".join(parts)
+        return {} if text == old else {"CONFIG": text}
+
+
+def _point(text: str, name: str, line: int, start: int, end: int) -> ProgramPoint:
+    found = {part[1]: Field(part.start(2), part[2]) for part in _FIELD.finditer(text, start, end)}
+    joints = "J1" in found
+    names = [f"J{i}" for i in range(1, 10)] if joints else list("XYZWPR")
+    fields = tuple(found[one] for one in names if one in found)
+    problem = require_numbers(fields)
+    if not joints and len(fields) < 6:
+        problem = "has no pose"
+    extra = [part for one, part in found.items() if one.startswith("E")]
+    problem = problem or external_problem(extra)
+    point = ProgramPoint(name, line, fields, joints, DEGREE, problem=problem)
+    if joints or problem:
+        return point
+    frames = _FRAMES.search(text, start, end)
+    if frames:
+        frame, tool = (one if one.isdigit() else None for one in frames.groups())
+        point = replace(
+            point,
+            frame=None if frame is None else f"UF{frame}",
+            tool=None if tool is None else f"UT{tool}",
+        )
+    config = _CONFIG.search(text, start, end)
+    if config is None:
+        return point
+    marks = {"CONFIG": Field(config.start(1), config[1])}
+    return replace(point, marks=marks, posture=_posture(config[1]))
+
+
+def _posture(config: str) -> Posture:
+    words = config.replace(",", " ").split()
+    ranges = np.tile([-np.inf, np.inf], (6, 1))
+    if words[:1] and words[0] in "NF":
+        ranges[4] = (-np.inf, 0.0) if words[0] == "N" else (0.0, np.inf)
+    for joint, word in zip(TURN_OF, words[3:6], strict=False):
+        if re.fullmatch(r"-?\d+", word):
+            ranges[joint] = (2.0 * int(word) + np.array([-1.0, 1.0])) * HALF_TURN
+    above = {"U": True, "D": False}.get(words[1] if len(words) > 1 else "")
+    behind = {"T": False, "B": True}.get(words[2] if len(words) > 2 else "")
+    return Posture(ranges, behind, above)

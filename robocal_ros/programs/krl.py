@@ -1,0 +1,253 @@
+"""KUKA programs (.src, .dat): points in braces, frames by number, status and turn.
+
+    DECL E6POS XP1={X 1250.5,Y -20.0,Z 980.25,A 90.0,B 0.0,C 180.0,S 2,T 35,E1 0.0,…}
+    DECL FDAT FP1={TOOL_NO 1,BASE_NO 2,IPO_FRAME #BASE,…}
+
+Of a point of an inline form (XP1) the frames are in FP1; elsewhere those that were set last above.
+Sources are in docs/programs.md.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from robocal_ros.ground.frames import Array
+from robocal_ros.programs.conventions import DEGREE, pose_of
+from robocal_ros.programs.points import (
+    EDGE,
+    Decimals,
+    Dialect,
+    Field,
+    Posture,
+    Program,
+    ProgramPoint,
+    Stance,
+    external_problem,
+    line_of,
+    masked,
+    require_numbers,
+)
+
+POSE = ("X", "Y", "Z", "A", "B", "C")
+AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
+EXTERNAL = ("E1", "E2", "E3", "E4", "E5", "E6")
+ROBROOT = ("$NULLFRAME", "$WORLD", "$ROBROOT")
+TARGETS = ("E6POS", "POS", "E6AXIS", "AXIS")
+BEHIND, ABOVE, FLIPPED = 1, 2, 4  # bits of S; the third says again what T says of A5
+ABSOLUTE = 16
+_ABSOLUTE = (
+    "taught on an absolutely accurate robot (bit 4 of S): its controller reckons with a model of "
+    "its own, not with the nominal one; switch it off, or give that model as --robot"
+)
+MOVES = r"S?(?:PTP|LIN|CIRC|SPL)"
+
+_BRACES = re.compile(r"\{([^{}]*)\}")
+_ASSIGNED = re.compile(
+    r"(?:\b(?P<type>E6POS|POS|FRAME|E6AXIS|AXIS)\s+)?(?P<name>\$?[A-Za-z_]\w*(?:\[[^\]\r\n]*\])?)"
+    r"\s*=\s*$"
+)
+_MOVED = re.compile(
+    rf"\b(?P<move>{MOVES}(?P<relative>_REL)?)\b[^\r\n{{}}]*(?:\{{[^{{}}]*\}}\s*,\s*)?$", re.I
+)
+_USED = re.compile(rf"\b{MOVES}\s+(\w+(?:\[\w+\])?)(?:\s*,\s*(\w+(?:\[\w+\])?))?", re.I)
+_FDAT = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{([^{}]*)\}", re.I)
+_FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
+_SET = re.compile(
+    r"\$(?P<kind>TOOL|BASE)\s*=\s*(?P<value>\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?[^\r\n;]*)"
+    r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)",
+    re.I,
+)
+_COMPUTED = re.compile(rf"\b{MOVES}(?:_REL)?\b[^\r\n{{}}]*(?:\w\s*:\s*[\w{{$]|\w\()[^\r\n]*", re.I)
+
+
+class KrlDialect(Dialect):
+    """KUKA: nine digits as the controller writes them; S and T follow the joints."""
+
+    maker, suffixes = "kuka", (".src", ".dat", ".sub")
+    decimals = Decimals(length=4, turn=6, joint=6)
+
+    def read(self, text: str) -> Program:
+        """Points of POS and E6POS, of AXIS and E6AXIS, and of motions; frames by number."""
+        clean = masked(text, ";")
+        frames = {"TOOL_DATA[0]": np.eye(4), "BASE_DATA[0]": np.eye(4)}
+        frames |= {name: np.eye(4) for name in ROBROOT}
+        for found in _FRAME_DATA.finditer(clean):
+            T = _frame(found[3])
+            if T is not None:
+                frames[f"{found[1].upper()}[{found[2]}]"] = T
+        inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
+        set_above = list(_settings(text, clean, frames))
+        used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
+        points: list[ProgramPoint] = []
+        for braces in _BRACES.finditer(clean):
+            point = _point(text, clean, braces, used)
+            if point is None:
+                continue
+            point = _framed(point, braces.start(), inline, set_above)
+            points.append(replace(point, order=len(points)))
+        computed = tuple(
+            (line_of(text, found.start()), text[found.start() : found.end()].strip())
+            for found in _COMPUTED.finditer(clean)
+        )
+        status = [bits_of(point.marks["S"]) for point in points if "S" in point.marks]
+        exact = sum(1 for one in status if one is not None and one & ABSOLUTE)
+        notes = [f"{exact} points were {_ABSOLUTE}"] if exact else []
+        return Program(text, tuple(points), frames, computed, tuple(notes))
+
+    def marks(self, point: ProgramPoint, stance: Stance) -> dict[str, str]:
+        """S and T, of which only bits that have changed are written."""
+        found = {}
+        q, negative = stance.q, stance.q < 0.0
+        for kind, mark in point.marks.items():
+            old = bits_of(mark)
+            if old is None or old < 0:
+                continue
+            new = old
+            if kind == "T":
+                for axis in np.flatnonzero(np.abs(q) > EDGE):
+                    new = (new & ~(1 << int(axis))) | (int(negative[axis]) << int(axis))
+            else:
+                new = (new & ~(BEHIND | ABOVE)) | BEHIND * stance.behind | ABOVE * stance.above
+                if abs(q[4]) > EDGE:
+                    new = (new & ~FLIPPED) | FLIPPED * bool(negative[4])
+            if new != old:
+                binary = re.fullmatch(r"'B([01]+)'", mark.text.strip(), re.I)
+                found[kind] = f"'B{new:0{len(binary[1])}b}'" if binary else str(new)
+        return found
+
+
+def _parts(body: str, at: int) -> dict[str, Field]:
+    """Components of an aggregate that begins at ``at``: X, Y … by name."""
+    found = {}
+    for part in re.finditer(r"[^,]+", body.partition(":")[2] if ":" in body else body):
+        shift = at + (body.index(":") + 1 if ":" in body else 0)
+        name = re.match(r"\s*(\w+(?:\[\])?)\s+", part[0])
+        if name:
+            value = part[0][name.end() :].rstrip()
+            found[name[1].upper()] = Field(shift + part.start() + name.end(), value)
+    return found
+
+
+def _frame(body: str) -> Array | None:
+    parts = _parts(body, 0)
+    fields = [parts[name] for name in POSE if name in parts]
+    if len(fields) < len(POSE) or require_numbers(fields):
+        return None
+    return pose_of("kuka", [part.value for part in fields])
+
+
+def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> ProgramPoint | None:
+    """The point in braces; None where something else is in them."""
+    parts = _parts(braces[1], braces.start() + 1)
+    joints = "A1" in parts and "X" not in parts
+    names = AXES if joints else POSE
+    before = clean[clean.rfind("\n", 0, braces.start()) + 1 : braces.start()]
+    assigned, moved = _ASSIGNED.search(before), _MOVED.search(before)
+    line = line_of(text, braces.start())
+    if assigned:
+        name = assigned["name"].upper()
+        target = (assigned["type"] or "").upper() in TARGETS or name in used
+        if not target or name.startswith(("$", "TOOL_DATA", "BASE_DATA")):
+            return None
+        title = assigned["name"]
+    elif moved:
+        title = f"{moved['move']} in line {line}"
+    else:
+        return None
+    if not any(name in parts for name in names):
+        return None
+    fields = tuple(parts[name] for name in names if name in parts)
+    problem = require_numbers(fields)
+    if moved and moved["relative"]:
+        problem = "is relative to the point before"
+    elif len(fields) < len(names):
+        problem = "leaves components as they are at run time: " + ", ".join(
+            name for name in names if name not in parts
+        )
+    extra = [parts[name] for name in EXTERNAL if name in parts]
+    problem = problem or external_problem(extra)
+    marks: dict[str, Field] = {name: parts[name] for name in ("S", "T") if name in parts}
+    point = ProgramPoint(title, line, fields, joints, DEGREE, marks=marks, problem=problem)
+    if joints or problem:
+        return replace(point, marks={})
+    return replace(point, posture=_posture(parts))
+
+
+def bits_of(mark: Field) -> int | None:
+    """Value of S or T, also as 'B100011' or 'HFF'; None where it is none."""
+    text = mark.text.strip()
+    binary = re.fullmatch(r"'([BH])([0-9A-F]+)'", text, re.I)
+    try:
+        return int(binary[2], 2 if binary[1] in "Bb" else 16) if binary else int(text)
+    except ValueError:
+        return None
+
+
+def _posture(parts: dict[str, Field]) -> Posture:
+    status = bits_of(parts["S"]) if "S" in parts else None
+    turn = bits_of(parts["T"]) if "T" in parts else None
+    ranges = None
+    if turn is not None and turn >= 0:
+        negative = np.array([(turn >> axis) & 1 for axis in range(6)], dtype=bool)
+        low, high = np.where(negative, -np.inf, 0.0), np.where(negative, 0.0, np.inf)
+        ranges = np.stack([low, high], axis=1)
+    if status is None or status < 0:
+        return Posture(ranges)
+    return Posture(ranges, bool(status & BEHIND), bool(status & ABOVE))
+
+
+@dataclass
+class _Set:
+    """Tool and base that are set from a place in the text on."""
+
+    at: int
+    names: dict[str, str | None] = field(default_factory=dict)
+
+
+def _settings(text: str, clean: str, frames: dict[str, Array]) -> Iterator[_Set]:
+    now: dict[str, str | None] = {}
+    for found in _SET.finditer(clean):
+        if found["bas"]:
+            kind, number = found["bas"].upper(), found["number"].strip()
+            if kind == "INITMOV":
+                now = {}
+            else:
+                now = now | {kind: f"{kind}_DATA[{number}]" if number.isdigit() else None}
+        else:
+            kind, value = found["kind"].upper(), found["value"].strip()
+            name: str | None = value.upper()
+            if value.startswith("{"):
+                T = _frame(value[1:-1])
+                name = None if T is None else f"${kind} of line {line_of(text, found.start())}"
+                if T is not None and name is not None:
+                    frames[name] = T
+            elif not re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
+                name = None
+            now = now | {kind: name}
+        yield _Set(found.start(), now)
+
+
+def _framed(
+    point: ProgramPoint, at: int, inline: dict[str, str], set_above: list[_Set]
+) -> ProgramPoint:
+    """The point with the names of its frames, and what about them forbids a correction."""
+    body = inline.get(point.name.upper().removeprefix("X"))
+    if body is not None:
+        parts = _parts(body, 0)
+        tool, base = (parts.get(name) for name in ("TOOL_NO", "BASE_NO"))
+        if "IPO_FRAME" in parts and parts["IPO_FRAME"].text.strip().upper() == "#TCP":
+            return replace(
+                point, problem=point.problem or "the robot carries the part to a tool that stands"
+            )
+        return replace(
+            point,
+            tool=None if tool is None else f"TOOL_DATA[{tool.text.strip()}]",
+            frame=None if base is None else f"BASE_DATA[{base.text.strip()}]",
+        )
+    names: dict[str, str | None] = {}
+    for one in set_above:
+        if one.at < at:
+            names = one.names
+    return replace(point, tool=names.get("TOOL"), frame=names.get("BASE"))

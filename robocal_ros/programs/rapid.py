@@ -1,0 +1,251 @@
+r"""ABB RAPID modules (.mod, .sys, .prg): robtargets and jointtargets, tooldata and wobjdata.
+
+    CONST robtarget p10:=[[600,0,812.5],[0.0,0.0,1.0,0.0],[0,-1,0,1],[9E9,9E9,9E9,9E9,9E9,9E9]];
+    MoveL p10,v200,z10,tGripper\WObj:=wFixture;
+
+A point's frames are those of the motions that name it. Sources are in docs/programs.md.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import Array
+from robocal_ros.programs.conventions import DEGREE, pose_of
+from robocal_ros.programs.points import (
+    EDGE,
+    Decimals,
+    Dialect,
+    Field,
+    Posture,
+    Program,
+    ProgramPoint,
+    Stance,
+    arguments,
+    external_problem,
+    line_of,
+    masked,
+    matching,
+    require_numbers,
+)
+
+Tree = Field | list["Tree"]
+
+QUADRANT = 90.0 * DEGREE
+QUADRANT_OF = {"cf1": 0, "cf4": 3, "cf6": 5}
+NONE, MANY = "", "?"
+
+_DECLARED = re.compile(
+    r"\b(?P<type>robtarget|jointtarget|tooldata|wobjdata)\s+(?P<name>\w+)\s*(?:\{[^}]*\})?\s*:=\s*(?=\[)",
+    re.I,
+)
+_ASSIGNED = re.compile(r"(?:^|[;\n])\s*(?P<name>\w+)\s*(?:\{[^}]*\})?\s*:=\s*(?=\[)")
+_MOVES = re.compile(
+    r"\b((?:Move|Trigg|Arc|Spot|Search|Paint|Disp)\w*)\b([^;:]*(?::=[^;:]*)*);", re.I
+)
+_PLAIN = {"movej": 1, "movel": 1, "movec": 2, "moveabsj": 1}
+_COMPUTED = re.compile(r"\b(Offs|RelTool)\s*\(\s*(\w+)", re.I)
+
+
+class RapidDialect(Dialect):
+    """ABB: a robtarget's quadrants follow the joints."""
+
+    maker, suffixes = "abb", (".mod", ".sys", ".prg", ".modx", ".sysx")
+    decimals = Decimals(length=4, turn=8, joint=6)
+
+    def read(self, text: str) -> Program:
+        """Robtargets and jointtargets, with the frames of the motions that name them."""
+        clean = masked(text, "!")
+        frames = {"tool0": np.eye(4), "wobj0": np.eye(4)}
+        problems: dict[str, str] = {}
+        points: list[tuple[str, ProgramPoint]] = []
+        taken = set()
+        for pattern in (_DECLARED, _ASSIGNED):
+            for found in pattern.finditer(clean):
+                if found.end() in taken:
+                    continue
+                taken.add(found.end())
+                tree = _tree(clean, found.end())
+                kind = (found.groupdict().get("type") or "").lower()
+                name = found["name"].lower()
+                if kind in ("tooldata", "wobjdata"):
+                    _read_frame(kind, name, tree, frames, problems)
+                else:
+                    points += _points(text, found["name"], name, tree)
+        uses = _uses(text, clean, frames, points)
+        framed = [_framed(name, point, uses, problems) for name, point in points]
+        framed.sort(key=lambda point: point.fields[0].start)
+        computed = tuple(
+            (line_of(text, found.start()), f"{found[1]}({found[2]}, …)")
+            for found in _COMPUTED.finditer(clean)
+        )
+        ordered = tuple(replace(point, order=i) for i, point in enumerate(framed))
+        return Program(text, ordered, frames, computed)
+
+    def marks(self, point: ProgramPoint, stance: Stance) -> dict[str, str]:
+        """Quadrants and cfx that have changed."""
+        found = {}
+        for name, joint in QUADRANT_OF.items():
+            if name in point.marks:
+                into = stance.q[joint] - point.marks[name].value * QUADRANT
+                if not -EDGE <= into <= QUADRANT + EDGE:
+                    found[name] = str(int(np.floor(stance.q[joint] / QUADRANT)))
+        cfx = int(point.marks["cfx"].value) if "cfx" in point.marks else -1
+        if 0 <= cfx < 8:
+            new = 4 * stance.behind + 2 * (not stance.above)
+            new += int(stance.q[4] < 0.0) if abs(stance.q[4]) > EDGE else cfx & 1
+            if new != cfx:
+                found["cfx"] = str(new)
+        return found
+
+
+def _tree(clean: str, at: int) -> Tree:
+    """A bracketed literal as nested lists of fields."""
+    end = matching(clean, at)
+    return [
+        _tree(clean, part.start) if part.text.startswith("[") else part
+        for part in arguments(clean, at + 1, end)
+    ]
+
+
+def _rows(tree: Tree, *lengths: int) -> list[list[Field]] | None:
+    """Rows of so many fields each; None where the tree is of another shape."""
+    if not isinstance(tree, list) or len(tree) != len(lengths):
+        return None
+    rows = []
+    for row, length in zip(tree, lengths, strict=True):
+        if not isinstance(row, list) or len(row) != length:
+            return None
+        fields = [part for part in row if isinstance(part, Field)]
+        if len(fields) < length:
+            return None
+        rows.append(fields)
+    return rows
+
+
+def _points(text: str, title: str, name: str, tree: Tree) -> list[tuple[str, ProgramPoint]]:
+    """The points in a literal: one, or those of an array."""
+    target, joints = _rows(tree, 3, 4, 4, 6), _rows(tree, 6, 6)
+    if target is None and joints is None:
+        if not isinstance(tree, list) or all(isinstance(part, Field) for part in tree):
+            return []
+        parts = enumerate(tree, start=1)
+        return [
+            found for i, part in parts for found in _points(text, f"{title}{{{i}}}", name, part)
+        ]
+    if joints is not None:
+        fields, extra = tuple(joints[0]), joints[1]
+        problem = require_numbers(fields) or external_problem(extra)
+        line = line_of(text, fields[0].start)
+        return [(name, ProgramPoint(title, line, fields, True, DEGREE, problem=problem))]
+    assert target is not None
+    fields, configured = (*target[0], *target[1]), target[2]
+    problem = require_numbers((*fields, *configured)) or external_problem(target[3])
+    point = ProgramPoint(title, line_of(text, fields[0].start), fields, problem=problem)
+    if not problem:
+        marks = dict(zip(("cf1", "cf4", "cf6", "cfx"), configured, strict=True))
+        point = replace(point, marks=marks, posture=_posture(marks))
+        try:
+            pose_of("abb", point.numbers)
+        except InputError as error:
+            point = replace(point, problem=str(error))
+    return [(name, point)]
+
+
+def _posture(marks: dict[str, Field]) -> Posture:
+    ranges = np.tile([-np.inf, np.inf], (6, 1))
+    for name, joint in QUADRANT_OF.items():
+        ranges[joint] = marks[name].value * QUADRANT + np.array([0.0, QUADRANT])
+    cfx = int(marks["cfx"].value)
+    if not 0 <= cfx < 8:
+        return Posture(ranges)
+    ranges[4] = (-np.inf, 0.0) if cfx & 1 else (0.0, np.inf)
+    return Posture(ranges, bool(cfx & 4), not cfx & 2)
+
+
+def _read_frame(
+    kind: str, name: str, tree: Tree, frames: dict[str, Array], problems: dict[str, str]
+) -> None:
+    """Put a tooldata or wobjdata into ``frames``, or why it cannot be into ``problems``."""
+    problems[name] = f"{kind} {name} cannot be read"
+    if not isinstance(tree, list) or not isinstance(tree[0], Field):
+        return
+    holds = tree[0].text.upper()
+    if holds != ("TRUE" if kind == "tooldata" else "FALSE"):
+        problems[name] = f"{name}: the robot carries the part to a tool that stands"
+        return
+    T = np.eye(4)
+    for part in tree[1:2] if kind == "tooldata" else tree[-2:]:
+        rows = _rows(part, 3, 4)
+        if rows is None or require_numbers([*rows[0], *rows[1]]):
+            return
+        T = T @ pose_of("abb", [part.value for row in rows for part in row])
+    if kind == "wobjdata" and isinstance(tree[1], Field) and tree[1].text.upper() != "TRUE":
+        problems[name] = f"{name}: its user frame is moved by another unit"
+        return
+    frames[name] = T
+    del problems[name]
+
+
+def _uses(
+    text: str, clean: str, frames: dict[str, Array], points: list[tuple[str, ProgramPoint]]
+) -> dict[str, tuple[str, str]]:
+    """Tool and work object of the motions that name a point; `MANY` where they differ.
+
+    Points that are written in a motion are added to ``points``.
+    """
+    uses: dict[str, tuple[str, str]] = {}
+    for found in _MOVES.finditer(clean):
+        parts = arguments(clean, found.start(2), found.end(2))
+        parts = [part for part in parts if part.text]
+        plain = [re.sub(r"\s*\\.*", "", part.text, flags=re.S) for part in parts]
+        if not parts:
+            continue
+        if found[1].lower() in _PLAIN:
+            tool = plain[-1].lower()
+        else:
+            tool = next((one.lower() for one in plain[1:] if one.lower() in frames), NONE)
+        wobj = re.search(r"\\\s*WObj\s*:=\s*(\w+)", found[2], re.I)
+        pair = (tool, wobj[1].lower() if wobj else "wobj0")
+        for part in parts[: _PLAIN.get(found[1].lower(), 2)]:
+            at = clean.find("[", part.start, part.end)
+            literal = (
+                at >= 0
+                and not clean[part.start : at].strip().startswith("\\")
+                and re.match(r"(?:\\\w+\s*,?\s*)*\[", clean[part.start : part.end])
+            )
+            if literal:
+                name = f"{found[1]} in line {line_of(text, at)}"
+                points += _points(text, name, f"@{at}", _tree(clean, at))
+                uses[f"@{at}"] = pair
+                continue
+            for name in _named(part.text):
+                before = uses.get(name, pair)
+                one, other = (a if a == b else MANY for a, b in zip(before, pair, strict=True))
+                uses[name] = (one, other)
+    return uses
+
+
+def _named(word: str) -> Sequence[str]:
+    """The point that an argument names, also within Offs( ) and RelTool( )."""
+    inner = _COMPUTED.match(word)
+    if inner:
+        return [inner[2].lower()]
+    name = re.match(r"(\w+)\s*(?:\{|\\|$)", word)
+    return [name[1].lower()] if name else []
+
+
+def _framed(
+    name: str, point: ProgramPoint, uses: dict[str, tuple[str, str]], problems: dict[str, str]
+) -> ProgramPoint:
+    if point.joints or name not in uses:
+        return point
+    tool, frame = uses[name]
+    problem = next((problems[one] for one in (tool, frame) if one in problems), "")
+    if MANY in (tool, frame):
+        problem = "motions with different tools or work objects go to it"
+    known = (None if one in (NONE, MANY) else one for one in (tool, frame))
+    return replace(point, tool=next(known), frame=next(known), problem=point.problem or problem)

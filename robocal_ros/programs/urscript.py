@@ -1,0 +1,149 @@
+"""Universal Robots scripts (.script): poses p[x, y, z, rx, ry, rz], joints [q1, …, q6], m and rad.
+
+    global Waypoint_1_p=p[.433025361705, -.467959205379, .522310714714, 1.5003, .5214, .5309]
+    global Waypoint_1_q=[1.9942, -1.6685, 1.9331, -.2718, 1.3209, .0036]
+    movej(get_inverse_kin(Waypoint_1_p, qnear=Waypoint_1_q), a=1.4, v=1.05)
+
+A list is a point where a motion goes to it, by itself or by its name. Sources are in
+docs/programs.md.
+"""
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robocal_ros.ground.frames import Array
+from robocal_ros.programs.conventions import pose_of
+from robocal_ros.programs.points import (
+    Decimals,
+    Dialect,
+    Field,
+    Posture,
+    Program,
+    ProgramPoint,
+    arguments,
+    line_of,
+    masked,
+    matching,
+    require_numbers,
+)
+
+TARGETS = {"movej": 1, "movel": 1, "movep": 1, "movec": 2, "servoj": 1, "servoc": 1}
+BASE, TCP = "base", "tcp"
+
+_CALL = re.compile(r"\b(movej|movel|movep|movec|servoj|servoc|set_tcp)\s*(?=\()")
+_ASSIGNED = re.compile(r"\b(\w+)\s*=\s*(?=p?\[)")
+_LIST = re.compile(r"p?\s*(?=\[)")
+_COMPUTED = re.compile(r"\b(pose_trans|pose_add|pose_sub|interpolate_pose)\s*\(")
+
+
+class UrScriptDialect(Dialect):
+    """Universal Robots: nothing in a pose says the posture, the qnear of a motion does."""
+
+    maker, suffixes = "ur", (".script", ".txt")
+    decimals = Decimals(length=7, turn=8, joint=8)
+
+    def read(self, text: str) -> Program:
+        """Lists that motions go to."""
+        clean = masked(text, "#")
+        frames: dict[str, Array] = {BASE: np.eye(4)}
+        lists = {found.end(): found[1] for found in _ASSIGNED.finditer(clean)}
+        values: dict[str, list[int]] = {}
+        for at, name in lists.items():
+            values.setdefault(name, []).append(at)
+        targets = _targets(text, clean, frames)
+        goals: dict[int, list[_Target]] = {}
+        for target in targets:
+            places = [target.at] if _LIST.match(target.word) else values.get(target.word, [])
+            for at in places:
+                goals.setdefault(at, []).append(target)
+        points = []
+        for at in sorted(goals):
+            point = _point(text, clean, at, lists.get(at), goals[at], values)
+            if point is not None:
+                points.append(point)
+        computed = tuple(
+            (line_of(text, found.start()), f"{found[1]}(…)") for found in _COMPUTED.finditer(clean)
+        )
+        return Program(text, tuple(points), frames, computed)
+
+
+@dataclass(frozen=True)
+class _Target:
+    """What a motion goes to: a list at ``at`` or the name of one; ``near`` likewise, or none."""
+
+    at: int
+    word: str
+    tool: str | None
+    order: int
+    near: Field | None = None
+
+
+def _targets(text: str, clean: str, frames: dict[str, Array]) -> list[_Target]:
+    """What the motions go to, in the order of the text; poses of set_tcp go into ``frames``."""
+    found, tool = [], None
+    for call in _CALL.finditer(clean):
+        parts = arguments(clean, call.end() + 1, matching(clean, call.end()))
+        if call[1] == "set_tcp":
+            fields = _fields(clean, parts[0].start)
+            tool = None
+            if fields is not None and len(fields) == 6 and not require_numbers(fields):
+                tool = f"set_tcp of line {line_of(text, call.start())}"
+                frames[tool] = pose_of("ur", [part.value for part in fields])
+            continue
+        for part in parts[: TARGETS[call[1]]]:
+            word, near = part, None
+            inverse = re.match(r"get_inverse_kin\s*(?=\()", part.text)
+            if inverse:
+                at = part.start + inverse.end()
+                inner = arguments(clean, at + 1, matching(clean, at))
+                word = inner[0]
+                near = inner[1] if len(inner) > 1 else None
+            found.append(_Target(word.start, word.text, tool, call.start(), near))
+    return found
+
+
+def _fields(clean: str, at: int) -> list[Field] | None:
+    """The numbers of a list that begins at ``at``; None where none does."""
+    begins = _LIST.match(clean, at)
+    if begins is None:
+        return None
+    return arguments(clean, begins.end() + 1, matching(clean, begins.end()))
+
+
+def _point(
+    text: str,
+    clean: str,
+    at: int,
+    name: str | None,
+    targets: list[_Target],
+    values: dict[str, list[int]],
+) -> ProgramPoint | None:
+    fields = _fields(clean, at)
+    if fields is None or len(fields) != 6:
+        return None
+    line, joints = line_of(text, at), not clean.startswith("p", at)
+    title = name or f"line {line}"
+    point = ProgramPoint(title, line, tuple(fields), joints, 1.0, problem=require_numbers(fields))
+    point = replace(point, order=min(target.order for target in targets))
+    if joints:
+        return point
+    tools = {target.tool for target in targets}
+    if len(tools) > 1:
+        return replace(point, problem=point.problem or "motions with different tools go to it")
+    near = next((target.near for target in targets if target.near is not None), None)
+    q = None if near is None else _joints(clean, near, values)
+    tool = tools.pop() or TCP
+    return replace(point, tool=tool, frame=BASE, posture=Posture(near=q))
+
+
+def _joints(clean: str, near: Field, values: dict[str, list[int]]) -> Array | None:
+    """The joints that a qnear names, or is."""
+    word = re.sub(r"^qnear\s*=\s*", "", near.text)
+    at = near.start + len(near.text) - len(word)
+    places = [at] if word.startswith("[") else values.get(word, [])
+    fields = _fields(clean, places[0]) if len(places) == 1 else None
+    if fields is None or len(fields) != 6 or require_numbers(fields):
+        return None
+    return np.array([part.value for part in fields])

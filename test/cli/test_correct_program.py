@@ -1,0 +1,141 @@
+"""``robocal correct-program`` on files: what is written, what never is, whose model it is."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from history_workers import SERIAL, proposal
+from robot_programs import KUKA_FRAMES, NOMINAL, drifted, krl, postures
+
+from robocal_ros.cli.main import main
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.robots import save_robot
+
+ACTUAL = drifted(NOMINAL, 1)
+SINGULAR = np.radians([10.0, -80.0, 95.0, 40.0, 0.02, -20.0])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    save_robot(ACTUAL, tmp_path / "identified.yaml")
+    text = krl(postures(3, 5), postures(1, 6))
+    (tmp_path / "weld.dat").write_bytes(text.encode("latin-1"))
+    (tmp_path / "$config.dat").write_text(KUKA_FRAMES)
+    return tmp_path
+
+
+def command(capsys, *words: str) -> tuple[int, dict]:
+    robot = ["--robot", "kr150_r3100"]
+    status = main(["correct-program", *words, *robot, "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+MODEL = ("--model", "identified.yaml")
+KNOWN = ("--frames", "$config.dat")
+
+
+def test_a_program_is_corrected_into_another_file(folder: Path, capsys):
+    before = (folder / "weld.dat").read_bytes()
+    words = ("weld.dat", *MODEL, *KNOWN, "--output", "new.dat")
+    status, document = command(capsys, *words)
+    assert status == 0
+    assert document["verdict"]["code"] == "ACCEPT"
+    assert document["count"] == {"corrected": 4, "unchanged": 0, "not_corrected": 0}
+    assert max(point["left_mm"] for point in document["points"]) < 1e-3
+    after = (folder / "new.dat").read_bytes()
+    assert before == (folder / "weld.dat").read_bytes() != after
+    assert b"N\xe4he" in after  # Latin-1 stays
+    assert after.count(b"\r\n") == before.count(b"\r\n")
+    status, document = command(capsys, *words)
+    assert status == 2
+    assert "is there already" in document["error"]["message"]
+    assert (folder / "new.dat").read_bytes() == after
+    status, document = command(capsys, "weld.dat", *MODEL, *KNOWN, "--output", "weld.dat")
+    assert status == 2
+    assert (folder / "weld.dat").read_bytes() == before
+
+
+def test_a_program_that_is_corrected_in_part_is_written_when_asked(folder: Path, capsys):
+    text = krl(postures(2, 5), SINGULAR[None])
+    (folder / "part.dat").write_bytes(text.encode("latin-1"))
+    words = ("part.dat", *MODEL, *KNOWN, "--output", "new.dat")
+    status, document = command(capsys, *words)
+    assert status == 0
+    assert document["verdict"]["code"] == "LIMIT_EXCEEDED"
+    assert document["output"] is None
+    assert not (folder / "new.dat").exists()
+    assert document["points"][2]["reason"].startswith("singular")
+    _, document = command(capsys, *words, "--partial")
+    assert document["output"] == "new.dat"
+    assert document["verdict"]["accept"] is False
+    last = (folder / "new.dat").read_text("latin-1").splitlines()[-2]
+    assert last == text.splitlines()[-2]
+
+
+def test_frames_and_bounds_come_from_the_command_line(folder: Path, capsys):
+    given = ["--frame", "TOOL_DATA[3]=120.5,-14.25,262,30,40,-15"]
+    given += ["--frame", "BASE_DATA[5]=900,-250.5,410.75,12,-3,5"]
+    _, one = command(capsys, "weld.dat", *MODEL, *given)
+    _, other = command(capsys, "weld.dat", *MODEL, *KNOWN)
+    assert one["points"] == other["points"]
+    assert one["output"] is None
+    _, tight = command(capsys, "weld.dat", *MODEL, *KNOWN, "--largest-mm", "0.001")
+    assert tight["count"]["not_corrected"] == 4
+    status, document = command(capsys, "weld.dat", *MODEL, "--frame", "TOOL_DATA[3]=1,2,3")
+    assert status == 2
+    assert "NAME=X,Y,Z" in document["error"]["message"]
+
+
+def test_the_model_is_a_robot_file_a_shown_calibration_or_the_one_in_force(folder: Path, capsys):
+    _, of_file = command(capsys, "weld.dat", *MODEL, *KNOWN)
+    shown = {"model": model_document(ACTUAL), "document": {}}
+    (folder / "shown.json").write_text(json.dumps(shown))
+    _, of_json = command(capsys, "weld.dat", "--model", "shown.json", *KNOWN)
+    same = dict(model_hash=NOMINAL.model_hash, model=model_document(ACTUAL), based_on=0)
+    in_force = ("weld.dat", "--robot-serial", SERIAL, "--state", "state", *KNOWN)
+    with CalibrationHistory.open(
+        SERIAL, model_hash=NOMINAL.model_hash, state_dir=folder / "state"
+    ) as history:
+        number = history.propose(proposal(**same))
+        status, document = command(capsys, *in_force)
+        assert status == 2
+        assert "accept one first" in document["error"]["message"]
+        history.accept(number, by="Ada", reason="", wall_ns=1)
+    _, of_history = command(capsys, *in_force)
+    for other in (of_json, of_history):
+        for one, two in zip(of_file["points"], other["points"], strict=True):
+            assert one["shift_mm"] == pytest.approx(two["shift_mm"], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        ("wide.dat", b"D\0E\0F\0", "one byte a character"),
+        ("empty.dat", b"DEFDAT A\r\nENDDAT\r\n", "no point"),
+        ("part.urp", b"\x1f\x8b", "no ending of a program"),
+    ],
+)
+def test_what_is_no_program_is_refused(folder: Path, capsys, name, content, why):
+    (folder / name).write_bytes(content)
+    status, document = command(capsys, name, *MODEL)
+    assert status == 2
+    assert why in document["error"]["message"]
+
+
+def test_a_model_of_another_robot_is_refused(folder: Path, capsys):
+    status, document = command(capsys, "weld.dat", "--model", "ur10")
+    assert (status, document["error"]["code"]) == (2, "WRONG_ROBOT")
+    (folder / "none.json").write_text("[1, 2]")
+    status, document = command(capsys, "weld.dat", "--model", "none.json")
+    assert (status, document["error"]["code"]) == (2, "BAD_INPUT")
+
+
+def test_people_get_a_table(folder: Path, capsys):
+    assert main(["correct-program", "weld.dat", *MODEL, "--robot", "kr150_r3100"]) == 0
+    said = capsys.readouterr().out
+    assert "3 not corrected" in said
+    assert "unknown frame BASE_DATA[5]" in said
+    assert "--partial writes the others" in said

@@ -1,0 +1,301 @@
+"""What is read of programs of each maker, and what of them comes out as it came in."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from robot_programs import NOMINAL, postures, programs
+from scipy.spatial.transform import Rotation
+
+from robocal_ros.ground import frames
+from robocal_ros.programs.conventions import numbers_of, pose_of
+from robocal_ros.programs.correcting import DIALECTS, dialect_of
+from robocal_ros.programs.points import Field, spliced, written
+
+POINTS, JOINTS = postures(6, 1), postures(2, 2)
+WRITTEN = programs(POINTS, JOINTS)
+
+# Numbers of a rotation as each maker's manual has them, by scipy.
+TURNS = {
+    "kuka": lambda R: R.as_euler("ZYX", degrees=True),
+    "fanuc": lambda R: R.as_euler("xyz", degrees=True),
+    "kawasaki": lambda R: R.as_euler("ZYZ", degrees=True),
+    "abb": lambda R: R.as_quat()[[3, 0, 1, 2]],
+    "ur": lambda R: R.as_rotvec(),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Gimbal lock")
+@pytest.mark.parametrize("maker", TURNS)
+@given(quat=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
+def test_a_pose_is_read_as_its_maker_means_it(maker, quat):
+    if np.linalg.norm(quat) < 1e-3:
+        return
+    R = Rotation.from_quat(quat)
+    scale = 1.0 if maker == "ur" else 1e3
+    place = [0.25, -1.5, 0.75]
+    T = pose_of(maker, [*(scale * np.array(place)), *TURNS[maker](R)])
+    # scipy's own angles leave out what is nearer to gimbal lock than 1e-7 rad
+    exact = 1e-12 if maker in ("abb", "ur") else 4e-7
+    np.testing.assert_allclose(T, frames.transform(R.as_matrix(), place), atol=exact)
+    again = pose_of(maker, numbers_of(maker, T))
+    np.testing.assert_allclose(again, T, atol=1e-7)  # at half a turn and at +-90 deg: by the root
+
+
+@pytest.mark.parametrize("maker", TURNS)
+def test_of_numbers_that_mean_the_same_the_nearest_are_written(maker):
+    """A flange that looks down stays at +180 where it was at +180."""
+    rng = np.random.default_rng(5)
+    for R in Rotation.random(50, random_state=6):
+        small = Rotation.from_rotvec(1e-4 * rng.standard_normal(3))
+        before = [0.0, 0.0, 0.0, *TURNS[maker](R)]
+        if maker == "abb":
+            before[3:] = [-value for value in before[3:]]
+        T = frames.transform((small * R).as_matrix(), np.zeros(3))
+        after = np.array(numbers_of(maker, T, before)[3:])
+        # near +-90 deg, or half a turn, the numbers themselves run
+        slow = maker in ("abb", "ur") or min(abs(np.cos(np.radians(before[4]))), 1.0) > 0.1
+        if slow and not (maker == "kawasaki" and abs(np.sin(np.radians(before[4]))) < 0.1):
+            assert np.max(np.abs(after - before[3:])) < (0.3 if maker != "ur" else 0.05)
+
+
+@pytest.mark.parametrize("maker", WRITTEN)
+def test_every_point_is_found_where_it_is_written(maker):
+    program = WRITTEN[maker]
+    dialect = dialect_of(program.suffix)
+    assert dialect.maker == maker
+    found = dialect.read(program.text)
+    poses = [point for point in found.points if not point.joints]
+    given = [point for point in found.points if point.joints]
+    assert (len(poses), len(given)) == (len(POINTS), len(JOINTS))
+    assert not any(point.problem for point in found.points)
+    for point, q in zip(given, JOINTS, strict=True):
+        shown = dialect.to_arm(np.array(point.numbers) * point.joint_unit)
+        digits = {"kuka": 1e-8, "abb": 1e-4, "fanuc": 2e-5, "ur": 1e-6}[maker]
+        np.testing.assert_allclose(shown, q, atol=digits)
+    lines = program.text.split("\n")
+    for point in found.points:
+        block = "\n".join(lines[point.line - 1 : point.line + 6])
+        assert all(part.text.strip() in block for part in point.fields)
+
+
+@pytest.mark.parametrize("maker", WRITTEN)
+def test_text_that_is_not_changed_stays_to_the_byte(maker):
+    program = WRITTEN[maker]
+    raw = program.text.encode("latin-1")
+    text = raw.decode("latin-1")
+    found = dialect_of(program.suffix).read(text)
+    parts = [part for one in found.points for part in (*one.fields, *one.marks.values())]
+    same = spliced(text, [(part, part.text) for part in parts])
+    assert same.encode("latin-1") == raw
+    for part in parts:  # each field is what it says
+        assert text[part.start : part.end] == part.text
+    gone = spliced(text, [(part, "") for part in parts])
+    assert len(gone) == len(text) - sum(len(part.text) for part in parts)
+
+
+def test_endings_are_of_one_maker_each():
+    endings = [suffix for dialect in DIALECTS for suffix in dialect.suffixes]
+    assert len(endings) == len(set(endings))
+
+
+KRL = """DEF Weld( )
+$BASE=$NULLFRAME
+BAS (#TOOL,2)
+PTP {A1 0,A2 -90,A3 90,A4 0,A5 30,A6 0} ; {A1 1,A2 2,A3 3,A4 4,A5 5,A6 6}
+LIN {X 1500,Y 0,Z 900,A 0,B 90,C 0,S 'B110',T 'B010010'} C_DIS
+$TOOL={X 0,Y 0,Z 200,A 0,B 0,C 0}
+CIRC {X 1,Y 2,Z 3,A 0,B 0,C 0},{X 4,Y 5,Z 6,A 0,B 0,C 0}
+LIN_REL {X 10,Y 0,Z 0,A 0,B 0,C 0}
+LIN {Z 900}
+FRAME offset={X 1,Y 2,Z 3,A 0,B 0,C 0}
+E6POS away={X 1500,Y 0,Z high,A 0,B 90,C 0,S 2,T 2}
+E6POS track={X 1500,Y 0,Z 900,A 0,B 90,C 0,S 2,T 2,E1 812.5}
+LIN away:offset
+END
+"""
+
+
+def test_krl_in_a_program():
+    found = dialect_of(".src").read(KRL)
+    words = {point.name: point for point in found.points}
+    assert list(words) == [
+        "PTP in line 4", "LIN in line 5", "CIRC in line 7", "LIN_REL in line 8", "LIN in line 9",
+        "away", "track",
+    ]  # fmt: skip
+    assert len(found.points) == 8  # both of the circle
+    line = words["LIN in line 5"]
+    assert (line.tool, line.frame) == ("TOOL_DATA[2]", "$NULLFRAME")
+    assert line.posture.behind is False
+    assert line.posture.above is True
+    assert np.array_equal(
+        line.posture.ranges[:, 1] == 0.0, [False, True, False, False, True, False]
+    )
+    circle = words["CIRC in line 7"]
+    assert found.frames[circle.tool][2, 3] == pytest.approx(0.2)
+    assert "relative" in words["LIN_REL in line 8"].problem
+    assert "A, B, C" in words["LIN in line 9"].problem
+    assert "'high'" in words["away"].problem
+    assert "812.5" in words["track"].problem
+    assert found.computed == ((13, "LIN away:offset"),)
+
+
+def test_krl_with_a_tool_that_stands_and_an_exact_robot():
+    text = (
+        "DECL E6POS XP1={X 1,Y 2,Z 3,A 0,B 0,C 0,S 18,T 2}\n"
+        "DECL FDAT FP1={TOOL_NO 1,BASE_NO 2,IPO_FRAME #TCP}\n"
+        "TOOL_DATA[1]={X 10,Y 0,Z 0,A 90,B 0,C 0}\nBASE_DATA[2]={X 0,Y 0,Z 5,A 0,B 0,C 0}\n"
+    )
+    found = dialect_of(".dat").read(text)
+    assert [point.name for point in found.points] == ["XP1"]
+    assert "stands" in found.points[0].problem
+    np.testing.assert_allclose(found.frames["TOOL_DATA[1]"][:3, 1], [-1.0, 0.0, 0.0], atol=1e-12)
+    assert "absolutely accurate" in found.notes[0]
+
+
+RAPID = r"""MODULE M
+  PERS tooldata tStand:=[FALSE,[[0,0,10],[1,0,0,0]],[1,[0,0,1],[1,0,0,0],0,0,0]];
+  PERS wobjdata wTwo:=[FALSE,TRUE,"",[[100,0,0],[1,0,0,0]],[[0,50,0],[0.7071068,0,0,0.7071068]]];
+  VAR robtarget pa{2}:=[[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]],
+    [[4,5,6],[1,0,0,0],[-1,0,0,5],[9E9,9E9,9E9,9E9,9E9,9E9]]];
+  CONST robtarget pOnTrack:=[[1,2,3],[1,0,0,0],[0,0,0,0],[812.5,9E9,9E9,9E9,9E9,9E9]];
+  CONST robtarget pVar:=[[1,y,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
+  CONST robtarget pTwice:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
+  CONST robtarget pStand:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
+  PROC main()
+    MoveJ [[6,0,8],[0,0,1,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]\ID:=1,v9,fine,tool0\WObj:=wTwo;
+    MoveL pTwice,v200\V:=50,z10,tool0;
+    MoveL RelTool(pTwice,0,0,5),v200,z10,tool0\WObj:=wTwo; ! MoveL pa,v1,fine,tOther;
+    MoveL pStand,v200,z10,tStand;
+    MoveC pa{1},pa{2},v200,z10,tool0\WObj:=wTwo;
+  ENDPROC
+ENDMODULE
+"""
+
+
+def test_rapid_in_a_module():
+    found = dialect_of(".mod").read(RAPID)
+    words = {point.name: point for point in found.points}
+    assert set(words) == {
+        "pa{1}", "pa{2}", "pOnTrack", "pVar", "pTwice", "pStand", "MoveJ in line 11",
+    }  # fmt: skip
+    inline = words["MoveJ in line 11"]
+    assert (inline.tool, inline.frame) == ("tool0", "wtwo")
+    np.testing.assert_allclose(found.frames["wtwo"][:3, 3], [0.1, 0.05, 0.0], atol=1e-12)
+    np.testing.assert_allclose(found.frames["wtwo"][:3, 0], [0.0, 1.0, 0.0], atol=1e-8)
+    second = words["pa{2}"]
+    assert second.numbers[:3] == [4.0, 5.0, 6.0]
+    assert second.posture.behind is True
+    assert second.posture.above is True
+    np.testing.assert_allclose(second.posture.ranges[0], np.radians([-90.0, 0.0]))
+    assert second.posture.ranges[4, 1] == 0.0
+    assert (second.tool, second.frame) == ("tool0", "wtwo")
+    assert "812.5" in words["pOnTrack"].problem
+    assert "'y'" in words["pVar"].problem
+    assert "different" in words["pTwice"].problem
+    assert "stands" in words["pStand"].problem
+    assert found.computed == ((13, "RelTool(pTwice, …)"),)
+
+
+FANUC = """/PROG  A
+/MN
+   1:J P[1] 50% FINE    ;
+   2:L P[2] 100mm/sec FINE INC    ;
+   3:L P[3] 100mm/sec FINE Offset,PR[1]    ;
+/POS
+P[1]{
+   GP1:
+\tUF : 0, UT : 1,\t\tCONFIG : 'F D B, 0, 1, -1',
+\tX =  1731.500  mm,\tY =     2.242  mm,\tZ =  -321.863  mm,
+\tW =  -176.060 deg,\tP =      .147 deg,\tR =  -172.829 deg
+   GP2:
+\tUF : 0, UT : 1,\t
+\tJ1=   300.000  mm
+};
+P[2]{
+   GP1:
+\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX =    10.000  mm,\tY =     0.000  mm,\tZ =     0.000  mm,
+\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
+};
+P[3:"gap"]{
+   GP1:
+\tUF : F, UT : F,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX = ********  mm,\tY =     0.000  mm,\tZ =     0.000  mm,
+\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
+};
+/END
+"""
+
+
+def test_fanuc_positions():
+    found = dialect_of(".LS").read(FANUC)
+    one, two, three = found.points
+    assert one.numbers == [1731.5, 2.242, -321.863, -176.06, 0.147, -172.829]
+    assert (one.tool, one.frame) == ("UT1", "UF0")
+    assert (one.posture.above, one.posture.behind) == (False, True)
+    assert one.posture.ranges[4, 0] == 0.0
+    turned = np.degrees(one.posture.ranges[[0, 3, 5]])
+    np.testing.assert_allclose(turned, [[-180, 180], [180, 540], [-540, -180]])
+    assert "INC" in two.problem
+    assert three.name == "P[3] gap"
+    assert "'********'" in three.problem
+    assert three.tool is None
+    assert found.computed == ((5, "P[3] 100mm/sec FINE Offset,PR[1]"),)
+
+
+SCRIPT = """def P():
+  global A_p=p[.4, -.3, .2, 0, 3.1416, 0]  # p[1,2,3,4,5,6]
+  B=[0, -1.57, 1.57, 0, 1.57, 0]
+  set_tcp(p[0,0,.1,0,0,0])
+  force_mode(p[0,0,0,0,0,0], [0,0,1,0,0,0], [0,0,10,0,0,0], 2, [.1,.1,.1,.1,.1,.1])
+  movej(B, a=1.4, v=1)
+  movel(A_p, a=1.2, v=.25)
+  set_tcp(p[0,0,.2,0,0,0])
+  movec(p[.4,-.3,.25,0,3.1,0], pose_trans(A_p, p[0,0,.1,0,0,0]), a=1.2, v=.25)
+  movej(get_inverse_kin(p[.4,-.3,z,0,3.1,0], qnear=B))
+end
+"""
+
+
+def test_urscript_targets():
+    found = dialect_of(".script").read(SCRIPT)
+    assert [point.name for point in found.points] == ["A_p", "B", "line 9", "line 10"]
+    named, joints, circle, last = found.points
+    assert (joints.joints, named.joints) == (True, False)
+    assert named.order > joints.order  # the motion to it comes later
+    np.testing.assert_allclose(found.frames[named.tool][2, 3], 0.1)
+    np.testing.assert_allclose(found.frames[circle.tool][2, 3], 0.2)
+    assert "'z'" in last.problem
+    np.testing.assert_allclose(last.posture.near, joints.numbers)
+    assert found.computed == ((9, "pose_trans(…)"),)
+
+
+@pytest.mark.parametrize(
+    ("value", "old", "digits", "expected"),
+    [
+        (12.34567, "12.3", None, "12.3457"),
+        (12.34567, "12.3456789", None, "12.3456700"),
+        (-0.00001, "0", None, "0.0000"),
+        (600.0, "6E+02", None, "600.0000"),
+        (-0.3841, "   -.384", 3, "   -.384"),
+        (0.0002, "    0.000", 3, "    0.000"),
+        (-1371.1664, " -1371.166", 3, " -1371.166"),
+    ],
+)
+def test_a_number_is_written_as_the_one_before(value, old, digits, expected):
+    assert written(value, Field(0, old), 4, digits) == expected
+
+
+def test_decimals_with_an_exponent():
+    assert Field(0, "1.25E-3").decimals == 5
+    assert Field(0, "9E9").decimals == 0
+    assert re.fullmatch(r"-?\d+\.\d{5}", written(-0.001251, Field(0, "1.25E-3"), 4))
+
+
+def test_the_robot_of_these_programs_is_as_its_side_view():
+    """The lengths that `robot_programs.side_view` states are the robot file's."""
+    T = NOMINAL.fk(np.radians([0.0, -90.0, 90.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(T[:3, 3], [1.965, 0.0, 1.984], atol=1e-9)
