@@ -30,6 +30,7 @@ from robocal_ros.ros import endpoints
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another
 from domains import free_domain  # noqa: E402
+from forked import ForkedScript  # noqa: E402
 from trajectory_controllers import missing_packages  # noqa: E402
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
@@ -67,18 +68,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class Executable:
-    """A node that runs as its own process, at most as long as the thread that starts it."""
+    """A node that runs as its own process, at most as long as the one that starts it.
 
-    def __init__(self, name: str, command: list[str], environment: dict[str, str]) -> None:
+    ``forked``: a script of the install tree, from a process that has read its code already.
+    """
+
+    def __init__(
+        self, name: str, command: list[str], environment: dict[str, str], *, forked: bool = False
+    ) -> None:
         self.name = name
-        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by stop)
-        self.process = subprocess.Popen(
-            [*ENDS_WITH_PARENT, *command],
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=self._log,
-            stderr=subprocess.STDOUT,
-        )
+        self._log = tempfile.NamedTemporaryFile("w+")  # noqa: SIM115 (closed by stop)
+        self.process: subprocess.Popen[str] | ForkedScript
+        if forked:
+            self.process = ForkedScript(command, environment, Path(self._log.name))
+        else:
+            self.process = subprocess.Popen(
+                [*ENDS_WITH_PARENT, *command],
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=subprocess.STDOUT,
+            )
 
     @property
     def output(self) -> str:
@@ -167,16 +177,15 @@ class Graph:
         ros = [f"-p{name}:={value}" for name, value in given.items()]
         ros += [f"-r{old}:={new}" for old, new in (remap or {}).items()]
         ros_arguments = [item for pair in ros for item in (pair[:2], pair[2:])]
-        program = (
-            [sys.executable, str(executable)]
-            if isinstance(executable, Path)
-            else [str(EXECUTABLES / executable)]
-        )
-        return self.run(str(executable), [*program, *arguments, "--ros-args", *ros_arguments])
+        script = str(EXECUTABLES / executable)
+        return self._run(str(executable), [script, *arguments, "--ros-args", *ros_arguments], True)
 
     def run(self, name: str, command: list[str]) -> Executable:
         """Start any command; it is ended with the test."""
-        process = Executable(name, command, self._environment)
+        return self._run(name, command, False)
+
+    def _run(self, name: str, command: list[str], forked: bool) -> Executable:
+        process = Executable(name, command, self._environment, forked=forked)
         self._executables.append(process)
         return process
 

@@ -30,6 +30,7 @@ node = Executable("cell_sim_node", [str(EXECUTABLES / "cell_sim_node")], dict(os
 print(node.process.pid, flush=True)
 time.sleep(600)
 """
+FORKED = TESTS.replace("os.environ))", "os.environ), forked=True)")
 
 
 def lives(pid: int) -> bool:
@@ -41,7 +42,7 @@ def lives(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGKILL])
-@pytest.mark.parametrize("script", [BENCH, TESTS], ids=["bench", "tests"])
+@pytest.mark.parametrize("script", [BENCH, TESTS, FORKED], ids=["bench", "tests", "forked"])
 def test_a_node_ends_with_what_started_it(script: str, by: signal.Signals, tmp_path: Path) -> None:
     with free_domain() as domain:
         starter = subprocess.Popen(

@@ -5,22 +5,16 @@ import os
 import subprocess
 import sys
 import tempfile
-from functools import cache
-from multiprocessing import forkserver, get_context
-from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
+from forked import become, forks
 from jsonschema import Draft202012Validator
 
 ROOT = Path(__file__).parents[2]
 SCHEMAS = {path.name: json.loads(path.read_text()) for path in (ROOT / "docs/schemas").glob("*")}
 HANGS_S = 180.0  # what only waits for busy cores is sooner done
 COMMAND = [sys.executable, "-m", "robocal_ros.cli.main"]
-# The command first: it sets the threads of what NumPy loads.
-WARM = ["robocal_ros.cli.main", "rich.table", "scipy.optimize", "scipy.spatial.transform"]
-WARM += ["warm_command"]
 
 
 def environment(**variables: str) -> dict[str, str]:
@@ -47,7 +41,7 @@ def robocal(*arguments: object, **variables: str) -> subprocess.CompletedProcess
         )
     with tempfile.TemporaryDirectory() as folder:
         said = [Path(folder) / name for name in ("stdout", "stderr")]
-        process = _forks().Process(target=_as_command, args=(words, given, Path.cwd(), said))
+        process = forks().Process(target=_as_command, args=(words, given, Path.cwd(), said))
         process.start()
         process.join(HANGS_S)
         if process.exitcode is None:
@@ -58,21 +52,8 @@ def robocal(*arguments: object, **variables: str) -> subprocess.CompletedProcess
         )
 
 
-@cache
-def _forks() -> ForkServerContext:
-    forkserver.set_forkserver_preload(WARM)
-    with patch.dict(os.environ, environment()):
-        os.environ["PYTHONPATH"] = f"{Path(__file__).parent}:{os.environ['PYTHONPATH']}"
-        forkserver.ensure_running()
-    return get_context("forkserver")
-
-
 def _as_command(words: list[str], given: dict[str, str], folder: Path, said: list[Path]) -> None:
-    os.environ.clear()
-    os.environ.update(given)
-    os.chdir(folder)
-    for number, file in enumerate(said, 1):
-        os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), number)
+    become(given, folder, said)
     sys.argv = ["robocal", *words]
     from robocal_ros.cli.main import main
 
