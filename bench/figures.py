@@ -121,7 +121,7 @@ def main() -> None:
     (IMAGES / "ur10_campaigns.png").write_bytes(png(campaign_figure(found)))
     joints = own_half("A").identification
     if isinstance(joints, FullIdentification):
-        (IMAGES / "ur10_joints.png").write_bytes(png(joint_functions_figure(joints)))
+        (IMAGES / "ur10_joints.png").write_bytes(png(joint_functions_figure(joints.known)))
     (IMAGES / "beam_circle.png").write_bytes(png(circle_figure()))
     bag = ROOT / "bags" / "demo_shift.mcap"
     (drawn,) = validate_bag(Job(str(bag), bag.name, "kr150_r3100")).figures

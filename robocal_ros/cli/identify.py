@@ -45,16 +45,9 @@ from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.tables import (
-    ANGLE_UNITS,
-    LENGTH_UNITS,
-    NUMBERS,
-    POSITION,
-    QUATERNION,
-    WORDS,
     beyond_limits,
-    check_plain,
     joint_texts,
-    read_cells,
+    read_joints,
     read_measurements,
     write_cells,
 )
@@ -300,7 +293,7 @@ def run_identify(args: argparse.Namespace) -> CliResult:
 
         args.figures.mkdir(parents=True, exist_ok=True)
         document["figures"] = str(args.figures / "joints.svg")
-        write_text(args.figures / "joints.svg", svg(joint_functions_figure(result)))
+        write_text(args.figures / "joints.svg", svg(joint_functions_figure(result.known)))
     status = DONE
     if verdict.code is Code.TOO_FEW_SAMPLES:
         document |= refusal(verdict.code, verdict.reason)
@@ -340,7 +333,7 @@ def _planned(args: argparse.Namespace) -> CliResult:
         candidates = random_postures(arm, CANDIDATES)
         warnings.append("collisions are not known here: look at the poses before you drive them")
     else:
-        candidates = _candidates(args.data, arm)
+        candidates = read_joints(args.data, arm)
         beyond = np.any((candidates < arm.lower) | (candidates > arm.upper), axis=1)
         if np.any(beyond):
             words = f"{args.data}: {np.sum(beyond)} poses are beyond the joint limits, left out"
@@ -368,16 +361,6 @@ def _planned(args: argparse.Namespace) -> CliResult:
         "warnings": warnings,
     }
     return CliResult(document, _show_plan)
-
-
-def _candidates(path: Path, arm: SerialArm) -> np.ndarray:
-    """Joints (m, n) of a table of poses, measured or not."""
-    units = ["mm" if slides else "deg" for slides in arm.prismatic]
-    columns = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
-    others = (*WORDS, *NUMBERS, *POSITION["mm"], *QUATERNION)
-    table = read_cells(path, lambda header, file: check_plain(header, file, columns, others))
-    factors = [LENGTH_UNITS["mm"] if slides else ANGLE_UNITS["deg"] for slides in arm.prismatic]
-    return np.column_stack([table.numbers(name) for name in columns]) * factors
 
 
 def _show_plan(console: "Console", document: Document) -> None:

@@ -19,8 +19,10 @@ from robocal_ros.cli.main import (
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text, write_text
 from robocal_ros.ground.frames import Array, transform_document
+from robocal_ros.identification.known_model import known_model
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import save_robot
+from robocal_ros.kinematics.tables import read_joints
 from robocal_ros.kinematics.universal_robots import (
     factory_arm,
     factory_dh,
@@ -140,6 +142,12 @@ def add_joint_functions(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``joint-functions``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument("--output", type=Path, metavar="T.csv", help="table to write")
+    parser.add_argument(
+        "--data", type=Path, metavar="CSV", help="poses: tell the error to expect there"
+    )
+    parser.add_argument(
+        "--figures", type=Path, metavar="DIR", help="write joints.svg there: functions with bands"
+    )
 
 
 def run_joint_functions(args: argparse.Namespace) -> CliResult:
@@ -153,13 +161,17 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
     steps = np.arange(_ROWS_PER_KNOT * knots + 1)[:, None] / _ROWS_PER_KNOT
     q = functions.first + functions.step * steps
     delta, slope = functions.delta(q), functions.slope(q)
-    joints, rows = [], ["joint,q,q_unit,delta,delta_unit,slope"]
+    known = None if functions.identified_from is None else known_model(arm)
+    sigma = np.full(q.shape, np.nan) if known is None else known.function_sigma(q)
+    joints, rows = [], ["joint,q,q_unit,delta,delta_unit,slope,sigma"]
     for i, name in enumerate(arm.joint_names):
         unit, small = ("mm", "um") if arm.prismatic[i] else ("deg", "urad")
         shown, micro = q[:, i] / _TO_SI[unit], 1e6 * delta[:, i]
         used = np.flatnonzero(delta[:, i])
         rows += [
-            f"{name},{shown[k]:.6f},{unit},{micro[k]:.4f},{small},{slope[k, i]:.8f}" for k in used
+            f"{name},{shown[k]:.6f},{unit},{micro[k]:.4f},{small},{slope[k, i]:.8f},"
+            f"{'' if known is None else f'{1e6 * sigma[k, i]:.4f}'}"
+            for k in used
         ]
         joints.append(
             {
@@ -167,8 +179,9 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
                 "unit": unit,
                 "from": float(shown[used[0]]) if len(used) else None,
                 "to": float(shown[used[-1]]) if len(used) else None,
-                f"rms_{small}": float(np.sqrt(np.mean(micro[used] ** 2))) if len(used) else 0.0,
+                f"rms_{small}": _rms(micro[used]) if len(used) else 0.0,
                 f"largest_{small}": float(np.max(np.abs(micro))),
+                f"sigma_{small}": _rms(1e6 * sigma[used, i]) if known and len(used) else None,
                 "compliance_micro": float(1e6 * functions.compliance[i]),
             }
         )
@@ -178,10 +191,35 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "joints": joints,
+        "predicted": None if args.data is None else _predicted(arm, args.data),
+        "figures": None,
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
     }
+    if args.figures is not None and known is not None:
+        from robocal_ros.report.figures import joint_functions_figure, svg
+
+        args.figures.mkdir(parents=True, exist_ok=True)
+        document["figures"] = str(args.figures / "joints.svg")
+        write_text(args.figures / "joints.svg", svg(joint_functions_figure(known)))
     return CliResult(document, _show_joint_functions)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _predicted(arm: SerialArm, path: Path) -> Document:
+    """Error to expect of the first target at the poses of a table, base and target placed there."""
+    known, q = known_model(arm), read_joints(path, arm)
+    variance = known.predicted_variance(q, np.zeros(len(q), dtype=np.int64), ("base", "tool"))
+    error_mm = 1e3 * np.sqrt(np.trace(variance, axis1=1, axis2=2))
+    return {
+        "poses": len(q),
+        "rms_mm": _rms(error_mm),
+        "max_mm": float(error_mm.max()),
+        "not_covered": float(np.mean(np.any(known.uncovered(q), axis=1))),
+    }
 
 
 def _show_joint_functions(console: "Console", document: Document) -> None:
@@ -191,10 +229,26 @@ def _show_joint_functions(console: "Console", document: Document) -> None:
         span = ["" if end is None else f"{end:.1f} {joint['unit']}" for end in ends]
         small = "um" if joint["unit"] == "mm" else "urad"
         numbers = [f"{joint[f'{name}_{small}']:.1f}" for name in ("rms", "largest")]
+        sigma = joint[f"sigma_{small}"]
+        numbers.append("" if sigma is None else f"{sigma:.1f}")
         rows.append([joint["name"], *span, *numbers, f"{joint['compliance_micro']:.4f}"])
     title = f"{document['robot']}: what joints turn besides what is read"
-    head = ("joint", "from", "to", "rms µrad", "largest µrad", "compliance µrad/(N m)")
+    head = (
+        "joint",
+        "from",
+        "to",
+        "rms µrad",
+        "largest µrad",
+        "sigma µrad",
+        "compliance µrad/(N m)",
+    )
     print_table(console, title, head, rows)
+    if told := document["predicted"]:
+        away = told["not_covered"]
+        console.print(
+            f"Error to expect at the {told['poses']} poses: {told['rms_mm']:.3f} mm rms, at most "
+            f"{told['max_mm']:.3f} mm; {away:.1%} have a joint where it was not measured."
+        )
     print_output(console, document)
 
 

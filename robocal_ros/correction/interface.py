@@ -4,7 +4,7 @@ The builders accept any object with the attributes of the ROS message.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.history.history_records import Head
-from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
+from robocal_ros.kinematics.joint_functions import ArmLoad, IdentifiedFrom, JointFunctions
 
 if TYPE_CHECKING:  # who hears a status needs no compiled code
     from robocal_ros.correction.bounds import Policy, Survey
@@ -244,7 +244,8 @@ def _layer(message: Any, n: int) -> tuple[JointFunctions | None, ArmLoad | None]
         if len(message.function_step) or len(message.compliance):
             table = np.array(message.function_coefficients, dtype=np.float64).reshape(n, -1)
             of_joints = message.function_first, message.function_step
-            functions = JointFunctions(*of_joints, table, message.compliance)
+            told = _identified_from(message, n) if len(message.identified_weight) else None
+            functions = JointFunctions(*of_joints, table, message.compliance, told)
         if len(message.link_mass):
             centre, pull = (
                 np.array([v.x, v.y, v.z]) for v in (message.payload_centre, message.gravity)
@@ -258,6 +259,13 @@ def _layer(message: Any, n: int) -> tuple[JointFunctions | None, ArmLoad | None]
     except ValueError as error:
         raise RefusedError(Reason.BAD_FUNCTIONS, f"model of {message.robot}: {error}") from error
     return functions, load
+
+
+def _identified_from(message: Any, n: int) -> IdentifiedFrom:
+    values = {f.name: getattr(message, f"identified_{f.name}") for f in fields(IdentifiedFrom)}
+    for name, width in (("q", n), ("p_flange", 3)):
+        values[name] = np.array(values[name], dtype=np.float64).reshape(-1, width)
+    return IdentifiedFrom(**values)
 
 
 def offered_tool(message: Any, accepted_state: int) -> OfferedTool:

@@ -3,17 +3,21 @@
 Its unknowns, how predictions depend on them, and a closed-form start.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
-from robocal_ros.ground.frames import Array, Index
+from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics import SerialArm
+
+Part = Literal["base", "tool", "geometry"]
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,15 @@ class UnknownLayout:
     def tool_places(self) -> Index:
         """Places (3 t,) of the targets' positions in the increment; none where they are held."""
         return (self.tool[self.tool >= 0][:, None] + np.arange(3)).ravel()
+
+    def columns(self, parts: Collection[Part]) -> Mask:
+        """Which of the unknowns (k,) belong to base or tool, where these are among the parts."""
+        mask = np.zeros(len(self.names), dtype=np.bool_)
+        if "base" in parts and self.base >= 0:
+            mask[self.base : self.base + 6] = True
+        if "tool" in parts and self.tool[0] >= 0:
+            mask[self.tool[0] :] = True
+        return mask
 
     def jacobian(self, state: CellModel, q: Array, target: Index) -> tuple[Array, Array]:
         """T_frame_target (m, 4, 4) and its twist [v; w] by the unknowns (m, tool_size, k)."""

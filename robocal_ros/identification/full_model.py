@@ -15,7 +15,7 @@ from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification.cell_model import CellModel, CellProblem, UnknownLayout
+from robocal_ros.identification.cell_model import CellModel, CellProblem, Part
 from robocal_ros.identification.joint_functions import (
     EVIDENCE_NEEDED,
     FunctionPrior,
@@ -23,17 +23,23 @@ from robocal_ros.identification.joint_functions import (
     JointTerms,
     Posterior,
 )
-from robocal_ros.identification.solve import Identification, Method, Part, identify
+from robocal_ros.identification.known_model import (
+    FREE,
+    KnownModel,
+    Rows,
+    gravity_torque,
+    identified_from,
+    sparse,
+    with_turns,
+)
+from robocal_ros.identification.solve import Identification, Method, identify
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import THETA, D
-from robocal_ros.kinematics.joint_functions import JointFunctions
 
 _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry alone
 # The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:
 # these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
 SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
-GAP_LENGTHS, GAP_SPACINGS = 2.0, 3.0
 _FREE_ROUNDS = 2  # in which a rejected sample may come back
 _ROUNDS, SETTLED = 12, 0.05  # of solving and judging the samples anew; share of the noise
 
@@ -44,130 +50,21 @@ class FullIdentification(Identification):
 
     Attributes
     ----------
-    terms : which joints have them.
-    prior : length and amplitude (n,) that the evidence chose for each function.
+    known : how well all of it is known.
     gain : (n,) evidence for each joint's function, natural logarithm.
-    all_covariance : (k, k) of all unknowns, those of ``layout`` first.
-    readings : (m, n) readings of each joint, rad (prismatic: m), sorted by size.
     left_out_rms_m : rms error at measured poses, each left out in turn.
     """
 
-    terms: JointTerms
-    prior: FunctionPrior
+    known: KnownModel
     gain: Array
-    all_covariance: Array
-    readings: Array
     left_out_rms_m: float
-
-    def uncovered(self, q: Array) -> Mask:
-        """Which joints (m, n) have a function that was not measured near readings (m, n).
-
-        Beyond the readings by half of its length, or in a gap that is wide beside the length and
-        the usual distance of two readings: there a function is zero, give or take its prior.
-        """
-        found = np.zeros(q.shape, dtype=np.bool_)
-        for joint in np.flatnonzero(self.terms.count):
-            x, own, length = q[:, joint], self.readings[:, joint], self.prior.length[joint]
-            at = np.clip(np.searchsorted(own, x), 1, len(own) - 1)
-            away = np.minimum(np.abs(x - own[at - 1]), np.abs(x - own[at]))
-            gap = max(GAP_LENGTHS * length, GAP_SPACINGS * (own[-1] - own[0]) / len(own))
-            beyond = (x < own[0] - 0.5 * length) | (x > own[-1] + 0.5 * length)
-            found[:, joint] = beyond | (away > gap)
-        return found
 
     def predicted_variance(self, q: Array, target: Index, without: Collection[Part] = ()) -> Array:
         """Covariance (m, 3, 3), m^2, of the predicted target positions.
 
         Where a joint was not measured its function is zero, give or take the prior.
         """
-        from robocal_ros.identification import row_kernels
-
-        rows = sparse_rows(self.layout, self.cell, self.terms, np.ascontiguousarray(q), target)
-        J, by_turn = np.ascontiguousarray(rows.J[:, :3]), rows.by_turn[:, :3]
-        covariance, own = self.all_covariance, np.flatnonzero(self._columns(without))
-        if len(own):  # what is solved anew takes up what it can of every other error
-            k = self.terms.size
-            normal, unused = np.zeros((k, k)), np.zeros(k)
-            ones, none = np.ones(len(q)), np.zeros((len(q), 3))
-            row_kernels.normal_equations(J, rows.column, none, ones, normal, unused)
-            keep = np.eye(k)
-            keep[own] -= np.linalg.lstsq(normal[np.ix_(own, own)], normal[own], rcond=None)[0]
-            covariance = keep @ covariance @ keep.T
-        spread = np.empty((len(q), 3, 3))
-        row_kernels.spreads(J, rows.column, covariance, spread)
-        unknown = self.terms.share_outside(q) * self.prior.amplitude
-        beyond = by_turn * unknown[:, None]
-        return np.asarray(spread + beyond @ np.swapaxes(beyond, 1, 2))
-
-    def function_sigma(self, q: Array) -> Array:
-        """Standard deviation (m, n) of each joint's function at readings (m, n), rad."""
-        from robocal_ros.identification import row_kernels
-
-        n = q.shape[1]
-        sigma = np.empty(q.shape)
-        for joint in range(n):
-            by_turn = np.zeros((len(q), 1, n))
-            by_turn[:, 0, joint] = 1.0
-            J, column = self.terms.rows(q, by_turn, np.zeros(q.shape))
-            spread = np.empty((len(q), 1, 1))
-            row_kernels.spreads(J, column, self.all_covariance, spread)
-            sigma[:, joint] = spread[:, 0, 0]
-        outside = self.terms.share_outside(q) * self.prior.amplitude
-        return np.sqrt(np.maximum(sigma, 0.0) + outside**2)
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Poses T (m, 4, 4) with the columns that they see, and their derivative by each turn."""
-
-    T: Array
-    J: Array
-    column: Index
-    by_turn: Array
-
-
-def gravity_torque(arm: SerialArm, q: Array) -> Array | None:
-    """Torque of gravity (m, n) about each axis, N m, in the controller's sense; None: no load.
-
-    It is what a compliance of one would turn.
-    """
-    if arm.load is None:
-        return None
-    n = arm.n
-    unit = JointFunctions(np.zeros(n), np.ones(n), np.zeros((n, 1)), np.ones(n))
-    return np.asarray(replace(arm, functions=unit).turned(q) - q)
-
-
-def _with_turns(layout: UnknownLayout, arm: SerialArm) -> tuple[UnknownLayout, Index]:
-    """The layout with a column for what each joint turns, where it has none; those columns."""
-    slots, names = layout.slots.copy(), layout.names
-    kinds = np.where(arm.prismatic, D, THETA)
-    for joint, kind in enumerate(kinds):
-        if slots[joint, kind] < 0:
-            slots[joint, kind] = len(names)
-            names = (*names, f"turn_{joint}")
-    return replace(layout, slots=slots, names=names), slots[range(arm.n), kinds]
-
-
-def sparse_rows(
-    layout: UnknownLayout, cell: CellModel, terms: JointTerms, q: Array, target: Index
-) -> _Rows:
-    """What poses (m, n) of targets (m,) see of all unknowns."""
-    wide, turns = _with_turns(layout, cell.arm)
-    T, J = wide.jacobian(cell, q, target)
-    by_turn = J[:, :, turns] * cell.arm.sign
-    return _sparse(terms, cell.arm, q, T, J[:, :, : len(layout.names)], by_turn)
-
-
-def _sparse(
-    terms: JointTerms, arm: SerialArm, q: Array, T: Array, dense: Array, by_turn: Array
-) -> _Rows:
-    k = dense.shape[2]
-    J, column = terms.rows(q, by_turn, gravity_torque(arm, q))
-    own = np.broadcast_to(np.arange(k), (len(q), k))
-    return _Rows(
-        T, np.concatenate([dense, J], axis=2), np.concatenate([own, column], axis=1), by_turn
-    )
+        return self.known.predicted_variance(q, target, without)
 
 
 @dataclass(frozen=True)
@@ -193,14 +90,14 @@ class _FullProblem:
         self.start, self.data = start, data
         self.layout = start.layout
         sigma = np.ones(len(data)) if data.sigma is None else data.sigma
-        wide, self.turns = _with_turns(start.layout, start.nominal)
+        wide, self.turns = with_turns(start.layout, start.nominal)
         self.problem = CellProblem(wide, data, start.cell.targets, sigma, lever_m, start.nominal)
 
-    def linearise(self, cell: CellModel, terms: JointTerms) -> tuple[Array, _Rows]:
+    def linearise(self, cell: CellModel, terms: JointTerms) -> tuple[Array, Rows]:
         residual, J = self.problem.linearise(cell)
         by_turn = J[:, :, self.turns] * cell.arm.sign
         dense = J[:, :, : len(self.layout.names)]
-        return residual, _sparse(terms, cell.arm, self.data.q, residual, dense, by_turn)
+        return residual, sparse(terms, cell.arm, self.data.q, residual, dense, by_turn)
 
     def values(self, cell: CellModel, terms: JointTerms) -> Array:
         """All unknowns (k,), from the mean of their prior; of the base zeros."""
@@ -214,7 +111,7 @@ class _FullProblem:
         arm = cell.arm
         return replace(cell, arm=arm.with_model(arm.mdh, terms.functions(values), arm.load))
 
-    def evidence(self, at: _Solution, residual: Array, rows: _Rows, weight: Array) -> JointEvidence:
+    def evidence(self, at: _Solution, residual: Array, rows: Rows, weight: Array) -> JointEvidence:
         from scipy.linalg import block_diag
 
         from robocal_ros.identification import row_kernels
@@ -290,7 +187,7 @@ class _FullProblem:
         return np.asarray(1.0 / (1.0 + np.maximum(visits[self.pose] - 1.0, 0.0) * rho))
 
     def left_out(
-        self, residual: Array, rows: _Rows, at: _Solution, weight: Array
+        self, residual: Array, rows: Rows, at: _Solution, weight: Array
     ) -> tuple[Array, Array]:
         """Residuals (m, c) of a fit without each sample's own pose, and their covariances.
 
@@ -430,7 +327,7 @@ def identify_full(
 
 
 def _round(
-    problem: _FullProblem, at: _Solution, residual: Array, rows: _Rows, weight: Array
+    problem: _FullProblem, at: _Solution, residual: Array, rows: Rows, weight: Array
 ) -> _Solution:
     evidence = problem.evidence(at, residual, rows, weight)
     prior = evidence.maximise(at.prior)
@@ -471,33 +368,60 @@ def _reported(
     error, expected = problem.left_out(residual, rows, at, weight)
     squared = np.maximum(_squared(error[:, :3], expected[:, :3, :3]), 0.0)
     stretch = max(1.0, np.sqrt(float(np.quantile(squared, 0.95)) / chi2_quantile(0.95, 3)))
-    covariance, noise = stretch**2 * at.posterior.covariance, stretch * at.prior.noise
+    known = _known(problem, at, weight, stretch)
     estimate = replace(
         start.estimate,
-        state=at.cell,
-        covariance=covariance[:k, :k],
-        scale=noise,
+        state=known.cell,
+        covariance=known.covariance[:k, :k],
+        scale=stretch * at.prior.noise,
         freedom=at.posterior.left,
         residual=residual,
         rejected=~keep,
     )
-    sigma = 1.0 if data.sigma is None else float(np.sqrt(np.mean(data.sigma**2)))
     plain = {field.name: getattr(start, field.name) for field in fields(Identification)}
     plain |= {
         "estimate": estimate,
-        "cell": at.cell,
+        "cell": known.cell,
         "rejected": tuple(data.sample[i] for i in np.flatnonzero(~keep)),
-        "noise_m": noise * sigma,
+        "noise_m": known.prior.noise,
     }
     if data.sigma is not None:
         used = weight @ np.sum(residual[:, :3] ** 2, axis=1)
         plain["sigma_ratio"] = float(np.sqrt(used / max(at.posterior.left, 1.0)))
     return FullIdentification(
         **plain,
-        terms=at.terms,
-        prior=at.prior,
+        known=known,
         gain=at.posterior.gain,
-        all_covariance=covariance,
-        readings=np.sort(data.q, axis=0),
         left_out_rms_m=problem.rms(error),
     )
+
+
+def _known(problem: _FullProblem, at: _Solution, weight: Array, stretch: float) -> KnownModel:
+    """How well it is known, sigmas ``stretch`` times as large; the arm keeps why."""
+    assert at.posterior is not None
+    start, data, layout = problem.start, problem.data, problem.layout
+    functions, prior = at.cell.arm.functions, at.prior
+    assert functions is not None
+    given = np.ones(len(data)) if data.sigma is None else data.sigma
+    scale = 1.0 if data.sigma is None else float(np.sqrt(np.mean(given**2)))
+    noise = stretch * scale * prior.noise
+    prior = FunctionPrior(prior.length, stretch * prior.amplitude, noise)
+    covariance, readings = stretch**2 * at.posterior.covariance, np.sort(data.q, axis=0)
+    known = KnownModel(layout, at.cell, at.terms, prior, covariance, readings)
+    sigma = np.full(at.terms.before, FREE)
+    if start.prior_covariance is not None:
+        spread = np.sqrt(np.diag(start.prior_covariance))
+        sigma[: len(spread)] = np.minimum(stretch * spread, FREE)
+    if start.target_reach_m is not None:
+        sigma[layout.tool_places] = min(stretch * start.target_reach_m, FREE)
+    told = identified_from(
+        known,
+        data.q,
+        data.target_index(at.cell.targets),
+        weight * (scale / given) ** 2,
+        0.0 if data.rotation is None else problem.problem.lever_m,
+        sigma,
+    )
+    arm = at.cell.arm
+    arm = arm.with_model(arm.mdh, replace(functions, identified_from=told), arm.load)
+    return replace(known, cell=replace(at.cell, arm=arm))

@@ -30,12 +30,13 @@ from robocal_ros.ground.frames import Array, Document, invert, log_rotation, tra
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
 from robocal_ros.identification.cell_model import (
     CellModel,
+    Part,
     carried,
     linear_start,
     place_base_and_points,
 )
 from robocal_ros.identification.full_model import FullIdentification, identify_full
-from robocal_ros.identification.solve import Identification, Method, Part, identify, still_joints
+from robocal_ros.identification.solve import Identification, Method, identify, still_joints
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document, parameters_document
 from robocal_ros.kinematics.tables import POSITION, check_plain, read_cells
@@ -238,7 +239,7 @@ def identify_and_judge(
     measured = np.column_stack([train.q.min(axis=0), train.q.max(axis=0)])
     away = (check.q < measured[:, 0]) | (check.q > measured[:, 1])
     if isinstance(result, FullIdentification):
-        away = result.uncovered(check.q)
+        away = result.known.uncovered(check.q)
     workspace_m = result.workspace_rms(result.estimate.covariance)
     doubt = still_joints(arm, train) and still_joints(arm, check)
     doubt = doubt or result.estimate.creeping
@@ -416,7 +417,7 @@ def joints_document(judged: JudgedIdentification) -> list[Document]:
     for joint, name in enumerate(arm.joint_names):
         unit, factor = ("mm", 1e3) if arm.prismatic[joint] else ("deg", float(np.degrees(1.0)))
         function = None
-        if isinstance(result, FullIdentification) and result.terms.count[joint]:
+        if isinstance(result, FullIdentification) and result.known.terms.count[joint]:
             function = _function_document(result, joint)
         functions = arm.functions
         found.append(
@@ -433,19 +434,19 @@ def joints_document(judged: JudgedIdentification) -> list[Document]:
 
 def _function_document(result: FullIdentification, joint: int) -> Document:
     """Rms of a joint's function, and of its standard deviation, where it was measured."""
-    arm = result.cell.arm
+    arm, known = result.cell.arm, result.known
     assert arm.functions is not None
     unit, micro, factor = ("deg", "urad", float(np.degrees(1.0)))
     if arm.prismatic[joint]:
         unit, micro, factor = "mm", "um", 1e3
-    lower, upper = result.readings[[0, -1], joint].tolist()
+    lower, upper = known.readings[[0, -1], joint].tolist()
     q = np.zeros((CURVE, arm.n))
     q[:, joint] = np.linspace(lower, upper, CURVE)
-    value, sigma = arm.functions.delta(q)[:, joint], result.function_sigma(q)[:, joint]
+    value, sigma = arm.functions.delta(q)[:, joint], known.function_sigma(q)[:, joint]
     return {
         f"rms_{micro}": float(np.sqrt(np.mean(value**2))) * 1e6,
         f"sigma_{micro}": float(np.sqrt(np.mean(sigma**2))) * 1e6,
-        f"length_{unit}": float(result.prior.length[joint]) * factor,
+        f"length_{unit}": float(known.prior.length[joint]) * factor,
     }
 
 

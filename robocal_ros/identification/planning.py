@@ -15,12 +15,12 @@ from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import DEFAULT_TARGET
 from robocal_ros.identification.cell_model import CellModel, make_layout
-from robocal_ros.identification.full_model import sparse_rows
 from robocal_ros.identification.joint_functions import (
     FunctionPrior,
     JointTerms,
     prior_covariance,
 )
+from robocal_ros.identification.known_model import sparse_rows
 from robocal_ros.identification.solve import default_prior
 from robocal_ros.kinematics import SerialArm
 

@@ -21,6 +21,7 @@ from robocal_ros.identification.cell_model import (
     WEAK_TARGET_M,
     CellModel,
     CellProblem,
+    Part,
     UnknownLayout,
     linear_start,
     make_layout,
@@ -71,7 +72,6 @@ def fitted_prior(arm: SerialArm, found: Array, covariance: Array) -> Array:
 # ---- least squares, maximum a posteriori --------------------------------------------------------
 
 
-Part = Literal["base", "tool", "geometry"]
 Method = Literal["map", "lsq"]
 
 _NAMED_TARGET_M = 0.01  # from here on what is known of a held target is said
@@ -157,19 +157,10 @@ class Identification:
         """Position rows (m, 3, k); what ``without`` could explain over all of them is removed."""
         _, J = self.layout.jacobian(self.cell, np.ascontiguousarray(q), target)
         rows = J[:, :3].reshape(-1, J.shape[2])
-        own = rows[:, self._columns(without)]
+        own = rows[:, self.layout.columns(without)]
         if own.shape[1]:
             rows = rows - own @ np.linalg.lstsq(own, rows, rcond=None)[0]
         return np.asarray(rows.reshape(len(q), 3, -1))
-
-    def _columns(self, parts: Collection[Part]) -> NDArray[np.bool_]:
-        """Mask (k,) of the unknowns that belong to base or tool."""
-        mask = np.zeros(len(self.layout.names), dtype=np.bool_)
-        if "base" in parts and self.layout.base >= 0:
-            mask[self.layout.base : self.layout.base + 6] = True
-        if "tool" in parts and self.layout.tool[0] >= 0:
-            mask[self.layout.tool[0] :] = True
-        return mask
 
 
 def identify(

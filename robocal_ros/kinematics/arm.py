@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.kinematics.joint_functions import ArmLoad, JointFunctions
+from robocal_ros.kinematics.joint_functions import ArmLoad, IdentifiedFrom, JointFunctions
 
 # ---- names and choice of the identifiable model parameters --------------------------------------
 
@@ -379,8 +379,13 @@ def model_document(arm: SerialArm) -> Document:
     return document
 
 
-def _as_lists(part: JointFunctions | ArmLoad) -> Document:
-    return {f.name: np.asarray(getattr(part, f.name)).tolist() for f in fields(part)}
+def _as_lists(part: JointFunctions | ArmLoad | IdentifiedFrom) -> Document:
+    values = {f.name: getattr(part, f.name) for f in fields(part)}
+    return {
+        name: _as_lists(value) if isinstance(value, IdentifiedFrom) else np.asarray(value).tolist()
+        for name, value in values.items()
+        if value is not None
+    }
 
 
 def arm_of(model: Document, nominal: SerialArm) -> SerialArm:
@@ -398,6 +403,8 @@ def layer_of(model: Mapping[str, Any]) -> tuple[JointFunctions | None, ArmLoad |
     """
     functions, load = model.get("functions"), model.get("load")
     try:
+        if functions is not None and (told := functions.get("identified_from")) is not None:
+            functions = functions | {"identified_from": IdentifiedFrom(**told)}
         return (
             None if functions is None else JointFunctions(**functions),
             None if load is None else ArmLoad(**load),

@@ -7,16 +7,69 @@ far the gravity torque about the axis winds the joint (a joint that slides: metr
 Both come before the geometric chain: `SerialArm.turned` gives what a rigid arm would read.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, Index
 
 STANDARD_GRAVITY = 9.80665  # m/s², of the 3rd CGPM, 1901
 # A slope from which on two readings could mean the same angle of the joint, with room to spare.
 STEEPEST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedFrom:
+    """What a model with joint functions was identified from, but for what was measured.
+
+    The covariance of geometry, functions and compliances together follows from where was measured,
+    the noise and the prior (`identification.known_model`). It is full, of a thousand
+    numbers and more, and its correlations count; these are few.
+
+    ``q`` (m, n), ``target`` (m,), ``weight`` (m,): readings of the poses that were used, rad
+    (prismatic: m), which target, and how many poses each stands for.
+    ``p_flange`` (t, 3): the targets, m.
+    ``lever``: length by which a measured turn counted, m; 0: positions alone.
+    ``noise``: of a coordinate, m.
+    ``parameter_sigma`` (k,), ``base_sigma``, ``target_sigma``: of the arm's free parameters, base
+        and targets' places before the data, m and rad; 0: held, from 1 on: nothing was known.
+    ``length``, ``amplitude`` (n,): of the functions' prior, rad (prismatic: m); 0: no function.
+
+    Raises `ValueError` for shapes that do not fit or numbers that cannot be.
+    """
+
+    q: Array
+    target: Index
+    weight: Array
+    p_flange: Array
+    lever: float
+    noise: float
+    parameter_sigma: Array
+    base_sigma: float
+    target_sigma: float
+    length: Array
+    amplitude: Array
+
+    def __post_init__(self) -> None:
+        for part in fields(self):
+            kind = np.int64 if part.name == "target" else np.float64
+            value = np.array(getattr(self, part.name), dtype=kind)
+            if not (np.all(np.isfinite(value)) and (part.name in _SIGNED or np.all(value >= 0))):
+                raise ValueError(f"identified from: {part.name} holds a number that cannot be")
+            value.flags.writeable = False
+            object.__setattr__(self, part.name, value if value.ndim else value.item())
+        if self.q.ndim != 2 or self.p_flange.shape[1:] != (3,):
+            raise ValueError("identified from: poses must be (m, n), targets (t, 3)")
+        (m, n), t = self.q.shape, len(self.p_flange)
+        sizes = (self.target.shape, self.weight.shape, self.length.shape, self.amplitude.shape)
+        if sizes != ((m,), (m,), (n,), (n,)) or not (m and t and self.noise > 0.0):
+            raise ValueError(f"identified from: {m} poses of {n} joints do not fit the rest")
+        if np.max(self.target) >= t or np.any((self.amplitude > 0.0) & (self.length <= 0.0)):
+            raise ValueError("identified from: a target or a length is not told")
+
+
+_SIGNED = ("q", "p_flange")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +83,7 @@ class JointFunctions:
     ``first``, ``step`` (n,): first knot and spacing of the knots, rad (prismatic: m).
     ``coefficients`` (n, m): rad (prismatic: m), in the controller's sense of counting.
     ``compliance`` (n,): not negative, rad/(N m) (prismatic: m/N).
+    ``identified_from``: what their covariance follows from; None: not known.
 
     Raises `ValueError` for shapes that do not fit, numbers that are not finite, a step or a
     compliance below zero, or a function that is so steep that a reading may be ambiguous.
@@ -39,6 +93,7 @@ class JointFunctions:
     step: Array
     coefficients: Array
     compliance: Array
+    identified_from: IdentifiedFrom | None = None
 
     def __post_init__(self) -> None:
         for name in ("first", "step", "coefficients", "compliance"):
@@ -57,6 +112,9 @@ class JointFunctions:
             )
         if not (np.all(self.step > 0.0) and np.all(self.compliance >= 0.0)):
             raise ValueError("joint functions: steps must be above 0, compliances not below")
+        told = self.identified_from
+        if told is not None and told.q.shape[1] != n:
+            raise ValueError(f"joint functions: of {n} joints, identified from {told.q.shape[1]}")
         edges = np.diff(np.pad(self.coefficients, ((0, 0), (1, 1))), axis=1)
         steepest = np.max(np.abs(edges), axis=1) / self.step  # no slope is larger
         if np.any(steepest > STEEPEST):

@@ -18,7 +18,12 @@ from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.files import nearest, quoted, read_text, share_folders, write_text
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics.arm import SerialArm
-from robocal_ros.kinematics.joint_functions import STANDARD_GRAVITY, ArmLoad, JointFunctions
+from robocal_ros.kinematics.joint_functions import (
+    STANDARD_GRAVITY,
+    ArmLoad,
+    IdentifiedFrom,
+    JointFunctions,
+)
 
 # ---- values of a YAML file by key, checked; errors name file, place and key ---------------------
 
@@ -222,7 +227,8 @@ def load_description(name: str | Path) -> RobotDescription:
     path = find_robot(name)
     text = read_text(path, "robot file")
     top = Fields(load_yaml(text, str(path)), str(path), "")
-    top.only("robot", "convention", "joints", "base", "tool", "load", "functions")
+    known = ("robot", "convention", "joints", "base", "tool", "load", "functions")
+    top.only(*known, "identified_from")
     robot = top.text("robot")
     convention = top.choice("convention", CONVENTIONS)
     joints = [_Joint(fields, convention) for fields in top.items("joints", "joint")]
@@ -243,6 +249,8 @@ def load_description(name: str | Path) -> RobotDescription:
         load=_load(top.below("load"), len(joints)) if "load" in top.values else None,
         functions=_functions(top, joints) if "functions" in top.values else None,
     )
+    if "identified_from" in top.values and arm.functions is None:
+        top.fail("is of joint functions, and there are none", "identified_from")
     velocity = np.array([joint.max_velocity for joint in joints])
     given = np.array([joint.max_acceleration for joint in joints])
     both = np.isinf(arm.lower) & np.isinf(arm.upper)
@@ -325,6 +333,9 @@ def save_robot(
         document["load"] = _load_document(arm.load)
     if arm.functions is not None:
         document["functions"] = _functions_document(arm, arm.functions)
+        if arm.functions.identified_from is not None:
+            told = _identified_document(arm.functions.identified_from, arm.prismatic)
+            document["identified_from"] = told
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
     remarks = "".join(f"# {line}\n" for line in comment.splitlines())
     write_text(Path(path), remarks + text)
@@ -448,7 +459,11 @@ def _functions(top: Fields, joints: Sequence["_Joint"]) -> JointFunctions:
     width = max(len(table) for table in tables)
     padded = np.array([table + [0.0] * (width - len(table)) for table in tables])
     try:
-        return JointFunctions(first, step, padded, compliance)
+        told = None
+        if "identified_from" in top.values:
+            slides = np.array([joint.prismatic for joint in joints])
+            told = _identified_from(top.below("identified_from"), slides)
+        return JointFunctions(first, step, padded, compliance, told)
     except ValueError as error:
         top.fail(f"cannot be: {error}", "functions")
 
@@ -469,6 +484,61 @@ def _functions_document(arm: SerialArm, functions: JointFunctions) -> list[dict[
             row[key] = [_shown(x, unit) for x in value] if values.ndim > 1 else _shown(value, unit)
         document.append(row)
     return document
+
+
+def _identified_from(fields: Fields, slides: NDArray[np.bool_]) -> IdentifiedFrom:
+    """Poses are rows of joints in deg (prismatic: mm), target, weight; raises ValueError."""
+    fields.only("poses", "targets_mm", "lever_mm", "noise_mm", *_BEFORE, "length", "amplitude")
+    n, units = len(slides), np.where(slides, MM, RAD)
+    table = np.array([row.split() for row in fields.text("poses").splitlines()], dtype=np.float64)
+    if table.shape[1] != n + 2:
+        fields.fail(f"must have rows of {n} joints, target and weight", "poses")
+    count = len(fields.values.get("targets_mm") or ())
+    return IdentifiedFrom(
+        q=table[:, :n] * units,
+        target=table[:, n].astype(np.int64),
+        weight=table[:, n + 1],
+        p_flange=np.array(fields.rows("targets_mm", count, 3)).reshape(-1, 3) * MM,
+        lever=fields.number("lever_mm") * MM,
+        noise=fields.positive("noise_mm") * MM,
+        parameter_sigma=np.array(fields.row("parameter_sigma")),
+        base_sigma=fields.number("base_sigma"),
+        target_sigma=fields.number("target_sigma"),
+        length=np.array(fields.numbers("length", n)) * units,
+        amplitude=np.array(fields.numbers("amplitude", n)) * _MICRO,
+    )
+
+
+# Standard deviations before the data, m and rad.
+_BEFORE = ("parameter_sigma", "base_sigma", "target_sigma")
+
+
+def _identified_document(told: IdentifiedFrom, slides: NDArray[np.bool_]) -> dict[str, Any]:
+    units = np.where(slides, MM, RAD)
+    rows = [
+        " ".join([*(f"{x:z.5f}" for x in q), str(target), f"{weight:.6g}"])
+        for q, target, weight in zip(told.q / units, told.target, told.weight, strict=True)
+    ]
+    return {
+        "targets_mm": (told.p_flange / MM).tolist(),
+        "lever_mm": told.lever / MM,
+        "noise_mm": told.noise / MM,
+        "parameter_sigma": told.parameter_sigma.tolist(),
+        "base_sigma": told.base_sigma,
+        "target_sigma": told.target_sigma,
+        "length": (told.length / units).tolist(),
+        "amplitude": (told.amplitude / _MICRO).tolist(),
+        "poses": _Lines("\n".join(rows) + "\n"),
+    }
+
+
+class _Lines(str):
+    """A text that a file shows line by line."""
+
+
+yaml.SafeDumper.add_representer(
+    _Lines, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|")
+)
 
 
 # ---- files that a command made for one robot: YAML, with the nominal model they belong to -------

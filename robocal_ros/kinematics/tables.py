@@ -466,6 +466,16 @@ def joint_texts(q: Array, arm: SerialArm) -> dict[str, list[str]]:
     return columns
 
 
+def read_joints(path: Path, arm: SerialArm) -> Array:
+    """Joints (m, n) of a table of poses, measured or not."""
+    units = ["mm" if slides else "deg" for slides in arm.prismatic]
+    columns = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
+    others = (*WORDS, *NUMBERS, *POSITION["mm"], *QUATERNION)
+    table = read_cells(path, lambda header, file: check_plain(header, file, columns, others))
+    factors = [LENGTH_UNITS["mm"] if slides else ANGLE_UNITS["deg"] for slides in arm.prismatic]
+    return np.column_stack([table.numbers(name) for name in columns]) * factors
+
+
 def read_table(path: Path, arm: SerialArm) -> tuple[Cells, TableLayout]:
     """Cells of a table of measurements, and where its columns are."""
     found: list[TableLayout] = []

@@ -14,7 +14,7 @@ from matplotlib.ticker import FormatStrFormatter, MultipleLocator
 from numpy.typing import NDArray
 
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.identification.full_model import FullIdentification
+from robocal_ros.identification.known_model import KnownModel
 
 BEFORE, AFTER, OLDEST = "#c2603a", "#0f6f86", "#7fb6c3"
 INK, FAINT, GRID = "#22303a", "#6d7b85", "#e6eaed"
@@ -172,20 +172,20 @@ def parameter_drift(cycles: Sequence[Document]) -> Figure:
     return figure
 
 
-def joint_functions_figure(found: FullIdentification) -> Figure:
+def joint_functions_figure(known: KnownModel) -> Figure:
     """What each joint turns besides what is read, with the band that holds 95 % of the guesses."""
-    arm = found.cell.arm
-    shown = [int(joint) for joint in np.flatnonzero(found.terms.count)]
+    arm = known.cell.arm
+    shown = [int(joint) for joint in np.flatnonzero(known.terms.count)]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 1.5 * len(shown) + 0.6), layout="constrained")
         rows = figure.subplots(max(1, len(shown)), squeeze=False)[:, 0]
         for axes, joint in zip(rows, shown, strict=False):
             q = np.zeros((1000, arm.n))
-            lower, upper = found.readings[[0, -1], joint]
+            lower, upper = known.readings[[0, -1], joint]
             q[:, joint] = np.linspace(lower, upper, len(q))
             assert arm.functions is not None
             value = 1e6 * arm.functions.delta(q)[:, joint]
-            band = 1.96e6 * found.function_sigma(q)[:, joint]
+            band = 1.96e6 * known.function_sigma(q)[:, joint]
             x = q[:, joint] * (1e3 if arm.prismatic[joint] else np.degrees(1.0))
             axes.fill_between(x, value - band, value + band, color=OLDEST, alpha=0.6, lw=0)
             axes.plot(x, value, color=AFTER, lw=1.2)

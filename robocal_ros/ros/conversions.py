@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +89,11 @@ def kinematic_model(
         message.function_step = functions.step.tolist()
         message.function_coefficients = functions.coefficients.ravel().tolist()
         message.compliance = functions.compliance.tolist()
+        if functions.identified_from is not None:
+            for part in fields(functions.identified_from):
+                value = np.asarray(getattr(functions.identified_from, part.name))
+                plain = value.ravel().tolist() if value.ndim else value.item()
+                setattr(message, f"identified_{part.name}", plain)
     if load is not None:
         message.link_mass = load.mass.tolist()
         message.link_centre = load.centre.ravel().tolist()

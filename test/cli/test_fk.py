@@ -1,17 +1,21 @@
 """``robocal fk`` and ``robocal import-ur``: answers, refusals, exit status and JSON."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from command import conforms
-from joint_errors import with_joint_errors
+from joint_errors import LENGTH, SIZE, with_joint_errors
 
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
+from robocal_ros.identification.solve import random_postures
+from robocal_ros.kinematics.joint_functions import IdentifiedFrom
 from robocal_ros.kinematics.robots import load_robot, save_robot
+from robocal_ros.kinematics.tables import write_cells
 
 
 def answer(command: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, Any]]:
@@ -162,8 +166,17 @@ def test_the_factory_calibration_of_a_ur5e(
 
 def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arm, path = with_joint_errors(load_robot("ur10"), 2), tmp_path / "full.yaml"
-    save_robot(arm, path)
+    measured = random_postures(arm, 100)
+    known = IdentifiedFrom(
+        q=measured, target=np.zeros(100), weight=np.ones(100), p_flange=np.full((1, 3), 0.1),
+        lever=0.0, noise=5e-5, parameter_sigma=np.full(len(arm.parameters), 1e-3), base_sigma=1.0,
+        target_sigma=1.0, length=np.full(6, LENGTH), amplitude=np.full(6, SIZE),
+    )  # fmt: skip
+    save_robot(replace(arm, functions=replace(arm.functions, identified_from=known)), path)
     command = ["joint-functions", "--robot", str(path), "--output", str(tmp_path / "t.csv")]
+    poses = {f"q{i}_deg": [f"{x:.6f}" for x in np.degrees(measured[:, i - 1])] for i in range(1, 7)}
+    write_cells(tmp_path / "poses.csv", poses)
+    command += ["--data", str(tmp_path / "poses.csv"), "--figures", str(tmp_path)]
     status, document = answer(command, capsys)
     assert status == 0
     rows = [line.split(",") for line in (tmp_path / "t.csv").read_text().splitlines()[1:]]
@@ -176,6 +189,12 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     told = document["joints"][2]
     assert told["largest_urad"] == pytest.approx(np.max(np.abs(elbow[:, 1])), abs=1e-3)
     np.testing.assert_allclose((told["from"], told["to"]), elbow[[0, -1], 0], atol=1e-6)
+    # at its poses the model is known better than before, and its own functions better than nothing
+    assert document["predicted"]["rms_mm"] < 1.0
+    assert document["predicted"]["not_covered"] == 0.0
+    sigma = np.array([float(row[6]) for row in rows if row[0] == "elbow_joint"])
+    assert sigma.min() < 0.8e6 * SIZE < sigma.max() <= 1.001e6 * SIZE
+    assert (tmp_path / "joints.svg").is_file()
     assert told["compliance_micro"] == pytest.approx(1e6 * arm.functions.compliance[2])
     assert main(command) == 0
     assert "what joints turn besides what is read" in capsys.readouterr().out

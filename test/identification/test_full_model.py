@@ -1,5 +1,6 @@
 """Joint functions and compliances: simulated by other code, found, and never for the worse."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,14 +8,19 @@ import pytest
 from bent_robot import COMPLIANCE, LOWER, NOISE_M, UPPER, BentRobot
 
 from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import identify, identify_and_judge, row_kernels
-from robocal_ros.identification.full_model import FullIdentification, gravity_torque, identify_full
+from robocal_ros.identification import known_model as model_knowledge
+from robocal_ros.identification.full_model import FullIdentification, identify_full
 from robocal_ros.identification.joint_functions import (
     FunctionPrior,
     JointEvidence,
     JointTerms,
 )
+from robocal_ros.identification.known_model import gravity_torque, known_model
+from robocal_ros.kinematics.arm import arm_of, model_document
+from robocal_ros.kinematics.robots import load_robot, save_robot
 
 
 def rms_mm(found, data):
@@ -62,7 +68,7 @@ def test_function_is_the_joints_error_within_its_band(bent):
     slow = np.stack([np.ones(400), np.sin(q[:, 2]), np.cos(q[:, 2])], axis=1)
     difference = found.cell.arm.functions.delta(q)[:, 2] - robot.own_error(q)[:, 2]
     difference -= slow @ np.linalg.lstsq(slow, difference, rcond=None)[0]
-    sigma = found.function_sigma(q)[:, 2]
+    sigma = found.known.function_sigma(q)[:, 2]
     assert np.sqrt(np.mean(difference**2)) < 1.3 * np.sqrt(np.mean(sigma**2))
     assert np.sqrt(np.mean(difference**2)) < 0.3 * robot.own_error(q)[:, 2].std()
 
@@ -71,14 +77,55 @@ def test_outside_of_what_was_measured_the_prior_is_left(bent):
     robot, _, _, found = bent
     far = robot.poses(200, UPPER + 0.5, UPPER + 0.9)
     assert np.all(found.cell.arm.functions.delta(far) == 0.0)
-    present = found.terms.count > 0
-    expected = np.broadcast_to(np.where(present, found.prior.amplitude, 0.0), far.shape)
-    assert found.function_sigma(far) == pytest.approx(expected)
+    present = found.known.terms.count > 0
+    expected = np.broadcast_to(np.where(present, found.known.prior.amplitude, 0.0), far.shape)
+    assert found.known.function_sigma(far) == pytest.approx(expected)
     target = np.zeros(200, dtype=np.int64)
     near = found.predicted_variance(robot.poses(200), target)
     assert np.mean(np.trace(found.predicted_variance(far, target), axis1=1, axis2=2)) > 10.0 * (
         np.mean(np.trace(near, axis1=1, axis2=2))
     )
+
+
+@pytest.mark.parametrize("way", ["document", "robot file"])
+def test_a_model_that_was_read_back_is_known_as_well_as_when_it_was_found(bent, tmp_path, way):
+    """Its readings are rounded to 1e-6 rad, and the last step of the solution moved its rows."""
+    robot, _, check, found = bent
+    arm = found.cell.arm
+    if way == "document":
+        back = arm_of(json.loads(json.dumps(model_document(arm))), robot.nominal)
+    else:
+        save_robot(arm, tmp_path / "bent.yaml")
+        back = load_robot(tmp_path / "bent.yaml")
+    known, target = known_model(back), np.zeros(len(check), dtype=np.int64)
+    assert np.array_equal(known.uncovered(check.q), found.known.uncovered(check.q))
+    sigma = known.function_sigma(check.q)
+    assert sigma == pytest.approx(found.known.function_sigma(check.q), rel=0.01, abs=1e-7)
+    told = [
+        np.trace(f.predicted_variance(check.q, target, ("base", "tool")), axis1=1, axis2=2)
+        for f in (found, known)
+    ]
+    assert told[1] == pytest.approx(told[0], rel=0.01)
+
+
+def test_of_many_poses_those_are_kept_that_tell_the_covariance(bent, monkeypatch):
+    robot, data, check, found = bent
+    monkeypatch.setattr(model_knowledge, "MOST_POSES", 600)
+    arm, target = identify_full(robot.nominal, data).cell.arm, np.zeros(len(check), dtype=np.int64)
+    kept = arm.functions.identified_from
+    assert abs(len(kept.q) - 600) <= 1
+    assert np.sum(kept.weight) == pytest.approx(1200.0, rel=0.1)
+    told = [
+        np.mean(np.trace(f.predicted_variance(check.q, target, ("base", "tool")), axis1=1, axis2=2))
+        for f in (found, known_model(arm))
+    ]
+    assert np.sqrt(told[1] / told[0]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_an_arm_that_keeps_nothing_says_so(bent):
+    robot, *_ = bent
+    with pytest.raises(InputError, match="does not say what it was identified from"):
+        known_model(robot.nominal)
 
 
 def test_outliers_are_named_and_not_learned(bent):
@@ -124,7 +171,7 @@ def test_without_a_load_there_are_functions_alone(bent):
     robot, data, _, _ = bent
     found = identify_full(replace(robot.nominal, load=None), data)
     assert np.all(found.cell.arm.functions.compliance == 0.0)
-    assert np.any(found.terms.count)
+    assert np.any(found.known.terms.count)
 
 
 def test_where_the_model_is_not_covered_is_told(bent):

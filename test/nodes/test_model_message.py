@@ -1,7 +1,7 @@
 """A model with joint functions as a message, over the wire and back; what cannot be is refused."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from robocal_ros.correction.interface import OfferedModel, Reason, RefusedError,
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.joint_functions import IdentifiedFrom
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.conversions import kinematic_model
 
@@ -39,13 +40,25 @@ def read(message: Any) -> OfferedModel:
     return offered_model(message, KinematicModel.ACCEPTED)
 
 
-@pytest.mark.parametrize("arm", [NOMINAL, COLD, replace(NOMINAL, load=None)])
+KNOWN = IdentifiedFrom(
+    q=Q, target=np.arange(50) % 2, weight=np.linspace(0.5, 2.0, 50), p_flange=np.eye(3)[:2],
+    lever=0.05, noise=4e-5, parameter_sigma=np.linspace(0.0, 1.0, len(NOMINAL.parameters)),
+    base_sigma=1.0, target_sigma=0.5, length=np.full(6, 0.06), amplitude=np.arange(6) * 1e-4,
+)  # fmt: skip
+IDENTIFIED = replace(COLD, functions=replace(COLD.functions, identified_from=KNOWN))
+
+
+@pytest.mark.parametrize("arm", [NOMINAL, COLD, IDENTIFIED, replace(NOMINAL, load=None)])
 def test_it_is_the_same_arm_behind_the_wire(arm: SerialArm) -> None:
     offered = read(message_of(arm))
     bare = replace(NOMINAL, load=None)
     back = bare.with_model(offered.mdh, offered.functions, offered.load)
     np.testing.assert_array_equal(back.fk(Q), arm.fk(Q))
     assert back.model_hash == arm.model_hash
+    if arm is IDENTIFIED:
+        for part in fields(KNOWN):
+            given = getattr(KNOWN, part.name)
+            np.testing.assert_array_equal(getattr(back.functions.identified_from, part.name), given)
     if arm.load is not None:
         assert back.load.payload_mass == arm.load.payload_mass
         np.testing.assert_array_equal(back.load.payload_centre, arm.load.payload_centre)
@@ -65,10 +78,13 @@ def set_to(name: str, values: Any) -> Callable[[Any], None]:
         (set_to("link_mass", [1.0] * 5), "load: centre must be"),
         (set_to("link_mass", []), "compliances without masses"),
         (set_to("payload_mass", -1.0), "mass must not be below 0"),
+        (set_to("identified_q", [0.0] * 7), "cannot reshape"),
+        (set_to("identified_noise", float("nan")), "noise holds a number that cannot be"),
+        (set_to("identified_target", [2] * 50), "a target or a length is not told"),
     ],
 )
 def test_what_cannot_be_is_refused_in_words(spoil: Callable[[Any], None], words: str) -> None:
-    message = message_of(COLD)
+    message = message_of(IDENTIFIED)
     spoil(message)
     with pytest.raises(RefusedError, match=words) as caught:
         read(message)

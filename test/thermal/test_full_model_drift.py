@@ -12,6 +12,7 @@ from shift import BALL, NOISE_M, T_SENSOR_BASE, DriftingRobot, Sample, built, po
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import Proposal
+from robocal_ros.identification.known_model import known_model
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import layer_of, model_document, payload_note
 from robocal_ros.session import events
@@ -73,6 +74,11 @@ def test_the_drift_comes_on_top_of_the_full_model(robot):
     assert document["model"] == "full"
     assert all(joint["function"] for joint in document["joints"])
     cold_m = robot.error_m(robot.session.current.arm, 0.0)
+    known, first = known_model(robot.session.current.arm), np.zeros(60, dtype=np.int64)
+    variance = known.predicted_variance(robot.check, first, ("base", "tool"))
+    # as a model that was read back says; the reference's base and ball add to it
+    assert cold_m > 0.5 * np.sqrt(np.mean(np.trace(variance, axis1=1, axis2=2)))
+    assert cold_m < 2.0 * np.sqrt(np.mean(np.trace(variance, axis1=1, axis2=2)))
     found = robot.visit(events.IDENTIFY, robot.q, KELVIN, 2.0)
     robot.take(found)
     before, now = robot.session.reference.cell.arm, robot.session.current.arm
