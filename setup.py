@@ -43,6 +43,7 @@ setup(
             "hand_eye_node = robocal_ros.hand_eye.node:main",
             "thermal_node = robocal_ros.thermal.node:main",
             "joint_correction_node = robocal_ros.correction.node:main",
+            "adapter_node = robocal_ros.adapter.node:main",
             "cell_sim_node = robocal_ros.cell_sim.node:main",
             "maintenance_node = robocal_ros.maintenance.node:main",
             "replay_node = robocal_ros.bags.replay_node:main",

@@ -25,6 +25,7 @@ MAY_IMPORT = {
     "ros": GROUND,
     "motion": GROUND | {"ros"},
     "bags": GROUND | {"ros", "motion"},
+    "adapter": {"ground", "ros"},
     **dict.fromkeys(CAPABILITIES, BELOW),
     "maintenance": BELOW | CAPABILITIES,
     "report": ABOVE,

@@ -19,7 +19,7 @@ from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import ReliabilityPolicy
 from robocal_msgs.msg import BeamEvent, ToolStep
-from sensor_msgs.msg import JointState, PointCloud2, PointField, Temperature
+from sensor_msgs.msg import JointState, PointCloud2, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -38,7 +38,7 @@ from robocal_ros.ground.samples import REFERENCE_SPHERE, SPHERE_CLOUD, stamp_ns
 from robocal_ros.hand_eye.data import PROFILE
 from robocal_ros.kinematics.urdf import urdf_of
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.conversions import NS, header, transform_message
+from robocal_ros.ros.conversions import NS, cloud, header, profile_cloud, transform_message
 from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 from robocal_ros.ros.robot import DESCRIPTION
 from robocal_ros.thermal.screening import THRESHOLD_M
@@ -172,32 +172,6 @@ def point(stamp_ns: int, frame: str, p: Array) -> PointStamped:
     return message
 
 
-def cloud(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
-    """Points (m, 3), as a sensor sends them: 32 bit."""
-    fields = [
-        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
-        for i, name in enumerate("xyz")
-    ]
-    return PointCloud2(
-        header=header(stamp_ns, frame),
-        height=1,
-        width=len(points),
-        fields=fields,
-        point_step=12,
-        row_step=12 * len(points),
-        data=array("B", points.astype("<f4").tobytes()),
-        is_dense=True,
-    )
-
-
-def profile(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
-    """A profile (m, 2), x and z, in its sensor's plane y = 0."""
-    x, z = points.T
-    message = cloud(stamp_ns, frame, np.column_stack([x, np.zeros_like(x), z]))
-    message.is_dense = bool(np.all(np.isfinite(points)))
-    return message
-
-
 TRUTH_S = 1.0  # between two states of the truth
 CENTRE = "sphere_center"
 
@@ -279,7 +253,7 @@ class CellOutputs:
             self._send(REFERENCE_SPHERE, point(at, floor, shot.floor))
         for view in came.profiles:
             frame = settings["profile_frame"]
-            self._send(PROFILE, profile(stamp_ns(view.time_s), frame, view.points))
+            self._send(PROFILE, profile_cloud(stamp_ns(view.time_s), frame, view.points))
         for told in came.temperatures:
             for name, celsius in zip(names, told.celsius.tolist(), strict=True):
                 stamp = header(stamp_ns(told.time_s), name)

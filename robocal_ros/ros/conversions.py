@@ -1,6 +1,7 @@
 """Documents and history entries as messages: pure mapping. A number that is not finite stays."""
 
 import math
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, Transform, TransformStamped
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, CalibrationSummary, KinematicModel
+from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from robocal_ros.ground import frames
@@ -37,6 +39,32 @@ def time_message(stamp_ns: int) -> Time:
 def header(stamp_ns: int, frame: str) -> Header:
     """A header."""
     return Header(stamp=time_message(stamp_ns), frame_id=frame)
+
+
+def cloud(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
+    """Points (m, 3), as a sensor sends them: 32 bit."""
+    fields = [
+        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+        for i, name in enumerate("xyz")
+    ]
+    return PointCloud2(
+        header=header(stamp_ns, frame),
+        height=1,
+        width=len(points),
+        fields=fields,
+        point_step=12,
+        row_step=12 * len(points),
+        data=array("B", points.astype("<f4").tobytes()),
+        is_dense=True,
+    )
+
+
+def profile_cloud(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
+    """A profile (m, 2), x and z, in its sensor's plane y = 0."""
+    x, z = points.T
+    message = cloud(stamp_ns, frame, np.column_stack([x, np.zeros_like(x), z]))
+    message.is_dense = bool(np.all(np.isfinite(points)))
+    return message
 
 
 def transform_message(T: Any) -> Transform:

@@ -138,28 +138,33 @@ class EndpointNode(LifecycleNode):
         self,
         kind: type,
         topic: str,
-        callback: Callable[[Any], None],
+        callback: Callable[..., None],
         profile: QoSProfile,
         *,
         raw: bool = False,
+        timed: bool = False,
     ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
 
         A defect in the callback counts it too and is logged; it does not end the node. ``raw``:
-        the callback is given the serialized message.
+        the callback is given the serialized message; ``timed``: also what rclpy knows of it, its
+        ``source_timestamp`` (ns) among that.
         """
         count = self.inputs.setdefault(topic, InputCount())
 
-        def receive(message: Any) -> None:
+        def receive(message: Any, *info: Any) -> None:
             count.received += 1
             if not self.is_active:
                 count.ignored += 1
                 return
             try:
-                callback(message)
+                callback(message, *info)
             except Exception as error:
                 count.invalid += 1
                 self._log(topic, error)
+
+        def receive_timed(message: Any, info: Any) -> None:  # rclpy counts the arguments
+            receive(message, info)
 
         def lose(event: Any) -> None:
             count.lost += event.total_count_change
@@ -167,7 +172,7 @@ class EndpointNode(LifecycleNode):
         subscription = self.create_subscription(
             kind,
             topic,
-            receive,
+            receive_timed if timed else receive,
             own(profile),
             event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             qos_overriding_options=overridable(),

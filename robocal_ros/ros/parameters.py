@@ -25,14 +25,15 @@ QOS_OVERRIDES = "qos_overrides."  # of topics, which are declared with their end
 # Parameters that several nodes have, and what a launch file gives to all of its nodes: below /** of
 # a parameter file they reach nodes that have no use for them.
 SHARED = frozenset({
-    "autostart", "base_frame", "deviation_deg", "deviation_mm", "edge_noise_mm", "flange_frame",
-    "flange_radius_mm", "follow_joint_trajectory", "gap_bool", "gap_stale_s", "hard_stop_service",
+    "autostart", "base_frame", "beams", "deviation_deg", "deviation_mm", "edge_noise_mm",
+    "flange_frame", "flange_radius_mm", "follow_joint_trajectory", "gap_bool", "gap_stale_s",
+    "hard_stop_service",
     "housing_depth_mm", "housing_reach_mm", "housing_top_mm", "input_jitter_ms",
     "input_period_ms", "joint_acceleration_deg_s2", "joint_gap_s", "joint_velocity_deg_s",
     "laser", "mandrel_length_mm", "mandrel_quat_xyzw", "mandrel_radius_mm", "mandrel_xyz_mm",
-    "method", "motion_late_s", "motion_silence_s", "opening_radius_mm",
+    "method", "motion_late_s", "motion_silence_s", "opening_radius_mm", "profile_frame",
     "repeatability_mm", "retract_mm", "robot", "seed", "sensor_frame", "serial",
-    "standstill_after_s", "standstill_before_s", "standstill_tolerance_deg", "state_dir",
+    "standstill_after_s", "standstill_before_s", "standstill_tolerance_deg", "state_dir", "station",
     "stop_deceleration_deg_s2", "target", "taught_quat_xyzw", "taught_xyz_mm",
     "tcp_acceleration_mm_s2", "tcp_speed_mm_s", "tolerance_mm", "tool_frame", "tool_length_mm",
     "tool_radius_mm", "topics",

@@ -13,6 +13,7 @@ from rclpy.qos import ReliabilityPolicy
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
+from robocal_ros.adapter.node import AdapterNode
 from robocal_ros.bags.recorder_node import RecorderNode
 from robocal_ros.bags.replay_node import ReplayNode
 from robocal_ros.cell_sim.node import CellSimNode
@@ -39,6 +40,7 @@ NODES = (
     CellSimNode,
     MaintenanceNode,
     JointCorrectionNode,
+    AdapterNode,
 )
 PAGES = {
     ThermalNode: "thermal_node",

@@ -1,0 +1,1 @@
+"""What drivers publish of inputs and scanners, as the messages that the nodes read."""
