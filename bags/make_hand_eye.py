@@ -1,6 +1,6 @@
 """Make the golden hand-eye bags: ``python bags/make_hand_eye.py`` writes ``hand_eye_*.mcap``.
 
-Simulated: a UR10 whose lengths err by 0.05 mm shows a line laser a sphere,
+Simulated: a UR10 whose lengths err by 0.1 mm shows a line laser a sphere,
 stairs and the edge of a block, each in a bag of its own with a target file (``.yaml``) beside it:
 
 - ``joint_states``: before, during and after each standstill;
@@ -64,6 +64,7 @@ from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye.profiles import sensor_of
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.targets import (
     LaserTarget,
@@ -84,8 +85,8 @@ SEEDS = {"sphere": 21, "step": 22, "line": 23}
 JITTER_SEED = 31  # of the readings of resting joints
 START_NS = 1_790_000_000_000_000_000
 CHECKS = 5
-SENSOR = ProfileSensor(spikes=0.003, dropouts=0.01, gaps=1)
-GEOMETRY_M, REPEATABILITY_RAD = 5e-5, 1e-5
+SENSOR = ProfileSensor(gaps=1)
+GEOMETRY_M, REPEATABILITY_RAD = 1e-4, 1e-5
 RADIUS_M = 0.02
 CENTRE = np.array([0.837, -0.059, 0.045])
 T_BASE_USER = frames.transform(frames.exp_rotation([0.01, -0.02, -2.1]), [0.84, -0.02, 0.03])
@@ -95,7 +96,9 @@ SHOWN_S = 0.5  # of each motion is recorded, before the standstill and after it
 DELAY_S = 0.04  # of a profile's message behind its stamp
 MICROMETRE = 1e-6
 TRUTH, FRAME = "/truth/hand_eye", "laser"
-CONFIG = HandEyeConfig(sensor_frame=FRAME, capture_timeout_s=TIMEOUT_S)
+CONFIG = HandEyeConfig(
+    sensor_frame=FRAME, sensor=sensor_of("", "towards"), capture_timeout_s=TIMEOUT_S
+)
 CLOUD_FIELDS = [
     {"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate("xyz")
 ]
@@ -189,8 +192,8 @@ def profile_records(recording: Recording, rng: np.random.Generator) -> Iterator[
     early_s, blind_s = arrivals()[[EARLY, BLIND]] + [EARLY_S, BLIND_S]
     q = _way(recording).at(np.array([early_s]))[0]
     T_base_flange = recording.robot.flange(q, Warmth.cold(len(q)))[0]
-    T_base_sensor = T_base_flange @ recording.cell.T_flange_sensor
-    yield _cloud(early_s, SENSOR.shoot(T_base_sensor, recording.scene, rng))
+    T_base_light = T_base_flange @ recording.cell.T_flange_light
+    yield _cloud(early_s, SENSOR.shoot(T_base_light, recording.scene, rng))
     yield _cloud(blind_s, np.full_like(profiles[0], np.nan))
 
 

@@ -1,7 +1,8 @@
 """What a line laser sees of a target, and the least error that any estimator can reach with it.
 
 A path of its own: planes, lines and circles are cut in base, and every derivative is a central
-difference of that, so that the bound is not the estimator's own opinion.
+difference of that, so that the bound is not the estimator's own opinion. How well a profile tells
+its feature is the profile's own; poses err by far more.
 """
 
 from collections.abc import Callable
@@ -44,6 +45,21 @@ class Sight:
     aim: Array | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Least:
+    """The Cramer-Rao bound of increments (v, w) about a pivot, poses being off by a nuisance.
+
+    Attributes
+    ----------
+    covariance : (6, 6); ``of_poses`` : (6, 6) what of it the poses' errors alone make.
+    step : (6,) by which the errors that the poses have move the estimate that reaches the bound.
+    """
+
+    covariance: Array
+    of_poses: Array
+    step: Array
+
+
 def circles(T_base_sensor: Array, centre: Array, radius_m: float) -> Array:
     """(x0, z0, r) (m, 3) of the circles that laser planes (m, 4, 4) cut out of a sphere."""
     eye, normal = T_base_sensor[:, :3, 3], T_base_sensor[:, :3, 1]
@@ -69,44 +85,30 @@ def _along_axes(T_base_sensor: Array, point: Array) -> tuple[Array, Array]:
     return np.sum(away * x, axis=1), np.sum(away * z, axis=1)
 
 
-def circle_covariance(r: float, noise_m: float, pitch_m: float) -> Array:
-    """Covariance (3, 3) of (x0, z0, r) from an arc up to 60 deg, z with noise at every pitch."""
-    u = np.arange(-np.sin(np.pi / 3.0) * r, np.sin(np.pi / 3.0) * r, pitch_m)
-    h = np.sqrt(r**2 - u**2)
-    J = np.column_stack([-u / h, np.ones_like(u), -r / h])  # of z = z0 - h
-    return np.asarray(noise_m**2 * np.linalg.inv(J.T @ J))
-
-
-def corner_covariance(turn_rad: float, flank_m: float, noise_m: float, pitch_m: float) -> Array:
-    """Covariance (2, 2) of the corner of two flanks, 45 deg down on either side, then turned."""
-    slope = np.tan(np.array([0.25, -0.25]) * np.pi + turn_rad)
-    points = np.maximum(flank_m * np.cos(np.arctan(slope)) / pitch_m, 4.0)
-    variance = 4.0 * noise_m**2 / points  # of a straight line at the end of its points
-    J = np.array([[-1.0, 1.0], [-slope[1], slope[0]]]) / (slope[0] - slope[1])
-    return np.asarray((J * variance) @ J.T)
-
-
 def moved(T: Array, step: Array, pivot: Array) -> Array:
     """Poses after (v, w) along their own axes: the pivot moves by v, turned by w."""
-    turn = frames.exp_rotation(step[3:])
-    return np.asarray(T @ frames.transform(turn, pivot + step[:3] - turn @ pivot))
+    turn = frames.exp_rotation(step[..., 3:])
+    shift = pivot + step[..., :3] - turn @ pivot
+    return np.asarray(T @ frames.transform(turn, shift))
 
 
-def least_covariance(
+def least(
     sight: Sight,
     T_base_flange: Array,
     pose: Index,
+    error: Array,
     T_flange_sensor: Array,
     pivot: Array,
     place: Array,
     covariance: Array,
     noise: Noise,
-) -> Array:
-    """Cramer-Rao: least covariance (6, 6) of the increment (v, w) about the pivot.
+) -> Least:
+    """The bound.
 
     Parameters
     ----------
     T_base_flange : (m, 4, 4) true pose of each sighting; ``pose`` (m,): which have it in common.
+    error : (m, 6) of each reported pose: (v, w) along its own axes.
     place : (k,) the target's unknowns; covariance : (m, c, c) of the features.
     """
 
@@ -118,19 +120,24 @@ def least_covariance(
     size = 6 + sight.unknowns
     steps = STEP * np.eye(size + 6)
     slopes = np.stack([(seen(h) - seen(-h)) / (2.0 * STEP) for h in steps], axis=2)
-    J, common = slopes[:, :, :size], slopes[:, :, size:]
+    J, robot = slopes[:, :, :size], slopes[:, :, size:]
     spread = np.repeat([noise.pose_m, noise.pose_rad], 3)
-    if sight.aim is not None:
-        common = np.concatenate([common, sight.aim], axis=2)
-        spread = np.append(spread, [noise.aim_m, noise.aim_m])
-    information = np.zeros((size, size))
+    information, right, parts = np.zeros((size, size)), np.zeros(size), []
     for one in np.unique(pose):
         rows = np.flatnonzero(pose == one)
-        G = common[rows].reshape(-1, common.shape[2]) * spread
+        G = robot[rows].reshape(-1, 6)
         own = J[rows].reshape(-1, size)
-        total = G @ G.T
+        total = (G * spread**2) @ G.T
+        if sight.aim is not None:
+            aim = noise.aim_m * sight.aim[rows].reshape(-1, 2)
+            total += aim @ aim.T
         for k in range(len(rows)):
             block = slice(k * sight.components, (k + 1) * sight.components)
             total[block, block] += covariance[rows[k]]
-        information += own.T @ np.linalg.solve(total, own)
-    return np.asarray(np.linalg.inv(information)[:6, :6])
+        weighted = np.linalg.solve(total, own).T
+        information += weighted @ own
+        right += weighted @ G @ error[rows[0]]
+        parts.append(weighted @ (G * spread))
+    C = np.linalg.inv(information)
+    by_pose = (C @ np.concatenate(parts, axis=1))[:6]
+    return Least(C[:6, :6], by_pose @ by_pose.T, -(C @ right)[:6])

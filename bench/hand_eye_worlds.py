@@ -1,233 +1,279 @@
-"""Simulated sightings of a sphere, of stairs and of an edge, without profiles: quick to draw.
+"""Simulated shots of a sphere, of stairs and of an edge; what the operator knows, what is true.
 
-Poses come from the simulated cell, features from the geometry of `bench.hand_eye_bound`, with the
-noise that points of a line laser leave in them.
+Whole profiles of a sensor and poses of a robot that err as real ones do (`ProfileSensor`,
+`PoseRobot`).
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.hand_eye_bound import (
-    Noise,
-    Sight,
-    circle_covariance,
-    circles,
-    corner_covariance,
-    least_covariance,
-    piercings,
-)
+from bench.hand_eye_bound import Least, Noise, Sight, circles, least, piercings
 from bench.hand_eye_cell import (
+    ArmRobot,
     HandEyeCell,
     PoseRobot,
+    Robot,
+    SimulatedShots,
     TrueStairs,
+    WantedView,
+    edge_block,
     edge_shots,
     sphere_shots,
     step_shots,
 )
-from robocal_ros.cell_sim.sensors import ProfileSensor, Scene
-from robocal_ros.estimation.edge import EdgeRule
+from bench.measured_runs import Q_NEAR
+from robocal_ros.cell_sim.robot import Warmth
+from robocal_ros.cell_sim.sensors import Scene, ball_on_table
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen
+from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.mount_problem import (
-    Index,
+    CornerModel,
     LineModel,
     MountProblem,
     MountState,
-    Sightings,
     SphereModel,
-    TargetModel,
     TargetView,
-    pivot_of,
 )
-from robocal_ros.hand_eye.result import PoseNoise, increment
-from robocal_ros.hand_eye.solve import look
-from robocal_ros.hand_eye.stairs import StepTask
-from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.hand_eye.tasks import LineTask, SphereTask, Task
+from robocal_ros.hand_eye.profiles import Profile, profile_of
+from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings, Method, PoseNoise, increment
+from robocal_ros.hand_eye.solve import features, solve_task
+from robocal_ros.hand_eye.stairs import task_of
+from robocal_ros.hand_eye.targets import (
+    LaserTarget,
+    LineTarget,
+    SphereTarget,
+    Staircase,
+    StepTarget,
+)
+from robocal_ros.hand_eye.tasks import HandEyeData, Task
 
 Array = NDArray[np.float64]
 
 RADIUS_M = 0.02
 CENTRE = np.array([0.837, -0.059, 0.045])
 T_BASE_USER = frames.transform(frames.exp_rotation([0.01, -0.02, -2.1]), [0.84, -0.02, 0.03])
+LINE = LineTarget(T_BASE_USER[:3, 3], T_BASE_USER[:3, 0])
 LINE_M = 0.2  # between the planes in which an unknown line's ends are counted
-POINT_M = 3.7e-5  # of a profile point
-PITCH_M = 2.0 * 0.2 * float(np.tan(np.radians(14.0))) / 1280.0  # between profile points
-FLANK_M = 8e-3  # of a surface beside an edge
 AIM_M = 2e-4
 MACHINING_M = 1e-4 / 3.0
-NOISE = Noise(5e-5, 5e-5)
-AIMED = replace(NOISE, aim_m=AIM_M)
+GAUGED_M = 5e-6  # of stairs that were measured
+TAUGHT_M, TAUGHT_RAD = 5e-5, 5e-4  # told of a frame that is taught with an arm that errs
 STAIRS = TrueStairs(T_BASE_USER)
 STAIRCASE = Staircase(STAIRS.steps, STAIRS.length_m, STAIRS.height_m, STAIRS.depth_m)
+SETTINGS = HandEyeSettings()
+CELL = HandEyeCell()
+X = CELL.T_flange_sensor
 
 
-class Blind(ProfileSensor):
-    """A sensor of the same range that is spared the work of taking profiles."""
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Shots with what the operator knows of the target; z of the profiles is a height."""
 
-    def shoot(self, T_base_sensor: Array, scene: Scene, rng: np.random.Generator) -> Array:
-        """Nothing."""
-        return np.empty((0, 2))
+    target: LaserTarget | None
+    data: HandEyeData
+
+    def task(self, classic: bool = False) -> Task:
+        """The estimator's view of it."""
+        return task_of(self.target, "edge", classic, towards=True)
+
+    def solve(self, method: Method = "best") -> HandEyeResult:
+        """The judged mount, as node and command find it."""
+        return solve_task(self.task(method == "classic"), self.data, method, SETTINGS)
 
 
-BLIND = HandEyeCell(sensor=Blind(), robot=PoseRobot(0.0, 0.0))
-X = BLIND.T_flange_sensor
+def data_of(shots: SimulatedShots) -> HandEyeData:
+    """As an operator has them."""
+    names = tuple(f"shot {i + 1}" for i in range(len(shots.profiles)))
+    profiles: list[Profile | RobocalError] = []
+    for points, name in zip(shots.profiles, names, strict=True):
+        try:
+            profiles.append(profile_of(points, name))
+        except RobocalError as error:
+            profiles.append(error)
+    return HandEyeData(
+        names, shots.T_base_flange, profiles, tuple(shots.marks) if any(shots.marks) else None
+    )
+
+
+def known_to(robot: Robot) -> Array:
+    """What the robot takes for the base (4, 4): a target taught at the station is known there."""
+    if not isinstance(robot, ArmRobot):
+        return np.eye(4)
+    there = robot.true.flange(Q_NEAR, Warmth.cold(robot.nominal.n))[0]
+    return np.asarray(robot.nominal.fk(Q_NEAR) @ frames.invert(there))
+
+
+def sphere_set(cell: HandEyeCell, rng: np.random.Generator, poses: int = 15) -> Calibration:
+    """A sphere."""
+    return Calibration(
+        SphereTarget(RADIUS_M), data_of(sphere_shots(cell, CENTRE, RADIUS_M, poses, rng))
+    )
+
+
+def edge_set(cell: HandEyeCell, rng: np.random.Generator, poses: int = 15) -> Calibration:
+    """An edge, unknown."""
+    return Calibration(None, data_of(edge_shots(cell, T_BASE_USER, poses, rng)))
+
+
+def known_edge_set(cell: HandEyeCell, rng: np.random.Generator, poses: int = 15) -> Calibration:
+    """An edge, known."""
+    T = known_to(cell.robot) @ T_BASE_USER
+    shots = edge_shots(cell, T_BASE_USER, poses, rng)
+    return Calibration(LineTarget(T[:3, 3], T[:3, 0]), data_of(shots))
+
+
+def step_set(
+    cell: HandEyeCell,
+    rng: np.random.Generator,
+    poses: int = 5,
+    aim_m: float = AIM_M,
+    machining_m: float = 0.0,
+    told_m: float = MACHINING_M,
+) -> Calibration:
+    """Stairs; what is known of their corners is off by ``machining_m`` throughout."""
+    shots = step_shots(cell, STAIRS, poses, rng, aim_m=aim_m)
+    corners = {
+        mark: points + machining_m * rng.standard_normal(points.shape)
+        for mark, points in STAIRCASE.marked_corners().items()
+    }
+    T = known_to(cell.robot) @ T_BASE_USER
+    told = (TAUGHT_M, TAUGHT_RAD) if isinstance(cell.robot, ArmRobot) else (0.0, 0.0)
+    target = StepTarget(
+        T, corners, STAIRCASE.edge_user, told_m, user_sigma_m=told[0], user_sigma_rad=told[1]
+    )
+    return Calibration(target, data_of(shots))
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A target and true poses before it.
+    """A target, and true poses before it, from which it may be shot again.
 
     Attributes
     ----------
-    model, place : as the estimator has them, the place the true one.
-    sight, unknowns : the same for the bench's own geometry.
-    T_base_flange : (m, 4, 4) true pose of each feature; ``pose`` (m,): which belong together.
-    covariance : (m, 3, 3) of the features.
+    place : the target's true place, as the estimator has it.
+    wanted : views, at the poses where the robot stands.
+    noise : of the robot, and of the eye.
     """
 
-    task: Task
-    model: TargetModel
+    target: LaserTarget | None
     place: Array
-    sight: Sight
-    unknowns: Array
-    T_base_flange: Array
-    pose: Index
-    covariance: Array
-    noise: Noise
-    exact: TargetView = field(init=False)
-
-    def __post_init__(self) -> None:
-        value = np.zeros((len(self.pose), 3))
-        value[:, : self.sight.components] = self.seen
-        if self.sight.aim is not None:
-            value[:, 2] = 0.0  # the light is taken to lie on the marks
-        object.__setattr__(self, "exact", self._view(self.T_base_flange, value))
+    scene: Scene
+    wanted: tuple[WantedView, ...]
+    robot: PoseRobot
+    aim_m: float = 0.0
 
     @property
-    def seen(self) -> Array:
-        """Features (m, c) without error."""
-        return self.sight.see(self.T_base_flange @ X, self.unknowns)
+    def noise(self) -> Noise:
+        """Of the robot's poses and of the eye."""
+        return Noise(self.robot.position_m, self.robot.rotation_rad, self.aim_m)
 
     @property
-    def pivot(self) -> Array:
-        """Middle (3,) of what is seen, sensor frame."""
-        value = self.exact.sightings.value
-        return np.array([value[:, 0].mean(), 0.0, value[:, 1].mean()])
+    def true_T_base_flange(self) -> Array:
+        """(m, 4, 4)."""
+        light = np.array([view.T_base_light for view in self.wanted])
+        return np.asarray(light @ frames.invert(CELL.T_flange_light))
 
-    def measured(self, rng: np.random.Generator) -> TargetView:
-        """With errors of robot and sensor."""
-        m, c = len(self.pose), self.sight.components
-        root = np.linalg.cholesky(self.covariance[:, :c, :c])
-        value = self.exact.sightings.value.copy()
-        value[:, :c] += (root @ rng.standard_normal((m, c, 1)))[:, :, 0]
-        count = int(self.pose.max()) + 1
-        turn = frames.exp_rotation(self.noise.pose_rad * rng.standard_normal((count, 3)))
-        away = self.noise.pose_m * rng.standard_normal((count, 3))
-        error = frames.transform(turn, away)[self.pose]
-        return self._view(self.T_base_flange @ error, value)
+    def shot(self, rng: np.random.Generator) -> Calibration:
+        """Shots from these poses, which err anew."""
+        cell = HandEyeCell(robot=self.robot)
+        shots = cell.shoot(self.scene, self.wanted, len(self.wanted), rng)
+        return Calibration(self.target, data_of(shots))
 
-    def bound(self) -> Array:
-        """Cramer-Rao (6, 6) about the pivot, by the bench's own geometry."""
-        c = self.sight.components
-        return least_covariance(
-            self.sight, self.T_base_flange, self.pose, X, self.pivot, self.unknowns,
-            self.covariance[:, :c, :c], self.noise,
+    def least(self, made: Calibration, pivot: Array) -> tuple[Least, Array]:
+        """The bound of what these shots show, and the estimator's own at the truth (6, 6)."""
+        view = features(made.task(), made.data).view
+        s, T = view.sightings, self.true_T_base_flange
+        error = np.array(
+            [increment(*pair, np.zeros(3)) for pair in zip(T, made.data.T_base_flange, strict=True)]
+        )
+        sight, unknowns = sight_of(view)
+        c = sight.components
+        found = least(
+            sight, T[s.shot], s.pose, error[s.shot], X, pivot, unknowns,
+            s.covariance[:, :c, :c], self.noise,
         )  # fmt: skip
-
-    def own_bound(self) -> Array:
-        """The same by the estimator's Jacobian at the truth."""
-        noise = PoseNoise(self.noise.pose_m, self.noise.pose_rad, self.noise.aim_m)
+        value = np.zeros_like(s.value)
+        value[:, :c] = sight.see(T[s.shot] @ X, unknowns)
+        if sight.aim is not None:
+            value[:, 2] = 0.0  # the light is taken to lie on the marks
+        exact = TargetView(view.model, type(s)(
+            s.names, s.shot, s.pose, T[s.shot], value, s.covariance
+        ))  # fmt: skip
+        noise = PoseNoise(self.noise.pose_m, self.noise.pose_rad, self.aim_m)
         state = MountState(X, (self.place,))
-        problem = MountProblem((self.exact,), noise, state, pivot=self.pivot)
+        problem = MountProblem((exact,), noise, state, pivot=pivot)
         J = problem.linearise(state)[1].reshape(-1, len(problem.names))
-        return np.asarray(np.linalg.inv(J.T @ J)[:6, :6])
-
-    def _view(self, T_base_flange: Array, value: Array) -> TargetView:
-        names = tuple(f"{self.task.kind} {i + 1}" for i in range(len(self.pose)))
-        sightings = Sightings(names, self.pose, self.pose, T_base_flange, value, self.covariance)
-        return TargetView(self.model, sightings)
+        return found, np.asarray(np.linalg.inv(J.T @ J)[:6, :6])
 
 
-def sphere_world(rng: np.random.Generator, noise: Noise = NOISE, poses: int = 15) -> World:
-    """Circles on a sphere."""
-    T = sphere_shots(BLIND, CENTRE, RADIUS_M, poses, rng).true_T_base_flange
-
-    def see(T_base_sensor: Array, centre: Array) -> Array:
-        return circles(T_base_sensor, centre, RADIUS_M)
-
-    covariance = [circle_covariance(r, POINT_M, PITCH_M) for r in see(T @ X, CENTRE)[:, 2]]
-    return World(
-        SphereTask(SphereTarget(RADIUS_M)), SphereModel(RADIUS_M), CENTRE, Sight(see, 3, 3),
-        CENTRE, T, np.arange(poses), np.array(covariance), noise,
-    )  # fmt: skip
-
-
-def line_world(
-    rng: np.random.Generator, known: bool, noise: Noise = NOISE, poses: int = 15
-) -> World:
-    """Points of a straight edge; an unknown one has four unknowns: where it cuts two planes."""
-    T = edge_shots(BLIND, T_BASE_USER, poses, rng).true_T_base_flange
+def sight_of(view: TargetView) -> tuple[Sight, Array]:
+    """How the features of a view come about, and the true unknowns of the target (k,)."""
+    model = view.model
+    if isinstance(model, SphereModel):
+        return Sight(lambda T, centre: circles(T, centre, RADIUS_M), 3, 3), CENTRE
     origin, along, aside = T_BASE_USER[:3, 3], T_BASE_USER[:3, 0], T_BASE_USER[:3, 1:3]
+    if isinstance(model, LineModel):
+        if model.known:
+            return Sight(lambda T, _: piercings(T, origin, along)[0], 0, 2), np.zeros(0)
 
-    def see(T_base_sensor: Array, ends: Array) -> Array:
-        if known:
-            return piercings(T_base_sensor, origin, along)[0]
-        first, last = origin + aside @ ends[:2], origin + LINE_M * along + aside @ ends[2:]
-        return piercings(T_base_sensor, first, last - first)[0]
+        def seen(T: Array, ends: Array) -> Array:
+            first, last = origin + aside @ ends[:2], origin + LINE_M * along + aside @ ends[2:]
+            return piercings(T, first, last - first)[0]
 
-    unknowns = 0 if known else 4
-    target = LineTarget(origin, along) if known else None
-    return World(
-        LineTask(target, EdgeRule()), LineModel(known), np.stack([origin, along]),
-        Sight(see, unknowns, 2), np.zeros(unknowns), T, np.arange(poses),
-        _corners(rng, poses), noise,
-    )  # fmt: skip
-
-
-def step_world(rng: np.random.Generator, noise: Noise = AIMED, poses: int = 5) -> World:
-    """Corners of stairs; in every profile each has a machining error of its own."""
-    shots = step_shots(BLIND, STAIRS, poses, rng, aim_m=noise.aim_m)
-    marks, steps = STAIRCASE.marked_corners(), STAIRS.steps
-    user = np.concatenate([marks[mark] for mark in shots.marks])
-    base = user @ T_BASE_USER[:3, :3].T + T_BASE_USER[:3, 3]
-    pose = np.repeat(np.arange(poses), steps)
-
-    def see(T_base_sensor: Array, nothing: Array) -> Array:
-        xz, far = piercings(T_base_sensor, base, T_BASE_USER[:3, 0])
-        return np.column_stack([xz, far])
-
-    covariance = _corners(rng, poses)[pose]
-    covariance[:, 2, 2] = 0.0
+        return Sight(seen, 4, 2), np.zeros(4)
+    if not isinstance(model, CornerModel):
+        raise ValueError("no such target")
+    base = model.corner_user @ T_BASE_USER[:3, :3].T + origin
+    step = model.corner_user[:, 2] / STAIRS.height_m - 1.0
     aim = np.zeros((len(base), 3, 2))
-    aim[:, 2, 0], aim[:, 2, 1] = 1.0, np.tile(np.linspace(-1.0, 1.0, steps), poses)
-    task = StepTask(StepTarget(T_BASE_USER, marks, STAIRCASE.edge_user))
-    return World(
-        task, task.model(user), T_BASE_USER, Sight(see, 0, 3, aim), np.zeros(0),
-        shots.true_T_base_flange[pose], pose, covariance + MACHINING_M**2 * np.eye(3), noise,
-    )  # fmt: skip
+    aim[:, 2, 0], aim[:, 2, 1] = 1.0, 2.0 * step / (STAIRS.steps - 1) - 1.0
+    return Sight(lambda T, _: np.column_stack(piercings(T, base, along)), 0, 3, aim), np.zeros(0)
 
 
-def _corners(rng: np.random.Generator, poses: int) -> Array:
-    """Covariances (poses, 3, 3) of (x, z) of corners that are turned in the laser plane."""
-    covariance = np.tile(np.eye(3), (poses, 1, 1))
-    for one, turn in zip(
-        covariance, rng.uniform(-BLIND.tilt_rad, BLIND.tilt_rad, poses), strict=True
-    ):
-        one[:2, :2] = corner_covariance(turn, FLANK_M, POINT_M, PITCH_M)
-    return covariance
+Draw = Callable[[np.random.Generator], World]
 
 
-def calibrated(task: Task, view: TargetView) -> MountFit:
-    """As the solver does it with the features of profiles; no noise is told."""
-    fit = fit_mount((view,), look(task, view)[0])
-    require_seen(fit)
-    return fit
+def _world(
+    target: LaserTarget | None,
+    place: Array,
+    scene: Scene,
+    shots: SimulatedShots,
+    robot: PoseRobot,
+    aim_m: float = 0.0,
+) -> World:
+    light = shots.true_T_base_flange @ CELL.T_flange_light
+    wanted = tuple(WantedView(T, mark) for T, mark in zip(light, shots.marks, strict=True))
+    return World(target, place, scene, wanted, robot, aim_m)
 
 
-def squared_error(fit: MountFit) -> float:
+def sphere_world(
+    rng: np.random.Generator, poses: int = 15, robot: PoseRobot | None = None
+) -> World:
+    """A ball."""
+    shots = sphere_shots(CELL, CENTRE, RADIUS_M, poses, rng)
+    scene = ball_on_table(CENTRE, RADIUS_M)
+    return _world(SphereTarget(RADIUS_M), CENTRE, scene, shots, robot or PoseRobot())
+
+
+def line_world(rng: np.random.Generator, known: bool, poses: int = 15) -> World:
+    """A straight edge; an unknown one has four unknowns: where it cuts two planes."""
+    shots = edge_shots(CELL, T_BASE_USER, poses, rng)
+    place = np.stack([LINE.point_base, LINE.direction_base])
+    scene = Scene((edge_block(T_BASE_USER),))
+    return _world(LINE if known else None, place, scene, shots, PoseRobot())
+
+
+def step_world(rng: np.random.Generator, poses: int = 5) -> World:
+    """Stairs that were measured."""
+    shots = step_shots(CELL, STAIRS, poses, rng, aim_m=AIM_M)
+    target = StepTarget(T_BASE_USER, STAIRCASE.marked_corners(), STAIRCASE.edge_user, GAUGED_M)
+    return _world(target, T_BASE_USER, Scene((STAIRS.body,)), shots, PoseRobot(), AIM_M)
+
+
+def squared_error(result: HandEyeResult) -> float:
     """Squared error of a mount in units of its covariance: chi-square where that is true."""
-    step = increment(fit.state.T_flange_sensor, X, pivot_of(fit.views))
-    return float(step @ np.linalg.solve(fit.covariance[:6, :6], step))
+    step = increment(result.T_flange_sensor, X, result.pivot)
+    return float(step @ np.linalg.solve(result.covariance, step))

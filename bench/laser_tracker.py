@@ -59,6 +59,7 @@ class TrackerCell:
     arcs : joint values (n, dof) of the two paths; ``scan`` (m, dof) of the profiles.
     edge_rad : angle in the sensor's x-y plane from its y to the edge between both faces;
         ``lean_rad`` turns the cube about that edge.
+    sensor : that of the source, without the form of real ones: its method has no model of it.
     around : whatever else the sensor may see.
     """
 
@@ -69,7 +70,7 @@ class TrackerCell:
     scan: Array
     sizes: Sizes = field(default_factory=Sizes)
     T_tracker_base: Array = field(default_factory=lambda: T_TRACKER_BASE.copy())
-    sensor: ProfileSensor = field(default_factory=ProfileSensor)
+    sensor: ProfileSensor = field(default_factory=lambda: ProfileSensor.exact(noise_m=3.7e-5))
     edge_rad: float = float(np.radians(40.0))
     lean_rad: float = float(np.radians(7.0))
     around: tuple[ScannedBody, ...] = ()

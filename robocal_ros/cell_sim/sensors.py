@@ -1,12 +1,12 @@
 """What measures in the simulated cell: line laser, sphere sensor and floor sphere; when it stands.
 
-The light leaves the sensor's origin within the plane y = 0, around z. The camera sits on the y
+The light leaves its frame's origin within the plane y = 0, around z. The camera sits on the y
 axis; a point is seen when light falls on it, not too flat, and nothing stands before the camera.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,7 @@ from robocal_ros.thermal.cell_setup import SensorField
 
 AWAY_M = 1e-9  # a ray does not meet the surface on which it begins
 TABLE_M = 2.0
+STEEPEST = 10.0  # of a surface that the spot is a mean of; beyond, it ends there
 
 
 class ScannedBody(Protocol):
@@ -207,7 +208,9 @@ def _inside(outline: Array, points: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class ProfileSensor:
-    """A sensor.
+    """A sensor; it errs as real ones do unless it is told not to (`ProfileSensor.exact`).
+
+    The errors are those measured on the profiles of others (docs/simulation.md).
 
     ``columns``: of a profile, at equal steps of x / z.
     ``near_m``, ``far_m``: measuring range along z.
@@ -216,7 +219,10 @@ class ProfileSensor:
     ``flattest_rad``: angle from the surface's normal, of light or view, beyond which nothing is
     seen.
     ``noise_m``: standard deviation of z.
-    ``towards``: whether z is told as a height over the middle of the range, not as a distance.
+    ``spot_m``: width over which a column sees a mean: edges have their tops rounded.
+    ``horns``: how far the sensor sharpens that again; beside a top then stand two others.
+    ``towards``: whether z is told as a height over the middle of the range, not as a distance; the
+    sensor's frame is there then, turned about x.
     ``linearity_m``: amplitudes of a smooth error of z over the field, m: of second degree across
     it, of the product, and of second degree along the beam; as real sensors have it.
     ``ends``: columns at both ends of what is seen in a row that are off by up to ``spike_m``.
@@ -234,25 +240,45 @@ class ProfileSensor:
     half_angle_rad: float = float(np.radians(14.0))
     baseline_m: float = 0.09
     flattest_rad: float = float(np.radians(80.0))
-    noise_m: float = 3.7e-5
-    towards: bool = False
-    linearity_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ends: int = 0
+    noise_m: float = 1.5e-5
+    spot_m: float = 4e-4
+    horns: float = 0.5
+    towards: bool = True
+    linearity_m: tuple[float, float, float] = (2e-5, -1e-5, 2e-5)
+    ends: int = 2
     quantum_m: float = 0.0
-    spikes: float = 0.0
+    spikes: float = 0.003
     spike_m: float = 2e-3
-    dropouts: float = 0.0
+    dropouts: float = 0.02
     gaps: int = 0
     gap_columns: int = 25
     ghosts: float = 0.0
 
-    def shoot(self, T_base_sensor: Array, scene: Scene, rng: np.random.Generator) -> Array:
+    @classmethod
+    def exact(cls, **changes: Any) -> "ProfileSensor":
+        """One without errors, but for these ``changes``; z is a distance."""
+        none: dict[str, Any] = dict.fromkeys(
+            ("noise_m", "spot_m", "horns", "spikes", "dropouts"), 0.0
+        )
+        none |= {"towards": False, "linearity_m": (0.0, 0.0, 0.0), "ends": 0}
+        return cls(**(none | changes))
+
+    @property
+    def T_light_sensor(self) -> Array:
+        """The frame (4, 4) in which profiles are told, where the light has its own."""
+        if not self.towards:
+            return np.eye(4)
+        T = np.diag([1.0, -1.0, -1.0, 1.0])
+        T[2, 3] = 0.5 * (self.near_m + self.far_m)
+        return T
+
+    def shoot(self, T_base_light: Array, scene: Scene, rng: np.random.Generator) -> Array:
         """A profile (columns, 2): x, z, m, sensor frame; not-a-number where nothing returns."""
         u = np.linspace(-1.0, 1.0, self.columns) * np.tan(self.half_angle_rad)
-        R, origin = T_base_sensor[:3, :3], np.tile(T_base_sensor[:3, 3], (self.columns, 1))
+        R, origin = T_base_light[:3, :3], np.tile(T_base_light[:3, 3], (self.columns, 1))
         rays = np.column_stack([u, np.zeros_like(u), np.ones_like(u)])
         rays = (rays / np.linalg.norm(rays, axis=1)[:, None]) @ R.T
-        camera = T_base_sensor[:3, 3] + self.baseline_m * R[:, 1]
+        camera = T_base_light[:3, 3] + self.baseline_m * R[:, 1]
         distance, normal = scene.meet(origin, rays)
         lit = np.isfinite(distance)
         spot = origin + np.where(lit, distance, 0.0)[:, None] * rays
@@ -273,6 +299,7 @@ class ProfileSensor:
             taken = lit & np.isfinite(share) & (rng.random(self.columns) < self.ghosts)
             xz[taken] = there[taken]
         n = self.columns
+        xz = self._spotted(xz)
         xz[:, 1] += self.noise_m * rng.standard_normal(n) + self._nonlinear(xz)
         if self.ends:
             near = np.convolve(np.isnan(xz[:, 1]), np.ones(2 * self.ends + 1), "same") > 0.0
@@ -291,6 +318,27 @@ class ProfileSensor:
         if self.towards:
             xz[:, 1] = 0.5 * (self.near_m + self.far_m) - xz[:, 1]
         return np.asarray(xz)
+
+    def _spotted(self, xz: Array) -> Array:
+        """Points (n, 2) as means over the spot, of a surface that goes on without a jump."""
+        pitch = 2.0 * self.far_m * np.tan(self.half_angle_rad) / self.columns
+        half = round(0.5 * self.spot_m / pitch)
+        if half == 0:
+            return xz
+        with np.errstate(invalid="ignore"):
+            goes_on = np.abs(np.diff(xz[:, 1])) < STEEPEST * pitch  # not-a-number does not
+        number = np.concatenate([[0], np.cumsum(~goes_on)])
+        first = np.searchsorted(number, number)
+        last = np.searchsorted(number, number, side="right") - 1
+        row = np.arange(len(xz))
+        sums = np.vstack([np.zeros(2), np.cumsum(np.nan_to_num(xz), axis=0)])
+
+        def mean(half: int) -> Array:
+            k = np.minimum(half, np.minimum(row - first, last - row))
+            return np.asarray((sums[row + k + 1] - sums[row - k]) / (2 * k + 1)[:, None])
+
+        told = (1.0 + self.horns) * mean(half) - self.horns * mean(2 * half)
+        return np.where(np.isnan(xz), np.nan, told)
 
     def _nonlinear(self, xz: Array) -> Array:
         """Error of z (n,) of points (n, 2), m."""
@@ -500,14 +548,14 @@ TARGET_ROOM = 2.0  # a target further away than this many times the range is not
 class ProfileStation:
     """The sensor and its pace.
 
-    ``T_flange_sensor`` (4, 4): where it truly sits.
+    ``T_flange_light`` (4, 4): where its light truly leaves.
     ``target`` (3,): about where the scene is, base, m.
     ``settle_s``, ``period_s``: rest before the first profile, and between two of them.
     ``delay_s``: from a profile to when it is told.
     """
 
     sensor: ProfileSensor
-    T_flange_sensor: Array
+    T_flange_light: Array
     scene: Scene
     target: Array
     settle_s: float = 0.5
@@ -516,7 +564,7 @@ class ProfileStation:
 
     def near(self, T_base_flange: Array) -> bool:
         """Whether the target may be in range at a flange pose (4, 4) known to centimetres."""
-        away = (T_base_flange @ self.T_flange_sensor)[:3, 3] - self.target
+        away = (T_base_flange @ self.T_flange_light)[:3, 3] - self.target
         return bool(np.linalg.norm(away) < TARGET_ROOM * self.sensor.far_m)
 
     def shoot(
@@ -524,7 +572,7 @@ class ProfileStation:
     ) -> "ProfileShot | None":
         """A profile; None where nothing returns."""
         rng = draws.of(Stream.PROFILES, tick)
-        points = self.sensor.shoot(T_base_flange @ self.T_flange_sensor, self.scene, rng)
+        points = self.sensor.shoot(T_base_flange @ self.T_flange_light, self.scene, rng)
         if not np.any(np.isfinite(points)):
             return None
         return ProfileShot(time_s, time_s + self.delay_s, points)

@@ -25,7 +25,7 @@ from robocal_ros.hand_eye.result import ARM_M, PoseNoise, apart, at_origin, incr
 AXES = ("the laser line (x)", "the laser plane's normal (y)", "the beam (z)")
 ALONG = 0.9  # cosine from which a direction is named after an axis
 SMALL_TURN_RAD = float(np.radians(1.0))  # turns below this show nothing
-FARTHEST_AXIS_M = 100.0  # a turn about an axis beyond it is a translation
+FARTHEST_AXIS_M = 5.0  # a turn about an axis beyond it is a translation, in a field of 0.1 m
 ENOUGH = "by 20 deg or more"
 
 # Chance that a clean set loses any shot. A robot's errors hang together and have longer tails than

@@ -136,9 +136,14 @@ class SensorDescription:
     def field(
         self, near_mm: float, far_mm: float, width_mm: float, noise_mm: float
     ) -> tuple[float, float, float, float]:
-        """Near and far end, width and noise, m; the numbers where nothing is told of them."""
+        """Near and far end, width and noise, m; the numbers where nothing is told of them.
+
+        Of numbers that are distances the middle counts as 0 where z grows towards the sensor.
+        """
         if self.near_mm is not None and self.far_mm is not None:
             near_mm, far_mm = self.near_mm, self.far_mm
+        elif self.towards and near_mm < far_mm:
+            near_mm, far_mm = 0.5 * (far_mm - near_mm), -0.5 * (far_mm - near_mm)
         width_mm = width_mm if self.width_mm is None else self.width_mm
         noise_mm = noise_mm if self.noise_mm is None else self.noise_mm
         return near_mm * 1e-3, far_mm * 1e-3, width_mm * 1e-3, noise_mm * 1e-3

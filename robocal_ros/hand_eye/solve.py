@@ -423,7 +423,7 @@ def _name_mistake(
     def suspects() -> Iterator[tuple[str, Callable[[], float]]]:
         for words, poses in undone(data.T_base_flange):
             yield words, partial(with_poses, poses)
-        if read is not None and error is not None:
+        if read is not None and error is not None and not task.read_by_poses:
             return  # open directions lie in the poses, whatever is told of the target
         for words, other in task.suspects():
             yield words, partial(with_target, other)

@@ -23,7 +23,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
 from robocal_ros.kinematics.robots import load_robot
 
-QUIET = ProfileSensor(noise_m=0.0)
+QUIET = ProfileSensor.exact()
 CENTRE, RADIUS = np.array([0.75, -0.1, 0.15]), 0.02
 T_BASE_USER = frames.transform(frames.exp_rotation([0.02, -0.03, 0.4]), [0.75, -0.1, 0.1])
 STAIRS = TrueStairs(T_BASE_USER)

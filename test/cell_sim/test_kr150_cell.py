@@ -36,6 +36,7 @@ from robocal_ros.cell_sim.cell import (
     poses,
 )
 from robocal_ros.cell_sim.robot import Effects, Warmth, shift, turn
+from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.motion.cell import Housing, MotionCell, ToolBody
@@ -267,7 +268,7 @@ def test_the_line_laser_sees_its_target_at_each_of_its_poses():
     assert len(came.profiles) == len(poses("profile"))
     robot, cold = cell.plan.robot, Warmth.cold(6)
     for shot, q in zip(came.profiles, poses("profile"), strict=True):
-        T = robot.flange(q, cold)[0] @ T_FLANGE_LASER
+        T = robot.flange(q, cold)[0] @ T_FLANGE_LASER @ ProfileSensor().T_light_sensor
         x, y, z = np.linalg.inv(T)[:3] @ np.append(TARGET, 1.0)
         reach = np.sqrt(TARGET_RADIUS_M**2 - y**2)
         away = np.hypot(shot.points[:, 0] - x, shot.points[:, 1] - z) - reach

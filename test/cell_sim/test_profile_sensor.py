@@ -18,7 +18,7 @@ from robocal_ros.cell_sim.sensors import (
 from robocal_ros.ground import frames
 
 DOWN = np.diag([1.0, -1.0, -1.0])
-QUIET = ProfileSensor(noise_m=0.0)
+QUIET = ProfileSensor.exact()
 WIDE = replace(QUIET, near_m=0.15, far_m=0.35)
 RADIUS, CENTRE = 0.02, np.array([0.8, 0.1, 0.3])
 
@@ -47,7 +47,7 @@ def test_points_lie_on_the_ball(y):
 
 def test_noise_is_that_of_the_sensor():
     """Along z, on a level plate; of 1000 columns a standard deviation is known to 2 %."""
-    sensor = ProfileSensor(columns=1000)
+    sensor = ProfileSensor.exact(columns=1000, noise_m=3.7e-5)
     T = looking([0, 0, 30], [0.5, 0, 0], [0, 0, 0.2])
     z = sensor.shoot(T, Scene((table([0.5, 0, 0]),)), rng())[:, 1] - 0.2
     assert z.std() == pytest.approx(3.7e-5, rel=0.1)
@@ -199,3 +199,58 @@ def test_a_mirrored_spot_is_seen_where_the_camera_believes_it():
     p = in_base(T, ghost[other])
     on_table, on_wall = np.abs(p[:, 2]) < 1e-9, np.abs(p[:, 0] - 0.55) < 1e-9
     assert (on_table | on_wall).all()
+
+
+ROOF = block(np.eye(4), 0.2, 0.1, 0.1)
+ON_ROOF = view(
+    np.column_stack([[0.0, 1.0, 1.0], [np.sqrt(2.0), 0.0, 0.0], [0.0, 1.0, -1.0]]) / np.sqrt(2.0),
+    np.zeros(3), [0.1, 0.0, 0.0], [0.0, 0.0, 0.2],
+)  # fmt: skip
+
+
+def above_the_roof(sensor: ProfileSensor) -> np.ndarray:
+    """Places (n, 2) of a roof of 90 deg: x, and how far outside of it."""
+    x, z = sensor.shoot(ON_ROOF, Scene((ROOF,)), rng()).T
+    return np.column_stack([x, 0.2 + np.abs(x) - z])
+
+
+def test_a_top_is_rounded_over_the_spot_and_nothing_else():
+    """There the mean of |x| over the spot is told; beyond it what is."""
+    x, outside = above_the_roof(ProfileSensor.exact(spot_m=1e-3)).T
+    top, half = np.nanargmin(np.abs(x)), 6  # columns: half of the spot at 0.21 m
+    mean = np.abs(x[top - half : top + half + 1]).mean()
+    assert outside[top] == pytest.approx(np.abs(x[top]) - mean, rel=0.05)  # x is a mean, too
+    assert mean > 2e-4
+    assert np.nanmax(np.abs(outside[np.abs(x) > 0.6e-3])) < 1e-12
+
+
+def test_horns_stand_beside_a_top():
+    x, outside = above_the_roof(ProfileSensor.exact(spot_m=1e-3, horns=1.0)).T
+    beside = (np.abs(x) > 0.4e-3) & (np.abs(x) < 1e-3)
+    assert np.nanmax(outside[beside]) > 5e-5
+    assert np.nanmax(np.abs(outside[np.abs(x) > 1.1e-3])) < 1e-12
+
+
+def test_heights_are_of_a_frame_in_the_middle_of_the_range():
+    sensor = ProfileSensor.exact(towards=True)
+    T = looking([10, -20, 50], CENTRE, [0.004, 0.009, 0.195 + np.sqrt(RADIUS**2 - 0.009**2)])
+    points = in_base(
+        T @ sensor.T_light_sensor, sensor.shoot(T, ball_on_table(CENTRE, RADIUS), rng())
+    )
+    assert np.linalg.norm(points - CENTRE, axis=1) == pytest.approx(RADIUS, abs=1e-12)
+
+
+def test_by_default_it_errs_as_real_ones_do():
+    """A level plate: bent by 20 to 50 um, lost and speckled points, wrong ones at its ends."""
+    T = looking([0, 0, 0], [0.5, 0, 0], [0, 0, 0.205])
+    x, z = ProfileSensor().shoot(T, Scene((table([0.5, 0, 0]),)), rng()).T
+    lost = np.isnan(z)
+    assert lost.mean() == pytest.approx(0.02, abs=5 * np.sqrt(0.02 / 1280))
+    off = z[~lost] + 0.005
+    near = np.abs(off) < 2e-4
+    assert 1280 * 0.02 > np.sum(~near) > 0
+    bend = np.polyfit(x[~lost][near], off[near], 2)
+    field = np.polyval(bend, x[~lost][near])
+    assert 2e-5 < np.ptp(field) < 5e-5
+    scatter = (off[near] - field).std()
+    assert scatter == pytest.approx(ProfileSensor().noise_m, rel=0.15)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_eye_command import chi_square, pose_of, robocal, shots, target
+from hand_eye_command import HEIGHTS, RANGE, chi_square, pose_of, robocal, shots, target
 from hand_eye_tables import (
     CELL,
     CENTRE,
@@ -112,7 +112,7 @@ class TestRecovered:
 
     def test_several_targets_together_are_better_than_each(self, made, sphere):
         words = [word for kind in ("sphere", "step", "line") for word in (f"--{kind}", made / kind)]
-        found = robocal("joint", *words)
+        found = robocal("joint", *HEIGHTS, *words)
         assert chi_square(found) < FAR_OFF
         assert found["working_error_mm"] < sphere["working_error_mm"]
         names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
@@ -122,7 +122,7 @@ class TestRecovered:
         words = [word for kind in ("sphere", "step") for word in (f"--{kind}", made / kind)]
         words += ["--line", tmp_path / "line"]
         shutil.copytree(made / "line", tmp_path / "line")
-        found = robocal("joint", *words, "--check", "check.csv")
+        found = robocal("joint", *HEIGHTS, *words, "--check", "check.csv")
         assert found["verdict"]["accept"]
         judges = [
             robocal(kind, *shots(made / kind), *target(made / kind), "--check", check)
@@ -130,27 +130,28 @@ class TestRecovered:
             for check in [made / kind / "check.csv"]
         ]
         assert found["held_out"]["n"] == sum(one["held_out"]["n"] for one in judges)
-        # 0.23 mm is to be expected: of the robot 0.05 mm in each axis, and at 20 of the 28 samples,
-        # the corners, the aim of 0.2 mm along the edges and its turn; 1.3 for a scatter of 4 shots
-        assert found["held_out"]["rms_mm"] < 0.3
+        # 0.31 mm is to be expected: of the robot 0.12 mm in each axis and 0.1 mrad, at 20 of the 28
+        # samples, the corners, the aim of 0.2 mm along the edges and its turn; 1.3 for a scatter of
+        # 4 shots
+        assert found["held_out"]["rms_mm"] < 1.3 * 0.31
         some = shots_of("line")
         T = some.T_base_flange[SHOTS : SHOTS + CHECKS].copy()
         T[:, 2, 3] += 0.03  # as far as the edge was lowered before these were seen
         write_part(tmp_path / "line", "moved", some, range(SHOTS, SHOTS + CHECKS), T)
-        refused = robocal("joint", *words, "--check", "moved.csv")
+        refused = robocal("joint", *HEIGHTS, *words, "--check", "moved.csv")
         assert refused["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
         assert "not used to solve" in refused["verdict"]["reason"]
         assert refused["held_out"]["n"] == CHECKS
         assert refused["T_flange_sensor"] == found["T_flange_sensor"]
         for name, said in (("poses.csv", "other shots must judge"), ("none.csv", "none of the")):
-            failed = robocal("joint", *words, "--check", name, status=2)
+            failed = robocal("joint", *HEIGHTS, *words, "--check", name, status=2)
             assert said in failed["error"]["message"]
 
     def test_a_line_without_a_target_file_is_unknown_in_joint(self, made, tmp_path):
         shutil.copytree(made / "groove", tmp_path / "groove")
         (tmp_path / "groove" / "target.yaml").unlink()
         both = ["--sphere", made / "sphere", "--line", tmp_path / "groove"]
-        found = robocal("joint", *both, "--line-kind", "groove")
+        found = robocal("joint", *HEIGHTS, *both, "--line-kind", "groove")
         assert not found["target"]["line"]["known"]
         assert chi_square(found) < FAR_OFF
 
@@ -211,8 +212,12 @@ class TestMistakes:
     def test_the_sphere_always_at_the_same_place_of_the_profile(self, tmp_path):
         """At one distance, in the middle: the sensor may turn about the sphere."""
         write_part(tmp_path, "poses", same_place(), range(SHOTS))
-        words = ("rotation about", "other distances")
-        self.refused("RANK_DEFICIENT", *words, run=self.sphere(tmp_path))
+        found = robocal(*self.sphere(tmp_path))
+        assert found["verdict"]["code"] == "POSES_NOT_INFORMATIVE"
+        for words in found["unobservable"]:
+            assert words.startswith("rotation about")
+            assert "other distances" in words
+        assert min(found["sigma"]["rot_deg"]) > 5.0
 
     @pytest.mark.parametrize(
         ("factor", "columns", "words"),
@@ -271,7 +276,7 @@ class TestMistakes:
     def test_stairs_from_a_wrong_pose_are_rejected_as_a_shot(self, tmp_path):
         some = shots_of("step")
         T = some.T_base_flange[:SHOTS].copy()
-        T[4, 2, 3] += 0.002
+        T[4, 2, 3] += 0.004  # 20 times what the robot errs by
         write_part(tmp_path, "poses", some, range(SHOTS), T)
         write_target(tmp_path / "target.yaml", target_of("step"))
         found = robocal("step", *shots(tmp_path), *target(tmp_path))
@@ -390,7 +395,8 @@ class TestPlan:
         return path
 
     def plan(self, kind: str, poses: Path, mount: Path, *more: object) -> list[object]:
-        return ["check-plan", "--target-kind", kind, "--poses", poses, "--mount", mount, *more]
+        words = ["--target-kind", kind, "--poses", poses, "--mount", mount, *more]
+        return ["check-plan", *words, *([] if "--near-mm" in words else RANGE)]
 
     def centre(self) -> list[object]:
         return ["--radius-mm", 20, "--center-mm", ",".join(str(1e3 * v) for v in CENTRE)]
@@ -473,7 +479,8 @@ class TestPlan:
         at = np.random.default_rng(0).uniform([-0.01, -0.05, 0.29], [0.01, 0.05, 0.31], (10, 3))
         poses = tmp_path / "plan.csv"
         write_pose_table(poses, np.stack([step(T_base_user, -p) for p in at]))
-        found = robocal(*self.plan("line", poses, mount, "--target", known))
+        field = ["--near-mm", 190, "--far-mm", 210]
+        found = robocal(*self.plan("line", poses, mount, "--target", known, *field))
         assert (found["rank"], found["unknowns"]) == (3, 6)
         assert len(found["unobservable"]) == 3
         assert found["verdict"]["code"] == "RANK_DEFICIENT"
@@ -486,7 +493,7 @@ class TestPlan:
         poses = write_part(tmp_path, "poses", some, range(SHOTS), T)
         found = robocal(*self.plan("sphere", poses, mount, *self.centre()))
         assert list(found["unseen"]) == ["s5"]
-        assert "the sensor sees 190 to 210 mm" in found["unseen"]["s5"]
+        assert "the sensor sees 10 to -10 mm" in found["unseen"]["s5"]
 
     @pytest.mark.parametrize(
         ("text", "words"),

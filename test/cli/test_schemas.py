@@ -46,11 +46,22 @@ CROSSED = ["tool", "crossed", "--radius-mm", "12", "--period-s", "2", "--start-d
 RUN = ["tool", "crossed", "--robot", "ur10", "--laser", "laser.yaml", "--taught-mm", "0,0,150",
        "--sample-period-s", "0.002", "--joints", "joints.csv"]  # fmt: skip
 PARALLEL = ["tool", "parallel", "--up-mm", "400", "--down-mm", "360", "--x-mm", "800"]
-SPHERE = ["--radius-mm", "20", "--poses", "sphere/poses.csv", "--profiles", "sphere/profiles"]
-FEW_SPHERE = [*SPHERE[:2], "--poses", "sphere/few.csv", *SPHERE[4:]]
-STEP = ["--target", "step/target.yaml", "--poses", "step/poses.csv", "--profiles", "step/profiles"]
-LINE = ["--poses", "line/poses.csv", "--profiles", "line/profiles"]
-PLANNED = ["hand-eye", "check-plan", "--target-kind", "sphere", "--radius-mm", "20"]
+HEIGHTS = ["--z-grows", "towards"]
+SPHERE = [
+    "--radius-mm",
+    "20",
+    *HEIGHTS,
+    "--poses",
+    "sphere/poses.csv",
+    "--profiles",
+    "sphere/profiles",
+]
+FEW_SPHERE = [*SPHERE[:4], "--poses", "sphere/few.csv", *SPHERE[6:]]
+STEP = ["--target", "step/target.yaml", "--poses", "step/poses.csv",
+        "--profiles", "step/profiles", *HEIGHTS]  # fmt: skip
+LINE = ["--poses", "line/poses.csv", "--profiles", "line/profiles", *HEIGHTS]
+PLANNED = ["hand-eye", "check-plan", "--target-kind", "sphere", "--radius-mm", "20",
+           "--near-mm", "10", "--far-mm", "-10"]  # fmt: skip
 CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
            "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
@@ -221,7 +232,7 @@ CASES = {
     ),
     "hand-eye joint": (
         "hand-eye.joint.json",
-        ["hand-eye", "joint", "--sphere", "sphere", "--line", "line"],
+        ["hand-eye", "joint", *HEIGHTS, "--sphere", "sphere", "--line", "line"],
         ["hand-eye", "joint", "--sphere", "sphere"],
         (2, "BAD_INPUT"),
     ),

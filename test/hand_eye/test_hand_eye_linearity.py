@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import HandEyeCell, PoseRobot
-from bench.hand_eye_shots import SETTINGS, sphere_set
-from bench.hand_eye_worlds import RADIUS_M, X
+from bench.hand_eye_worlds import RADIUS_M, SETTINGS, X, sphere_set
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.profiles import Profile
@@ -17,18 +16,15 @@ from robocal_ros.hand_eye.tasks import SphereTask
 BENT_M = (3e-5, -2e-5, 4e-5)  # as real sensors: 20 to 100 um over the field
 RUNS = 6
 SPHERE = SphereTarget(RADIUS_M)
-# A robot that errs by less than the sensor, so that this one is what is seen.
-# A height counts from the middle of the range: the sensor's frame is turned about x, and there.
-T_DISTANCE_HEIGHT = np.diag([1.0, -1.0, -1.0, 1.0])
-T_DISTANCE_HEIGHT[2, 3] = 0.2
 
 
 def bent(linearity_m=BENT_M):
-    return ProfileSensor(noise_m=7e-6, towards=True, linearity_m=linearity_m, ends=2)
+    return ProfileSensor(noise_m=7e-6, linearity_m=linearity_m)
 
 
 def shot_with(sensor, seed):
-    cell = HandEyeCell(sensor=sensor, robot=PoseRobot(5e-6))
+    # A robot that errs by less than the sensor, so that this one is what is seen.
+    cell = HandEyeCell(sensor=sensor, robot=PoseRobot(5e-6, 0.0))
     return sphere_set(cell, np.random.default_rng([33, seed]))
 
 
@@ -77,7 +73,7 @@ def landed_m(result, points):
     told = points if result.linearity is None else result.linearity.corrected(points)
     there, found = (
         frames.apply(T, np.insert(p, 1, 0.0, axis=1))
-        for T, p in ((X @ T_DISTANCE_HEIGHT, true), (result.T_flange_sensor, told))
+        for T, p in ((X, true), (result.T_flange_sensor, told))
     )
     return np.sqrt(np.mean(np.sum((there - found) ** 2, axis=1)))
 

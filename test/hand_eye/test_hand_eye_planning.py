@@ -8,10 +8,12 @@ from hand_eye_sets import (
     CELL,
     CENTRE,
     POSE_M,
+    POSE_RAD,
     RADIUS_M,
     STAIRS,
     T_BASE_USER,
     data_of,
+    sphere_task,
     stairs_target,
 )
 from scipy.optimize import minimize
@@ -38,12 +40,11 @@ from robocal_ros.hand_eye.result import (
     expected_error_m,
 )
 from robocal_ros.hand_eye.solve import solve_task
-from robocal_ros.hand_eye.targets import SphereTarget, Staircase, StepTarget
-from robocal_ros.hand_eye.tasks import SphereTask
+from robocal_ros.hand_eye.targets import Staircase, StepTarget
 
-SENSOR = SensorRange(width_m=0.09)
-NOISE = PoseNoise(POSE_M, 1e-6, 1e-4)
-LIMIT_M = 3e-4
+SENSOR = SensorRange(near_m=0.01, far_m=-0.01, width_m=0.09, noise_m=CELL.sensor.noise_m)
+NOISE = PoseNoise(POSE_M, POSE_RAD, 2e-4)
+LIMIT_M = 6e-4
 
 
 def sphere_poses(count, cell=CELL, seed=0):
@@ -75,8 +76,8 @@ PLANNED = {
 def test_expected_error_is_that_of_a_calibration_from_these_poses():
     """The information of a plan against the covariance that profiles from it give."""
     shots = sphere_shots(CELL, CENTRE, RADIUS_M, 15, np.random.default_rng(3))
-    settings = HandEyeSettings(POSE_M, 1e-6)
-    result = solve_task(SphereTask(SphereTarget(RADIUS_M)), data_of(shots), "best", settings)
+    settings = HandEyeSettings(POSE_M, POSE_RAD)
+    result = solve_task(sphere_task(), data_of(shots), "best", settings)
     plan = judged(BALL, shots.true_T_base_flange)
     assert plan.rank == plan.unknowns == 9
     achieved = np.sqrt(np.diag(at_origin(result.covariance, result.pivot)))
@@ -96,8 +97,8 @@ def test_a_sphere_of_unknown_place_is_where_the_poses_see_it(seed, strays):
     plan = check_plan(PlannedSphere(RADIUS_M, SENSOR), poses, rough, SENSOR, NOISE, LIMIT_M)
     assert sorted(plan.unseen) == list(range(12 - strays, 12))
     if not strays:  # against what is achieved, at the same points of the field
-        settings = HandEyeSettings(POSE_M, 1e-6)
-        result = solve_task(SphereTask(SphereTarget(RADIUS_M)), data_of(shots), "best", settings)
+        settings = HandEyeSettings(POSE_M, POSE_RAD)
+        result = solve_task(sphere_task(), data_of(shots), "best", settings)
         covariance = at_origin(result.covariance, result.pivot)
         achieved_m = expected_error_m(covariance, SENSOR.field_points)
         # The place is found to 3 mm, and how well a circle tells it grows with the 11 mm or so by
@@ -197,13 +198,11 @@ def test_proposed_poses_do_what_they_promise(turned):
     every = np.concatenate([poor, plan.proposed])
     rng = np.random.default_rng(8)
     scene = ball_on_table(CENTRE, RADIUS_M)
-    profiles = [CELL.sensor.shoot(T @ CELL.T_flange_sensor, scene, rng) for T in every]
+    profiles = [CELL.sensor.shoot(T @ CELL.T_flange_light, scene, rng) for T in every]
     stands = [CELL.robot.stand(T, rng) for T in every]
     reported = np.array([stand.T_base_flange for stand in stands])
     shots = SimulatedShots(every, reported, profiles, [""] * len(every), None)
-    result = solve_task(
-        SphereTask(SphereTarget(RADIUS_M)), data_of(shots), "best", HandEyeSettings()
-    )
+    result = solve_task(sphere_task(), data_of(shots), "best", HandEyeSettings())
     assert result.verdict.accept
     assert len(result.rejected) <= 1  # nothing that is proposed is out of view
     off_m = apart(result.T_flange_sensor, CELL.T_flange_sensor, SENSOR.field_points)
@@ -217,7 +216,7 @@ def misfit(centre, T_base_sensor):
     total = 0.0
     for T in T_base_sensor:
         s = T[:3, :3].T @ (centre - T[:3, 3])
-        wanted = [0.0, np.copysign(off, s[1]), 0.2 + BEHIND * RADIUS_M]
+        wanted = [0.0, np.copysign(off, s[1]), -BEHIND * RADIUS_M]
         total += np.log1p(np.sum(((s - wanted) / allowed) ** 2))
     return total
 

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_eye_driver import ARM, CENTRE, SPHERE, sphere_set
+from hand_eye_driver import ARM, CENTRE, LASER, SPHERE, sphere_set, wide_cell
 from hand_eye_laser import TARGETS, driver_of
 
-from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.samples import JointSample
@@ -21,7 +20,6 @@ from robocal_ros.hand_eye.planning import (
     rough_mount,
     sphere_centre,
 )
-from robocal_ros.hand_eye.profiles import DEFAULT
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.session import events
 
@@ -66,15 +64,15 @@ def test_the_sphere_is_where_it_was_seen(history):
     driver.sphere(2)
     data = driver.session.data
     assert (
-        sphere_centre(data, history, ARM, TRUTH, DEFAULT) is None
+        sphere_centre(data, history, ARM, TRUTH, LASER) is None
     )  # two profiles do not tell their sides
     driver.sphere(6)
     data = driver.session.data
     # Off by what the mount is off: 2 mm along each axis.
-    assert np.linalg.norm(sphere_centre(data, history, ARM, CONFIGURED, DEFAULT) - CENTRE) < 4e-3
+    assert np.linalg.norm(sphere_centre(data, history, ARM, CONFIGURED, LASER) - CENTRE) < 4e-3
     number = driver.ask(events.CALIBRATE).calibration_id
     found_mm = history.document(number)["target"]["center_mm"]
-    assert sphere_centre(data, history, ARM, CONFIGURED, DEFAULT) == pytest.approx(
+    assert sphere_centre(data, history, ARM, CONFIGURED, LASER) == pytest.approx(
         1e-3 * np.array(found_mm)
     )
 
@@ -82,7 +80,7 @@ def test_the_sphere_is_where_it_was_seen(history):
 def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):
     driver = driver_of(history)
     driver.sphere(1)
-    poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(width_m=0.09)
+    poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(0.01, -0.01, 0.09)
 
     def unseen(centre: np.ndarray | None) -> int:
         config = driver.session.config
@@ -103,7 +101,7 @@ def test_a_plan_takes_the_noise_that_calibrate_takes(history):
     """A shift that is given alone is a turn too, at an arm's length of 3 m."""
     driver = driver_of(history)
     driver.sphere(1)
-    poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(width_m=0.09)
+    poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(0.01, -0.01, 0.09)
 
     def error_m(turn_rad: float | None) -> float:
         config = HandEyeConfig(robot_sigma_m=2e-4, robot_sigma_rad=turn_rad)
@@ -144,12 +142,12 @@ def test_as_many_poses_as_can_be_judged():
         planned_poses(ARM, [], [pose] * (MOST_POSES + 1))
 
 
-WIDE = SensorRange(0.17, 0.26, 0.1)
+WIDE = SensorRange(0.045, -0.045, 0.1)
 
 
 def plan(start: dict, shots, marks=()):
     """A plan of the poses of shots, with a sensor that is roughly known."""
-    data, truth = data_set_begun(SPHERE | start), sphere_set()[0].T_flange_sensor
+    data, truth = data_set_begun(SPHERE | start), wide_cell().T_flange_sensor
     rough = truth @ frames.transform(frames.exp_rotation([0.02, -0.01, 0.02]), [2e-3] * 3)
     config = HandEyeConfig(robot_sigma_m=2e-5)
     return judged_plan(data, ARM.fk(shots.q), marks, rough, WIDE, config)
@@ -158,9 +156,7 @@ def plan(start: dict, shots, marks=()):
 @pytest.mark.parametrize("name", list(TARGETS))
 def test_a_plan_that_will_do_is_told_from_one_that_will_not(name):
     changes, shoot, target, count = TARGETS[name]
-    wide = ProfileSensor(near_m=WIDE.near_m, far_m=WIDE.far_m, half_angle_rad=0.25)
-    cell = replace(sphere_set()[0], sensor=wide)
-    shots = shoot(cell, target, count, np.random.default_rng(3))
+    shots = shoot(wide_cell(), target, count, np.random.default_rng(3))
     marks = shots.marks if name == "step" else ()
     good = plan(changes, shots, marks)
     assert good.verdict.accept, good.verdict.reason

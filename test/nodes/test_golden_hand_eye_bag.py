@@ -31,7 +31,7 @@ BAGS = Path(__file__).parents[2] / "bags"
 EVENT_TOPIC = "/hand_eye_node/session_events"
 INPUTS = {f"/{kind}": kind for kind in (JOINTS, PROFILE)}
 CALLED = (START, CAPTURE, REMOVE, CALIBRATE, ACCEPT)
-SETTINGS = {"sensor_frame": "laser", "capture_timeout_s": 1.0}
+SETTINGS = {"sensor_frame": "laser", "z_grows": "towards", "capture_timeout_s": 1.0}
 
 
 @pytest.fixture(scope="module", params=["step"])  # the one with marks; the others replay elsewhere

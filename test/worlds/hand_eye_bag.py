@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hand_eye_driver import ARM, FRAME, START_NS, TYPE, Driver, Recorded
+from hand_eye_driver import ARM, FRAME, LASER, START_NS, TYPE, Driver, Recorded
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter, read_data_set, write_data_set
@@ -17,7 +17,7 @@ EVENTS = "/hand_eye_node/session_events"
 def hand_eye_bag(path: Path) -> None:
     """A sphere, a capture without a profile, a result that is accepted, a set from a file."""
     with CalibrationHistory.open("K1", state_dir=path.parent / "state_hand_eye") as history:
-        config = HandEyeConfig(sensor_frame=FRAME, capture_timeout_s=1.0)
+        config = HandEyeConfig(sensor_frame=FRAME, sensor=LASER, capture_timeout_s=1.0)
         driver = Driver(HandEyeSession(ARM, history, config, "test"))
         first = configuration(driver.session, {kind: f"/{kind}" for kind in TYPE})
         driver.sphere(10)

@@ -24,8 +24,12 @@ def robocal(action: str, *words: object, status: int = 0) -> Any:
     return document
 
 
+HEIGHTS = ["--z-grows", "towards"]  # as the simulated sensor tells its profiles
+RANGE = ["--near-mm", 10, "--far-mm", -10]  # the same of a plan
+
+
 def shots(folder: Path, table: str = "poses") -> list[object]:
-    return ["--poses", folder / f"{table}.csv", "--profiles", folder / "profiles"]
+    return ["--poses", folder / f"{table}.csv", "--profiles", folder / "profiles", *HEIGHTS]
 
 
 def target(folder: Path) -> list[object]:

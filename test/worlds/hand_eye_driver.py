@@ -12,11 +12,11 @@ import numpy as np
 from bench.hand_eye_cell import ArmRobot, HandEyeCell, SimulatedShots, sphere_shots
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.cell_sim.cell import rigid_robot
-from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.hand_eye.profiles import SensorDescription
 from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.targets import SphereTarget, target_document
 from robocal_ros.kinematics.robots import load_robot
@@ -28,7 +28,9 @@ START_NS = 1_700_000_000 * NS
 ARM = load_robot("ur10")
 CENTRE, RADIUS_M = np.array([0.75, -0.1, 0.15]), 0.02
 Q_NEAR = np.radians([-30.0, -100.0, -110.0, -60.0, 90.0, 20.0])
+GEOMETRY_M = 1e-4  # of each length, and as much at 1 m of each angle
 FRAME = "laser"
+LASER = SensorDescription(z_grows="towards")
 TYPE = {
     JOINTS: "sensor_msgs/msg/JointState",
     PROFILE: "sensor_msgs/msg/PointCloud2",
@@ -55,13 +57,23 @@ class Recorded(NamedTuple):
 
 @cache
 def sphere_set(count: int = 14) -> tuple[HandEyeCell, SimulatedShots]:
-    """Shots of a sphere by a UR10 that repeats to a hundredth of a millimetre."""
+    """Shots of a sphere by a UR10 that repeats to 0.02 mm, and errs by some 0.2 mm."""
     rng = np.random.default_rng(8)
-    noise = replace(Effects.none(), noise=True)
-    true = replace(rigid_robot(ARM, 0.0, rng), repeatability=1e-5, effects=noise)
+    true = rigid_robot(ARM, GEOMETRY_M, rng)
+    true.static_error[-1] = 0.0  # nobody can tell it from a shift of the sensor
+    effects = replace(true.effects, noise=True)
+    true = replace(true, repeatability=1e-5, effects=effects)
     robot = ArmRobot(true, Q_NEAR)
     cell = HandEyeCell(ProfileSensor(columns=320), robot, roll_rad=0.5)
     return cell, sphere_shots(cell, CENTRE, RADIUS_M, count, rng)
+
+
+WIDE = ProfileSensor(near_m=0.17, far_m=0.26, half_angle_rad=0.25)
+
+
+def wide_cell() -> HandEyeCell:
+    """The same robot with a sensor that sees 90 mm of depth."""
+    return replace(sphere_set()[0], sensor=WIDE)
 
 
 def namespace(value: Any) -> Any:

@@ -4,6 +4,7 @@ import numpy as np
 from hand_eye_driver import (
     ARM,
     FRAME,
+    LASER,
     SPHERE,
     Driver,
     sphere_shots_of,
@@ -33,7 +34,7 @@ TARGETS = {
 
 
 def driver_of(history, **changes) -> Driver:
-    config = HandEyeConfig(sensor_frame=FRAME, **changes)
+    config = HandEyeConfig(sensor_frame=FRAME, **({"sensor": LASER} | changes))
     return Driver(HandEyeSession(ARM, history, config, "test"))
 
 
@@ -46,7 +47,7 @@ def begun(history, **changes) -> Driver:
     return driver
 
 
-def off_m(history, outcome, truth: np.ndarray, depth_m: float = 0.2) -> float:
+def off_m(history, outcome, truth: np.ndarray, depth_m: float = 0.0) -> float:
     """How far a point at the working distance is off."""
     T = np.array(history.model(outcome.calibration_id)["T_parent_sensor"])
     return float(np.linalg.norm(((T - truth) @ [0.0, 0.0, depth_m, 1.0])[:3]))

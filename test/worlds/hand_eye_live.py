@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from hand_eye_driver import FRAME, RADIUS_M, Recorded, Robot, sphere_shots_of
+from hand_eye_driver import FRAME, LASER, RADIUS_M, Recorded, Robot, sphere_shots_of
 from rclpy.qos import HistoryPolicy, QoSProfile
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import CalibrateHandEye, CaptureHandEye, StartHandEye
@@ -41,7 +41,8 @@ def settings_of(folder: Path, **parameters: Any) -> dict[str, Any]:
     """Parameters of a node that calibrates on the sphere."""
     file = folder / "sphere.yaml"
     write_target(file, SphereTarget(RADIUS_M))
-    return {"serial": "K7", "sensor_frame": FRAME, "target_file": str(file)} | parameters
+    told = {"serial": "K7", "sensor_frame": FRAME, "target_file": str(file)}
+    return told | {"z_grows": LASER.z_grows} | parameters
 
 
 class LiveSensor:

