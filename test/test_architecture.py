@@ -10,7 +10,12 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 GROUND = {"ground", "estimation", "kinematics", "identification", "history", "session"}
 MODELS = {"ground", "estimation", "kinematics", "identification"}
-BELOW = GROUND | {"ros", "motion", "bags"}  # the capabilities, which know nothing of each other
+BELOW = GROUND | {
+    "ros",
+    "motion",
+    "bags",
+    "programs",
+}  # the capabilities, which know nothing of each other
 CAPABILITIES = {"thermal", "tool", "hand_eye", "correction"}
 ABOVE = BELOW | CAPABILITIES | {"maintenance"}
 # room -> rooms of ours that it may import beside itself
@@ -30,7 +35,7 @@ MAY_IMPORT = {
     "maintenance": BELOW | CAPABILITIES,
     "report": ABOVE,
     "cell_sim": ABOVE | {"report"},
-    "cli": ABOVE | {"report", "cell_sim", "programs"},
+    "cli": ABOVE | {"report", "cell_sim"},
 }
 COMMANDS = {"cli", "cli_sensors"}  # files of a room
 ROS_FILES = {

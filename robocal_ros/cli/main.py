@@ -497,6 +497,10 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "cli.programs:correct_program",
         "correct the points of a program (KRL, RAPID, FANUC .ls, URScript) for the robot as it is",
     ),
+    "frame-shift": CliCommand(
+        "cli.programs:frame_shift",
+        "the shift of a controller's base and tool frame that serves the working poses best",
+    ),
     "iso9283": CliCommand(
         "cli.identify:iso9283",
         "position accuracy and repeatability (AP, RP) of single poses as ISO 9283, 7.2, "

@@ -1,4 +1,4 @@
-"""Robots that ROS does not command: ``robocal correct-program``."""
+"""Robots that ROS does not command: ``robocal correct-program`` and ``frame-shift``."""
 
 import argparse
 import json
@@ -23,12 +23,14 @@ from robocal_ros.cli.main import (
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground.errors import Code, InputError, WrongRobotError
 from robocal_ros.ground.files import read_bytes, read_text, write_bytes
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
+from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
     STATES,
     CorrectionModels,
@@ -37,6 +39,7 @@ from robocal_ros.programs.correcting import (
     report,
 )
 from robocal_ros.programs.fanuc import FanucDialect
+from robocal_ros.programs.frame_shift import LEVER_M, PARTS, best_shift
 from robocal_ros.programs.points import Dialect, frame_given
 
 if TYPE_CHECKING:
@@ -269,4 +272,154 @@ def _show_corrected(console: "Console", document: Document) -> None:
     for place in document["computed"]:
         print_words(console, f"Line {place['line']} makes a point itself: {place['text']}")
     print_verdict(console, document)
+    print_output(console, document)
+
+
+# ---- the shift of base and tool frame ------------------------------------------------------------
+
+
+_SHIFT_EXAMPLE = """example:
+  robocal frame-shift --robot kr150_r3100 --robot-serial 4711 --poses work.csv --maker kuka \\
+      --tool 'TOOL_DATA[1]=0,0,300,0,0,0' --base 'BASE_DATA[2]=900,0,400,0,0,0'
+"""
+_TURNED_MM = 1e3 * LEVER_M
+
+
+def add_frame_shift(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``frame-shift``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _SHIFT_EXAMPLE
+    add_model_options(parser)
+    parser.add_argument(
+        "--poses",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="working poses: q1_deg … (prismatic: q1_mm), and sample and weight where wanted",
+    )
+    parser.add_argument(
+        "--maker", required=True, choices=sorted(COUNT), help="of the controller: how it is written"
+    )
+    for name, what in (("tool", "tool"), ("base", "base, work object, user frame or feature")):
+        parser.add_argument(
+            f"--{name}",
+            action="append",
+            default=[],
+            metavar="NAME=X,Y,Z,…",
+            help=f"a {what} that the controller has, in the maker's own numbers and units, to be "
+            "printed as shifted; several may be given",
+        )
+    parser.add_argument(
+        "--parts",
+        choices=("base,tool", *PARTS),
+        default="base,tool",
+        help="which frames may be shifted, default both",
+    )
+    parser.add_argument(
+        "--lever-mm",
+        type=positive,
+        default=_TURNED_MM,
+        metavar="L",
+        help=f"a turn of the tool counts as the way of a point so far off, default {_TURNED_MM:g}",
+    )
+    parser.add_argument(
+        "--limit-mm", type=positive, default=0.1, metavar="S", help="for the share, default 0.1"
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="text to write, never over one")
+
+
+def run_frame_shift(args: argparse.Namespace) -> CliResult:
+    """Do ``frame-shift``. Raises `RobocalError` for what a user can mend."""
+    if args.output is not None and args.output.exists():
+        raise InputError("is there already: name another file", file=str(args.output))
+    models, warnings = given_models(args)
+    nominal = models.nominal
+    q, names, weight = _working_poses(args.poses, nominal)
+    tools = [frame_given(args.maker, given) for given in args.tool]
+    bases = [frame_given(args.maker, given) for given in args.base]
+    tools = tools or [("", nominal.T_flange_tool)]
+    bases = bases or [("", np.eye(4))]
+    shift = best_shift(
+        models,
+        q,
+        tools[0][1],
+        parts=tuple(args.parts.split(",")),
+        weight=weight,
+        lever_m=1e-3 * args.lever_mm,
+    )
+    lines = []
+    if "tool" in args.parts:
+        moved = [(name, T @ shift.T_tool_shift) for name, T in tools]
+        lines += [tool_text(args.maker, T, name) for name, T in moved]
+    if "base" in args.parts:
+        moved = [(name, shift.T_base_shift @ T) for name, T in bases]
+        lines += [base_text(args.maker, T, name) for name, T in moved]
+    words = "\n".join(lines)
+    if args.output is not None:
+        write_bytes(args.output, (words + "\n").encode())
+    before, after = _errors(shift.before, args.limit_mm), _errors(shift.after, args.limit_mm)
+    verdict = Verdict(Code.ACCEPT, f"{before['rms_mm']:.3f} mm rms become {after['rms_mm']:.3f}")
+    if after["rms_mm"] > 0.9 * before["rms_mm"]:
+        verdict = Verdict(
+            Code.NO_SIGNIFICANT_GAIN, f"{verdict.reason}: correct the program instead"
+        )
+    poses = zip(names, _sizes(shift.before), _sizes(shift.after), strict=True)
+    document: Document = {
+        "robot": nominal.name,
+        "model_hash": nominal.model_hash,
+        "maker": args.maker,
+        "text": words,
+        "T_base_shift": transform_document(shift.T_base_shift),
+        "T_tool_shift": transform_document(shift.T_tool_shift),
+        "before": before,
+        "after": after,
+        "poses": [{"name": name, "before": one, "after": other} for name, one, other in poses],
+        "output": None if args.output is None else str(args.output),
+        "warnings": warnings,
+        "verdict": verdict_document(verdict),
+    }
+    return CliResult(document, _show_shift)
+
+
+def _working_poses(path: Path, arm: SerialArm) -> tuple[Array, tuple[str, ...], Array | None]:
+    """Joints (m, n), names and weights (m,) of a table."""
+    units = ["mm" if slides else "deg" for slides in arm.prismatic]
+    columns = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
+    table = read_cells(
+        path, lambda header, file: check_plain(header, file, columns, ("sample", "weight"))
+    )
+    factors = np.where(arm.prismatic, 1e-3, np.pi / 180.0)
+    q = np.column_stack([table.numbers(name) for name in columns]) * factors
+    weight = table.numbers("weight") if "weight" in table.columns else None
+    if weight is not None and (np.any(weight < 0.0) or not np.any(weight > 0.0)):
+        raise InputError("weights are 0 or above, and not all 0", file=str(path), column="weight")
+    return q, read_samples(table, tuple(map(str, table.rows))), weight
+
+
+def _sizes(twist: Array) -> list[Document]:
+    return [
+        {"mm": 1e3 * float(np.linalg.norm(e[:3])), "deg": float(np.degrees(np.linalg.norm(e[3:])))}
+        for e in twist
+    ]
+
+
+def _errors(twist: Array, limit_mm: float) -> Document:
+    mm = 1e3 * np.linalg.norm(twist[:, :3], axis=1)
+    share = float(np.mean(1e3 * np.abs(twist[:, :3]) <= limit_mm))
+    rms = float(np.sqrt(np.mean(mm**2)))
+    return {"rms_mm": rms, "max_mm": float(np.max(mm)), "share_within_limit": share}
+
+
+def _show_shift(console: "Console", document: Document) -> None:
+    rows = []
+    for pose in document["poses"]:
+        sizes = [pose[when][unit] for unit in ("mm", "deg") for when in ("before", "after")]
+        rows.append([pose["name"], *(f"{size:.4f}" for size in sizes)])
+    head = ("pose", "before mm", "after mm", "before deg", "after deg")
+    print_table(console, f"{document['robot']}: error of the tool at the working poses", head, rows)
+    shares = (document[when]["share_within_limit"] for when in ("before", "after"))
+    before, after = (f"{100.0 * share:.1f} %" for share in shares)
+    print_words(console, f"Coordinates of the error within the limit: {before}, then {after}")
+    print_verdict(console, document)
+    console.out(document["text"], highlight=False)
     print_output(console, document)

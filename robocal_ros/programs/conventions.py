@@ -7,13 +7,14 @@ about z, the new y, the new z.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, fixed
 
 Maker = Literal["kuka", "abb", "fanuc", "ur", "kawasaki"]
 COUNT: dict[Maker, int] = {"kuka": 6, "abb": 7, "fanuc": 6, "ur": 6, "kawasaki": 6}
@@ -80,6 +81,74 @@ def _turns(maker: Maker, R: Array) -> list[Array]:
     both = (roll, pitch, yaw), (roll + np.pi, np.pi - pitch, yaw + np.pi)
     order = slice(None) if maker == "fanuc" else slice(None, None, -1)
     return [np.array(one[order]) / DEGREE for one in both]
+
+
+# ---- frames as text for a controller, with 1e-4 mm and 1e-5 deg ---------------------------------
+
+
+ABB_UNKNOWN = "1,[0,0,1]"  # ABB takes no load without mass or with its centre in the flange
+ABB_REMARK = "! mass and centre of gravity are placeholders: enter this tool's, in kg and mm\n"
+ABB_STILL = "[[0,0,0],[1,0,0,0]]"
+
+
+@dataclass(frozen=True)
+class Load:
+    """What ABB's tooldata holds beside the frame.
+
+    ``mass_kg``: of the tool, above 0.
+    ``centre`` (x, y, z): of gravity in the flange frame, m.
+    """
+
+    mass_kg: float
+    centre: tuple[float, float, float]
+
+
+def tool_text(maker: Maker, T_flange_tool: Array, name: str = "", load: Load | None = None) -> str:
+    """A tool (4, 4) for a controller; ``name`` as it has it, ``load`` for ABB."""
+    if maker == "kuka":
+        return f"{name or '$TOOL'}={_frame_text(maker, T_flange_tool)}"
+    if maker == "ur":
+        return f"set_tcp({_frame_text(maker, T_flange_tool)})"
+    if maker == "kawasaki":
+        return f"TOOL {_frame_text(maker, T_flange_tool)}"
+    frame = _frame_text(maker, T_flange_tool)
+    if maker == "fanuc":
+        return frame
+    weight, remark = ABB_UNKNOWN, ABB_REMARK
+    if load is not None:
+        centre = ",".join(fixed(np.array(load.centre) * 1e3, 3))
+        weight, remark = f"{load.mass_kg:.3f},[{centre}]", ""
+    return f"{remark}PERS tooldata {name or 'tcp'}:=[TRUE,{frame},[{weight},[1,0,0,0],0,0,0]];"
+
+
+def base_text(maker: Maker, T_base_frame: Array, name: str = "") -> str:
+    """A base, work object, user frame or feature (4, 4) for a controller; ``name`` as it has it."""
+    frame = _frame_text(maker, T_base_frame)
+    if maker == "kuka":
+        return f"{name or '$BASE'}={frame}"
+    if maker == "abb":
+        return f'PERS wobjdata {name or "wobj"}:=[FALSE,TRUE,"",{frame},{ABB_STILL}];'
+    if maker == "ur":
+        name = name or "base"
+        return f"# no base can be set: go to pose_trans({name}, p) in place of p\n{name}={frame}"
+    return f"BASE {frame}" if maker == "kawasaki" else frame
+
+
+def _frame_text(maker: Maker, T: Array) -> str:
+    numbers = np.array(numbers_of(maker, T))
+    digits = {"ur": (7, 8), "abb": (4, 9)}.get(maker, (4, 5))
+    place, turn = fixed(numbers[:3], digits[0]), fixed(numbers[3:], digits[1])
+    cells = [*place, *turn]
+    if maker == "kuka":
+        named = ",".join(f"{axis} {cell}" for axis, cell in zip("XYZABC", cells, strict=True))
+        return f"{{{named}}}"
+    if maker == "abb":
+        return f"[[{','.join(place)}],[{','.join(turn)}]]"
+    if maker == "fanuc":
+        x, y, z, w, p, r = cells
+        return f"X {x}  Y {y}  Z {z}\nW {w}  P {p}  R {r}"
+    row = ",".join(cells)
+    return f"p[{row}]" if maker == "ur" else f"TRANS({row})"
 
 
 def _about_z(angle: float) -> Array:

@@ -29,11 +29,11 @@ from robocal_ros.cli.main import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import transform_document
+from robocal_ros.programs.conventions import Load
 from robocal_ros.tool.circle import CircleMotion, classic_from_path, fit_circle
 from robocal_ros.tool.crossed_model import estimate_tool
 from robocal_ros.tool.edges import InputRule, debounced
 from robocal_ros.tool.files import (
-    Load,
     circle_document,
     classic_run_document,
     exported,
@@ -392,7 +392,7 @@ def _show_parallel(console: "Console", document: Document) -> None:
         console.print(f"Tip in the flange frame, mm: {spaced(document['tcp_mm'], 3, ', ')}")
 
 
-FORMATS = ("urdf", "kuka", "abb", "fanuc", "ur")
+FORMATS = ("urdf", "kuka", "abb", "fanuc", "ur", "kawasaki")
 
 
 def add_export(parser: argparse.ArgumentParser) -> None:

@@ -1,7 +1,6 @@
 """Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +10,7 @@ from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
-from robocal_ros.ground.frames import Array, Document, fixed, urdf_joint, urdf_origin
+from robocal_ros.ground.frames import Array, Document, urdf_joint, urdf_origin
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields
 from robocal_ros.kinematics.tables import (
@@ -24,6 +23,7 @@ from robocal_ros.kinematics.tables import (
     read_rotations,
     read_stamps,
 )
+from robocal_ros.programs.conventions import Load, Maker, tool_text
 from robocal_ros.tool.circle import CircleFit
 from robocal_ros.tool.crossed_model import BeamStep, ToolEstimate
 from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge, StepKind, debounced
@@ -66,49 +66,13 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
     return frames.transform(rotation, xyz)
 
 
-Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]
-ABB_UNKNOWN = "1,[0,0,1]"  # ABB takes no load without mass or with its centre in the flange
-ABB_REMARK = "! mass and centre of gravity are placeholders: enter this tool's, in kg and mm\n"
-
-
-@dataclass(frozen=True)
-class Load:
-    """What ABB's tooldata holds beside the frame.
-
-    ``mass_kg``: of the tool, above 0.
-    ``centre`` (x, y, z): of gravity in the flange frame, m.
-    """
-
-    mass_kg: float
-    centre: tuple[float, float, float]
-
-
-def exported(T_flange_tool: Array, format: Format, load: Load | None = None) -> str:
-    """Text for a controller, with 1e-4 mm and 1e-5 deg; ``load`` is for ABB.
-
-    Conventions, each from the flange to the tool: KUKA A, B, C about z, the new y, the new x; FANUC
-    W, P, R about the fixed x, y, z (the same angles in the other order), and so is URDF's rpy; ABB
-    a unit quaternion, real part first; Universal Robots a rotation vector.
-    """
-    T = T_flange_tool
-    x, y, z = fixed(T[:3, 3] * 1e3, 4)
-    roll, pitch, yaw = fixed(np.degrees(frames.rpy(T[:3, :3])), 5)
+def exported(
+    T_flange_tool: Array, format: Maker | Literal["urdf"], load: Load | None = None
+) -> str:
+    """Text for URDF or a controller, with 1e-4 mm and 1e-5 deg; ``load`` is for ABB."""
     if format == "urdf":
-        return urdf_joint("tool0", "tcp", *urdf_origin(T))
-    if format == "kuka":
-        return f"$TOOL={{X {x},Y {y},Z {z},A {yaw},B {pitch},C {roll}}}"
-    if format == "fanuc":
-        return f"X {x}  Y {y}  Z {z}\nW {roll}  P {pitch}  R {yaw}"
-    if format == "ur":
-        pose = fixed(T[:3, 3], 7) + fixed(frames.log_rotation(T[:3, :3]), 8)
-        return f"set_tcp(p[{','.join(pose)}])"
-    qx, qy, qz, qw = fixed(frames.quat_xyzw(T), 9)
-    weight, remark = ABB_UNKNOWN, ABB_REMARK
-    if load is not None:
-        centre = ",".join(fixed(np.array(load.centre) * 1e3, 3))
-        weight, remark = f"{load.mass_kg:.3f},[{centre}]", ""
-    frame = f"[[{x},{y},{z}],[{qw},{qx},{qy},{qz}]]"
-    return f"{remark}PERS tooldata tcp:=[TRUE,{frame},[{weight},[1,0,0,0],0,0,0]];"
+        return urdf_joint("tool0", "tcp", *urdf_origin(T_flange_tool))
+    return tool_text(format, T_flange_tool, load=load)
 
 
 POSITION = ("x_mm", "y_mm", "z_mm")

@@ -21,6 +21,7 @@ from bench.laser_tracker import prp_cell
 from robocal_ros.cli.main import COMMANDS
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics.robots import load_description, load_robot, save_robot
+from robocal_ros.kinematics.tables import joint_texts, write_cells
 from robocal_ros.kinematics.urdf import urdf_of
 
 UR_NOMINAL = """[DH]
@@ -66,6 +67,7 @@ CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
            "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
 CORRECT = ["correct-program", "--robot", ROBOT, "--model", "full.yaml"]
+SHIFT = ["frame-shift", "--robot", ROBOT, "--model", "full.yaml"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -272,6 +274,12 @@ CASES = {
         [*CORRECT, "weld.urp"],
         (2, "BAD_INPUT"),
     ),
+    "frame-shift": (
+        "frame-shift.json",
+        [*SHIFT, "--poses", "work.csv", "--maker", "kuka"],
+        [*SHIFT, "--poses", "nowhere.csv", "--maker", "kuka"],
+        (2, "BAD_INPUT"),
+    ),
     "iso9283": (
         "iso9283.json",
         ["iso9283", "--data", str(ROOT / "docs/examples/positions.csv"), "--commanded", "P1=1,2,3"],
@@ -312,6 +320,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "arm.urdf").write_text(urdf_of(load_robot(ROBOT)))
     (folder / "weld.dat").write_text(krl(postures(3, 5), postures(1, 6)), encoding="latin-1")
     (folder / "frames.dat").write_text(KUKA_FRAMES)
+    work = joint_texts(postures(8, 7), load_robot(ROBOT))
+    write_cells(folder / "work.csv", work)
     table(folder / "data.csv", measured(60))
     table(folder / "few.csv", measured(3))
     visits = shift()

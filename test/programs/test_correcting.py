@@ -13,7 +13,7 @@ from robot_programs import (
     TOOL_TURN,
     drifted,
     krl,
-    pose,
+    poses_in,
     postures,
     programs,
     side_view,
@@ -36,53 +36,12 @@ POINTS, JOINTS = postures(12, 3), postures(3, 4)
 WRITTEN = programs(POINTS, JOINTS)
 MODELS = CorrectionModels(NOMINAL, ACTUAL, NOMINAL)
 REACH_M = 3.6  # of the tool from axis 1, at most
-NUMBER = re.compile(r"-?\d*\.?\d+(?:E[-+]?\d+)?")
 
 
 def corrected(maker, models=MODELS, **options):
     program = WRITTEN[maker]
     correction = ProgramCorrection(dialect_of(program.suffix), models, program.frames, **options)
     return correction.correct(program.text)
-
-
-# ---- a controller of our own: reads the texts along another way ---------------------------------
-
-
-def poses_in(maker: str, text: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Commanded flange poses, and joints, of a program of `robot_programs`."""
-    found, joints = [], []
-    for line in text.splitlines():
-        if maker == "kuka" and line.startswith("DECL E6POS"):
-            v = [float(x) for x in re.findall(r"[XYZABC] (-?[\d.]+)", line.partition("{")[2])]
-            found.append(pose(Rotation.from_euler("ZYX", v[3:], degrees=True), np.array(v[:3])))
-        elif maker == "kuka" and line.startswith("DECL E6AXIS"):
-            joints.append(np.radians([float(x) for x in re.findall(r"A\d (-?[\d.]+)", line)]))
-        elif maker == "abb" and " robtarget " in line:
-            v = [float(x) for x in NUMBER.findall(line.partition(":=")[2])]
-            quat = np.array(v[3:7])
-            assert abs(np.linalg.norm(quat) - 1.0) < 1e-7  # what ABB asks for
-            found.append(pose(Rotation.from_quat(quat[[1, 2, 3, 0]]), np.array(v[:3])))
-        elif maker == "abb" and " jointtarget " in line:
-            joints.append(
-                np.radians([float(x) for x in NUMBER.findall(line.partition(":=")[2])][:6])
-            )
-        elif maker == "ur" and "_p=p[" in line:
-            v = [float(x) for x in line.partition("p[")[2].rstrip("]").split(",")]
-            found.append(pose(Rotation.from_rotvec(v[3:]), 1e3 * np.array(v[:3])))
-        elif maker == "ur" and "movej([" in line:
-            joints.append(
-                np.array([float(x) for x in re.search(r"\(\[(.*)\]", line)[1].split(",")])
-            )
-    if maker == "fanuc":
-        for block in re.findall(r"GP1:(.*?)(?:GP2|\};)", text, re.DOTALL):
-            v = [float(x) for x in re.findall(r"[XYZWPR] =\s*(-?[\d.]+) ", block)]
-            if v:
-                found.append(pose(Rotation.from_euler("xyz", v[3:], degrees=True), np.array(v[:3])))
-            else:
-                j = np.radians([float(x) for x in re.findall(r"J\d=\s*(-?[\d.]+)", block)])
-                joints.append(j + np.array([0.0, 0.0, j[1], 0.0, 0.0, 0.0]))
-    base = np.eye(4) if maker == "ur" else T_BASE_FRAME
-    return [base @ T @ np.linalg.inv(T_FLANGE_TOOL) for T in found], joints
 
 
 def missed(T: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:

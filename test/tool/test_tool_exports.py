@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground import frames
-from robocal_ros.tool.files import Load, exported
+from robocal_ros.programs.conventions import Load
+from robocal_ros.tool.files import exported
 
 NUMBER = r"-?\d+(?:\.\d+)?"
 TURNS = [
@@ -61,7 +62,19 @@ def of_urdf(text: str) -> tuple[list[float], Rotation]:
     return [1e3 * v for v in xyz], Rotation.from_euler("xyz", rpy)
 
 
-READERS = {"urdf": of_urdf, "kuka": of_kuka, "abb": of_abb, "fanuc": of_fanuc, "ur": of_ur}
+def of_kawasaki(text: str) -> tuple[list[float], Rotation]:
+    x, y, z, *oat = map(float, re.fullmatch(r"TOOL TRANS\((.*)\)", text)[1].split(","))
+    return [x, y, z], Rotation.from_euler("ZYZ", oat, degrees=True)
+
+
+READERS = {
+    "kawasaki": of_kawasaki,
+    "urdf": of_urdf,
+    "kuka": of_kuka,
+    "abb": of_abb,
+    "fanuc": of_fanuc,
+    "ur": of_ur,
+}
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -4,6 +4,7 @@ What a maker writes of joints and frames is stated here once more, along scipy's
 that a reader that has it wrong does not agree with itself.
 """
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ KUKA_FRAMES = (
     "TOOL_DATA[3]={X 120.5,Y -14.25,Z 262.0,A 30.0,B 40.0,C -15.0}\n"
     "BASE_DATA[5]={X 900.0,Y -250.5,Z 410.75,A 12.0,B -3.0,C 5.0}\n"
 )
+NUMBER = re.compile(r"-?\d*\.?\d+(?:E[-+]?\d+)?")
 NONE = "9E9,9E9,9E9,9E9,9E9,9E9"
 
 
@@ -200,6 +202,46 @@ def urscript(points: np.ndarray, joints: np.ndarray) -> str:
         f"  movej([{', '.join(f'{v:.6f}' for v in q)}], a=1.4, v=1.05) # back" for q in joints
     ]
     return "\n".join([*lines, "end", ""])
+
+
+# ---- a controller of our own: reads the texts along another way ---------------------------------
+
+
+def poses_in(maker: str, text: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Commanded flange poses, and joints, of a program of `robot_programs`."""
+    found, joints = [], []
+    for line in text.splitlines():
+        if maker == "kuka" and line.startswith("DECL E6POS"):
+            v = [float(x) for x in re.findall(r"[XYZABC] (-?[\d.]+)", line.partition("{")[2])]
+            found.append(pose(Rotation.from_euler("ZYX", v[3:], degrees=True), np.array(v[:3])))
+        elif maker == "kuka" and line.startswith("DECL E6AXIS"):
+            joints.append(np.radians([float(x) for x in re.findall(r"A\d (-?[\d.]+)", line)]))
+        elif maker == "abb" and " robtarget " in line:
+            v = [float(x) for x in NUMBER.findall(line.partition(":=")[2])]
+            quat = np.array(v[3:7])
+            assert abs(np.linalg.norm(quat) - 1.0) < 1e-7  # what ABB asks for
+            found.append(pose(Rotation.from_quat(quat[[1, 2, 3, 0]]), np.array(v[:3])))
+        elif maker == "abb" and " jointtarget " in line:
+            joints.append(
+                np.radians([float(x) for x in NUMBER.findall(line.partition(":=")[2])][:6])
+            )
+        elif maker == "ur" and "_p=p[" in line:
+            v = [float(x) for x in line.partition("p[")[2].rstrip("]").split(",")]
+            found.append(pose(Rotation.from_rotvec(v[3:]), 1e3 * np.array(v[:3])))
+        elif maker == "ur" and "movej([" in line:
+            joints.append(
+                np.array([float(x) for x in re.search(r"\(\[(.*)\]", line)[1].split(",")])
+            )
+    if maker == "fanuc":
+        for block in re.findall(r"GP1:(.*?)(?:GP2|\};)", text, re.DOTALL):
+            v = [float(x) for x in re.findall(r"[XYZWPR] =\s*(-?[\d.]+) ", block)]
+            if v:
+                found.append(pose(Rotation.from_euler("xyz", v[3:], degrees=True), np.array(v[:3])))
+            else:
+                j = np.radians([float(x) for x in re.findall(r"J\d=\s*(-?[\d.]+)", block)])
+                joints.append(j + np.array([0.0, 0.0, j[1], 0.0, 0.0, 0.0]))
+    base = np.eye(4) if maker == "ur" else T_BASE_FRAME
+    return [base @ T @ np.linalg.inv(T_FLANGE_TOOL) for T in found], joints
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""``robocal correct-program`` on files: what is written, what never is, whose model it is."""
+"""``robocal correct-program`` and ``frame-shift`` on files: what is written, whose model it is."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from history_workers import SERIAL, proposal
-from robot_programs import KUKA_FRAMES, NOMINAL, drifted, krl, postures
+from robot_programs import (
+    KUKA_FRAMES,
+    NOMINAL,
+    T_BASE_FRAME,
+    T_FLANGE_TOOL,
+    drifted,
+    krl,
+    postures,
+)
 
 from robocal_ros.cli.main import main
+from robocal_ros.ground.frames import transform_from_quat
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import save_robot
+from robocal_ros.kinematics.tables import joint_texts, write_cells
+from robocal_ros.programs.correcting import dialect_of
 
 ACTUAL = drifted(NOMINAL, 1)
 SINGULAR = np.radians([10.0, -80.0, 95.0, 40.0, 0.02, -20.0])
@@ -27,9 +38,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def command(capsys, *words: str) -> tuple[int, dict]:
+def command(capsys, *words: str, name: str = "correct-program") -> tuple[int, dict]:
     robot = ["--robot", "kr150_r3100"]
-    status = main(["correct-program", *words, *robot, "--json"])
+    status = main([name, *words, *robot, "--json"])
     return status, json.loads(capsys.readouterr().out)
 
 
@@ -139,3 +150,80 @@ def test_people_get_a_table(folder: Path, capsys):
     assert "3 not corrected" in said
     assert "unknown frame BASE_DATA[5]" in said
     assert "--partial writes the others" in said
+
+
+def shifted(capsys, *words: str) -> tuple[int, dict]:
+    return command(capsys, "--poses", "work.csv", *MODEL, *words, name="frame-shift")
+
+
+@pytest.fixture
+def work(folder: Path) -> Path:
+    columns = {"sample": [f"w{i}" for i in range(12)]} | joint_texts(postures(12, 8), NOMINAL)
+    write_cells(folder / "work.csv", columns)
+    return folder
+
+
+def test_frames_come_out_as_shifted(work: Path, capsys):
+    tool, base = "TOOL_DATA[3]=120.5,-14.25,262,30,40,-15", "BASE_DATA[5]=900,-250.5,410.75,12,-3,5"
+    frames = ("--tool", tool, "--base", base, "--base", "BASE_DATA[6]=0,0,0,0,0,0")
+    status, document = shifted(capsys, "--maker", "kuka", *frames, "--output", "frames.src")
+    assert status == 0
+    assert document["verdict"]["code"] == "ACCEPT"
+    assert document["after"]["rms_mm"] < 0.9 * document["before"]["rms_mm"]
+    assert [pose["name"] for pose in document["poses"]] == [f"w{i}" for i in range(12)]
+    text = document["text"]
+    assert (work / "frames.src").read_text() == text + "\n"
+    found = dialect_of(".src").read(text).frames
+    T_base, T_tool = (frames_of(document[name]) for name in ("T_base_shift", "T_tool_shift"))
+    for name, expected in (
+        ("TOOL_DATA[3]", T_FLANGE_TOOL @ T_tool),
+        ("BASE_DATA[5]", T_base @ T_BASE_FRAME),
+        ("BASE_DATA[6]", T_base),
+    ):
+        np.testing.assert_allclose(found[name], expected, atol=3e-7)
+    status, document = shifted(capsys, "--maker", "kuka", "--output", "frames.src")
+    assert status == 2
+    assert "is there already" in document["error"]["message"]
+
+
+def frames_of(document: dict) -> np.ndarray:
+    return transform_from_quat(1e-3 * np.array(document["xyz_mm"]), document["quat_xyzw"])
+
+
+@pytest.mark.parametrize(
+    ("maker", "lines"),
+    [
+        ("kuka", ["$TOOL={X ", "$BASE={X "]),
+        ("abb", ["! mass", "PERS tooldata tcp:=[TRUE,[[", "PERS wobjdata wobj:=[FALSE,TRUE,"]),
+        ("fanuc", ["X ", "W ", "X ", "W "]),
+        ("ur", ["set_tcp(p[", "# no base", "base=p["]),
+        ("kawasaki", ["TOOL TRANS(", "BASE TRANS("]),
+    ],
+)
+def test_each_maker_has_its_own_text(work: Path, capsys, maker, lines):
+    _, document = shifted(capsys, "--maker", maker)
+    told = document["text"].splitlines()
+    assert [line[: len(start)] for line, start in zip(told, lines, strict=True)] == lines
+    _, alone = shifted(capsys, "--maker", maker, "--parts", "tool")
+    assert len(alone["text"].splitlines()) < len(told)
+    assert alone["T_base_shift"]["xyz_mm"] == [0.0, 0.0, 0.0]
+
+
+def test_weights_are_taken_from_the_table(work: Path, capsys):
+    cells = joint_texts(postures(12, 8), NOMINAL) | {"weight": ["1000", *["1"] * 11]}
+    _, plain = shifted(capsys, "--maker", "kuka")
+    write_cells(work / "work.csv", cells)
+    _, weighed = shifted(capsys, "--maker", "kuka")
+    assert weighed["poses"][0]["after"]["mm"] < plain["poses"][0]["after"]["mm"]
+    write_cells(work / "work.csv", cells | {"weight": ["0"] * 12})
+    status, document = shifted(capsys, "--maker", "kuka")
+    assert (status, document["error"]["column"]) == (2, "weight")
+
+
+def test_people_get_the_shift_as_a_table(work: Path, capsys):
+    words = ["frame-shift", "--poses", "work.csv", *MODEL, "--robot", "kr150_r3100"]
+    assert main([*words, "--maker", "ur"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "error of the tool at the working poses" in said
+    assert "within the limit" in said
+    assert "set_tcp(p[" in said
