@@ -20,17 +20,25 @@ from robocal_ros.correction.joint_correction import (
     same_models,
 )
 from robocal_ros.correction.limiter import (
+    ADDS,
     FIGURES,
     LARGEST,
     NOT_WITHIN,
+    OFFSET,
+    OFFSET_RATE,
+    OUT,
     REDUCED,
     REMAINING,
     SHIFT,
     SLIDING,
+    TAUGHT,
+    TOO_FAST,
     TURNING,
+    VELOCITY,
     OffsetLimiter,
     OffsetLimits,
     put_out,
+    step_out,
 )
 from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
 from robocal_ros.ground import frames
@@ -308,9 +316,7 @@ class DesiredOffset:
         self.figures = np.zeros(FIGURES)  # what is said of the messages, see `limiter`
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
-        # whether the last message was corrected with ``stage``, and its velocities are worked out
-        self.made = self.fast = False
-        self._zero = np.zeros(reference.n)
+        self.made = False  # whether the last message was corrected with ``stage``
         self._span = np.array([reference.lower, reference.upper], dtype=np.float64)
         bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
         self._bounds = np.array(bounds, dtype=np.float64)
@@ -329,7 +335,7 @@ class DesiredOffset:
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
-        self.made = self.fast = False
+        self.made = False
         self.figures[[SHIFT, LARGEST, REMAINING]] = 0.0
         if self.stage is None:
             return np.zeros_like(q), None
@@ -367,24 +373,26 @@ class DesiredOffset:
     ) -> float:
         """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
 
-        In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`, and
-        leaves the velocities to the caller.
+        In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`.
         """
-        stage, limits, span = self.stage, limiter.limits, self._span
+        stage, memory, limits, span = self.stage, limiter.memory, limiter.limits, self._span
         if stage is not None and self._config.policy is Policy.REFUSE:
-            share = stage.step_out(
-                q, velocity, *times, limiter.memory, limits, active, speeds, span, self._bounds,
-                self._tcp, self.figures,
+            share = step_out(
+                q, velocity, *times, memory, limits, active, speeds, span, self._bounds, self._tcp,
+                stage.largest, stage.free_axis, stage.works, stage.reports, self.figures,
             )  # fmt: skip
             if share != NOT_WITHIN:
-                self.made = self.fast = True
+                self.made = True
                 return share
-        if stage is not None:
-            desired = self.at(q[None])[0][0]
+        desired = self.at(q[None])[0][0]
+        share = put_out(memory, q, desired, *times, limits, active, speeds[0], span)
+        if isinstance(stage, ClampedCorrection) and self.made and not limiter.withheld.any():
+            memory[VELOCITY] = stage.velocity_one(memory[TAUGHT], velocity, memory[OUT])
         else:
-            desired, self.made, self.fast = self._zero, False, False
-            self.figures[SHIFT] = self.figures[LARGEST] = self.figures[REMAINING] = 0.0
-        return put_out(limiter.memory, q, desired, *times, limits, active, speeds[0], span)
+            memory[VELOCITY] = velocity + memory[OFFSET_RATE]
+        self.figures[ADDS] = memory[OFFSET].any()
+        self.figures[TOO_FAST] = 1.0  # as far as is known here
+        return share
 
     def begins(self, q: Array) -> Array:
         """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.

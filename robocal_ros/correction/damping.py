@@ -1,7 +1,8 @@
 """Compiled algebra of the joint correction: goals, residuals, and the damping of weak directions.
 
 Twists [v; w] in base axes at the tool, m and rad. Where they are weighed against each other, and in
-the Jacobian, lengths are in units of `LENGTH`.
+the Jacobian, lengths are in units of `LENGTH`. Twists are six numbers, matrices (3, 3) nine, row by
+row, without a branch: `six_axis` works on several points at a time in vector registers.
 
 A free axis is the tool's z: a turn about it is left out of the residual and of the Jacobian.
 """
@@ -13,6 +14,9 @@ from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
 
 Array = NDArray[np.float64]
+Three = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 # The length (m) that weighs as 1 rad: what a tool's flank or a sensor's range makes of a turn.
 LENGTH = 0.3
@@ -22,7 +26,10 @@ LEAST_ERROR = 1e-6
 # Squared singular values from so many lambda^2 on are not damped; at 3 the damping of the first
 # order cancels the singular value's own growth.
 WINDOW = 3.0
-MOST_SWEEPS = 12
+TINY = 1e-300
+# What is said of a point, after its n joints.
+POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, WEAK = range(7)
+REPORT = 7
 
 
 @lean
@@ -66,14 +73,186 @@ def residual(goal: Array, T: Array, tool: Array, free: bool, e: Array) -> None:
 
 
 @lean
-def product(A: Array, B: Array, out: Array) -> None:
-    """Sum over the joints of the columns' products: A^T B of (n, 6) arrays."""
-    for r in range(6):
-        for c in range(6):
-            value = 0.0
-            for i in range(A.shape[0]):
-                value += A[i, r] * B[i, c]
-            out[r, c] = value
+def weighed(e: Six) -> Six:
+    """A twist with lengths in units of `LENGTH`."""
+    return WEIGHT * e[0], WEIGHT * e[1], WEIGHT * e[2], e[3], e[4], e[5]
+
+
+@lean
+def dot(a: Six, b: Six) -> float:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
+
+
+@lean
+def more(a: Six, s: float, b: Six) -> Six:
+    """A + s b."""
+    return (
+        a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2],
+        a[3] + s * b[3], a[4] + s * b[4], a[5] + s * b[5],
+    )  # fmt: skip
+
+
+@lean
+def total(m: Nine, s: float, n: Nine) -> Nine:
+    """M + s N."""
+    return (
+        m[0] + s * n[0], m[1] + s * n[1], m[2] + s * n[2], m[3] + s * n[3], m[4] + s * n[4],
+        m[5] + s * n[5], m[6] + s * n[6], m[7] + s * n[7], m[8] + s * n[8],
+    )  # fmt: skip
+
+
+@lean
+def times(m: Nine, n: Nine) -> Nine:
+    """M N."""
+    a, b, c, d, e, f, g, h, i = m
+    return (
+        a * n[0] + b * n[3] + c * n[6], a * n[1] + b * n[4] + c * n[7],
+        a * n[2] + b * n[5] + c * n[8], d * n[0] + e * n[3] + f * n[6],
+        d * n[1] + e * n[4] + f * n[7], d * n[2] + e * n[5] + f * n[8],
+        g * n[0] + h * n[3] + i * n[6], g * n[1] + h * n[4] + i * n[7],
+        g * n[2] + h * n[5] + i * n[8],
+    )  # fmt: skip
+
+
+@lean
+def on(m: Nine, x: float, y: float, z: float) -> Three:
+    """M applied to a vector."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )  # fmt: skip
+
+
+@lean
+def inverse(m: Nine) -> Nine:
+    """By cofactors."""
+    a, b, c, d, e, f, g, h, i = m
+    x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
+    s = 1.0 / (a * x + b * y + c * z)
+    return (
+        s * x, s * (c * h - b * i), s * (b * f - c * e),
+        s * y, s * (a * i - c * g), s * (c * d - a * f),
+        s * z, s * (b * g - a * h), s * (a * e - b * d),
+    )  # fmt: skip
+
+
+@lean
+def _turned_over(m: Nine) -> Nine:
+    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
+
+
+@lean
+def _root(T: Nine) -> Nine:
+    """Lower factor L of I + T^T T = L L^T."""
+    n = times(_turned_over(T), T)
+    a = np.sqrt(1.0 + n[0])
+    b, c = n[1] / a, n[2] / a
+    d = np.sqrt(1.0 + n[4] - b * b)
+    e = (n[5] - b * c) / d
+    return a, 0.0, 0.0, b, d, 0.0, c, e, np.sqrt(1.0 + n[8] - c * c - e * e)
+
+
+@lean
+def _spread(u: Nine, a: float, b: float, c: float) -> Nine:
+    """U diag(a, b, c) U^T."""
+    u0, u1, u2, u3, u4, u5, u6, u7, u8 = u
+    xy = a * u0 * u3 + b * u1 * u4 + c * u2 * u5
+    xz = a * u0 * u6 + b * u1 * u7 + c * u2 * u8
+    yz = a * u3 * u6 + b * u4 * u7 + c * u5 * u8
+    return (
+        a * u0 * u0 + b * u1 * u1 + c * u2 * u2, xy, xz,
+        xy, a * u3 * u3 + b * u4 * u4 + c * u5 * u5, yz,
+        xz, yz, a * u6 * u6 + b * u7 * u7 + c * u8 * u8,
+    )  # fmt: skip
+
+
+@lean
+def _turn(p: float, q: float, o: float) -> Three:
+    """Cosine, sine and tangent of Jacobi's rotation for two diagonal elements and theirs beside."""
+    apart = q - p
+    t = 2.0 * o / (abs(apart) + np.sqrt(apart * apart + 4.0 * o * o) + TINY)
+    t = t if apart >= 0.0 else -t
+    cosine = 1.0 / np.sqrt(t * t + 1.0)
+    return cosine, t * cosine, t
+
+
+@lean
+def _both(cosine: float, sine: float, x: float, y: float) -> tuple[float, float]:
+    return cosine * x - sine * y, sine * x + cosine * y
+
+
+@lean
+def _sweep(m: Six, u: Nine) -> tuple[Six, Nine]:
+    """A rotation for each element beside the diagonal: ``m`` is the diagonal, then ab, ac, bc."""
+    a, b, c, x, y, z = m
+    u0, u1, u2, u3, u4, u5, u6, u7, u8 = u
+    cosine, sine, t = _turn(a, b, x)
+    a, b, x = a - t * x, b + t * x, 0.0
+    y, z = _both(cosine, sine, y, z)
+    u0, u1 = _both(cosine, sine, u0, u1)
+    u3, u4 = _both(cosine, sine, u3, u4)
+    u6, u7 = _both(cosine, sine, u6, u7)
+    cosine, sine, t = _turn(a, c, y)
+    a, c, y = a - t * y, c + t * y, 0.0
+    x, z = _both(cosine, sine, x, z)
+    u0, u2 = _both(cosine, sine, u0, u2)
+    u3, u5 = _both(cosine, sine, u3, u5)
+    u6, u8 = _both(cosine, sine, u6, u8)
+    cosine, sine, t = _turn(b, c, z)
+    b, c, z = b - t * z, c + t * z, 0.0
+    x, y = _both(cosine, sine, x, y)
+    u1, u2 = _both(cosine, sine, u1, u2)
+    u4, u5 = _both(cosine, sine, u4, u5)
+    u7, u8 = _both(cosine, sine, u7, u8)
+    return (a, b, c, x, y, z), (u0, u1, u2, u3, u4, u5, u6, u7, u8)
+
+
+@lean
+def _damp(s: float, square: float) -> float:
+    rest = 1.0 - s / (WINDOW * square)
+    rest = rest if rest > 0.0 else 0.0
+    return square * rest * rest * rest
+
+
+@lean
+def _damped(m: Nine, square: float) -> tuple[Nine, Nine, float]:
+    """Damping d(M) of a symmetric matrix, (M + d(M))^-1, and how many directions are damped."""
+    s, u = (m[0], m[4], m[8], m[1], m[2], m[5]), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    s, u = _sweep(s, u)
+    s, u = _sweep(s, u)
+    s, u = _sweep(s, u)
+    s, u = _sweep(s, u)
+    a, b, c = _damp(s[0], square), _damp(s[1], square), _damp(s[2], square)
+    count = (1.0 if a > 0.0 else 0.0) + (1.0 if b > 0.0 else 0.0) + (1.0 if c > 0.0 else 0.0)
+    whole = _spread(u, 1.0 / (s[0] + a), 1.0 / (s[1] + b), 1.0 / (s[2] + c))
+    return _spread(u, a, b, c), whole, count
+
+
+@lean
+def damping(
+    A: Nine, B: Nine, C: Nine, e: Six, steepness: float, per_error: float
+) -> tuple[Nine, Nine, float]:
+    """P and R for the blocks of J J^T and the weighed error; how many directions are damped.
+
+    See `joint_correction` (2) and (3).
+    """
+    position = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
+    P, first, count = _damped(A, lambda_square(position, steepness, per_error))
+    T = times(first, B)
+    L = _root(T)
+    back = inverse(L)
+    C = total(C, -1.0, times(_turned_over(B), T))
+    C = times(times(back, C), _turned_over(back))
+    R, _, more_weak = _damped(C, lambda_square(dot(e, e), steepness, per_error))
+    return P, times(times(L, R), _turned_over(L)), count + more_weak
+
+
+@lean
+def left(e: Six, y: Six, P: Nine, R: Nine) -> Six:
+    """What is left to do, e - D y."""
+    p, w = on(P, y[0], y[1], y[2]), on(R, y[3], y[4], y[5])
+    return e[0] - p[0], e[1] - p[1], e[2] - p[2], e[3] - w[0], e[4] - w[1], e[5] - w[2]
 
 
 @lean
@@ -85,145 +264,32 @@ def lambda_square(error_square: float, steepness: float, per_error: float) -> fl
 
 
 @lean
-def inverse_norm(M: Array, L: Array, column: Array) -> float:
-    """Trace of the inverse of a symmetric matrix (6, 6), infinite where it is singular."""
-    newton.copy(M, L)
-    if not newton.factor_in_place(L):
-        return np.inf
-    trace = 0.0
-    for k in range(6):
-        for r in range(6):
-            column[r] = 1.0 if r == k else 0.0
-        newton.solve_in_place(L, column)
-        trace += column[k]
-    return trace
+def add_product(A: Array, B: Array, out: Array) -> None:
+    """Add A^T B of (n, 6) arrays: the columns' products over the joints."""
+    for r in range(6):
+        for c in range(6):
+            for i in range(A.shape[0]):
+                out[r, c] += A[i, r] * B[i, c]
 
 
 @lean
-def eigen(A: Array, U: Array) -> None:
-    """Eigenvalues of a symmetric matrix (3, 3), onto its diagonal, and its vectors as columns.
-
-    By Jacobi's rotations.
-    """
-    for r in range(3):
-        for c in range(3):
-            U[r, c] = 1.0 if r == c else 0.0
-    for _ in range(MOST_SWEEPS):
-        off = A[1, 0] * A[1, 0] + A[2, 0] * A[2, 0] + A[2, 1] * A[2, 1]
-        on = A[0, 0] * A[0, 0] + A[1, 1] * A[1, 1] + A[2, 2] * A[2, 2]
-        if off <= 1e-34 * on:
-            return
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                ratio = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
-                t = 1.0 / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
-                t = t if ratio >= 0.0 else -t
-                cosine = 1.0 / np.sqrt(t * t + 1.0)
-                sine = t * cosine
-                for k in range(3):
-                    x, y = A[k, p], A[k, q]
-                    A[k, p], A[k, q] = cosine * x - sine * y, sine * x + cosine * y
-                for k in range(3):
-                    x, y = A[p, k], A[q, k]
-                    A[p, k], A[q, k] = cosine * x - sine * y, sine * x + cosine * y
-                    x, y = U[k, p], U[k, q]
-                    U[k, p], U[k, q] = cosine * x - sine * y, sine * x + cosine * y
+def block(M: Array, r: int, c: int) -> Nine:
+    """The (3, 3) part of a matrix that begins there."""
+    return (
+        M[r, c], M[r, c + 1], M[r, c + 2], M[r + 1, c], M[r + 1, c + 1], M[r + 1, c + 2],
+        M[r + 2, c], M[r + 2, c + 1], M[r + 2, c + 2],
+    )  # fmt: skip
 
 
 @lean
-def damped(A: Array, square: float, out: Array, inverse: Array, U: Array) -> int:
-    """Damping (3, 3) of a symmetric matrix ``A``, and (A + damping)^-1; how many are damped.
-
-    ``A`` is used up.
-    """
-    eigen(A, U)
-    count = 0
+def fill(m: Nine, k: int, M: Array) -> None:
+    """Put a block onto the diagonal of a matrix, from ``k`` on; beside it are zeros."""
     for r in range(3):
-        for c in range(3):
-            out[r, c], inverse[r, c] = 0.0, 0.0
-    for k in range(3):
-        rest = 1.0 - A[k, k] / (WINDOW * square)
-        d = square * rest * rest * rest if rest > 0.0 else 0.0
-        count += 1 if rest > 0.0 else 0
-        one = 1.0 / (A[k, k] + d)
-        for r in range(3):
-            for c in range(3):
-                out[r, c] += U[r, k] * d * U[c, k]
-                inverse[r, c] += U[r, k] * one * U[c, k]
-    return count
-
-
-@lean
-def damping(M: Array, position: float, rotation: float, D: Array, U: Array) -> int:
-    """Damping D (6, 6) of M = J J^T, see `joint_correction` (2); how many directions are damped.
-
-    ``position`` and ``rotation`` are the squares l^2 of the two. ``M`` is used up.
-    """
-    A, B, C = M[:3, :3], M[:3, 3:], M[3:, 3:]
-    T, L, inverse = D[:3, 3:], D[3:, :3], D[3:, 3:]  # in what is not filled in yet
-    count = damped(A, position, D[:3, :3], inverse, U)
-    for i in range(3):
-        for c in range(3):
-            T[i, c] = inverse[i, 0] * B[0, c] + inverse[i, 1] * B[1, c] + inverse[i, 2] * B[2, c]
-    for r in range(3):
-        for c in range(3):
-            C[r, c] -= B[0, r] * T[0, c] + B[1, r] * T[1, c] + B[2, r] * T[2, c]
-            L[r, c] = T[0, r] * T[0, c] + T[1, r] * T[1, c] + T[2, r] * T[2, c]
-        L[r, r] += 1.0
-    root(L)
-    between(L, C)
-    count += damped(C, rotation, D[3:, 3:], T, U)
-    around(L, D[3:, 3:], T)
-    for r in range(3):
-        for c in range(3):
-            D[r, 3 + c], D[3 + r, c] = 0.0, 0.0
-    return count
-
-
-@lean
-def root(L: Array) -> None:
-    """Lower factor of L L^T (3, 3), positive definite, in place; what is above it is zero."""
-    for c in range(3):
-        for r in range(c, 3):
-            value = L[r, c]
-            for k in range(c):
-                value -= L[r, k] * L[c, k]
-            L[r, c] = np.sqrt(value) if r == c else value / L[c, c]
-        for r in range(c):
-            L[r, c] = 0.0
-
-
-@lean
-def between(L: Array, C: Array) -> None:
-    """L^-1 C L^-T of symmetric C (3, 3), in place, with a lower triangle L."""
-    for _ in range(2):  # L^-1 C, turned over: the second time the whole
-        for c in range(3):
-            for r in range(3):
-                for k in range(r):
-                    C[r, c] -= L[r, k] * C[k, c]
-                C[r, c] /= L[r, r]
-        for r in range(3):
-            for c in range(r):
-                C[r, c], C[c, r] = C[c, r], C[r, c]
-
-
-@lean
-def around(L: Array, S: Array, scratch: Array) -> None:
-    """L S L^T (3, 3), in place of S, with a lower triangle L."""
-    for r in range(3):
-        for c in range(3):
-            value = 0.0
-            for k in range(r + 1):
-                value += L[r, k] * S[k, c]
-            scratch[r, c] = value
-    for r in range(3):
-        for c in range(3):
-            value = 0.0
-            for k in range(c + 1):
-                value += scratch[r, k] * L[c, k]
-            S[r, c] = value
+        for c in range(6):
+            M[k + r, c] = 0.0
+    M[k, k], M[k, k + 1], M[k, k + 2] = m[0], m[1], m[2]
+    M[k + 1, k], M[k + 1, k + 1], M[k + 1, k + 2] = m[3], m[4], m[5]
+    M[k + 2, k], M[k + 2, k + 1], M[k + 2, k + 2] = m[6], m[7], m[8]
 
 
 @lean

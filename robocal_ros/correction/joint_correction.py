@@ -42,15 +42,12 @@ where the taught one is. Together this is the correction from (reference arm, ta
 (actual arm, new tool), but a bent tool's larger bounds do not loosen the arm's.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.correction import solution
-from robocal_ros.correction.damping import WEIGHT
-from robocal_ros.correction.limiter import step_out
+from robocal_ros.correction import damping, solution
 from robocal_ros.correction.solution import RATE_STEP_S, STEP_AHEAD_S, work_size
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
@@ -178,26 +175,19 @@ class JointCorrection:
         """
         joints = np.asarray(q, dtype=np.float64)
         points = plain(joints.reshape(-1, self.n))
-        out = np.empty((len(points), self.n + solution.REPORT))
-        given = self.largest, self.free_axis, self.work, out
-        if self.models.shape[2] > 9:
-            turned = np.empty_like(points)
-            solution.turn_batch(points, self.work, turned)
-            solution.correct_batch(turned, *given)
-            solution.read_batch(points, turned, self.free_axis, self.work, out)
-        else:
-            solution.correct_batch(points, *given)
+        out = np.empty((len(points), self.n + damping.REPORT))
+        solution.correct_batch(points, self.largest, self.free_axis, self.work, out)
         lead = joints.shape[:-1]
         corrected, report = plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
         return CorrectionResult(
             q=corrected.reshape(joints.shape),
-            position_error_m=report[solution.POSITION_ERROR],
-            rotation_error_rad=report[solution.ROTATION_ERROR],
-            iterations=report[solution.ITERATIONS].astype(np.int64),
-            converged=report[solution.CONVERGED] > 0.5,
-            tcp_shift_m=report[solution.TCP_SHIFT],
-            tcp_rotation_rad=report[solution.TCP_ROTATION],
-            weak=report[solution.WEAK] > 0.5,
+            position_error_m=report[damping.POSITION_ERROR],
+            rotation_error_rad=report[damping.ROTATION_ERROR],
+            iterations=report[damping.ITERATIONS].astype(np.int64),
+            converged=report[damping.CONVERGED] > 0.5,
+            tcp_shift_m=report[damping.TCP_SHIFT],
+            tcp_rotation_rad=report[damping.TCP_ROTATION],
+            weak=report[damping.WEAK] > 0.5,
             joint_shift=(corrected - points).reshape(joints.shape),
         )
 
@@ -205,32 +195,9 @@ class JointCorrection:
         """The correction with the models exchanged: from corrected to taught joints.
 
         Exact (to rounding: 1e-11 rad for condition numbers below 1e3) where no direction is weak
-        and all six equations hold; `staged.StagedCorrection.uncorrect` in the other postures too.
+        and all six equations hold; `StagedCorrection.uncorrect` in the other postures too.
         """
         return JointCorrection(self.models[::-1], self.largest, self.free_axis, self.slope)
-
-
-def path_rates(
-    corrected: Callable[[Array], Array],
-    q: Array,
-    velocity: Array,
-    acceleration: Array | None,
-    here: Array,
-) -> tuple[Array, Array]:
-    """Rates (m, n) of ``corrected(q)`` along the path q + v t + a t^2 / 2 at t = 0.
-
-    ``here`` (m, n): the shift at q. Central differences of the shift over 0.2 ms each way; without
-    accelerations, of which then come none, from one side.
-    """
-    if acceleration is None:
-        ahead = q + velocity * STEP_AHEAD_S
-        rate = (corrected(ahead) - ahead - here) / STEP_AHEAD_S
-        return velocity + rate, np.zeros_like(q)
-    h = RATE_STEP_S
-    ends = [q + velocity * t + 0.5 * acceleration * t * t for t in (-h, h)]
-    before, after = (corrected(at) - at for at in ends)
-    rate = (after - before) / (2.0 * h)
-    return velocity + rate, acceleration + (after - 2.0 * here + before) / h**2
 
 
 EXACT = 1e-13  # rad, m: to rounding
@@ -273,7 +240,7 @@ def _drift_slope(models: Array) -> float:
     n = models.shape[1] - 2
     q = np.random.default_rng(0).uniform(-RANGE, RANGE, (POSTURES, n))
     found = JointCorrection(models).correct(q)
-    size = np.hypot(found.tcp_shift_m * WEIGHT, found.tcp_rotation_rad).max()
+    size = np.hypot(found.tcp_shift_m * damping.WEIGHT, found.tcp_rotation_rad).max()
     return float(DRIFT_SLOPE / (1.0 + (SLOWER - 1.0) / (1.0 + (size / LITTLE_DRIFT) ** 4)))
 
 
@@ -284,6 +251,7 @@ class StagedCorrection:
     the reference's.
     ``arm_largest``, ``tool_largest`` (n,): largest joint shift of each stage, rad (prismatic: m).
     ``free_axis``: the tool may turn about its z, in both stages.
+    ``works``, ``largest``, ``reports``: of its stages, for kernels.
     """
 
     def __init__(
@@ -297,7 +265,7 @@ class StagedCorrection:
         reference, actual = stack_models(reference, actual)
         bare = actual.copy()
         bare[-1] = reference[-1]
-        self.n, self._free = len(reference) - 2, free_axis
+        self.n, self.free_axis = len(reference) - 2, free_axis
         drift = np.stack([reference, bare])
         self._arm = JointCorrection(drift, arm_largest, free_axis, _drift_slope(drift))
         self._tool: JointCorrection | None = None
@@ -307,14 +275,12 @@ class StagedCorrection:
             )
         parts = [self._arm] if self._tool is None else [self._arm, self._tool]
         self.stages = len(parts)
-        self._works = np.stack([part.work for part in parts])
-        self._largest = np.stack([part.largest for part in parts])
-        self._reports = np.empty((2, self.stages, self.n + solution.REPORT))
-        self._one = np.empty((self.stages, self.n + solution.REPORT))
-        self._spare = np.empty((2, self.n))
+        self.works = np.stack([part.work for part in parts])
+        self.largest = np.stack([part.largest for part in parts])
+        self.reports = np.empty((2, self.stages, self.n + damping.REPORT))
+        self._spare = np.empty((3, self.n))
         self._back = [part.inverse() for part in reversed(parts)]
         self._back_works = np.stack([part.work for part in self._back])
-        self._solved: Array | None = None  # taught joints whose report is in `_one`
 
     def correct(self, q: Array) -> StagedResult:
         """Correct joints (m, n)."""
@@ -324,51 +290,21 @@ class StagedCorrection:
         tool = self._tool.correct(arm.q)
         return StagedResult(tool.q, arm, tool)
 
-    def correct_one(self, q: Array, out: Array) -> None:
-        """Correct one point (n,), for a stream: the bits of `correct`, without its objects.
-
-        ``out`` (stages, n + solution.REPORT) gets each stage's joints and report; the corrected
-        joints are ``out[-1, :n]``. Both are contiguous arrays of float64.
-        """
-        solution.correct_staged(q, self._largest, self._free, self._works, out)
-
     def uncorrect_one(self, corrected: Array) -> Array:
         """`uncorrect` for one point (n,), for a stream."""
         q = np.empty(self.n)
-        limits = self._largest, self._free
-        if solution.uncorrect_staged(corrected, *limits, self._works, 20, EXACT, self._one, q):
-            self._solved = q
+        given = self.largest, self.free_axis, self.works, 20, EXACT, self.reports[0], q
+        if solution.uncorrect_staged(corrected, *given):
             return q
         return np.asarray(self.uncorrect(corrected[None])[0])
 
-    def step_out(
-        self, goal: Array, velocity: Array, elapsed: float, longest: float, memory: Array,
-        limits: Array, active: Array, speeds: Array, span: Array, bounds: Array, tcp: Array,
-        figures: Array,
-    ) -> float:  # fmt: skip
-        """Correct one target of a stream and put it out, see `step_out`."""
-        return step_out(
-            goal, velocity, elapsed, longest, memory, limits, active, speeds, span, bounds, tcp,
-            self._largest, self._free, self._works, self._reports, figures,
-        )  # fmt: skip
-
     def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
         """Velocities (n,) of one point's taught joints ``q``, of those of the corrected ones."""
-        if q is not self._solved:
-            self.correct_one(q, self._one)
-        found, self._solved = np.empty(self.n), None
-        works, whole = self._back_works, not self._one[:, self.n + solution.WEAK].any()
-        if not (
-            whole
-            and self.n == 6
-            and not self._free
-            and solution.velocity_by_chain(corrected, velocity, q, works[0], works[-1], found)
-        ):
-            given = self._largest, self._free, self._works
-            at_q = self._one[-1, : self.n].copy()
-            solution.taught_velocity_by_differences(
-                q, velocity, at_q, *given, self._spare, self._one, found
-            )
+        found = np.empty(self.n)
+        solution.taught_velocity(
+            corrected, velocity, q, self.largest, self.free_axis, self.works, self._back_works,
+            self.reports[0], self._spare, found,
+        )  # fmt: skip
         return found
 
     def uncorrect(self, corrected: Array) -> Array:
@@ -402,35 +338,34 @@ class StagedCorrection:
         """
         out_v, out_a = np.empty(q.shape), np.empty(q.shape)
         rough = np.ones(len(q), dtype=np.bool_)
-        if self.n == 6 and not self._free:
+        if self.n == 6 and not self.free_axis:
             points, qd = plain(q), plain(velocity)
             qdd = np.zeros_like(points) if acceleration is None else plain(acceleration)
             solution.rates_batch(
-                points, qd, qdd, plain(result.q), self._works[0], self._works[-1], out_v, out_a
+                points, qd, qdd, plain(result.q), self.works[0], self.works[-1], out_v, out_a
             )
             rough = ~(result.whole & np.isfinite(out_v).all(axis=1))
         if np.any(rough):
             bends = None if acceleration is None else acceleration[rough]
-            out_v[rough], out_a[rough] = path_rates(
-                lambda at: self.correct(at).q,
-                q[rough],
-                velocity[rough],
-                bends,
-                (result.q - q)[rough],
+            out_v[rough], out_a[rough] = self._path_rates(
+                q[rough], velocity[rough], bends, (result.q - q)[rough]
             )
         return out_v, out_a
 
+    def _path_rates(
+        self, q: Array, velocity: Array, acceleration: Array | None, shift: Array
+    ) -> tuple[Array, Array]:
+        """Rates (m, n) along the path q + v t + a t^2 / 2, on which the ``shift`` is that at t = 0.
 
-def load_kernels(arm: SerialArm) -> None:
-    """Call the compiled code once, so that the first command need not wait for it."""
-    packed, largest, q = pack_model(arm), np.ones(arm.n), np.zeros((2, arm.n))
-    arm.fk(q)
-    stage = StagedCorrection(packed, packed, largest, largest)
-    stage.rates(q, q, q, stage.correct(q))
-    stage.correct_one(q[0], np.empty((stage.stages, arm.n + solution.REPORT)))
-    stage.uncorrect(q)
-    stage.uncorrect_one(q[0])
-    stage.taught_velocity_one(q[0], q[0], q[0])
-    given = np.ones((stage.stages, arm.n)), False, stage._works, np.zeros((2, arm.n))
-    report = np.empty((stage.stages, arm.n + solution.REPORT))
-    solution.taught_velocity_by_differences(q[0], q[0], q[0], *given, report, np.empty(arm.n))
+        Central differences over 0.2 ms each way; without accelerations, of which then come none,
+        from one side.
+        """
+        if acceleration is None:
+            ahead = q + velocity * STEP_AHEAD_S
+            rate = (self.correct(ahead).q - ahead - shift) / STEP_AHEAD_S
+            return velocity + rate, np.zeros_like(q)
+        h = RATE_STEP_S
+        ends = [q + velocity * t + 0.5 * acceleration * t * t for t in (-h, h)]
+        before, after = (self.correct(at).q - at for at in ends)
+        rate = (after - before) / (2.0 * h)
+        return velocity + rate, acceleration + (after - 2.0 * shift + before) / h**2

@@ -29,12 +29,10 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.correction.damping import POSITION_ERROR, TCP_SHIFT, WEAK
 from robocal_ros.correction.solution import (
-    POSITION_ERROR,
-    TCP_SHIFT,
-    WEAK,
     correct_staged,
-    velocity_by_chain,
+    rates_at,
     velocity_by_differences,
     within,
 )
@@ -307,9 +305,12 @@ def step_out(
         out[j] = velocity[j] + memory[OFFSET_RATE, j]
     if exact:
         taught, corrected, last = memory[TAUGHT], memory[OUT], works.shape[0] - 1
+        none, unused = memory[TRIED], memory[TRIED + 1]
+        for j in range(n):
+            none[j] = 0.0
         if not (
             whole and n == 6 and not free
-            and velocity_by_chain(taught, velocity, corrected, works[0], works[last], out)
+            and rates_at(taught, velocity, none, corrected, works[0], works[last], out, unused)
         ):  # fmt: skip
             velocity_by_differences(
                 taught, velocity, corrected, largest, free, works, memory[VELOCITY + 1],
@@ -355,10 +356,6 @@ class OffsetLimiter:
         """(n,) offset less the desired one."""
         return np.asarray(self.memory[OFFSET] - self.memory[DESIRED])
 
-    def step(self, desired: Array, dt_s: float, active: Array) -> None:
-        """A step of ``dt_s`` > 0 at rest."""
-        advance(self.state, desired, dt_s, False, self.limits, active)
-
     def follow(
         self, desired: Array, times: Array, speed: Array, active: Array
     ) -> tuple[Array, Array]:
@@ -366,14 +363,3 @@ class OffsetLimiter:
         offsets, rates = np.empty_like(desired), np.empty_like(desired)
         follow(self.state, desired, times, speed, self.limits, active, offsets, rates)
         return offsets, rates
-
-
-def load_kernels(n: int) -> None:
-    """Call the compiled code once, so that the first command need not wait for it."""
-    limiter = OffsetLimiter(np.zeros(n, dtype=np.bool_), TURNING, SLIDING)
-    limiter.step(np.zeros(n), 0.004, np.ones(n))
-    zeros, ones = np.zeros(n), np.ones(n)
-    put_out(
-        limiter.memory, zeros, zeros, 0.004, 0.004, limiter.limits, ones, ones, np.zeros((2, n))
-    )
-    limiter.follow(np.zeros((2, n)), np.arange(2.0), np.zeros(2), np.ones(n))

@@ -14,7 +14,6 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from robocal_ros.correction import joint_correction, limiter
 from robocal_ros.correction.bounds import CorrectionConfig, CorrectionGate, DesiredOffset
 from robocal_ros.correction.interface import (
     CorrectionStatus,
@@ -513,15 +512,21 @@ class CorrectionSession:
 
 def load_kernels(arm: SerialArm) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
-    joint_correction.load_kernels(arm)
-    limiter.load_kernels(arm.n)
-    config, q, ones = CorrectionConfig(), np.zeros(arm.n), np.ones(arm.n)
-    desired, speeds = DesiredOffset(arm, config), np.ones((2, arm.n))
+    config, n = CorrectionConfig(), arm.n
+    q, zeros, ones = np.zeros((2, n)), np.zeros(n), np.ones(n)
+    arm.fk(q)
+    desired, offsets = DesiredOffset(arm, config), Output(arm, config, RobotState(arm, 0.0, ones))
+    given = zeros, zeros, (0.004, 0.004), offsets.limiter, ones, np.ones((2, n))
+    desired.put_out(*given)
     desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)
-    offsets = limiter.OffsetLimiter(arm.prismatic, config.turning, config.sliding)
-    desired.put_out(q, q, (0.004, 0.004), offsets, ones, speeds)
+    desired.put_out(*given)
+    stage = desired.stage
+    assert stage is not None
+    stage.rates(q, q, q, stage.correct(q))
+    stage.taught_velocity_one(zeros, zeros, stage.uncorrect_one(zeros))
+    offsets.limiter.follow(q, np.arange(2.0), np.zeros(2), ones)
     state = RobotState(arm, config.joint_state_age_s, config.start_near(arm))
-    state.require_positions(arm.joint_names, np.arange(arm.n), q[None])
+    state.require_positions(arm.joint_names, np.arange(n), q[:1])
     doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
     point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
     gather_rows(doubles, places[:, 0], np.empty((1, 1)))

@@ -1,6 +1,7 @@
 """Compiled solution of the joint correction: one point, a point through all stages, or many.
 
-Nearly all points of six joints are solved by `six_axis`; the others, and all other arms, here.
+Nearly all points of six turning joints are solved by `six_axis`; the others, and all other arms,
+here.
 ``work`` holds `work_size` numbers, so that a point allocates nothing; `prepare` puts the models and
 the constants of a correction there, once. Equations: see `joint_correction`.
 """
@@ -11,7 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.correction import damping, six_axis
-from robocal_ros.correction.six_axis import CONSTANTS, LANES, ROWS, N
+from robocal_ros.correction.damping import (
+    CONVERGED,
+    ITERATIONS,
+    POSITION_ERROR,
+    REPORT,
+    ROTATION_ERROR,
+    TCP_ROTATION,
+    TCP_SHIFT,
+    WEAK,
+    Nine,
+    Six,
+)
+from robocal_ros.correction.six_axis import CONSTANTS, LANES, N
 from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.kernels import (
@@ -34,16 +47,13 @@ FINAL_STEPS = 2
 # A solution this many times beyond the bound is another posture of the arm.
 MOST_OVER = 3.0
 
-# What is written after the n joints.
-POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, WEAK = range(7)
-REPORT = 7
 # Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
 RATE_STEP_S = 2e-4
 # Where they do in a velocity from one side: some 1e-6 rad/s.
 STEP_AHEAD_S = 5e-7
 VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
 MOST_STEPS = 20
-POSES, SQUARES, TWISTS = 6, 3, 5
+POSES, TWISTS = 6, 4
 STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
 
 
@@ -65,12 +75,8 @@ class Workspace(NamedTuple):
     frames: Array
     J: Array  # (n, 6) Jacobian at the taught joints, and at those tried last
     there: Array
-    M: Array  # (6, 6) J J^T
-    U: Array  # (3, 3) vectors of a part of M
-    D: Array  # (6, 6) the damping
     B: Array  # (6, 6) matrix of a step
-    e: Array  # (6,) residual, multipliers, their step, and scratch
-    y: Array
+    e: Array  # (6,) residual, step of the multipliers, and scratch
     step: Array
     spare: Array
     order: Array
@@ -79,7 +85,6 @@ class Workspace(NamedTuple):
     constants: Array  # of `six_axis`, for sixteen points
     came: Array
     goes: Array
-    late: Array
     taught_layer: Array  # (n + 1, w) joint functions of both models; w is 0 where neither has some
     layer: Array
     scratch: Array  # (n, SCRATCH) of `turn_joints`
@@ -89,10 +94,9 @@ class Workspace(NamedTuple):
 
 def work_size(n: int, w: int) -> int:
     """How many scratch numbers a solution needs: n joints, w columns of their functions."""
-    many = CONSTANTS + LANES * (N + ROWS + 1)
-    small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 9 + 6 * TWISTS + SETTINGS
-    layers = (2 * (n + 1) * w + n * (SCRATCH + 2)) if w else 0
-    return 18 * n + 18 * n + n + small + many + layers
+    many = CONSTANTS + LANES * (2 * N + REPORT)
+    small = 16 * POSES + 24 * (n // 8 + 1) + 36 + 6 * TWISTS + SETTINGS
+    return (18 + 18 + 1 + SCRATCH + 2) * n + small + many + 2 * (n + 1) * w
 
 
 @lean
@@ -103,25 +107,20 @@ def room_in(work: Array, n: int) -> Workspace:
     turns, at = work[at : at + turns_size(n)], at + turns_size(n)
     frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
     J, at = work[at : at + 12 * n].reshape(2, n, 6), at + 12 * n
-    squares, at = work[at : at + 36 * SQUARES].reshape(SQUARES, 6, 6), at + 36 * SQUARES
-    U, at = work[at : at + 9].reshape(3, 3), at + 9
+    B, at = work[at : at + 36].reshape(6, 6), at + 36
     twists, at = work[at : at + 6 * TWISTS].reshape(TWISTS, 6), at + 6 * TWISTS
     x, at = work[at : at + n], at + n
     settings, at = work[at : at + SETTINGS], at + SETTINGS
     constants, at = work[at : at + CONSTANTS], at + CONSTANTS
     came, at = work[at : at + LANES * N], at + LANES * N
-    goes, at = work[at : at + LANES * ROWS], at + LANES * ROWS
-    late, at = work[at : at + LANES], at + LANES
-    layered = n if work.shape[0] > at else 0
-    w = (work.shape[0] - at - layered * (SCRATCH + 2)) // (2 * (n + 1))
-    layers, at = work[at : at + 2 * (n + 1) * w].reshape(2, n + 1, w), at + 2 * (n + 1) * w
-    scratch = work[at : at + layered * SCRATCH].reshape(layered, SCRATCH)
-    both = work[at + layered * SCRATCH :].reshape(2, layered)
+    goes, at = work[at : at + LANES * (N + REPORT)], at + LANES * (N + REPORT)
+    scratch, at = work[at : at + SCRATCH * n].reshape(n, SCRATCH), at + SCRATCH * n
+    both, at = work[at : at + 2 * n].reshape(2, n), at + 2 * n
+    layers = work[at:].reshape(2, n + 1, (work.shape[0] - at) // (2 * (n + 1)))
     return Workspace(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
-        turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
-        twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
-        constants, came, goes, late, layers[0], layers[1], scratch, both[0], both[1],
+        turns, frames, J[0], J[1], B, twists[0], twists[1], twists[2], twists[3], x, settings,
+        constants, came, goes, layers[0], layers[1], scratch, both[0], both[1],
     )  # fmt: skip
 
 
@@ -189,74 +188,58 @@ def _jacobian(free: bool, room: Workspace, J: Array) -> None:
 
 
 @lean
-def _damp(free: bool, room: Workspace) -> bool:
-    """Damping ``D`` for J and the residual at the taught joints; whether a direction is weak."""
-    n, M, D, settings = room.x.shape[0], room.M, room.D, room.settings
-    position, both = 0.0, 0.0
-    for r in range(3):
-        position += room.e[r] * damping.WEIGHT * room.e[r] * damping.WEIGHT
-        both += room.e[3 + r] * room.e[3 + r]
-    both += position
-    position = damping.lambda_square(position, settings[STEEPNESS], settings[PER_ERROR])
-    rotation = damping.lambda_square(both, settings[STEEPNESS], settings[PER_ERROR])
-    damping.product(room.J, room.J, M)
-    absent = max(6 - n, 1 if free else 0)  # directions in which no joint moves the tool
-    if n >= 6:
-        for r in range(6):
-            for c in range(6):
-                D[r, c] = 0.0
-        if free:  # of which J knows nothing: a one fills its place
-            z = damping.tool_axis(room.here, room.tool)
-            for r in range(3):
-                for c in range(3):
-                    D[3 + r, 3 + c] = z[r] * z[c]
-                    M[3 + r, 3 + c] += z[r] * z[c]
-        if (
-            damping.WINDOW * rotation * (damping.inverse_norm(M, room.B, room.spare) - absent)
-            <= 1.0
-        ):
-            return False
-        damping.product(room.J, room.J, M)
-    return damping.damping(M, position, rotation, D, room.U) > absent
+def _weighed(room: Workspace) -> Six:
+    e = room.e
+    return damping.weighed((e[0], e[1], e[2], e[3], e[4], e[5]))
 
 
 @lean
-def _add_step(q: Array, free: bool, room: Workspace) -> float:
-    """One step with the factored matrix; returns its largest component in the joints."""
-    step, size = room.step, 0.0
+def _damp(room: Workspace) -> tuple[Nine, Nine, float]:
+    """Damping P and R for J and the residual at the taught joints; how many directions have it."""
+    M, settings = room.B, room.settings
     for r in range(6):
-        step[r] = room.e[r] * damping.WEIGHT if r < 3 else room.e[r]
         for c in range(6):
-            step[r] -= room.D[r, c] * room.y[c]
-    damping.substitute(room.B, room.order, step)
-    for r in range(6):
-        room.y[r] += step[r]
-    for i in range(room.x.shape[0]):
-        value, before = 0.0, room.x[i]
-        for r in range(6):
-            value += room.J[i, r] * room.y[r]
-        room.x[i] = value
-        size = max(size, abs(value - before))
-    _residual_at(q, free, room)
-    return size
+            M[r, c] = 0.0
+    damping.add_product(room.J, room.J, M)
+    A, B, C = damping.block(M, 0, 0), damping.block(M, 0, 3), damping.block(M, 3, 3)
+    return damping.damping(A, B, C, _weighed(room), settings[STEEPNESS], settings[PER_ERROR])
 
 
 @lean
-def _newton(q: Array, free: bool, room: Workspace) -> int:
+def _add_step(q: Array, free: bool, room: Workspace, y: Six, P: Nine, R: Nine) -> tuple[Six, float]:
+    """Multipliers after a step with the factored matrix, and its largest component in the joints.
+
+    The shift is J^T y.
+    """
+    rest, step, size = damping.left(_weighed(room), y, P, R), room.step, 0.0
+    for r in range(6):
+        step[r] = rest[r]
+    damping.substitute(room.B, room.order, step)
+    y = damping.more(y, 1.0, (step[0], step[1], step[2], step[3], step[4], step[5]))
+    for i in range(room.x.shape[0]):
+        before, J = room.x[i], room.J[i]
+        room.x[i] = damping.dot((J[0], J[1], J[2], J[3], J[4], J[5]), y)
+        size = max(size, abs(room.x[i] - before))
+    _residual_at(q, free, room)
+    return y, size
+
+
+@lean
+def _newton(q: Array, free: bool, room: Workspace, P: Nine, R: Nine) -> int:
     """Multipliers y and shift x = J^T y with e(q + x) = D y; iterations, 0 where none is found."""
+    y = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for iteration in range(1, MOST_ITERATIONS + 1):
         if iteration > 1:
             _jacobian(free, room, room.there)
-        damping.product(room.J if iteration == 1 else room.there, room.J, room.B)
-        for r in range(6):
-            for c in range(6):
-                room.B[r, c] += room.D[r, c]
+        damping.fill(P, 0, room.B)
+        damping.fill(R, 3, room.B)
+        damping.add_product(room.J if iteration == 1 else room.there, room.J, room.B)
         if not damping.eliminate(room.B, room.order):
             return 0
-        size = _add_step(q, free, room)
+        y, size = _add_step(q, free, room, y, P, R)
         if size <= SMALL_STEP:
             for _ in range(FINAL_STEPS):
-                _add_step(q, free, room)
+                y, _ = _add_step(q, free, room, y, P, R)
             return iteration
         if not size < 10.0:
             return 0
@@ -272,15 +255,15 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
     damping.swap_tool(room.goal, room.taught_tool, room.tool)
     for i in range(n):
         room.x[i] = 0.0
-    for r in range(6):
-        room.y[r] = 0.0
     _residual_at(q, free, room)
     out[n + TCP_SHIFT], out[n + TCP_ROTATION] = newton.length(e, 0), newton.length(e, 3)
     out[n + ITERATIONS], out[n + CONVERGED], out[n + WEAK] = 0.0, 1.0, 0.0
     if newton.largest_of(e) > SMALL_RESIDUAL or not newton.largest_of(e) < np.inf:
         _jacobian(free, room, room.J)
-        out[n + WEAK] = 1.0 if _damp(free, room) else 0.0
-        out[n + ITERATIONS] = _newton(q, free, room)
+        P, R, count = _damp(room)
+        # more than those in which no joint moves the tool
+        out[n + WEAK] = 1.0 if count > max(6 - n, 1 if free else 0) else 0.0
+        out[n + ITERATIONS] = _newton(q, free, room, P, R)
         fine = out[n + ITERATIONS] > 0.0
         for i in range(n):
             fine = fine and abs(room.x[i]) <= MOST_OVER * largest[i]
@@ -295,39 +278,12 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
 
 
 @lean
-def _put(q: Array, lane: int, lanes: int, room: Workspace) -> None:
-    """A point becomes one of those that `six_axis` solves."""
-    for i in range(N):
-        room.came[i * lanes + lane] = q[i]
-
-
-@lean
 def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
     """A point of `six_axis`, with its report; False where it must be solved here."""
-    goes, n = room.goes, N
-    for i in range(n):
-        out[i] = goes[i * lanes + lane]
-    out[n + POSITION_ERROR] = goes[six_axis.POSITION_LEFT * lanes + lane]
-    out[n + ROTATION_ERROR] = goes[six_axis.ROTATION_LEFT * lanes + lane]
-    out[n + ITERATIONS] = six_axis.ITERATIONS
-    out[n + WEAK] = goes[six_axis.WEAK * lanes + lane]
-    out[n + CONVERGED] = goes[six_axis.FINE * lanes + lane]
-    out[n + TCP_SHIFT] = goes[six_axis.TCP_SHIFT * lanes + lane]
-    out[n + TCP_ROTATION] = goes[six_axis.TCP_ROTATION * lanes + lane]
-    return bool(out[n + CONVERGED] > 0.5)
-
-
-@lean
-def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
-    if room.settings[IS_STRAIGHT] > 0.5:
-        _put(q, 0, 1, room)
-        six_axis.correct_one(room.constants, room.came, room.goes)
-        if _take_over(room, 0, 1, out):
-            return
-        six_axis.correct_one_damped(room.constants, room.came, room.goes)
-        if _take_over(room, 0, 1, out):
-            return
-    _correct(q, largest, free, room, out)
+    for r in range(N + REPORT):
+        out[r] = room.goes[r * lanes + lane]
+    out[N + ITERATIONS] = six_axis.ITERATIONS
+    return bool(out[N + CONVERGED] > 0.5)
 
 
 # Where joints turn otherwise than they read, what a rigid reference arm would read is corrected to
@@ -341,18 +297,10 @@ def _is_turned(room: Workspace) -> bool:
 
 
 @lean
-def _turn(q: Array, room: Workspace, turned: Array) -> None:
-    """What a rigid reference arm would read at ``q`` (n,)."""
-    turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
-    for i in range(q.shape[0]):
-        turned[i] = room.scratch[i, TURNED]
-
-
-@lean
 def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> None:
     """Make joints of what a rigid arm would read, in ``out``, and its shift that of the true arms.
 
-    ``turned`` (n,) is what `_turn` makes of ``q``.
+    ``turned`` (n,) is what a rigid reference arm would read at ``q``.
     """
     n, e, back = q.shape[0], room.e, room.back
     walk(turned, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
@@ -377,41 +325,35 @@ def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> N
 
 
 @lean
-def turn_batch(q: Array, work: Array, turned: Array) -> None:
-    """What a rigid reference arm would read (m, n) at ``q`` (m, n): what `correct_batch` takes."""
-    room = room_in(work, q.shape[1])
-    for k in range(q.shape[0]):
-        _turn(q[k], room, turned[k])
-
-
-@lean
-def read_batch(q: Array, turned: Array, free: bool, work: Array, out: Array) -> None:
-    """Joints of what `correct_batch` made of ``turned`` (m, n), in ``out``."""
-    room = room_in(work, q.shape[1])
-    for k in range(q.shape[0]):
-        _read(q[k], turned[k], free, room, out[k])
-
-
-@lean
-def _correct_weak(q: Array, largest: Array, room: Workspace, out: Array) -> None:
-    """Those of the points (m, 6) of which ``out`` says that they are not solved."""
-    count, n = 0, N
+def _put(q: Array, lane: int, lanes: int, room: Workspace) -> None:
+    """A point becomes one of ``lanes``: what a rigid reference arm would read there."""
+    if _is_turned(room):
+        turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
     for i in range(q.shape[0]):
-        if out[i, n + CONVERGED] > 0.5:
-            continue
-        _put(q[i], count, LANES, room)
-        room.late[count] = i
-        count += 1
-        if count == LANES:
-            six_axis.correct_lanes_damped(room.constants, room.came, room.goes)
-            for lane in range(count):
-                k = int(room.late[lane])
-                if not _take_over(room, lane, count, out[k]):
-                    _correct(q[k], largest, False, room, out[k])
-            count = 0
-    for lane in range(count):
-        k = int(room.late[lane])
-        _correct_one(q[k], largest, False, room, out[k])
+        room.came[i * lanes + lane] = room.scratch[i, TURNED] if _is_turned(room) else q[i]
+
+
+@lean
+def _take(
+    q: Array, lane: int, lanes: int, largest: Array, free: bool, room: Workspace, out: Array
+) -> None:
+    """Take a point from where `six_axis` has solved it, else solve it here."""
+    solved = room.settings[IS_STRAIGHT] > 0.5 and _take_over(room, lane, lanes, out)
+    for i in range(q.shape[0]):
+        room.turned[i] = room.came[i * lanes + lane]
+    if not solved:
+        _correct(room.turned, largest, free, room, out)
+    if _is_turned(room):
+        _read(q, room.turned, free, room, out)
+
+
+@lean
+def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
+    """A point (n,) of any arm."""
+    _put(q, 0, 1, room)
+    if room.settings[IS_STRAIGHT] > 0.5:
+        six_axis.correct_one(room.constants, room.came, room.goes)
+    _take(q, 0, 1, largest, free, room, out)
 
 
 @lean
@@ -421,31 +363,24 @@ def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Arra
     for stage in range(works.shape[0]):
         room = room_in(works[stage], n)
         start = q if stage == 0 else out[stage - 1, :n]
-        if _is_turned(room):
-            _turn(start, room, room.turned)
-            _correct_one(room.turned, largest[stage], free, room, out[stage])
-            _read(start, room.turned, free, room, out[stage])
-        else:
-            _correct_one(start, largest[stage], free, room, out[stage])
+        _correct_one(start, largest[stage], free, room, out[stage])
 
 
 @lean
 def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
-    """Joints that put the actual tool where the reference tool is at ``q`` (m, n), of rigid arms.
+    """Joints that put the actual tool where the reference tool is at ``q`` (m, n).
 
     ``largest`` (n,) bounds the joint shift; ``free``: the turn about the tool's z is free.
     ``out`` (m, n + 7): joints, then the report.
     """
     room, first = room_in(work, q.shape[1]), 0
-    if room.settings[IS_STRAIGHT] > 0.5:
-        while q.shape[0] - first >= LANES:
-            for lane in range(LANES):
-                _put(q[first + lane], lane, LANES, room)
-            six_axis.correct_lanes(room.constants, room.came, room.goes)
-            for lane in range(LANES):
-                _take_over(room, lane, LANES, out[first + lane])
-            first += LANES
-        _correct_weak(q[:first], largest, room, out)
+    while room.settings[IS_STRAIGHT] > 0.5 and q.shape[0] - first >= LANES:
+        for lane in range(LANES):
+            _put(q[first + lane], lane, LANES, room)
+        six_axis.correct_lanes(room.constants, room.came, room.goes)
+        for lane in range(LANES):
+            _take(q[first + lane], lane, LANES, largest, free, room, out[first + lane])
+        first += LANES
     for i in range(first, q.shape[0]):
         _correct_one(q[i], largest, free, room, out[i])
 
@@ -484,65 +419,48 @@ def _stand(q: Array, links: Array, root: Array, tool: Array, room: Workspace) ->
 
 
 @lean
+def rates_at(
+    q: Array, qd: Array, qdd: Array, corrected: Array, first: Array, last: Array,
+    velocity: Array, acceleration: Array,
+) -> bool:  # fmt: skip
+    """Joint rates (6,) at corrected joints: the tool moves as the reference tool does.
+
+    J' qd' = J qd, and its derivative J' qdd' + (dJ'/dt) qd' = J qdd + (dJ/dt) qd, analytically.
+    Meaningful where no direction is weak; False where the pose is singular, and for joint
+    functions. ``first`` holds the reference model, ``last`` the actual one: ``work`` of the first
+    and of the last stage.
+    """
+    n = q.shape[0]
+    taught, room = room_in(first, n), room_in(last, n)
+    J, L, v, a = room.J, room.B, room.e, room.spare
+    if _is_turned(room):
+        return False
+    _stand(q, taught.taught_links, taught.taught_root, taught.taught_tool, room)
+    newton.bias(taught.taught_links, room.frames, room.here, qd, v, a)
+    for i in range(n):
+        for r in range(6):
+            a[r] += J[i, r] * qdd[i]
+    _stand(corrected, room.links, room.root, room.tool, room)
+    if not newton.factor(J, L):
+        return False
+    newton.solve(J, L, v, velocity, velocity)
+    newton.bias(room.links, room.frames, room.here, velocity, v, room.step)
+    for r in range(6):
+        a[r] -= room.step[r]
+    newton.solve(J, L, a, velocity, acceleration)
+    return newton.largest_of(velocity) < np.inf
+
+
+@lean
 def rates_batch(
     q: Array, qd: Array, qdd: Array, corrected: Array, first: Array, last: Array, out_v: Array,
     out_a: Array,
 ) -> None:  # fmt: skip
-    """Joint rates (m, 6) at corrected joints: the tool moves as the reference tool does.
-
-    J' qd' = J qd, and its derivative J' qdd' + (dJ'/dt) qd' = J qdd + (dJ/dt) qd, analytically.
-    Meaningful where no direction is weak; NaN where the pose is singular, and for joint functions.
-    ``first`` holds the reference model, ``last`` the actual one: ``work`` of the first and of the
-    last stage.
-    """
-    taught, room = room_in(first, q.shape[1]), room_in(last, q.shape[1])
-    n, J, L, v, a = q.shape[1], room.J, room.B, room.e, room.spare
+    """`rates_at` for points (m, 6); NaN where that is False."""
     for m in range(q.shape[0]):
-        velocity, acceleration = out_v[m], out_a[m]
-        if _is_turned(room):
-            for i in range(n):
-                velocity[i], acceleration[i] = np.nan, np.nan
-            continue
-        _stand(q[m], taught.taught_links, taught.taught_root, taught.taught_tool, room)
-        newton.bias(taught.taught_links, room.frames, room.here, qd[m], v, a)
-        for i in range(n):
-            for r in range(6):
-                a[r] += J[i, r] * qdd[m, i]
-        _stand(corrected[m], room.links, room.root, room.tool, room)
-        if not newton.factor(J, L):
-            for i in range(n):
-                velocity[i], acceleration[i] = np.nan, np.nan
-            continue
-        newton.solve(J, L, v, velocity, velocity)
-        newton.bias(room.links, room.frames, room.here, velocity, v, room.step)
-        for r in range(6):
-            a[r] -= room.step[r]
-        newton.solve(J, L, a, velocity, acceleration)
-
-
-@lean
-def velocity_by_chain(
-    q: Array, qd: Array, corrected: Array, first: Array, last: Array, out: Array
-) -> bool:
-    """The velocities (6,) of `rates_batch` for one point; whether they are finite."""
-    n = q.shape[0]
-    taught, room = room_in(first, n), room_in(last, n)
-    if _is_turned(room):
-        return False
-    J, L, v = room.J, room.B, room.e
-    _stand(q, taught.taught_links, taught.taught_root, taught.taught_tool, room)
-    for r in range(6):
-        v[r] = 0.0
-        for i in range(n):
-            v[r] += J[i, r] * qd[i]
-    _stand(corrected, room.links, room.root, room.tool, room)
-    if not newton.factor(J, L):
-        return False
-    newton.solve(J, L, v, out, out)
-    size = 0.0
-    for i in range(n):
-        size += abs(out[i])
-    return size < np.inf
+        if not rates_at(q[m], qd[m], qdd[m], corrected[m], first, last, out_v[m], out_a[m]):
+            for i in range(q.shape[1]):
+                out_v[m, i], out_a[m, i] = np.nan, np.nan
 
 
 @lean
@@ -563,22 +481,31 @@ def velocity_by_differences(
 
 
 @lean
-def taught_velocity_by_differences(
-    q: Array, velocity: Array, corrected: Array, largest: Array, free: bool, works: Array,
-    spare: Array, report: Array, out: Array,
+def taught_velocity(
+    corrected: Array, velocity: Array, q: Array, largest: Array, free: bool, works: Array,
+    back: Array, report: Array, spare: Array, out: Array,
 ) -> None:  # fmt: skip
     """Velocities ``out`` (n,) of the taught joints ``q``, of those of the corrected ones (n,).
 
-    The shift changes slower than the joints move. ``spare`` (2, n) is scratch.
+    ``back``: works of the correction with the models exchanged; ``report`` (k, n + 7) and ``spare``
+    (3, n) are scratch. By differences the shift changes slower than the joints move.
     """
-    n = q.shape[0]
+    n, last, at_q = q.shape[0], works.shape[0] - 1, spare[1]
+    correct_staged(q, largest, free, works, report)
+    whole = n == 6 and not free
+    for stage in range(last + 1):
+        whole = whole and report[stage, n + WEAK] == 0.0
+    for j in range(n):
+        out[j], at_q[j], spare[0, j] = velocity[j], report[last, j], 0.0
+    if whole and rates_at(corrected, velocity, spare[0], q, back[0], back[last], out, spare[2]):
+        return
     for j in range(n):
         out[j] = velocity[j]
     for _ in range(MOST_STEPS):
-        velocity_by_differences(q, out, corrected, largest, free, works, spare[0], report, spare[1])
+        velocity_by_differences(q, out, at_q, largest, free, works, spare[0], report, spare[2])
         size = 0.0
         for j in range(n):
-            miss = velocity[j] - spare[1, j]
+            miss = velocity[j] - spare[2, j]
             size = max(size, abs(miss))
             out[j] += miss
         if not size > VELOCITY_EXACT:

@@ -8,16 +8,10 @@ from itertools import accumulate
 
 import numpy as np
 
-from robocal_ros.correction.bounds import (
-    ClampedCorrection,
-    CorrectionConfig,
-    DesiredOffset,
-    require_limits,
-)
+from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset, require_limits
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
     ADDS,
-    DESIRED,
     LONGEST_STEP_S,
     OFFSET,
     OFFSET_RATE,
@@ -326,13 +320,10 @@ class TargetStream:
     def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""
         output, index, velocity = self._output, self._index, command.velocity
-        memory = output.limiter.memory
         if velocity is not None:
             velocity = self._velocity_out()
-        if self.lag_s == 0.0:
-            adds = self._desired.figures[ADDS] if self._desired.fast else memory[OFFSET].any()
-            if not adds:
-                return command
+        if self.lag_s == 0.0 and not self._desired.figures[ADDS]:
+            return command
         return JointCommand(command.names, output.out[index], velocity, command.stamp_ns, CORRECTED)
 
     def _velocity_out(self) -> Array:
@@ -341,20 +332,13 @@ class TargetStream:
         Those of the correction where the offset is the desired one, else by what went out, or the
         limiter's rates.
         """
-        output, index, stage = self._output, self._index, self._output.stage
-        memory = output.limiter.memory
+        output, index = self._output, self._index
         if self.lag_s > 0.0 and self._step_s > 0.0:
             velocity = (output.out - self._before)[index] / self._step_s
-        elif self._desired.fast:
-            velocity = memory[VELOCITY, index]
+        else:
+            velocity = output.limiter.memory[VELOCITY, index]
             if not self._desired.figures[TOO_FAST]:
                 return velocity
-        elif isinstance(stage, ClampedCorrection) and np.array_equal(
-            memory[OFFSET], memory[DESIRED]
-        ):
-            velocity = stage.velocity_one(output.taught, self._velocity, output.out)[index]
-        else:
-            velocity = self._velocity[index] + memory[OFFSET_RATE, index]
         names = [self._arm.joint_names[i] for i in index]
         hold_speeds(names, velocity[None], np.ones(1), self._fastest[index])
         return velocity
