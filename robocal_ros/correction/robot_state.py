@@ -11,6 +11,7 @@ from robocal_ros.correction.interface import (
     JointCommand,
     Reason,
     RefusedError,
+    TrajectoryCommand,
     require_finite,
 )
 from robocal_ros.correction.joint_correction import StagedCorrection, plain
@@ -257,17 +258,11 @@ def _require_single(names: tuple[str, ...]) -> None:
 class SentPath:
     """A trajectory that was put out, and the controller's clock on it."""
 
+    command: TrajectoryCommand  # as put out
     index: Index  # (k,) its joints
-    begin_s: float  # zero of ``times`` on the session's clock
-    times: Array  # (m,) of its points, s
-    out: Array  # (m, k) as put out
-    velocity: Array | None  # (m, k); None for straight lines between the points
-    acceleration: Array | None  # (m, k); None for cubics
+    begin_s: float  # from when its times count, on the session's clock
     known_times: Array  # (r,) of the next rows: its points, before them where it leads in
-    offsets: Array  # (r, n)
-    rates: Array  # (r, n) of the offset
-    bends: Array  # (r, n) its accelerations, where the path has some
-    withheld: Array  # (r, n) what of it the limiter adds
+    known: Array  # (4, r, n) offset, its rate, its acceleration, and what of it the limiter adds
     stage: StagedCorrection | None  # that it was made with
     led_from: Array  # (k,) where the controller leads in from
     put_s: float  # since when
@@ -306,28 +301,30 @@ class SentPath:
 
     def live(self, now_s: float) -> bool:
         """Whether the robot may still be moving by it."""
-        return self.time(now_s) <= self.times[-1] + RESPONSE_S and (
+        return self.time(now_s) <= self.lasts_s + RESPONSE_S and (
             now_s <= self._stopped_s + RESPONSE_S
         )
 
+    @property
+    def lasts_s(self) -> float:
+        """Time of its last point."""
+        return float(self.command.time_from_start_s[-1])
+
     def place(self, now_s: float) -> Array:
         """Where the controller is (k,), between the points as it drives there."""
-        t = self.time(now_s)
-        if t < self.times[0]:
-            lead = self.times[0] + self.begin_s - self.put_s
-            part = np.clip((self.times[0] - t) / lead, 0.0, 1.0) if lead > 0.0 else 0.0
-            return np.asarray(self.out[0] + part * (self.led_from - self.out[0]))
-        k = int(np.searchsorted(self.times, t, side="right")) - 1
-        if k + 1 >= len(self.times):
-            return self.out[-1].copy()
-        ends = slice(k, k + 2)
-        rates = None if self.velocity is None else self.velocity[ends]
-        bends = None if self.acceleration is None else self.acceleration[ends]
-        return spline(self.times, self.out[ends], rates, bends, k, t)[0]
+        t, times, out = self.time(now_s), self.command.time_from_start_s, self.command.position
+        if t < times[0]:
+            lead = times[0] + self.begin_s - self.put_s
+            part = np.clip((times[0] - t) / lead, 0.0, 1.0) if lead > 0.0 else 0.0
+            return np.asarray(out[0] + part * (self.led_from - out[0]))
+        return driven(times, out, self.command.velocity, self.command.acceleration, t)
 
-    def at(self, rows: Array, now_s: float) -> Array:
-        """Rows (r, n) of it now (n,)."""
-        t, times = self.time(now_s), self.known_times
+    def withheld(self, now_s: float) -> Array:
+        """What of the offset the limiter adds now (n,)."""
+        return self._at(3, now_s)
+
+    def _at(self, row: int, now_s: float) -> Array:
+        t, times, rows = self.time(now_s), self.known_times, self.known[row]
         k = int(np.searchsorted(times, t, side="right")) - 1
         if not 0 <= k < len(times) - 1:
             return rows[max(k, 0)].copy()
@@ -339,13 +336,25 @@ class SentPath:
         """Offset and its rate (n,) now, as the controller drives them between the points."""
         t, times = self.time(now_s), self.known_times
         k = int(np.searchsorted(times, t, side="right")) - 1
-        if self.velocity is None or not 0 <= k < len(times) - 1:
-            return self.at(self.offsets, now_s), self.at(self.rates, now_s)
-        ends = slice(k, k + 2)
+        if self.command.velocity is None or not 0 <= k < len(times) - 1:
+            return self._at(0, now_s), self._at(1, now_s)
+        offsets, rates, bends, _ = self.known[:, k : k + 2]
         # it comes in by a cubic
-        comes_in = k < len(times) - len(self.times)
-        bends = None if self.acceleration is None or comes_in else self.bends[ends]
-        return spline(times, self.offsets[ends], self.rates[ends], bends, k, t)
+        comes_in = k < len(times) - len(self.command)
+        quintic = self.command.acceleration is not None and not comes_in
+        return spline(times, offsets, rates, bends if quintic else None, k, t)
+
+
+def driven(
+    times: Array, points: Array, rates: Array | None, bends: Array | None, t: float
+) -> Array:
+    """Where a controller is (k,) at ``t`` between points (m, k), from the first one on."""
+    k = int(np.searchsorted(times, t, side="right")) - 1
+    if k + 1 >= len(times):
+        return points[-1].copy()
+    ends = slice(k, k + 2)
+    rates, bends = (None if rows is None else rows[ends] for rows in (rates, bends))
+    return spline(times, points[ends], rates, bends, k, t)[0]
 
 
 def spline_terms(
@@ -409,7 +418,7 @@ class Output:
     def correction(self, now_s: float) -> tuple[StagedCorrection | None, Array]:
         """The correction in what is put out now, and what the limiter adds to it (n,)."""
         if self.path is not None:
-            return self.path.stage, self.path.at(self.path.withheld, now_s)
+            return self.path.stage, self.path.withheld(now_s)
         return self.stage, self.limiter.withheld
 
     def uncorrected(self, corrected: Array, now_s: float) -> Array:
@@ -550,9 +559,9 @@ class Output:
         if self.path is not None:
             state, path = self.limiter.state, self.path
             state[OFFSET], rate = path.offset(now_s)
-            moving = path.time(now_s) < path.times[-1] and path.live(now_s)
+            moving = path.time(now_s) < path.lasts_s and path.live(now_s)
             state[OFFSET_RATE] = rate if moving else 0.0
-            state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
+            state[DESIRED] = state[OFFSET] - path.withheld(now_s)
             state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
 
     def reject(self, path: SentPath) -> None:

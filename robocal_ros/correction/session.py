@@ -267,7 +267,7 @@ class CorrectionSession:
         self._interrupted = path, self.stream.phase
         self.stream.phase = StreamPhase.IDLE
         self._goal[:] = q[-1]
-        self._note_withheld(path.withheld, q)
+        self._note_withheld(path.known[3], q)
         return corrected
 
     def _note_withheld(self, withheld: Array, q: Array) -> None:

@@ -6,7 +6,6 @@ smoothly is a motion from where it is to rest, some tenths of a second ahead.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,8 +38,8 @@ from robocal_ros.correction.robot_state import (
     RobotState,
     RobotTrack,
     SentPath,
+    driven,
     hold_speeds,
-    spline,
     spline_terms,
 )
 from robocal_ros.ground.frames import Array, Index
@@ -51,7 +50,7 @@ from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, Moti
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
 SPLINE_PEAK = 1.875
 SETTLED = 1e-9  # rad, m: of an offset that is the desired one
-LONGEST_WAIT_S = 60.0  # for which it is worked out how long an offset takes
+LONGEST_WAIT_S, STEP_S = 60.0, 0.02  # for which it is worked out how long an offset takes
 TRIES = 12
 LOOKED_AT = 33  # speeds of a spline, from point to point
 STOP_SPACING_S = 0.025  # of the points of a stop
@@ -98,11 +97,10 @@ class TrajectoryCorrector:
             offsets, rates, bends = self._follow(desired, follows, times, speed, active)
             self._require_end(limiter.withheld[index], active)
             out = q + offsets
-            velocity = acceleration = None
-            if command.velocity is not None:
-                velocity = command.velocity + rates[:, index]
-            if command.acceleration is not None:
-                acceleration = command.acceleration + bends[:, index]
+            rates_of = (command.velocity, rates), (command.acceleration, bends)
+            velocity, acceleration = (
+                None if given is None else given + of[:, index] for given, of in rates_of
+            )
             require_limits(out, self._arm)
             self._require_speeds(command, index, out, (velocity, acceleration), times, led_from)
         finally:
@@ -114,30 +112,23 @@ class TrajectoryCorrector:
             offset, rate = begin[OFFSET], begin[OFFSET_RATE]
             first = np.stack([offset, rate, 0.0 * rate, withheld])
             sent = np.concatenate([first[:, None], sent], axis=1)
-        path = SentPath(
+        corrected = command
+        if offsets[:, index].any():
+            corrected = TrajectoryCommand(
+                command.names, out[:, index], command.time_from_start_s, velocity, acceleration,
+                command.stamp_ns, CORRECTED,
+            )  # fmt: skip
+        return corrected, SentPath(
+            command=corrected,
             index=index,
             begin_s=now_s + starts_in_s,
-            times=command.time_from_start_s,
-            out=out[:, index],
-            velocity=velocity,
-            acceleration=acceleration,
             known_times=known_times,
-            **dict(zip(("offsets", "rates", "bends", "withheld"), sent, strict=True)),
+            known=sent,
             stage=self._desired.stage if result is not None else None,
             led_from=out[0, index] if led_from is None else led_from,
             put_s=now_s,
             at_once=starts_in_s == 0.0,
         )
-        if not offsets[:, index].any():
-            return command, path
-        corrected = replace(
-            command,
-            position=out[:, index],
-            velocity=velocity,
-            acceleration=acceleration,
-            mark=CORRECTED,
-        )
-        return corrected, path
 
     def _begin(
         self,
@@ -158,7 +149,8 @@ class TrajectoryCorrector:
         if output.path is None and self._state.stands(index, now_s):  # a stream's that is over
             limiter.state[OFFSET_RATE] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
-            here = _place_now(command, index, q, times)
+            here, rates = q[0].copy(), (command.velocity, command.acceleration)
+            here[index] = driven(times, q[:, index], *rates, 0.0)
             begins = self._desired.begins(here)
             limiter.state[OFFSET, index] = output.begin_at(index, here, begins, now_s)
             limiter.state[DESIRED] = begins[0]
@@ -178,12 +170,11 @@ class TrajectoryCorrector:
         """Refuse a path at whose last point the offset is not the desired one."""
         if np.all(np.abs(withheld) <= SETTLED):
             return
-        limiter, more_s, dt = self._output.limiter, 0.0, 0.02
-        target, state = limiter.state[DESIRED].copy(), limiter.state.copy()
-        while more_s < LONGEST_WAIT_S and np.any(np.abs(limiter.withheld * active) > SETTLED):
-            limiter.step(target, dt, active)
-            more_s += dt
-        limiter.state[:] = state
+        limiter, times = self._output.limiter, np.arange(STEP_S, LONGEST_WAIT_S, STEP_S)
+        target = np.tile(limiter.state[DESIRED], (len(times), 1))
+        offsets, _ = limiter.follow(target, times, np.zeros(len(times)), active)
+        away = np.abs((offsets - target) * active).max(axis=1) > SETTLED
+        more_s = (np.count_nonzero(away) + 1) * STEP_S
         raise RefusedError(
             Reason.TOO_SHORT,
             f"the offset would still be {np.max(np.abs(withheld)):.6f} away at its last point; "
@@ -286,7 +277,7 @@ class TrajectoryCorrector:
             return None
         clock = path.time(now_s)
         rate = (path.time(now_s + ahead_s) - clock) / ahead_s
-        left = float(path.times[-1]) - clock - ahead_s
+        left = path.lasts_s - clock - ahead_s
         t, slow, on = np.zeros(1), np.zeros(1), np.zeros(1)
         if rate > 0.0 and left > 0.0:
             lasts, share = self._slow_down(path, now_s + ahead_s / rate, rate, left)
@@ -297,20 +288,15 @@ class TrajectoryCorrector:
         velocity = speed * slow[:, None]
         velocity[-1] = 0.0
         offsets, rates = np.array([path.offset(at) for at in at_s]).transpose(1, 0, 2)
+        withheld = np.array([path.withheld(at) for at in at_s])
         names = tuple(self._arm.joint_names[i] for i in path.index)
         command = TrajectoryCommand(names, position, ahead_s + t, velocity, mark=CORRECTED)
         return command, SentPath(
+            command=command,
             index=path.index,
             begin_s=now_s,
-            times=command.time_from_start_s,
-            out=position,
-            velocity=velocity,
-            acceleration=None,
             known_times=command.time_from_start_s,
-            offsets=offsets,
-            rates=rates * slow[:, None],
-            bends=0.0 * rates,
-            withheld=np.array([path.at(path.withheld, at) for at in at_s]),
+            known=np.stack([offsets, rates * slow[:, None], 0.0 * rates, withheld]),
             stage=path.stage,
             led_from=path.place(now_s),
             put_s=now_s,
@@ -396,19 +382,6 @@ def _over(rows: Array, withheld: Array, h: Array, moves: NDArray[np.bool_], limi
         fast[None], limits[[ACCELERATION, RATE], None], limits[[REST_ACCELERATION, REST_RATE], None]
     )
     return np.array([np.max(np.abs(x) / m) for x, m in zip((bend, rate), most, strict=True)])
-
-
-def _place_now(command: TrajectoryCommand, index: Index, q: Array, times: Array) -> Array:
-    """Taught joints (n,) at time 0 of a path that has begun, between the points as it is driven."""
-    k = int(np.searchsorted(times, 0.0, side="right")) - 1
-    here, ends = q[k].copy(), slice(k, k + 2)
-    if k + 1 < len(times):
-        rates, bends = (
-            None if rows is None else rows[ends]
-            for rows in (command.velocity, command.acceleration)
-        )
-        here[index] = spline(times, q[ends, index], rates, bends, k, 0.0)[0]
-    return here
 
 
 def _peaks(
@@ -576,12 +549,11 @@ class RobotStop:
 def on_its_path(path: SentPath, planned: TrajectoryCommand, now_s: float) -> JointPlan:
     """A stop ``planned`` on a path, with its way since `AHEAD_S` before now: so far it is now."""
     at_s = now_s + np.arange(-AHEAD_S, AHEAD_S - 1e-9, SPACING_S)
-    h = 1e-4
-    before, q, after = (np.array([path.place(at + d) for at in at_s]) for d in (-h, 0.0, h))
+    q, qd = _motion(path, at_s, 1.0)
     assert planned.velocity is not None
     return JointPlan(
         np.concatenate([at_s - at_s[0], AHEAD_S + planned.time_from_start_s]),
         np.concatenate([q, planned.position]),
-        np.concatenate([(after - before) / (2.0 * h), planned.velocity]),
+        np.concatenate([qd, planned.velocity]),
         np.zeros((len(at_s) + len(planned.position), q.shape[1])),
     )

@@ -189,7 +189,7 @@ def midway(robot: Robot, watch: Watch, seed: int, steps: int, q: np.ndarray) -> 
     path = begun(robot, taught)
     if path is None:
         return False
-    begin_s, out = robot.now, TrajectoryCommand(NAMES, path.out, path.times, path.velocity)
+    begin_s, out = robot.now, path.command
     splines = [CubicHermiteSpline(t, c.position, c.velocity) for c in (taught, out)]
     for _ in range(steps):
         robot.now += DT

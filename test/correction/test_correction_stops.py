@@ -73,7 +73,7 @@ def test_stops_anywhere(
         assert np.allclose(stop.velocity[0], np.diff(about, axis=0)[0] / 2e-5, atol=5e-3)
     assert not stop.velocity[-1].any()
     if len(times) < 2:
-        assert np.array_equal(stop.position[-1], path.out[-1])
+        assert np.array_equal(stop.position[-1], path.command.position[-1])
         return
     driven = CubicHermiteSpline(times, stop.position, stop.velocity)
     dense = np.linspace(0.0, times[-1], 2001)
@@ -317,12 +317,11 @@ def test_how_long_a_robot_has_stood():
 def test_whether_a_robot_follows_its_path(late_s):
     robot = SimulatedController()
     began_s, lasts_s = robot.now_s + late_s, 4.0
-    rows = np.zeros((2, 6))
+    times = np.array([0.0, lasts_s])
     path = SentPath(
-        index=np.arange(6), begin_s=began_s - late_s, times=np.array([0.0, lasts_s]),
-        out=np.stack([HOME, HOME + lasts_s * SPEED]), velocity=None,
-        acceleration=None, known_times=np.array([0.0, lasts_s]), offsets=rows, rates=rows,
-        bends=rows, withheld=rows, stage=None,
+        TrajectoryCommand(NAMES, np.stack([HOME, HOME + lasts_s * SPEED]), times),
+        index=np.arange(6), begin_s=began_s - late_s, known_times=times,
+        known=np.zeros((4, 2, 6)), stage=None,
         led_from=HOME, put_s=began_s, at_once=True,
     )  # fmt: skip
     assert robot.track.follows(path, robot.now_s)  # nothing tells otherwise
