@@ -19,6 +19,7 @@ from robocal_ros.ros.parameters import (
     Setting,
     advanced,
     given_pose,
+    number,
     pose_settings,
 )
 from robocal_ros.ros.session_node import STATE_DIR
@@ -28,133 +29,60 @@ NOMINAL = "nominal"
 SAME = ("stream_gap_s", "joint_state_age_s", "flange_frame", "model_age_s", "free_axis", "shadow")
 
 
+# fmt: off
 SETTINGS = (
     *ROBOT_SETTINGS,
-    Setting(
-        "reference",
-        NOMINAL,
-        "Model that the program was made with: nominal, or path of a robot file that holds the "
-        "calibrated cold model of a taught program",
-    ),
+    Setting("reference", NOMINAL, "Model that the program was made with: nominal, or path of a "
+            "robot file that holds the calibrated cold model of a taught program"),
     *pose_settings(
         "taught",
         "Tool on the flange that the program was made with; as the quaternion at its default: the "
         "robot file's",
         "Its orientation: z from flange to tip",
     ),
-    Setting(
-        "command_joints",
-        [""],
-        "Joints of joint_commands (Float64MultiArray), in its order; empty: all joints of the arm, "
-        "from base to flange",
-    ),
-    Setting(
-        "shadow",
-        False,
-        "Compute everything and change nothing: outputs go out as the inputs came in",
-    ),
-    Setting(
-        "policy",
-        Policy.REFUSE.value,
-        "What becomes of a command whose correction exceeds a bound or leads beyond a limit: "
-        "refuse it, clamp the correction, or pass it while its offset goes to zero",
-        choices=tuple(policy.value for policy in Policy),
-    ),
-    Setting(
-        "model_age_s",
-        0.0,
-        "A model whose stamp is older is no longer used; 0: it may be of any age",
-        unit="s",
-        low=0.0,
-        high=1e7,
-    ),
-    Setting(
-        "free_axis",
-        False,
-        "The tool may turn about its z axis (drill, sphere, torch): the joints move as little as "
-        "they can",
-    ),
-    Setting(
-        "velocity_limits",
-        [0.0],
-        "Largest speed of each joint after correction, rad/s (sliding: m/s), one number for each; "
-        "0: as the robot file says; without any the correction cannot be enabled",
-        low=0.0,
-        high=1e3,
-    ),
+    Setting("command_joints", [""], "Joints of joint_commands (Float64MultiArray), in its order; "
+            "empty: all joints of the arm, from base to flange"),
+    Setting("shadow", False,
+            "Compute everything and change nothing: outputs go out as the inputs came in"),
+    Setting("policy", Policy.REFUSE.value, "What becomes of a command whose correction exceeds a "
+            "bound or leads beyond a limit: refuse it, clamp the correction, or pass it while its "
+            "offset goes to zero", choices=tuple(policy.value for policy in Policy)),
+    number("model_age_s", 0.0,
+           "A model whose stamp is older is no longer used; 0: it may be of any age", 0.0, 1e7),
+    Setting("free_axis", False, "The tool may turn about its z axis (drill, sphere, torch): the "
+            "joints move as little as they can"),
+    number("velocity_limits", [0.0], "Largest speed of each joint after correction, rad/s "
+           "(sliding: m/s), one number for each; 0: as the robot file says; without any the "
+           "correction cannot be enabled", 0.0, 1e3),
     Setting("tool_child_frame", "", "Child frame that the tools must have; empty: any"),
-    Setting(
-        "follow_joint_trajectory",
-        "",
-        "Action of the controller that goals of follow_joint_trajectory go to; empty: no action",
-    ),
+    Setting("follow_joint_trajectory", "", "Action of the controller that goals of "
+            "follow_joint_trajectory go to; empty: no action"),
     HARD_STOP,
     STATE_DIR,
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
-    Setting(
-        "thermal_tcp_mm", 1.0, "Largest correction of the arm's drift at the tool", "mm", 0.0, 20.0
-    ),
-    Setting("thermal_tcp_deg", 0.1, "and in orientation", "deg", 0.0, 5.0),
-    Setting(
-        "tool_tcp_mm", 10.0, "Largest change of the tool that is made up for", "mm", 0.0, 100.0
-    ),
-    Setting("tool_tcp_deg", 4.0, "and in orientation", "deg", 0.0, 30.0),
+    number("thermal_tcp_mm", 1.0, "Largest correction of the arm's drift at the tool", 0.0, 20.0),
+    number("thermal_tcp_deg", 0.1, "and in orientation", 0.0, 5.0),
+    number("tool_tcp_mm", 10.0, "Largest change of the tool that is made up for", 0.0, 100.0),
+    number("tool_tcp_deg", 4.0, "and in orientation", 0.0, 30.0),
     *advanced(
-        Setting(
-            "thermal_joint_deg",
-            0.3,
-            "Largest correction of a joint for the arm's drift; near a singularity less is "
-            "corrected, so that this holds",
-            unit="deg",
-            low=0.001,
-            high=5.0,
-        ),
-        Setting(
-            "tool_joint_deg",
-            5.0,
-            "and for a changed tool; where more is needed, commands are refused",
-            unit="deg",
-            low=0.001,
-            high=30.0,
-        ),
-        Setting(
-            "offset_deg_s",
-            2.0,
-            "Fastest change of what is added to a joint while the program moves none; its "
-            "acceleration is 10 times that, and in motion both are larger: 5 and 100 times that",
-            unit="deg/s",
-            low=0.01,
-            high=2.0,
-        ),
-        Setting("offset_mm_s", 5.0, "and to a sliding joint", "mm/s", 0.01, 5.0),
-        Setting(
-            "stream_gap_s",
-            0.1,
-            "After a longer pause, and one of two periods, a stream of targets goes on only where "
-            "the robot can be soon",
-            unit="s",
-            low=0.01,
-            high=10.0,
-        ),
-        Setting(
-            "start_deg",
-            0.02,
-            "How far from where a command begins a joint may stand",
-            unit="deg",
-            low=0.001,
-            high=0.5,
-        ),
-        Setting("start_mm", 0.05, "How far a sliding joint may stand from there", "mm", 0.001, 1.0),
-        Setting(
-            "joint_state_age_s",
-            0.2,
-            "Older joint states do not tell where the robot is",
-            unit="s",
-            low=0.01,
-            high=5.0,
-        ),
+        number("thermal_joint_deg", 0.3, "Largest correction of a joint for the arm's drift; near "
+               "a singularity less is corrected, so that this holds", 0.001, 5.0),
+        number("tool_joint_deg", 5.0, "and for a changed tool; where more is needed, commands are "
+               "refused", 0.001, 30.0),
+        number("offset_deg_s", 2.0, "Fastest change of what is added to a joint while the program "
+               "moves none; its acceleration is 10 times that, and in motion both are larger: 5 "
+               "and 100 times that", 0.01, 2.0),
+        number("offset_mm_s", 5.0, "and to a sliding joint", 0.01, 5.0),
+        number("stream_gap_s", 0.1, "After a longer pause, and one of two periods, a stream of "
+               "targets goes on only where the robot can be soon", 0.01, 10.0),
+        number("start_deg", 0.02, "How far from where a command begins a joint may stand",
+               0.001, 0.5),
+        number("start_mm", 0.05, "How far a sliding joint may stand from there", 0.001, 1.0),
+        number("joint_state_age_s", 0.2, "Older joint states do not tell where the robot is",
+               0.01, 5.0),
     ),
 )
+# fmt: on
 
 
 def reference_arm(settings: Mapping[str, Any], nominal: SerialArm) -> SerialArm:
