@@ -116,7 +116,7 @@ class JointWire:
     """
 
     def __init__(self, *, is_reading: bool = False) -> None:
-        self._is_reading = is_reading
+        self.is_reading = is_reading
         self.is_finite = True
         self._layout: _Layout | None = None
         self._efforts = 0  # how many go out
@@ -140,7 +140,7 @@ class JointWire:
         self.is_finite = math.isfinite(sum(layout.numbers.unpack_from(data, first)))
         if not self.is_finite:
             efforts = layout.field(numbers, 2)
-            if not (self._is_reading and np.isfinite(position).all()):
+            if not (self.is_reading and np.isfinite(position).all()):
                 return None
             if velocity is not None and not np.isfinite(velocity).all():
                 velocity = None
@@ -317,17 +317,17 @@ def all_finite(*rows: Any) -> bool:
 class JointMessage:
     """A serialized ``JointState`` that came in, its command, and what goes out for it.
 
-    With ``is_reading`` velocities that are as many as joints, and efforts, go out empty where one
-    is not finite: many drivers have none. Raises `InputError` when it cannot be read.
+    Of a reading velocities that are as many as joints, and efforts, go out empty where one is not
+    finite: many drivers have none. Raises `InputError` when it cannot be read.
     """
 
-    def __init__(self, wire: JointWire, data: bytes, *, is_reading: bool = False) -> None:
-        self._wire, self._data, self._is_reading = wire, data, is_reading
+    def __init__(self, wire: JointWire, data: bytes) -> None:
+        self._wire, self._data = wire, data
         self._command = wire.read(data)
         self._message: Any = None
         if self._command is None:
             self._message = read_message(data, JointState)
-            if is_reading:
+            if wire.is_reading:
                 self._drop_unknown(self._message)
 
     @staticmethod
@@ -347,7 +347,8 @@ class JointMessage:
         """Build the session's command; raises `RefusedError` as `finite_command`."""
         if self._command is not None:
             return self._command
-        return joint_command(self._message) if self._is_reading else finite_command(self._message)
+        build = joint_command if self._wire.is_reading else finite_command
+        return build(self._message)
 
     def unchanged(self) -> Any:
         """What came, to publish; of a reading without what its driver does not know."""
@@ -365,7 +366,7 @@ class JointMessage:
         message.position = doubles(command.position)
         if command.velocity is not None:
             message.velocity = doubles(command.velocity)
-        elif self._is_reading:
+        elif self._wire.is_reading:
             message.velocity = array("d")
         return message
 

@@ -162,7 +162,7 @@ class JointCorrectionNode(RobotNode):
             pass
         else:
             self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
-        states = partial(JointMessage, JointWire(is_reading=True), is_reading=True)
+        states = partial(JointMessage, JointWire(is_reading=True))
         targets, act = partial(JointMessage, JointWire()), self._on_target
         self._listen(STATES, states, self._on_states, endpoints.SENSOR)
         self._listen(TARGETS, targets, partial(act, TARGETS), endpoints.HEARTBEAT)

@@ -33,7 +33,7 @@ def a_path(**fields: Any) -> JointTrajectory:
 
 
 def came(state: JointState, *, is_reading: bool = False) -> JointMessage:
-    return JointMessage(JointWire(), serialize_message(state), is_reading=is_reading)
+    return JointMessage(JointWire(is_reading=is_reading), serialize_message(state))
 
 
 def as_message(out: Any, kind: type) -> Any:
