@@ -133,17 +133,6 @@ def test_reaches_the_taught_pose(
     assert np.allclose(result.tcp_shift_m, np.linalg.norm(apart, axis=1), rtol=0.0, atol=1e-14)
 
 
-def test_a_batch_gives_the_bits_of_single_points() -> None:
-    rng = np.random.default_rng(2)
-    reference = robot("kr150_r3100")
-    correction = JointCorrection.between(reference, drifted(reference, rng, 1e-3))
-    q = rng.uniform(-2.0, 2.0, (50, 6))
-    batch = correction.correct(q)
-    single = np.array([correction.correct(row).q for row in q])
-    assert np.array_equal(batch.q, single)
-    assert correction.correct(q[3]).iterations == batch.iterations[3]
-
-
 def test_nothing_to_correct_gives_the_same_joints() -> None:
     arm = robot("ur10")
     q = np.random.default_rng(3).uniform(-2.0, 2.0, (100, 6))

@@ -23,7 +23,7 @@ from joint_correction_live import (
 )
 from joint_errors import with_joint_errors
 from rclpy.node import Node
-from robocal_msgs.msg import KinematicModel, ToolFrame
+from robocal_msgs.msg import CorrectionStatus, KinematicModel, ToolFrame
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -217,21 +217,6 @@ def test_velocities_that_a_driver_does_not_know_are_none(graph: Any) -> None:
     assert line.node.inputs["joint_states"].invalid == 0
 
 
-def test_efforts_that_are_not_finite_do_not_go_out(graph: Any) -> None:
-    line = Line(graph)
-    line.target()
-    bad = array("d", [np.nan] * 6)
-    line.refused(line.to_target, joints(HOME, effort=bad), "joint_targets")
-    message = trajectory(np.stack([HOME, HOME]), np.array([0.0, 1.0]))
-    message.points[1].effort = bad
-    line.refused(line.to_path, message, "joint_trajectory")
-    line.states.clear()
-    line.stand(effort=bad)  # many drivers have none: the positions are wanted all the same
-    assert len(line.wait(line.states).effort) == 0
-    assert len(line.targets) == 1
-    assert not line.paths
-
-
 def test_a_robot_that_stands_elsewhere_gets_nothing_until_the_operator_says_so(graph: Any) -> None:
     line = Line(graph, enable_on_start=True)
     line.take(model_message(drifted()), line.to_model, "kinematic_model")
@@ -241,6 +226,9 @@ def test_a_robot_that_stands_elsewhere_gets_nothing_until_the_operator_says_so(g
     line.refused(line.to_target, joints(HOME), "joint_targets")
     report = line.report(DiagnosticStatus.ERROR, "START_MISMATCH")
     assert "joint_a1" in report.message
+    told = line.told(state=CorrectionStatus.MISMATCH)
+    assert "joint_a1" in told.mismatch
+    assert "START_MISMATCH" in told.reason
     line.at = HOME
     line.rest()
     line.refused(line.to_target, joints(HOME), "joint_targets")
@@ -290,15 +278,6 @@ def test_simulated_time_judges_stamps(graph: Any) -> None:
         else:
             part = JointState(name=NAMES[:2], position=array("d", HOME[:2]))
             line.refused(line.to_target, part, "joint_targets")
-
-
-def test_the_tool_of_another_frame_is_refused(graph: Any) -> None:
-    line = Line(graph, tool_child_frame="gun")
-    message = tool_message(np.eye(4), child_frame_id="gripper")
-    line.refused(line.to_tool, message, "tool")
-    message.child_frame_id = "gun"
-    line.take(message, line.to_tool, "tool")
-    assert line.node._session.status().new_tool
 
 
 def test_without_a_serial_the_diagnostics_name_the_robot(graph: Any) -> None:

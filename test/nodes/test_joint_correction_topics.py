@@ -244,17 +244,6 @@ def test_the_status_is_latched_and_goes_out_every_second(graph: Any) -> None:
     assert np.all(np.diff(times) > 0.8)  # nothing changes: not with each look
 
 
-def test_a_mismatch_is_a_state_of_its_own(graph: Any) -> None:
-    line = Line(graph, enable_on_start=True)
-    line.take(model_message(drifted()), line.to_model, "kinematic_model")
-    line.at = HOME + 0.01
-    line.rest()
-    line.refused(line.to_target, joints(HOME), "joint_targets")
-    told = line.told(state=CorrectionStatus.MISMATCH)
-    assert "joint_a1" in told.mismatch
-    assert "START_MISMATCH" in told.reason
-
-
 def test_a_measured_tool_waits_for_the_robot_to_stand(graph: Any) -> None:
     line = Line(graph, enable_on_start=True, taught_xyz_mm=[0.0, 0.0, 250.0])
     T = np.eye(4)
@@ -314,10 +303,12 @@ def test_what_exceeds_a_bound_is_clamped_and_counted(graph: Any) -> None:
 
 def test_parameters_become_the_sessions_configuration(graph: Any) -> None:
     given = {"policy": "clamp", "model_age_s": 60.0, "free_axis": True, "joint_state_age_s": 5.0}
+    given["tool_child_frame"] = "gun"
     limits = [1.0, 0.0, 2.0, 0.0, 0.0, 3.0]
     line = Line(graph, velocity_limits=limits, **given)
     config = session_config(line.node.settings, line.node.robot)
     assert (config.policy.value, config.model_age_s, config.free_axis) == ("clamp", 60.0, True)
+    assert config.tool_frame == "gun"
     assert config.velocity_limits is not None
     assert list(config.velocity_limits[[0, 2, 5]]) == [1.0, 2.0, 3.0]
     assert np.all(config.velocity_limits[[1, 3, 4]] > 0.0)
