@@ -11,7 +11,7 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.motion.cell import MotionCell, along, departure, joint_way, raised_way
-from robocal_ros.motion.plan import JointPlan, joined, start_near, stop, stop_time
+from robocal_ros.motion.plan import JointPlan, joined, start_near, stop_time
 from robocal_ros.motion.robot_watch import (
     VELOCITY_S,
     LeftPlanError,
@@ -193,14 +193,9 @@ class Mover:
         """Whether a route is under way."""
         return self._route is not None
 
-    @property
-    def silent(self) -> bool:
-        """Whether joint states are missing."""
-        return self.watch.silent_s > self._config.driving.silence_s
-
     def beside_home(self) -> str:
         """Which joint is how far from home, in words; empty when the robot is there."""
-        if self._q is None or self.silent:
+        if self._q is None or self.watch.silent:
             return self.unheard
         away = np.abs(self._q - self._config.home)
         return self._off(away, np.broadcast_to(self._config.home_near, away.shape))
@@ -215,7 +210,7 @@ class Mover:
     @property
     def unheard(self) -> str:
         """Why nobody knows where the robot is, in words; empty where it is known."""
-        if self._q is not None and not self.silent:
+        if self._q is not None and not self.watch.silent:
             return ""
         silent_s = self.watch.silent_s
         return "joint states are " + (
@@ -228,7 +223,7 @@ class Mover:
 
     def require_heard(self, when: str) -> Array:
         """The joints (n,); FaultError where they are silent, with words for ``when`` that was."""
-        if self._q is None or self.silent:
+        if self._q is None or self.watch.silent:
             raise FaultError(Code.TOO_FEW_SAMPLES, f"{self.unheard} {when}")
         return self._q
 
@@ -242,10 +237,6 @@ class Mover:
         found, allowed = scale * away[joint], scale * near[joint]
         name = self._arm.joint_names[joint]
         return f"{name} is {found:.2f} {unit} off (allowed {allowed:.2f} {unit})"
-
-    def resting(self, span_s: float) -> Array | None:
-        """The joints where the robot has rested for so long; None while it moves, or is silent."""
-        return None if self.silent else self.watch.resting(span_s)
 
     def require_at(self, q: Array) -> None:
         """Look after a robot that is to stand at joints (n,).
@@ -336,18 +327,14 @@ class Mover:
             self.place = STATION
         self._route = None
         self.watch.forget()
-        return self._planned(state, now_s)
+        return self.stopping.begin(state, now_s)
 
     def stop_measured(self, now_s: float) -> JointPlan | None:
         """The stop of whatever moves the robot, from its readings alone; None while these fail.
 
         Just after a silence too: its mean speed would drive on a robot that has stopped meanwhile.
         """
-        if self.silent or not self.watch.tells_speed(VELOCITY_S + self._config.driving.silence_s):
+        watch = self.watch
+        if watch.silent or not watch.tells_speed(VELOCITY_S + self._config.driving.silence_s):
             return None
-        return self._planned(self.watch.state(now_s, keeps=False), now_s)
-
-    def _planned(self, state: tuple[Array, Array], now_s: float) -> JointPlan:
-        plan = stop(self._arm, self._config.driving.limits, *state)
-        self.stopping.begin(plan, now_s)
-        return plan
+        return self.stopping.begin(watch.state(now_s, keeps=False), now_s)

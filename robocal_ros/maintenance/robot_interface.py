@@ -311,7 +311,7 @@ class CellInterface(Asking):
     def not_handed_over(self) -> bool:
         """Whether the robot is not at rest at home with nobody who may move it."""
         robot = self.robot
-        rests = robot.resting(STANDS_S) is not None and not robot.moving
+        rests = robot.watch.resting(STANDS_S) is not None and not robot.moving
         return self.tool.doubted or not rests or bool(robot.beside_home())
 
     def doubt(self) -> None:
@@ -356,7 +356,7 @@ class CellInterface(Asking):
             self._failed = stopping.failed
             if self._failed:
                 self.request(HardStop, self._failed)
-        rests = robot.resting(STANDS_S) is not None
+        rests = robot.watch.resting(STANDS_S) is not None
         self._told_s = min(self._told_s, robot.newest_s)  # their clock may have begun anew
         since_s = robot.newest_s - self._told_s  # readings that are late do not count against it
         if tool.armed and tool.engaged:
@@ -364,7 +364,7 @@ class CellInterface(Asking):
                 self._stop_measured()
         elif tool.armed:
             tool.armed = not rests or since_s < STANDS_S or self._measuring > 0
-            moves = robot.resting(SETTLED_S) is None or self._measuring > 0
+            moves = robot.watch.resting(SETTLED_S) is None or self._measuring > 0
             if moves and since_s >= robot.stops_within_s:
                 self._stop_measured()
         if tool.gone(self.now_s) and not robot.beside_home():
@@ -420,7 +420,7 @@ class CellInterface(Asking):
         over.
         """
         until_s = self.now_s + self.config.times.rest_s
-        while (q := self.robot.resting(span_s)) is None or self.tool.armed:
+        while (q := self.robot.watch.resting(span_s)) is None or self.tool.armed:
             if self.now_s >= until_s:
                 self.robot.require_heard("so that nobody knows whether the robot rests")
                 moves = "the robot does not come to rest"
@@ -437,7 +437,7 @@ class CellInterface(Asking):
         more.
         """
         self.robot.require_heard("where the way of the robot begins")
-        q = self.robot.resting(SETTLED_S)
+        q = self.robot.watch.resting(SETTLED_S)
         if q is None:
             raise FaultError(Code.CONFLICT, "the robot does not rest where its way begins")
         self.robot.require_at(route.plan.q[0])

@@ -204,6 +204,11 @@ class RobotWatch:
         """How long the joint states have been silent."""
         return self.silence.lasts_s if self._readings else np.inf
 
+    @property
+    def silent(self) -> bool:
+        """Whether joint states are missing for longer than they may while the robot moves."""
+        return self.silent_s > self._driving.silence_s
+
     def scaling_known(self, now_s: float) -> bool:
         """Whether the controller's speed scaling was told lately."""
         return now_s - self._scaled_s <= TOLD_S
@@ -253,9 +258,9 @@ class RobotWatch:
         return now_s - self._ended_s if self.at_end(now_s) else -np.inf
 
     def resting(self, span_s: float) -> Array | None:
-        """The joints where the robot has rested for so long; None while it moves."""
+        """The joints where the robot has rested for so long; None while it moves, or is silent."""
         recent = self._since(span_s)
-        if recent is None:
+        if recent is None or self.silent:
             return None
         spread = np.ptp(np.array([q for _, q in recent]), axis=0)
         return recent[-1][1] if np.max(spread) < REST_RAD else None
@@ -440,11 +445,13 @@ class WatchedStop:
         """Whether the robot is yet to stand."""
         return self._plan is not None
 
-    def begin(self, plan: JointPlan, now_s: float) -> None:
-        """A stop is sent now."""
+    def begin(self, state: tuple[Array, Array], now_s: float) -> JointPlan:
+        """The stop from joints and velocities (n,), which is sent now."""
+        plan = stop(self._arm, self._limits, *state)
         self._began_s = self._first_s = now_s
         self.sent, self._deaf, self.failed = 0, 0, ""
         self._note(plan, now_s)
+        return plan
 
     def _note(self, plan: JointPlan, now_s: float) -> None:
         self._plan, self._sent_s, self._rejected = plan, now_s, ""

@@ -33,7 +33,6 @@ from robocal_ros.motion.plan import (
     plunge,
     ramp_of,
     start_near,
-    stop,
 )
 from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch, WatchedStop
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
@@ -259,13 +258,13 @@ class ToolDriver:
         """
         if why := self._closed(now_s):
             raise ConflictError(f"{why}: nothing may move")
-        if self.robot.silent_s > self._config.silence_s:
+        if self.robot.silent:
             raise ConflictError("joint states are missing: nothing can be armed without them")
         if self.phase is not DrivePhase.IDLE:
             raise ConflictError(f"the robot is {self.phase.value}: arm it when it stands")
         if self._session.run is not None:
             raise ConflictError("a run is open: cancel it, then arm, then measure")
-        if self._resting(STANDS_S) is None or self._stopping.under_way:
+        if self.robot.resting(STANDS_S) is None or self._stopping.under_way:
             raise ConflictError("the robot moves: arm it when it stands")
         self.armed, self._armed_at_s, self.told = True, now_s, ""
 
@@ -280,7 +279,7 @@ class ToolDriver:
         if not self.armed:
             why = f" ({self.told})" if self.told else ""
             raise ConflictError(f"not armed{why}: call arm before the measurement")
-        if self._resting(STANDS_S) is None:
+        if self.robot.resting(STANDS_S) is None:
             raise ConflictError("the robot moves, or its joint states are missing: let it stand")
 
     def words(self) -> str:
@@ -382,13 +381,9 @@ class ToolDriver:
         run = self._session.run
         return NO_RUN if run is None else (run.number, len(run.steps) + 1)
 
-    def _resting(self, span_s: float) -> Array | None:
-        silent = self.robot.silent_s > self._config.silence_s
-        return None if silent else self.robot.resting(span_s)
-
     def _begin(self, now_s: float) -> None:
         """Send the way to the awaited step, once the robot rests."""
-        q = self._resting(STANDS_S if self._driven == NO_RUN else SETTLED_S)
+        q = self.robot.resting(STANDS_S if self._driven == NO_RUN else SETTLED_S)
         step = self._session.awaited
         if q is None or step is None:
             return
@@ -401,7 +396,7 @@ class ToolDriver:
         self._start(plan, self._cell, DrivePhase.APPROACH, now_s)
 
     def _measure(self, now_s: float) -> None:
-        q, step = self._resting(SETTLED_S), self._session.awaited
+        q, step = self.robot.resting(SETTLED_S), self._session.awaited
         if q is None or step is None or self._cell is None:
             return
         plan = measuring(self._cell, step, q)
@@ -425,9 +420,9 @@ class ToolDriver:
 
     def _supervise(self, now_s: float) -> None:
         """Raise what must stop the robot."""
-        silent_s = self.robot.silent_s
-        if silent_s > self._config.silence_s:
-            raise StopError(Code.TOO_FEW_SAMPLES, f"joint states are silent for {silent_s:.2f} s")
+        if self.robot.silent:
+            silent = f"joint states are silent for {self.robot.silent_s:.2f} s"
+            raise StopError(Code.TOO_FEW_SAMPLES, silent)
         if self.phase is DrivePhase.APPROACH and self._beams[True]:
             raise StopError(
                 Code.BEAM_EDGES_WRONG,
@@ -460,9 +455,7 @@ class ToolDriver:
         state = robot.state(now_s, keeps=keeps) if moving else None
         self._settle(reason)
         if state is not None:
-            plan = stop(self._session.nominal, self._config.limits, *state)
-            self._stopping.begin(plan, now_s)
-            self._send(plan, True)
+            self._send(self._stopping.begin(state, now_s), True)
         if self._session.run is not None:
             told = {"code": int(code), "reason": reason}
             self._ask(Command(BREAK_OFF, {**told, LEFT_PLAN: True} if left_plan else told))

@@ -218,7 +218,7 @@ def test_a_stop_that_a_pausing_controller_is_seen_to_take_is_over():
         controller.take(state, robot.scaling, now_s)
         robot.held_s = controller.held_s
         if number == 60:
-            stopping.begin(stop(NOMINAL, MotionLimits(), HOME, np.zeros(6)), now_s)
+            stopping.begin((HOME, np.zeros(6)), now_s)
         stopping.look(robot, now_s)
         if not 100 <= number <= 100 + np.ceil(STANDS_S / CYCLE_S):
             assert stopping.under_way is (60 <= number < 100)

@@ -103,7 +103,7 @@ def test_a_stop_of_a_robot_that_rests_is_not_sent_again():
         robot.reading(now_s, HOME + 3e-5 * rng.uniform(-1.0, 1.0, 6), now_s)
         robot.silence.look(now_s)
         if number == 60:
-            stopping.begin(stop(ARM, MotionLimits(), HOME, np.zeros(6)), now_s)
+            stopping.begin((HOME, np.zeros(6)), now_s)
         assert stopping.look(robot, now_s) is None
     assert stopping.sent == 1
     assert not stopping.under_way
@@ -170,7 +170,7 @@ def test_a_stop_that_is_lost_in_a_pause_does_not_let_the_motion_go_on(lost):
     for scaling in [1.0] * 60 + [0.0] * 60:
         read(scaling)
     paused = q
-    stopping.begin(stop(ARM, MotionLimits(), *robot.state(now_s, keeps=True)), now_s)
+    stopping.begin(robot.state(now_s, keeps=True), now_s)
     for _ in range(round(30.0 / PERIOD_S)):
         read(0.0)
         plan = stopping.look(robot, now_s)

@@ -178,7 +178,7 @@ class OwnMotions(HouseNode):
             mover.require_sane(now_s)
         except FaultError as error:
             self._stop(str(error))
-        if self._going and (q := mover.resting(REST_S)) is not None:
+        if self._going and (q := mover.watch.resting(REST_S)) is not None:
             self._go(q)
         if mover.arrived(now_s):
             self._say("arrived", way=self.motion.way)
