@@ -299,3 +299,20 @@ def test_the_robot_of_these_programs_is_as_its_side_view():
     """The lengths that `robot_programs.side_view` states are the robot file's."""
     T = NOMINAL.fk(np.radians([0.0, -90.0, 90.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(T[:3, 3], [1.965, 0.0, 1.984], atol=1e-9)
+
+
+@pytest.mark.parametrize("maker", WRITTEN)
+@given(data=st.data())
+def test_text_that_somebody_has_spoiled_harms_nothing(maker, data):
+    """Cut, doubled and mistyped: what is still read as a point is written where it stands."""
+    text = WRITTEN[maker].text
+    for _ in range(data.draw(st.integers(1, 4))):
+        at, length = data.draw(st.tuples(st.integers(0, len(text)), st.integers(0, 40)))
+        new = data.draw(st.text("[](){},;:=.-+019eEXPJ\"'!#\\ \n\xe4", max_size=3))
+        text = text[:at] + new + text[at + length :]
+    found = dialect_of(WRITTEN[maker].suffix).read(text)
+    fine = [point for point in found.points if not point.problem]
+    parts = [part for point in fine for part in (*point.fields, *point.marks.values())]
+    assert all(text[part.start : part.end] == part.text for part in parts)
+    assert all(np.all(np.isfinite(point.numbers)) for point in fine)
+    assert spliced(text, [(part, part.text) for part in set(parts)]) == text
