@@ -17,6 +17,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge, damaged_files, known_serials, state_folder
 from robocal_ros.history.history_records import (
     BEFORE_ANY,
+    FRAME_SHIFT,
     HEALTHY_TOOL,
     MANDREL,
     THERMAL,
@@ -156,7 +157,7 @@ def _time(stamp_ns: int) -> str:
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
-_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL)
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL, FRAME_SHIFT)
 
 
 def _kind(value: str) -> str:

@@ -2,12 +2,14 @@
 
 import argparse
 import json
-from dataclasses import replace
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robocal_ros import __version__
 from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
@@ -26,7 +28,7 @@ from robocal_ros.ground.files import read_bytes, read_text, write_bytes
 from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
-from robocal_ros.history.history_records import THERMAL
+from robocal_ros.history.history_records import FRAME_SHIFT, THERMAL, Proposal
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
@@ -39,7 +41,7 @@ from robocal_ros.programs.correcting import (
     report,
 )
 from robocal_ros.programs.fanuc import FanucDialect
-from robocal_ros.programs.frame_shift import LEVER_M, PARTS, best_shift
+from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_shift, given_shift
 from robocal_ros.programs.points import Dialect, frame_given
 
 if TYPE_CHECKING:
@@ -102,7 +104,15 @@ def given_models(args: argparse.Namespace) -> tuple[CorrectionModels, list[str]]
     """
     robot, warnings = describe_robot(args.robot)
     nominal = robot.arm
-    actual = read_model(args.model, nominal) if args.model else _in_force(args, nominal)
+    if args.model:
+        actual = read_model(args.model, nominal)
+    else:
+        with _history(args, nominal) as history:
+            chosen = history.head(THERMAL).calibration_id
+            if chosen is None:
+                words = f"no model is in force for {args.robot_serial}: accept one first"
+                raise InputError(words, file=str(history.path))
+            actual = arm_of(history.model(chosen), nominal)
     reference = nominal if args.reference is None else read_model(args.reference, nominal)
     return CorrectionModels(nominal, actual, reference), warnings
 
@@ -130,19 +140,15 @@ def read_model(path: Path, nominal: SerialArm) -> SerialArm:
     return arm
 
 
-def _in_force(args: argparse.Namespace, nominal: SerialArm) -> SerialArm:
+def _history(args: argparse.Namespace, nominal: SerialArm) -> CalibrationHistory:
     folder = state_folder() if args.state is None else args.state.absolute()
-    with CalibrationHistory.open(
+    return CalibrationHistory.open(
         args.robot_serial,
         model_hash=nominal.model_hash,
         state_dir=folder,
         create=False,
         owner=False,
-    ) as history:
-        chosen = history.head(THERMAL).calibration_id
-        if chosen is None:
-            raise InputError(f"no model is in force for {args.robot_serial}: accept one first")
-        return arm_of(history.model(chosen), nominal)
+    )
 
 
 def add_correct_program(parser: argparse.ArgumentParser) -> None:
@@ -283,6 +289,7 @@ _SHIFT_EXAMPLE = """example:
       --tool 'TOOL_DATA[1]=0,0,300,0,0,0' --base 'BASE_DATA[2]=900,0,400,0,0,0'
 """
 _TURNED_MM = 1e3 * LEVER_M
+WORTH_IT = 0.9  # of the error: less of a gain is not worth a change of the controller's frames
 
 
 def add_frame_shift(parser: argparse.ArgumentParser) -> None:
@@ -326,6 +333,17 @@ def add_frame_shift(parser: argparse.ArgumentParser) -> None:
         "--limit-mm", type=positive, default=0.1, metavar="S", help="for the share, default 0.1"
     )
     parser.add_argument("--output", type=Path, metavar="FILE", help="text to write, never over one")
+    kept = parser.add_mutually_exclusive_group()
+    kept.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the shift in the robot's history: 'robocal history accept' brings it into force",
+    )
+    kept.add_argument(
+        "--in-force",
+        action="store_true",
+        help="find nothing: print the frames as the shift in force has them, and what it leaves",
+    )
 
 
 def run_frame_shift(args: argparse.Namespace) -> CliResult:
@@ -339,14 +357,21 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     bases = [frame_given(args.maker, given) for given in args.base]
     tools = tools or [("", nominal.T_flange_tool)]
     bases = bases or [("", np.eye(4))]
-    shift = best_shift(
-        models,
-        q,
-        tools[0][1],
-        parts=tuple(args.parts.split(",")),
-        weight=weight,
-        lever_m=1e-3 * args.lever_mm,
-    )
+    if (args.keep or args.in_force) and args.robot_serial is None:
+        raise InputError("--keep and --in-force are about a history: give --robot-serial")
+    in_force = None if args.robot_serial is None else _shift_in_force(args, models, q, tools[0][1])
+    if args.in_force:
+        still = FrameShiftInForce(0, given_shift(models, q, tools[0][1], np.eye(4), np.eye(4)))
+        shift = (in_force or still).shift
+    else:
+        shift = best_shift(
+            models,
+            q,
+            tools[0][1],
+            parts=tuple(args.parts.split(",")),
+            weight=weight,
+            lever_m=1e-3 * args.lever_mm,
+        )
     lines = []
     if "tool" in args.parts:
         moved = [(name, T @ shift.T_tool_shift) for name, T in tools]
@@ -357,28 +382,111 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     words = "\n".join(lines)
     if args.output is not None:
         write_bytes(args.output, (words + "\n").encode())
-    before, after = _errors(shift.before, args.limit_mm), _errors(shift.after, args.limit_mm)
-    verdict = Verdict(Code.ACCEPT, f"{before['rms_mm']:.3f} mm rms become {after['rms_mm']:.3f}")
-    if after["rms_mm"] > 0.9 * before["rms_mm"]:
-        verdict = Verdict(
-            Code.NO_SIGNIFICANT_GAIN, f"{verdict.reason}: correct the program instead"
-        )
-    poses = zip(names, _sizes(shift.before), _sizes(shift.after), strict=True)
     document: Document = {
         "robot": nominal.name,
         "model_hash": nominal.model_hash,
         "maker": args.maker,
         "text": words,
-        "T_base_shift": transform_document(shift.T_base_shift),
-        "T_tool_shift": transform_document(shift.T_tool_shift),
-        "before": before,
-        "after": after,
-        "poses": [{"name": name, "before": one, "after": other} for name, one, other in poses],
+        **_shift_document(shift, names, args.limit_mm),
+        "in_force": None,
+        "calibration_id": None,
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
-        "verdict": verdict_document(verdict),
     }
+    if in_force is not None:
+        errors = _errors(in_force.shift.after, args.limit_mm)
+        document["in_force"] = {"revision": in_force.revision, **errors}
+    verdict = _shift_verdict(document, args.in_force)
+    document["verdict"] = verdict_document(verdict)
+    if args.keep:
+        document["calibration_id"] = _keep(args, models, shift, q, document, verdict)
     return CliResult(document, _show_shift)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameShiftInForce:
+    """A shift of the history, judged with the present model."""
+
+    revision: int
+    shift: FrameShift
+
+
+def _shift_in_force(
+    args: argparse.Namespace, models: CorrectionModels, q: Array, T_flange_tool: Array
+) -> FrameShiftInForce | None:
+    """The shift in force; None where the frames are as they were."""
+    with _history(args, models.nominal) as history:
+        head = history.head(FRAME_SHIFT)
+        if head.calibration_id is None:
+            return None
+        kept = history.model(head.calibration_id)
+    T_base, T_tool = (np.array(kept[name]) for name in ("T_base_shift", "T_tool_shift"))
+    return FrameShiftInForce(head.revision, given_shift(models, q, T_flange_tool, T_base, T_tool))
+
+
+def _shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -> Document:
+    poses = zip(names, _sizes(shift.before), _sizes(shift.after), strict=True)
+    return {
+        "T_base_shift": transform_document(shift.T_base_shift),
+        "T_tool_shift": transform_document(shift.T_tool_shift),
+        "before": _errors(shift.before, limit_mm),
+        "after": _errors(shift.after, limit_mm),
+        "poses": [{"name": name, "before": one, "after": other} for name, one, other in poses],
+    }
+
+
+def _shift_verdict(document: Document, only_judged: bool) -> Verdict:
+    """Whether the shift is worth entering: against what is in force, else the frames as given."""
+    was, now = document["in_force"], document["after"]["rms_mm"]
+    with_what = "without a shift" if was is None else f"with that of revision {was['revision']}"
+    rms = (document["before"] if was is None else was)["rms_mm"]
+    if only_judged:
+        gone = now <= document["before"]["rms_mm"]
+        code = Code.ACCEPT if gone else Code.WORSE_THAN_CURRENT
+        return Verdict(
+            code, f"{document['before']['rms_mm']:.3f} mm rms are {now:.3f} mm {with_what}"
+        )
+    words = f"{rms:.3f} mm rms {with_what} become {now:.3f} mm"
+    if now <= WORTH_IT * rms:
+        return Verdict(Code.ACCEPT, words)
+    hint = "correct the program instead" if was is None else "the frames in force still serve"
+    return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{words}: {hint}")
+
+
+def _keep(
+    args: argparse.Namespace,
+    models: CorrectionModels,
+    shift: FrameShift,
+    q: Array,
+    document: Document,
+    verdict: Verdict,
+) -> int:
+    """Put a shift into the history; its number there."""
+    now = time.time_ns()
+    with _history(args, models.nominal) as history:
+        thermal = history.head(THERMAL)
+        return history.propose(
+            Proposal(
+                kind=FRAME_SHIFT,
+                model_hash=models.nominal.model_hash,
+                based_on=history.head(FRAME_SHIFT).revision,
+                cycle_id="",
+                stamp_ns=now,
+                created_ns=now,
+                software=__version__,
+                method="frame-shift",
+                code=verdict.code,
+                reason=verdict.reason,
+                candidate_rms_mm=document["after"]["rms_mm"],
+                document=document,
+                model={
+                    "T_base_shift": shift.T_base_shift.tolist(),
+                    "T_tool_shift": shift.T_tool_shift.tolist(),
+                    "thermal_revision": thermal.revision,
+                },
+                inputs={"q": q},
+            )
+        )
 
 
 def _working_poses(path: Path, arm: SerialArm) -> tuple[Array, tuple[str, ...], Array | None]:
@@ -420,6 +528,12 @@ def _show_shift(console: "Console", document: Document) -> None:
     shares = (document[when]["share_within_limit"] for when in ("before", "after"))
     before, after = (f"{100.0 * share:.1f} %" for share in shares)
     print_words(console, f"Coordinates of the error within the limit: {before}, then {after}")
+    if document["in_force"]:
+        kept = document["in_force"]
+        words = f"In force: revision {kept['revision']}, with {kept['rms_mm']:.3f} mm rms"
+        print_words(console, words)
     print_verdict(console, document)
+    if document["calibration_id"] is not None:
+        print_words(console, f"Kept as calibration {document['calibration_id']}")
     console.out(document["text"], highlight=False)
     print_output(console, document)

@@ -33,9 +33,14 @@ TOOL = "tool"
 REFERENCE = "reference"  # the cold reference
 HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
 MANDREL = "mandrel_reference"  # how the mandrel measures while the beam station stands right
+FRAME_SHIFT = "frame_shift"  # of a controller's base and tool frame, for one thermal model
 HAND_EYE = "hand_eye"  # where a sensor sits; see `hand_eye_kind`
 # What is in force before anything was accepted; of other kinds nothing.
-BEFORE_ANY = {THERMAL: "the nominal model", TOOL: "the taught tool"}
+BEFORE_ANY = {
+    THERMAL: "the nominal model",
+    TOOL: "the taught tool",
+    FRAME_SHIFT: "the frames as they were",
+}
 
 
 def hand_eye_kind(sensor_frame: str) -> str:

@@ -81,6 +81,22 @@ def best_shift(
     return FrameShift(*shifts, before, after)
 
 
+def given_shift(
+    models: CorrectionModels,
+    q: Array,
+    T_flange_tool: Array,
+    T_base_shift: Array,
+    T_tool_shift: Array,
+) -> FrameShift:
+    """What a shift does that was found before, perhaps for another model.
+
+    Raises `LimitError` as `best_shift`.
+    """
+    before = _missed(models, q, T_flange_tool, np.eye(4), np.eye(4))
+    after = _missed(models, q, T_flange_tool, T_base_shift, T_tool_shift)
+    return FrameShift(T_base_shift, T_tool_shift, before, after)
+
+
 def shifted_joints(
     models: CorrectionModels,
     q: Array,

@@ -18,6 +18,7 @@ from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample, J
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     BEFORE_ANY,
+    FRAME_SHIFT,
     THERMAL,
     TOOL,
     Decision,
@@ -295,9 +296,9 @@ def measured_with(history: CalibrationHistory, entry: Entry) -> dict[str, int]:
     """Revisions, by kind, beside which alone a calibration may come into force.
 
     A tool's flange poses came from a thermal model: with another one, what the drift did to the
-    flange would stay in the tool, and be corrected a second time.
+    flange would stay in the tool, and be corrected a second time. Frames were shifted for one.
     """
-    if entry.kind != TOOL:
+    if entry.kind not in (TOOL, FRAME_SHIFT):
         return {}
     return {THERMAL: int(history.model(entry.id)["thermal_revision"])}
 

@@ -227,3 +227,77 @@ def test_people_get_the_shift_as_a_table(work: Path, capsys):
     assert "error of the tool at the working poses" in said
     assert "within the limit" in said
     assert "set_tcp(p[" in said
+
+
+@pytest.fixture
+def cell(work: Path, capsys) -> tuple:
+    """A robot whose thermal model is in force, and how to give it another one."""
+    where = ("--robot-serial", SERIAL, "--state", str(work / "state"))
+
+    def in_force(arm, revision):
+        with CalibrationHistory.open(
+            SERIAL, model_hash=NOMINAL.model_hash, state_dir=work / "state"
+        ) as history:
+            made = proposal(
+                model_hash=NOMINAL.model_hash, model=model_document(arm), based_on=revision
+            )
+            history.accept(history.propose(made), by="Ada", reason="", wall_ns=1)
+
+    def shift(*words):
+        ask = ["frame-shift", "--robot", "kr150_r3100", "--poses", "work.csv", "--maker", "kuka"]
+        status = main([*ask, *where, *words, "--json"])
+        return status, json.loads(capsys.readouterr().out)
+
+    def history(*words):
+        status = main(["history", *words, *where, "--json"])
+        return status, json.loads(capsys.readouterr().out)
+
+    in_force(ACTUAL, 0)
+    return in_force, shift, history
+
+
+def test_a_shift_is_kept_verified_and_rolled_back(cell):
+    in_force, shift, history = cell
+    _, first = shift("--keep")
+    assert first["in_force"] is None
+    assert history("accept", str(first["calibration_id"]))[0] == 0
+    # the same robot: what is in force serves, and is printed as it was found
+    _, again = shift()
+    assert again["verdict"]["code"] == "NO_SIGNIFICANT_GAIN"
+    assert again["in_force"]["rms_mm"] == pytest.approx(first["after"]["rms_mm"], rel=1e-9)
+    _, printed = shift("--in-force")
+    assert printed["text"] == first["text"]
+    assert printed["verdict"]["accept"]
+    # it has drifted: the shift in force leaves more, a new one less, absolute from the frames given
+    in_force(drifted(NOMINAL, 7), 1)
+    _, drift = shift("--keep")
+    assert drift["verdict"]["code"] == "ACCEPT"
+    assert drift["in_force"]["rms_mm"] > drift["after"]["rms_mm"]
+    assert history("accept", str(drift["calibration_id"]))[0] == 0
+    _, printed = shift("--in-force")
+    assert printed["text"] == drift["text"] != first["text"]
+    # and back, to the one before and to the frames as they were
+    assert history("rollback", "--kind", "frame_shift")[0] == 0
+    assert shift("--in-force")[1]["text"] == first["text"]
+    _, document = history("rollback", "--kind", "frame_shift", "--to", "nominal")
+    assert "the frames as they were" in document["verdict"]["reason"]
+    assert shift("--in-force")[1]["text"] == (
+        "$TOOL={X 0.0000,Y 0.0000,Z 0.0000,A 0.00000,B 0.00000,C 0.00000}\n"
+        "$BASE={X 0.0000,Y 0.0000,Z 0.0000,A 0.00000,B 0.00000,C 0.00000}"
+    )
+
+
+def test_a_shift_for_a_model_that_is_gone_is_stale(cell):
+    in_force, shift, history = cell
+    _, first = shift("--keep")
+    in_force(drifted(NOMINAL, 7), 1)
+    status, document = history("accept", str(first["calibration_id"]))
+    assert (status, document["error"]["code"]) == (3, "STALE")
+    assert shift("--keep", "--in-force")[0] == 2
+
+
+def test_what_is_kept_needs_a_history(work: Path, capsys):
+    for word in ("--keep", "--in-force"):
+        status, document = shifted(capsys, "--maker", "kuka", word)
+        assert status == 2
+        assert "give --robot-serial" in document["error"]["message"]
