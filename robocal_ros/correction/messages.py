@@ -11,6 +11,7 @@ size, counted from the end of the encapsulation. A stream's messages are laid ou
 their numbers are is found once.
 """
 
+import contextlib
 import math
 import struct
 from array import array
@@ -219,83 +220,6 @@ def _layout(data: bytes) -> _Layout | None:
     )
 
 
-@dataclass(frozen=True)
-class SerializedPath:
-    """A trajectory of m points of k joints."""
-
-    stamp_ns: int
-    frame_id: str
-    names: tuple[str, ...]
-    times_s: Array  # (m,) from the start
-    doubles: Array  # the message after its encapsulation, as numbers
-    size: int  # of that, bytes
-    places: NDArray[np.int64]  # (m, 4, 2) first number and count of each field of each point
-
-    def __len__(self) -> int:
-        return len(self.times_s)
-
-    def rows(self, field: int) -> Array | None:
-        """Numbers (m, k) of a field (0 to 2: positions …); None where it has none.
-
-        Raises `RefusedError` where a point has others than one for each joint.
-        """
-        counts, k = self.places[:, field, 1], len(self.names)
-        if not counts.any():
-            return None
-        for point in np.flatnonzero(counts != k)[:1]:
-            detail = f"point {point + 1} has {counts[point]} {POINT_FIELDS[field]} for {k} joints"
-            raise RefusedError(Reason.WRONG_SIZE, detail)
-        out = np.empty((len(self), k))
-        gather_rows(self.doubles, self.places[:, field], out)
-        return out
-
-    def is_finite(self, first: int = 0) -> bool:
-        """Whether every number of its fields is finite, from ``first`` on."""
-        begins, counts = self.places[:, first:].reshape(-1, 2).T
-        ends = np.cumsum(counts)
-        index = np.arange(ends[-1]) + np.repeat(begins - ends + counts, counts)
-        return bool(np.isfinite(self.doubles[index]).all())
-
-    def changed(self, frame_id: str, rows: dict[int, Array]) -> bytes:
-        """The message with other numbers (m, k) of fields, and a ``frame_id`` that it `takes`."""
-        doubles = self.doubles.copy()
-        for field, values in rows.items():
-            scatter_rows(np.ascontiguousarray(values), self.places[:, field], doubles)
-        body, stamp = doubles.tobytes(), FRAME - STAMP
-        rest = body[stamp + _string_size(self.frame_id) : self.size]
-        return HEAD + body[:stamp] + _string_bytes(frame_id) + rest
-
-    def takes(self, frame_id: str) -> bool:
-        """Whether all numbers stay aligned with this ``frame_id``."""
-        return (_string_size(frame_id) - _string_size(self.frame_id)) % 8 == 0
-
-
-def read_path(data: bytes) -> SerializedPath | None:
-    """Read a serialized trajectory; None for one without points, or no such message at all.
-
-    Raises `RefusedError` for too many points, before they are read.
-    """
-    size = len(data) - len(HEAD)
-    if size < FRAME - STAMP or data[:2] != HEAD[:2]:
-        return None
-    try:
-        sec, nanosec = struct.unpack_from("<iI", data, STAMP)
-        frame_id, at = _string(data, FRAME)
-        names, at = _names(data, at)
-        (count,) = struct.unpack_from("<I", data, at)
-    except (struct.error, UnicodeDecodeError):
-        return None
-    if not 0 < count <= size // LEAST_POINT:
-        return None
-    require_few(count)
-    doubles = np.zeros(-(-size // 8))
-    doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(HEAD))
-    places, times = np.empty((count, FIELDS, 2), dtype=np.int64), np.empty(count)
-    if not point_places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times):
-        return None
-    return SerializedPath(sec * NS + nanosec, frame_id, names, times, doubles, size, places)
-
-
 def doubles(values: Array) -> "array[float]":
     """The type that a message takes without looking at each number."""
     return array("d", values.tobytes())
@@ -407,20 +331,61 @@ def tail_message(command: JointCommand, kind: type, stamp_ns: int) -> Any:
 
 
 class PathMessage:
-    """A serialized trajectory that came in, its command, and what goes out for it.
+    """A serialized trajectory of ``points``, its command, and what goes out for it.
 
-    Raises `InputError` when it cannot be read.
+    Raises `InputError` when it cannot be read, `RefusedError` for too many points before they are.
     """
 
     def __init__(self, came: bytes) -> None:
-        self._came, self._path = came, read_path(came)
-        self.points = 0 if self._path is None else len(self._path)
-        if self._path is None and read_message(came, JointTrajectory).points:
+        self._came, self._size, self.points = came, len(came) - len(HEAD), 0
+        self._frame_id, self._stamp_ns = "", 0
+        self._names: tuple[str, ...] = ()
+        self._times_s = self._doubles = np.empty(0)  # the message after its encapsulation
+        # (m, 4, 2) first number and count of each field of each point
+        self._places: NDArray[np.int64] = np.empty((0, FIELDS, 2), dtype=np.int64)
+        with contextlib.suppress(struct.error, UnicodeDecodeError):
+            self._read()
+        if not self.points and read_message(came, JointTrajectory).points:
             raise InputError("this JointTrajectory is not laid out as ROS 2 lays it out")
 
-    def is_finite(self) -> bool:
-        """Whether every number is finite."""
-        return self._path is None or self._path.is_finite()
+    def _read(self) -> None:
+        """Find where its numbers are; no points where it has none, or is no such message."""
+        data, size = self._came, self._size
+        if size < FRAME - STAMP or data[:2] != HEAD[:2]:
+            return
+        sec, nanosec = STAMPS.unpack_from(data, STAMP)
+        frame_id, at = _string(data, FRAME)
+        names, at = _names(data, at)
+        (count,) = struct.unpack_from("<I", data, at)
+        if not 0 < count <= size // LEAST_POINT:
+            return
+        require_few(count)
+        doubles = np.zeros(-(-size // 8))
+        doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(HEAD))
+        places, times = np.empty((count, FIELDS, 2), dtype=np.int64), np.empty(count)
+        if point_places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times):
+            self.points, self._stamp_ns = count, sec * NS + nanosec
+            self._frame_id, self._names, self._times_s = frame_id, names, times
+            self._doubles, self._places = doubles, places
+
+    def is_finite(self, first: int = 0) -> bool:
+        """Whether every number of its points' fields is finite, from ``first`` on."""
+        begins, counts = self._places[:, first:].reshape(-1, 2).T
+        ends = np.cumsum(counts)
+        index = np.arange(counts.sum()) + np.repeat(begins - ends + counts, counts)
+        return bool(np.isfinite(self._doubles[index]).all())
+
+    def _rows(self, field: int) -> Array | None:
+        """Numbers (m, k) of a field (0 to 2: positions …); None where it has none."""
+        counts, k = self._places[:, field, 1], len(self._names)
+        if not counts.any():
+            return None
+        for point in np.flatnonzero(counts != k)[:1]:
+            detail = f"point {point + 1} has {counts[point]} {POINT_FIELDS[field]} for {k} joints"
+            raise RefusedError(Reason.WRONG_SIZE, detail)
+        out = np.empty((self.points, k))
+        gather_rows(self._doubles, self._places[:, field], out)
+        return out
 
     def command(self) -> TrajectoryCommand:
         """Build the session's command.
@@ -428,19 +393,18 @@ class PathMessage:
         Raises `RefusedError` when there are no points, numbers differ, a point has no positions,
         only some points have a rate, or an effort is not finite.
         """
-        path = self._path
-        if path is None:
+        if not self.points:
             raise RefusedError(Reason.NO_POINTS, "a controller drops it and drives on")
-        position, velocity, acceleration = (path.rows(field) for field in range(EFFORTS))
+        position, velocity, acceleration = (self._rows(field) for field in range(EFFORTS))
         if position is None:
             raise RefusedError(Reason.NO_POSITION, "a point of the trajectory has none")
         if velocity is None and acceleration is not None:
             raise RefusedError(Reason.WRONG_SIZE, "accelerations without velocities")
-        if not path.is_finite(EFFORTS):
+        if not self.is_finite(EFFORTS):
             raise RefusedError(Reason.NOT_FINITE, "an effort")
         rates = velocity, acceleration
         return TrajectoryCommand(
-            path.names, position, path.times_s, *rates, path.stamp_ns, path.frame_id
+            self._names, position, self._times_s, *rates, self._stamp_ns, self._frame_id
         )
 
     def unchanged(self) -> Any:
@@ -451,10 +415,18 @@ class PathMessage:
         """What to publish: with the command's positions, rates and mark."""
         rows = dict(enumerate((command.position, command.velocity, command.acceleration)))
         given = {field: values for field, values in rows.items() if values is not None}
-        if self._path is not None and self._path.takes(command.mark):
-            return self._path.changed(command.mark, given)
+        if (_string_size(command.mark) - _string_size(self._frame_id)) % 8:
+            return self._changed_message(command.mark, given)  # its numbers would not be aligned
+        doubles = self._doubles.copy()
+        for field, values in given.items():
+            scatter_rows(np.ascontiguousarray(values), self._places[:, field], doubles)
+        body, stamp = doubles.tobytes(), FRAME - STAMP
+        rest = body[stamp + _string_size(self._frame_id) : self._size]
+        return HEAD + body[:stamp] + _string_bytes(command.mark) + rest
+
+    def _changed_message(self, mark: str, given: dict[int, Array]) -> Any:
         message = read_message(self._came, JointTrajectory)
-        message.header.frame_id = command.mark
+        message.header.frame_id = mark
         for field, values in given.items():
             for point, row in zip(message.points, values, strict=True):
                 setattr(point, POINT_FIELDS[field], doubles(row))
