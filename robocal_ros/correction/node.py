@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
+from control_msgs.msg import JointTrajectoryControllerState as ControllerState
 from rclpy.serialization import serialize_message
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
@@ -156,12 +157,7 @@ class JointCorrectionNode(RobotNode):
         self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED)
         self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED)
         self.add_input(Float64, SCALING, self._on_scaling, endpoints.NEWEST)
-        try:
-            from control_msgs.msg import JointTrajectoryControllerState as ControllerState
-        except ImportError:  # an old control_msgs
-            pass
-        else:
-            self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
+        self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
         states = partial(JointMessage, JointWire(is_reading=True))
         targets, act = partial(JointMessage, JointWire()), self._on_target
         self._listen(STATES, states, self._on_states, endpoints.SENSOR)
