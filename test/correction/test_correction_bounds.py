@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from correction_robot import HOME, NOMINAL, drifted
 
 from robocal_ros.correction.bounds import (
     FADES_WITHIN,
@@ -16,21 +17,8 @@ from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.joint_correction import StagedCorrection, pack_model
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 
-NOMINAL = replace(
-    load_robot("kr150_r3100"), T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2])
-)
 CONFIG = CorrectionConfig(policy=Policy.CLAMP)
-HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
-
-
-def drifted(size: float, seed: int = 0) -> SerialArm:
-    """About 0.12 mm times ``size`` at the tool."""
-    rng = np.random.default_rng(seed)
-    chosen = NOMINAL.parameters
-    change = rng.standard_normal(len(chosen)) * np.where(chosen.is_length, 8e-5, 4e-5)
-    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * change))
 
 
 def bent(arm: SerialArm, shift_m: float = 3e-3, turn_deg: float = 1.0) -> SerialArm:

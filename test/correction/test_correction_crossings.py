@@ -6,41 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from correction_robot import FASTEST, LARGEST_A, ROUNDING
+from test_correction_solution import TOOL, bent, robot, staged
+from test_correction_solution import scaled_jacobian as jacobian
 
 from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset
 from robocal_ros.correction.damping import LENGTH
-from robocal_ros.correction.joint_correction import JointCorrection, StagedCorrection, pack_model
+from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.limiter import OFFSET, OUT, SLIDING, TAUGHT, TURNING, OffsetLimiter
 from robocal_ros.correction.six_axis import ITERATIONS
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
 
-TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
-BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])
 DT = 0.004
 CROSSED = {"wrist": 4, "elbow": 2, "shoulder": 1}  # the joint that crosses it
 SHIFT_M, TURN_DEG = 2e-3, 0.5
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
-
-
-def jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
-    """At the tool, with the units of the damping."""
-    J = arm.jacobian(q)
-    lever = (arm.fk(q)[:, :3, :3] @ arm.T_flange_tool[:3, 3])[..., None]
-    J[:, :3] = (J[:, :3] + np.cross(J[:, 3:], lever, axis=1)) / LENGTH
-    return np.asarray(J)
-
-
-def bent(arm: SerialArm, rng: np.random.Generator, shift_m: float, turn_deg: float) -> SerialArm:
-    direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    change = frames.transform(frames.exp_rotation(axis * np.radians(turn_deg)), shift_m * direction)
-    return replace(arm, T_flange_tool=arm.T_flange_tool @ change)
-
-
-def staged(taught: SerialArm, actual: SerialArm) -> StagedCorrection:
-    return StagedCorrection(pack_model(taught), pack_model(actual), *BOUNDS)
 
 
 def place(arm: SerialArm, q: np.ndarray) -> np.ndarray:
@@ -78,7 +59,7 @@ def ways(
 def test_no_crossing_takes_a_bent_tool_much_further_off_than_it_is_bent(
     crossed: str, shift_m: float, turn_deg: float, speed_deg_s: float, most_m: float
 ) -> None:
-    rng, taught = np.random.default_rng(1), replace(load_robot("kr150_r3100"), T_flange_tool=TOOL)
+    rng, taught = np.random.default_rng(1), robot("kr150_r3100")
     paths, worst, weak = ways(taught, CROSSED[crossed], np.radians(speed_deg_s), rng), 0.0, False
     for _ in range(25):
         q, actual = next(paths), bent(taught, rng, shift_m, turn_deg)
@@ -103,7 +84,7 @@ def test_no_crossing_takes_a_bent_tool_much_further_off_than_it_is_bent(
 @pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
 def test_a_drift_crosses_a_wrist_singularity_at_less_than_2_deg_s(name: str) -> None:
     """400 ways, shoulder or elbow near or not, drifts of 4 to 120 um: as paths and as streams."""
-    rng, taught = np.random.default_rng(4), replace(load_robot(name), T_flange_tool=TOOL)
+    rng, taught = np.random.default_rng(4), robot(name)
     taught = replace(taught, lower=np.full(6, -np.inf), upper=np.full(6, np.inf))
     chosen, paths = taught.parameters, ways(taught, 4, np.radians(60.0), rng)
     change = rng.standard_normal(len(chosen)) * np.where(chosen.is_length, 3e-4, 2e-4)
@@ -156,7 +137,7 @@ def streamed(taught: SerialArm, actual: SerialArm, q: np.ndarray) -> np.ndarray:
 
 def test_in_ordinary_postures_a_bent_tool_is_where_it_was_taught() -> None:
     """Some 12 deg from a wrist singularity, and where the position alone is not singular."""
-    rng, taught = np.random.default_rng(2), replace(load_robot("kr150_r3100"), T_flange_tool=TOOL)
+    rng, taught = np.random.default_rng(2), robot("kr150_r3100")
     q = rng.uniform(-2.0, 2.0, (4000, 6))
     J = jacobian(taught, q)
     least, of_position = (np.linalg.svd(x, compute_uv=False)[:, -1] for x in (J, J[:, :3]))
@@ -194,7 +175,7 @@ def damping(M: np.ndarray, square: np.ndarray) -> np.ndarray:
 
 def test_many_weak_points_are_solved_at_once_by_the_equations() -> None:
     """All take the same steps, sixteen at a time; e(q') = D y holds to rounding."""
-    rng, taught = np.random.default_rng(3), replace(load_robot("kr150_r3100"), T_flange_tool=TOOL)
+    rng, taught = np.random.default_rng(3), robot("kr150_r3100")
     change = rng.standard_normal(taught.mdh.shape) * 3e-5 * (taught.mdh != 0.0)
     actual, b, slope = taught.with_mdh(taught.mdh + change), np.radians(0.24), 1.0 / 60.0
     q = rng.uniform(-2.0, 2.0, (3000, 6))

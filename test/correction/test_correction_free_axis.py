@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_correction_solution import bent, tool_jacobian
 
 from robocal_ros.correction.damping import LENGTH
 from robocal_ros.correction.joint_correction import (
@@ -41,9 +42,7 @@ def changed(
     chosen = arm.parameters
     size = np.where(chosen.is_length, 2e-4, 1e-4)
     drift = arm.with_mdh(chosen.add(arm.mdh, size * rng.standard_normal(len(chosen))))
-    direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    bend = frames.transform(frames.exp_rotation(axis * np.radians(turn_deg)), direction * shift_m)
-    return replace(drift, T_flange_tool=arm.T_flange_tool @ bend)
+    return bent(drift, rng, shift_m, turn_deg)
 
 
 def miss(
@@ -54,14 +53,6 @@ def miss(
     axis = np.cross(T[:, :3, 2], goal[:, :3, 2])
     assert np.all(np.sum(T[:, :3, 2] * goal[:, :3, 2], axis=1) > 0.0)
     return np.linalg.norm((T - goal)[:, :3, 3], axis=1), np.linalg.norm(axis, axis=1)
-
-
-def tool_jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
-    """Geometric Jacobian (m, 6, n) at the tool's origin."""
-    J = arm.jacobian(q)
-    lever = (arm.fk(q)[:, :3, :3] @ arm.T_flange_tool[:3, 3])[..., None]
-    J[:, :3] += np.cross(J[:, 3:], lever, axis=1)
-    return J
 
 
 def origin_and_axis_rates(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from correction_robot import DT, HOME, NAMES, NOMINAL, Robot, offer
 from joint_errors import with_joint_errors
-from test_correction_solution import bent, drifted, pose_error, robot, well_conditioned
+from test_correction_solution import bent, drifted, pose_error, robot, staged, well_conditioned
 
 from robocal_ros.correction.bounds import (
     CorrectionConfig,
@@ -18,18 +18,13 @@ from robocal_ros.correction.bounds import (
     survey,
 )
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
-from robocal_ros.correction.joint_correction import JointCorrection, StagedCorrection, pack_model
+from robocal_ros.correction.joint_correction import JointCorrection, pack_model
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.solution import correct_staged
 from robocal_ros.kinematics import SerialArm
 
 NM = 1e-9
-BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])
 WIDE = CorrectionConfig(thermal=CorrectionConfig().tool)
-
-
-def staged(reference: SerialArm, actual: SerialArm) -> StagedCorrection:
-    return StagedCorrection(pack_model(reference), pack_model(actual), *BOUNDS)
 
 
 def pairs() -> list[tuple[SerialArm, SerialArm]]:

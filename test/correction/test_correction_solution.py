@@ -59,6 +59,10 @@ def bent(arm: SerialArm, rng: np.random.Generator, shift_m: float, turn_deg: flo
     return replace(arm, T_flange_tool=arm.T_flange_tool @ change)
 
 
+def staged(reference: SerialArm, actual: SerialArm) -> StagedCorrection:
+    return StagedCorrection(pack_model(reference), pack_model(actual), *BOUNDS)
+
+
 def tool_jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
     J = arm.jacobian(q)
     lever = (arm.fk(q)[..., :3, :3] @ arm.T_flange_tool[:3, 3])[..., None]
@@ -325,7 +329,7 @@ class Crossing:
 
     @property
     def stage(self) -> StagedCorrection:
-        return StagedCorrection(pack_model(self.reference), pack_model(self.actual), *BOUNDS)
+        return staged(self.reference, self.actual)
 
 
 def crossings(name: str, count: int, seed: int = 0) -> Iterator[Crossing]:
