@@ -276,7 +276,9 @@ def _show_corrected(console: "Console", document: Document) -> None:
     head = ("point", "line", "moved mm", "deg", "left mm", "why not")
     print_table(console, f"{document['program']}: {title}", head, rows, words=(0, 5))
     for place in document["computed"]:
-        print_words(console, f"Line {place['line']} makes a point itself: {place['text']}")
+        print_words(
+            console, f"Line {place['line']} makes a point or a frame itself: {place['text']}"
+        )
     print_verdict(console, document)
     print_output(console, document)
 

@@ -41,7 +41,9 @@ _FRAMES = re.compile(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
 _CONFIG = re.compile(r"CONFIG\s*:\s*'([^']*)'")
 _RELATIVE = re.compile(r"\bP\[\s*(\d+)[^\]]*\][^;\n]*\bINC\b")
 _COMPUTED = re.compile(
-    r"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\][^;\n]*\b(?:Tool_)?Offset\b[^;\n]*", re.I
+    r"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\][^;\n]*\b(?:Tool_)?Offset\b[^;\n]*"
+    r"|\b(?:P|UFRAME|UTOOL)\[[^\];\n]*\]\s*=[^;\n]*",
+    re.I,
 )
 
 

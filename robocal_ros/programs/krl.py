@@ -10,6 +10,7 @@ Sources are in docs/programs.md.
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
@@ -55,11 +56,17 @@ _USED = re.compile(rf"\b{MOVES}\s+(\w+(?:\[\w+\])?)(?:\s*,\s*(\w+(?:\[\w+\])?))?
 _FDAT = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{([^{}]*)\}", re.I)
 _FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
 _SET = re.compile(
-    r"\$(?P<kind>TOOL|BASE)\s*=\s*(?P<value>\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?[^\r\n;]*)"
+    r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*(?P<value>\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?[^\r\n;]*)"
     r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)",
     re.I,
 )
 _COMPUTED = re.compile(rf"\b{MOVES}(?:_REL)?\b[^\r\n{{}}]*(?:\w\s*:\s*[\w{{$]|\w\()[^\r\n]*", re.I)
+_CHANGED = re.compile(
+    r"\b(?:TOOL|BASE)_DATA\[[^\]\r\n]*\](?:\.\w+)?\s*=(?![\s=]*\{)[^\r\n]*"
+    r"|\$(?:TOOL|BASE)\.\w+\s*=(?!=)[^\r\n]*"
+    r"|(?<![$\w])[A-Z]\w*(?:\[[^\]\r\n]*\])?\.(?:[XYZABC]|A[1-6])\s*=(?!=)[^\r\n]*",
+    re.I,
+)
 
 
 class KrlDialect(Dialect):
@@ -89,7 +96,7 @@ class KrlDialect(Dialect):
             points.append(replace(point, order=len(points)))
         computed = tuple(
             (line_of(text, found.start()), text[found.start() : found.end()].strip())
-            for found in _COMPUTED.finditer(clean)
+            for found in chain(_COMPUTED.finditer(clean), _CHANGED.finditer(clean))
         )
         status = [bits_of(point.marks["S"]) for point in points if "S" in point.marks]
         exact = sum(1 for one in status if one is not None and one & ABSOLUTE)
@@ -223,7 +230,7 @@ def _settings(text: str, clean: str, frames: dict[str, Array]) -> Iterator[_Set]
                 name = None if T is None else f"${kind} of line {line_of(text, found.start())}"
                 if T is not None and name is not None:
                     frames[name] = T
-            elif not re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
+            elif found["part"] or not re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
                 name = None
             now = now | {kind: name}
         yield _Set(found.start(), now)

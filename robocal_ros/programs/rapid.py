@@ -48,6 +48,12 @@ _MOVES = re.compile(
 )
 _PLAIN = {"movej": 1, "movel": 1, "movec": 2, "moveabsj": 1}
 _COMPUTED = re.compile(r"\b(Offs|RelTool)\s*\(\s*(\w+)", re.I)
+_CHANGED = re.compile(
+    r"\b\w+(?:\{[^}]*\})?\.(?:trans|rot|robconf|extax|robax|tframe|uframe|oframe)\b[^;:]*:=[^;]*"
+    r"|\b\w+\s*:=\s*(?:CRobT|CJointT|CalcRobT|CalcJointT|MirPos)\b[^;]*"
+    r"|\b(?:PDisp|EOffs)(?:On|Set)\b[^;]*",
+    re.I,
+)
 
 
 class RapidDialect(Dialect):
@@ -78,10 +84,11 @@ class RapidDialect(Dialect):
         uses = _uses(text, clean, frames, points)
         framed = [_framed(name, point, uses, problems) for name, point in points]
         framed.sort(key=lambda point: point.fields[0].start)
-        computed = tuple(
-            (line_of(text, found.start()), f"{found[1]}({found[2]}, …)")
-            for found in _COMPUTED.finditer(clean)
-        )
+        made = [
+            (found.start(), f"{found[1]}({found[2]}, …)") for found in _COMPUTED.finditer(clean)
+        ]
+        made += [(found.start(), " ".join(found[0].split())) for found in _CHANGED.finditer(clean)]
+        computed = tuple((line_of(text, at), words) for at, words in sorted(made))
         ordered = tuple(replace(point, order=i) for i, point in enumerate(framed))
         return Program(text, ordered, frames, computed)
 

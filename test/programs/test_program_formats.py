@@ -142,6 +142,26 @@ def test_krl_in_a_program():
     assert found.computed == ((13, "LIN away:offset"),)
 
 
+def test_what_a_program_changes_itself_is_told():
+    krl = (
+        "BASE_DATA[2].Z=5\nTOOL_DATA[1]={X 1,Y 0,Z 0,A 0,B 0,C 0}\nXP1.X = XP1.X + 10\n"
+        "IF XP1.Y == 3 THEN\n$TOOL=TOOL_DATA[1]\n$TOOL.Z=250\nLIN {X 1,Y 2,Z 3,A 0,B 0,C 0}\n"
+    )
+    found = dialect_of(".src").read(krl)
+    words = {line: text for line, text in found.computed}
+    assert words == {1: "BASE_DATA[2].Z=5", 3: "XP1.X = XP1.X + 10", 6: "$TOOL.Z=250"}
+    assert found.points[0].tool is None  # no longer what it was
+    rapid = (
+        "p10.trans.z:=p10.trans.z+5;\npNow := CRobT(\\Tool:=tGun);\nPDispOn p10,p20,tGun;\n"
+        "wFix.uframe := DefFrame(p1,\n p2,p3);\n"
+    )
+    words = [text.partition(" ")[0] for _, text in dialect_of(".mod").read(rapid).computed]
+    assert words == ["p10.trans.z:=p10.trans.z+5", "pNow", "PDispOn", "wFix.uframe"]
+    fanuc = "/MN\n 1: UFRAME[2]=PR[3] ;\n 2: P[4]=LPOS ;\n 3:L P[4] 9mm/sec FINE ;\n/POS\n/END\n"
+    words = [text for _, text in dialect_of(".ls").read(fanuc).computed]
+    assert words == ["UFRAME[2]=PR[3]", "P[4]=LPOS"]
+
+
 def test_krl_with_a_tool_that_stands_and_an_exact_robot():
     text = (
         "DECL E6POS XP1={X 1,Y 2,Z 3,A 0,B 0,C 0,S 18,T 2}\n"
