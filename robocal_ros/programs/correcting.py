@@ -54,8 +54,8 @@ class CorrectedPoint:
 
     ``q``, ``q_corrected`` (n,): its joints before and after; None where they are not known.
     ``shift_m``, ``shift_rad``: of what is written. ``left_m``, ``left_rad``: by which the robot as
-    identified misses the place with the digits that are written; without a correction, where its
-    joints are known, with those that were there.
+    identified misses the place with the digits that are written, at the tool, of joints at the
+    flange; without a correction, where its joints are known, with those that were there.
     ``reason``: why it was not corrected; empty where it was, or nothing was to be done.
     """
 
@@ -129,7 +129,7 @@ class ProgramCorrection:
         ends = np.eye(4), np.eye(4)
         if not point.joints:
             ends = self._end(point, "frame", known), self._end(point, "tool", known)
-        T_base_frame, T_flange_tool = ends
+        T_base_frame, tool = ends
         nominal = self._models.nominal
         if point.joints:
             q = self._dialect.to_arm(np.array(point.numbers) * point.joint_unit)
@@ -137,14 +137,14 @@ class ProgramCorrection:
                 raise LimitError(f"{len(q)} joints, {nominal.name} has {nominal.n}")
         else:
             T = pose_of(self._dialect.maker, point.numbers)
-            T_base_flange = T_base_frame @ T @ frames.invert(T_flange_tool)
+            T_base_flange = T_base_frame @ T @ frames.invert(tool)
             q = chosen_posture(nominal, T_base_flange, point.posture, self._before)
         self._before = q
         result = CorrectedPoint(point, q=q)
         wanted = self._models.reference.fk(q)
         corrected = self._solved(q, wanted)
         if isinstance(corrected, str):
-            left_m, left_rad = _apart(self._models.actual.fk(q), wanted)
+            left_m, left_rad = _apart(self._models.actual.fk(q) @ tool, wanted @ tool)
             return replace(result, reason=corrected, left_m=left_m, left_rad=left_rad)
         shift_m, shift_rad = _apart(nominal.fk(corrected), nominal.fk(q))
         if shift_m < LEAST_M and shift_rad < LEAST_RAD:
@@ -155,8 +155,8 @@ class ProgramCorrection:
         if point.marks:
             marks = self._dialect.marks(point, stance_of(nominal, reached))
             changes += [(point.marks[name], text) for name, text in marks.items()]
-        left_m, left_rad = _apart(self._models.actual.fk(reached), wanted)
-        T_tool = [nominal.fk(one) @ T_flange_tool for one in (q, corrected)]
+        left_m, left_rad = _apart(self._models.actual.fk(reached) @ tool, wanted @ tool)
+        T_tool = [nominal.fk(one) @ tool for one in (q, corrected)]
         shift_m, shift_rad = _apart(T_tool[1], T_tool[0])
         return replace(
             result,

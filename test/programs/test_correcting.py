@@ -61,13 +61,14 @@ def test_the_robot_stands_right_to_half_the_last_digit(maker):
     taught, taught_joints = poses_in(maker, WRITTEN[maker].text)
     told, told_joints = poses_in(maker, done.text)
     assert (len(told), len(told_joints)) == (len(POINTS), len(JOINTS))
-    before = []
-    for q, meant, T in zip(POINTS, taught, told, strict=True):
+    before, poses = [], [one for one in done.points if not one.point.joints]
+    for one, q, meant, T in zip(poses, POINTS, taught, told, strict=True):
         now = inverse(NOMINAL, T[None], q)[0]
         away = missed(ACTUAL.fk(now), meant)
         # half a digit of each of three numbers; of a quaternion's four, twice as much turn
         assert away[1] <= angle * 0.5 * 10.0**-turn * (4.0 if maker == "abb" else 3.0) + 1e-8
         assert away[0] <= unit * np.sqrt(3.0) * 0.5 * 10.0**-length + 1e-8
+        assert one.left_m == pytest.approx(away[0], abs=1e-8)  # as the report says
         before.append(missed(ACTUAL.fk(inverse(NOMINAL, meant[None], q)[0]), meant)[0])
     assert np.median(before) > 2e-4  # there was something to correct
     step = (1.0 if maker == "ur" else np.pi / 180.0) * 0.5 * 10.0**-joint
