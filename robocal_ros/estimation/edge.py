@@ -57,6 +57,7 @@ class CornerFit:
     ``left_out`` (j, 2): where a surface ends without a corner that is known: its neighbour was not
     seen, or too little of it.
     ``noise_m``: standard deviation of a point along z, from the profile.
+    ``sides``: points (n, 2) on the two surfaces that meet at each corner, m; classic tells none.
     """
 
     points: Array
@@ -65,6 +66,7 @@ class CornerFit:
     convex: Mask
     left_out: Array
     noise_m: float
+    sides: tuple[tuple[Array, Array], ...] = ()
 
 
 def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
@@ -89,12 +91,14 @@ def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
             found.convex[::-1],
             found.left_out[::-1],
             noise,
+            found.sides[::-1],
         )
     found = replace(
         found,
         points=found.points * turned,
         covariance=found.covariance * np.outer(turned, turned),
         left_out=found.left_out * turned,
+        sides=tuple((a * turned, b * turned) for a, b in found.sides),
     )
     _require(found, rule)
     return found
@@ -103,12 +107,14 @@ def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
 def _best_corners(profile: Array, noise: float, rule: CornerRule) -> CornerFit:
     found = surfaces(profile, noise, rule)
     corners = [corner for corner in found.corners if corner is not None]
+    pairs = list(zip(found.flanks[:-1], found.flanks[1:], found.corners, strict=True))
     ends = [
         place
-        for a, b, corner in zip(found.flanks[:-1], found.flanks[1:], found.corners, strict=True)
+        for a, b, corner in pairs
         if corner is None
         for place in (a.at(a.end_m), b.at(b.start_m))
     ]
+    on = {id(flank): profile[flank.rows] for flank in found.flanks}  # a surface has one array
     return CornerFit(
         points=np.array([corner.point for corner in corners]).reshape(-1, 2),
         covariance=np.array([corner.covariance for corner in corners]).reshape(-1, 2, 2),
@@ -116,6 +122,7 @@ def _best_corners(profile: Array, noise: float, rule: CornerRule) -> CornerFit:
         convex=np.array([corner.turn_rad > 0.0 for corner in corners], dtype=np.bool_),
         left_out=np.array(ends).reshape(-1, 2),
         noise_m=noise,
+        sides=tuple((on[id(a)], on[id(b)]) for a, b, corner in pairs if corner is not None),
     )
 
 
@@ -209,10 +216,13 @@ class EdgeFit:
 
     ``point`` (2,): x, z in the sensor frame, m.
     ``covariance`` (2, 2): m^2.
+    ``sides``: points (n, 2) on the surfaces that meet there, m; none where one ends alone, and in
+    the classic form.
     """
 
     point: Array
     covariance: Array
+    sides: tuple[Array, ...] = ()
 
 
 def fit_edge(points: Array, rule: EdgeRule) -> EdgeFit:
@@ -224,7 +234,8 @@ def fit_edge(points: Array, rule: EdgeRule) -> EdgeFit:
     turned = mirror(rule.towards)
     profile, noise = ordered(points * turned, rule.kind)
     found = (_classic if rule.classic else _best)(profile, noise, rule)
-    return EdgeFit(found.point * turned, found.covariance * np.outer(turned, turned))
+    sides = tuple(side * turned for side in found.sides)
+    return EdgeFit(found.point * turned, found.covariance * np.outer(turned, turned), sides)
 
 
 def _best(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
@@ -251,11 +262,15 @@ def _candidates(profile: Array, noise: float, rule: EdgeRule) -> list[EdgeFit]:
     """What could be meant: the sharpest corners of this kind, else the ends of surfaces."""
     found = surfaces(profile, noise, rule)
     sign = 1.0 if rule.kind == "edge" else -1.0
-    corners = [c for c in found.corners if c is not None and sign * c.turn_rad > 0.0]
+    pairs = zip(found.flanks[:-1], found.flanks[1:], found.corners, strict=True)
+    corners = [(a, b, c) for a, b, c in pairs if c is not None and sign * c.turn_rad > 0.0]
     if corners:
-        sharpest = max(abs(corner.turn_rad) for corner in corners)
-        sharp = [c for c in corners if abs(c.turn_rad) >= _RIVAL * sharpest]
-        return [EdgeFit(corner.point, corner.covariance) for corner in sharp]
+        sharpest = max(abs(c.turn_rad) for _, _, c in corners)
+        return [
+            EdgeFit(c.point, c.covariance, (profile[a.rows], profile[b.rows]))
+            for a, b, c in corners
+            if abs(c.turn_rad) >= _RIVAL * sharpest
+        ]
     return _ends(found, profile) if rule.kind == "edge" else []
 
 

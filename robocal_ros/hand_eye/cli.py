@@ -557,11 +557,12 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
 def run_verify(args: argparse.Namespace) -> CliResult:
     """Do ``verify``. Raises `RobocalError` for what a user can mend."""
     settings = settings_of(args)
-    T_flange_sensor = read_flange_mount(args.result)
+    mount = read_flange_mount(args.result)
+    T_flange_sensor = mount.T_parent_sensor
     target = given_target(args.target_kind, args.target, args.radius_mm)
     task = task_of(target, args.line_kind, towards=described(args).towards)
     shots = given_shots(args, arm_of(args))
-    found = verify(task, shots.data, T_flange_sensor, settings)
+    found = verify(task, shots.data, T_flange_sensor, settings, mount.linearity)
     errors = errors_document(summarise(found.distance_m))
     rejected = {**shots.rejected, **by_shot(found.rejected, found.samples)}
     document: Document = {

@@ -487,7 +487,7 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
     if centre is not None and args.target_kind != "sphere":
         raise InputError("--center-mm is a sphere's")
     target = planned_target(known, sensor, centre, table.mark)
-    X = read_flange_mount(args.mount)
+    X = read_flange_mount(args.mount).T_parent_sensor
     noise = settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
     report = check_plan(target, table.T_base_flange, X, sensor, noise, settings.limit_m)
     marks = None

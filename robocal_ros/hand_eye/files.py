@@ -22,6 +22,7 @@ from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import Array, fixed, urdf_joint, urdf_origin
 from robocal_ros.hand_eye.camera_data import Image, decode_image
+from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.profiles import (
     CLOUDS,
     DEFAULT,
@@ -301,10 +302,14 @@ def _joints(table: Cells, layout: TableLayout, on_arc: NDArray[np.bool_]) -> Arr
 
 @dataclass(frozen=True, eq=False)
 class SensorMount:
-    """Where a sensor sits: ``T_parent_sensor`` (4, 4), m, on the flange or beside the robot."""
+    """Where a sensor sits: ``T_parent_sensor`` (4, 4), m, on the flange or beside the robot.
+
+    ``linearity``: of a line laser, where it was found with that.
+    """
 
     parent: Parent
     T_parent_sensor: Array
+    linearity: SensorLinearity | None = None
 
 
 def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
@@ -334,11 +339,17 @@ def read_mount(path: Path, *, accepted: bool = False) -> SensorMount:
     far_m = float(np.linalg.norm(T[:3, 3]))
     if far_m > FARTHEST_M[parent]:
         fields.fail(f"is {far_m:.4g} m away: is it a thousand times too far?", "xyz_mm")
-    return SensorMount(parent, T)
+    linearity = None
+    if top.values.get("linearity") is not None:
+        try:
+            linearity = SensorLinearity.of_document(top.values["linearity"])
+        except (KeyError, TypeError, ValueError):
+            top.fail("is no linearity as results have it", "linearity")
+    return SensorMount(parent, T, linearity)
 
 
-def read_flange_mount(path: Path) -> Array:
-    """T_flange_sensor (4, 4), m.
+def read_flange_mount(path: Path) -> SensorMount:
+    """Read the place of a sensor on the flange.
 
     Raises `InputError` as `read_mount`, and for a sensor that does not sit on the flange.
     """
@@ -349,7 +360,7 @@ def read_flange_mount(path: Path) -> Array:
             "flange: give T_flange_sensor",
             file=str(path),
         )
-    return mount.T_parent_sensor
+    return mount
 
 
 def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) -> str:

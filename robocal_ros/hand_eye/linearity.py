@@ -1,13 +1,15 @@
 """The sensor's own linearity: a smooth error of z over its field that all profiles share.
 
-A circle's residuals show it but for what looks like another circle. What all profiles have in
+A circle's residuals show it but for what looks like another circle, those of a straight surface
+beside an edge but for what looks like another line. What all profiles have in
 common of them, as a polynomial of low degree in x and z, is the sensor's; its degree is chosen by
 how well it predicts profiles that were left out (Stone 1974, cross-validation), its covariance
 allows for what else the residuals of one profile share (Liang and Zeger 1986, the sandwich).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +18,32 @@ from robocal_ros.estimation.sphere import linearised
 from robocal_ros.estimation.surfaces import mirror
 from robocal_ros.ground.frames import Array, Document
 
-FEWEST_ARCS = 8  # of poses of their own; more than the terms of the third degree
+FEWEST_POSES = 8  # more than the terms of the third degree
+BESIDE_M = 6e-4  # from a corner: so far its rounded top reaches (measured: up to 0.5 mm)
+FEWEST_POINTS = 20  # of a surface beside it
 DEGREES = (2, 3, 4)
 CLEAR = 3.0  # standard errors of what a left-out profile gains, as the ratio of its squares
 LARGEST = 0.01  # of the field's depth: makers state a tenth of it and less
 SCALE = 0.01  # one sigma of the scale of z, which arcs hardly show, and the mount does
 RIDGE = 1e-9  # of the trace: keeps directions solvable that nothing shows
+
+
+class SeenCurve(Protocol):
+    """Points (n, 2) of a profile on a curve of known form, sensor frame, m."""
+
+    @property
+    def points(self) -> Array:
+        """(n, 2)."""
+
+    def seen(self, towards: bool) -> tuple[Array, Array, Array]:
+        """Jacobian (n, p) of what is not known of it, residual (n,), its change with z (n,)."""
+
+
+class SeenFeature(Protocol):
+    """What a feature rests on."""
+
+    def moved(self, error: Callable[[Array], Array], towards: bool) -> Array:
+        """How the feature (3, k) moves where z of points (n, 2) grows by errors (n, k)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +53,72 @@ class SeenArc:
     points: Array
     circle: Array
 
-    def seen(self, towards: bool) -> tuple[Array, Array]:
-        """Jacobian (n, 3) of the circle, as the sensor counts z, and the residual (n,), m."""
+    def seen(self, towards: bool) -> tuple[Array, Array, Array]:
+        """See `SeenCurve`; of the circle, as the sensor counts z."""
         turned = mirror(towards)
         J, residual = linearised(
             np.append(self.circle[:2] * turned, self.circle[2]), self.points * turned
         )
-        return J * np.append(turned, 1.0), residual
+        J = J * np.append(turned, 1.0)
+        return J, residual, -J[:, 1]
+
+    def moved(self, error: Callable[[Array], Array], towards: bool) -> Array:
+        """See `SeenFeature`."""
+        J, _, share = self.seen(towards)
+        return np.asarray(-np.linalg.pinv(J) @ (share[:, None] * error(self.points)))
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLine:
+    """Points (n, 2) of a profile on a straight surface, sensor frame, m."""
+
+    points: Array
+
+    def across(self) -> tuple[Array, Array, Array]:
+        """Middle (2,), direction (2,) and normal (2,)."""
+        middle = self.points.mean(axis=0)
+        x, z = np.linalg.svd(self.points - middle, full_matrices=False)[2][0]
+        return middle, np.array([x, z]), np.array([-z, x])
+
+    def seen(self, towards: bool) -> tuple[Array, Array, Array]:
+        """See `SeenCurve`; of a shift and a turn, whichever way z grows."""
+        middle, along, normal = self.across()
+        away = self.points - middle
+        J = np.column_stack([np.ones(len(away)), away @ along])
+        return J, away @ normal, np.full(len(away), normal[1])
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCorner:
+    """A corner (2,), sensor frame, m, of two straight surfaces; no sides where one ends alone."""
+
+    point: Array
+    sides: tuple[Array, ...]
+
+    def moved(self, error: Callable[[Array], Array], towards: bool) -> Array:
+        """See `SeenFeature`."""
+        if not self.sides:
+            own = error(self.point[None])
+            return np.concatenate([0.0 * own, own, 0.0 * own])
+        normals, shifts = [], []
+        for line in map(SeenLine, self.sides):
+            middle, along, normal = line.across()
+            J, _, share = line.seen(towards)
+            at = np.array([1.0, (self.point - middle) @ along])
+            shifts.append(at @ np.linalg.pinv(J) @ (share[:, None] * error(line.points)))
+            normals.append(normal)
+        step = np.linalg.solve(np.array(normals), np.array(shifts))
+        return np.concatenate([step, np.zeros((1, step.shape[1]))])
+
+
+def beside_corners(sides: Iterable[Array], corners: Array) -> list[SeenLine]:
+    """Lines of sides (n, 2) but for what is next to corners (k, 2): no edge is sharp."""
+    lines = []
+    for side in sides:
+        far = np.linalg.norm(side[:, None] - corners, axis=2).min(axis=1) > BESIDE_M
+        if np.sum(far) >= FEWEST_POINTS:
+            lines.append(SeenLine(side[far]))
+    return lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +130,7 @@ class SensorLinearity:
     ``coefficients`` (k,), ``covariance`` (k, k): of products of Legendre's polynomials, and of the
     scale of z, m.
     ``rms_m``, ``max_m``: of the error at the points that showed it.
-    ``residual_m``, ``left_out_m``: rms of circles' residuals without it, and with one that is
+    ``residual_m``, ``left_out_m``: rms of residuals without it, and with one that is
     found from the other profiles.
     """
 
@@ -69,11 +150,31 @@ class SensorLinearity:
         true[:, 1] -= _basis(points, self.low, self.high, self.degree) @ self.coefficients
         return true
 
-    def pull(self, arc: SeenArc, towards: bool) -> Array:
-        """How the circle (x0, z0, r) moves with the coefficients (3, k)."""
-        J, _ = arc.seen(towards)
-        shape = _basis(arc.points, self.low, self.high, self.degree)
-        return np.asarray(-np.linalg.pinv(J) @ (-J[:, 1:2] * shape))
+    def pull(self, feature: SeenFeature, towards: bool) -> Array:
+        """How less of the error moves a feature with the coefficients (3, k)."""
+
+        def error(points: Array) -> Array:
+            return _basis(points, self.low, self.high, self.degree)
+
+        return feature.moved(error, towards)
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "SensorLinearity":
+        """As `document` told it, but for the covariance.
+
+        Raises `KeyError`, `TypeError` or `ValueError` for what is none.
+        """
+        coefficients = 1e-6 * np.array(document["coefficients_um"], dtype=np.float64)
+        low, high = (
+            1e-3 * np.array(document[name], dtype=np.float64) for name in ("low_mm", "high_mm")
+        )
+        rms, most, residual, left_out = (
+            1e-6 * float(document[name])
+            for name in ("rms_um", "max_um", "residual_um", "left_out_um")
+        )
+        unknown = np.zeros((len(coefficients), len(coefficients)))
+        degree = int(document["degree"])
+        return cls(low, high, degree, coefficients, unknown, rms, most, residual, left_out)
 
     def document(self) -> Document:
         """Figures and coefficients in um, the degree, and the field in mm: x and z."""
@@ -98,29 +199,28 @@ def _basis(points: Array, low: Array, high: Array, degree: int) -> Array:
 
 
 def fit_linearity(
-    arcs: Sequence[SeenArc], poses: NDArray[np.int64], towards: bool
+    curves: Sequence[SeenCurve], poses: NDArray[np.int64], towards: bool
 ) -> SensorLinearity | None:
-    """The error of z that arcs have in common; None where left-out ones do not clearly show it.
+    """The error of z that curves have in common; None where left-out ones do not clearly show it.
 
-    ``poses`` (a,): which pose each arc is of; those of one are left out together, for they show the
+    ``poses`` (a,): which pose each is of; those of one are left out together, for they show the
     same place of the field.
     """
     groups, group = np.unique(poses, return_inverse=True)
-    if len(groups) < FEWEST_ARCS:
+    if len(groups) < FEWEST_POSES:
         return None
     member = np.eye(len(groups))[group].T  # (g, a)
-    every = np.concatenate([arc.points for arc in arcs])
+    every = np.concatenate([curve.points for curve in curves])
     low, high = every.min(axis=0), every.max(axis=0)
-    seen = [arc.seen(towards) for arc in arcs]
-    shown = [np.linalg.qr(J)[0] for J, _ in seen]
-    residuals = [r - Q @ (Q.T @ r) for (_, r), Q in zip(seen, shown, strict=True)]
+    seen = [curve.seen(towards) for curve in curves]
+    shown = [np.linalg.qr(J)[0] for J, _, _ in seen]
+    residuals = [r - Q @ (Q.T @ r) for (_, r, _), Q in zip(seen, shown, strict=True)]
     squares = member @ np.array([r @ r for r in residuals])
     best: SensorLinearity | None = None
     for degree in DEGREES:
         shapes = []
-        for arc, (J, _), Q in zip(arcs, seen, shown, strict=True):
-            shape = _basis(arc.points, low, high, degree)[:, :-1]
-            along = -J[:, 1:2] * shape  # the normal's share of z
+        for curve, (_, _, share), Q in zip(curves, seen, shown, strict=True):
+            along = share[:, None] * _basis(curve.points, low, high, degree)[:, :-1]
             shapes.append(along - Q @ (Q.T @ along))
         normals = np.tensordot(member, np.array([A.T @ A for A in shapes]), axes=1)
         rights = member @ np.array([A.T @ r for A, r in zip(shapes, residuals, strict=True)])
@@ -144,7 +244,7 @@ def fit_linearity(
         found = np.append(found, 0.0)
         error = _basis(every, low, high, degree) @ found
         if np.max(np.abs(error)) > LARGEST * (high[1] - low[1]):
-            continue  # arcs at one place of the field do not tell it apart from their circles
+            continue  # curves at one place of the field do not tell it apart from themselves
         best = SensorLinearity(
             low, high, degree, found, covariance,
             float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))),

@@ -37,7 +37,6 @@ from robocal_ros.hand_eye.mount_fit import (
     without,
 )
 from robocal_ros.hand_eye.mount_problem import (
-    COMPONENTS,
     FIRST_NOISE,
     SENSOR_UNKNOWNS,
     MountProblem,
@@ -60,7 +59,7 @@ from robocal_ros.hand_eye.result import (
     judge_residuals,
     shots_of,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, Read, SphereTask, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task, read_with
 
 Part = tuple[Task, HandEyeData]
 
@@ -90,7 +89,7 @@ def solve_task(
     read = features(task, data)
     near, doubt = looked(task, data, read)
     fit = fit_mount((read.view,), near, settings.noise())
-    fit, read = _with_linearity(fit, read, settings.noise())
+    fit, (read,) = _with_linearity(fit, [read], settings.noise())
     fit = replace(fit, doubt=fit.doubt or doubt)
     require_radius(fit, (read.view,))
     require_seen(fit)
@@ -108,10 +107,10 @@ def _result_of(
 ) -> HandEyeResult:
     """The result of a fit to one target or several, judged."""
     field, pivot = field_of(data), pivot_of(fit.views)
-    bent = next((read for read in reads if read.linearity is not None), None)
+    linearity = next((read.linearity for read in reads if read.linearity is not None), None)
     of_it = np.zeros_like(fit.covariance)
-    if bent is not None and bent.linearity is not None:
-        _, of_it = _bent(fit, bent, bent.linearity)
+    if linearity is not None:
+        _, of_it = _bent(fit, reads, linearity)
     fit = replace(fit, covariance=fit.covariance + of_it)
     error_m = float(expected_error_m(fit.covariance[:6, :6], field - pivot))
     shots = len(data.names)
@@ -123,7 +122,6 @@ def _result_of(
         "robot_sigma_mm": fit.noise.sigma_m * 1e3,
         "working_distance_mm": float(field[0, 2]) * 1e3,
     }
-    linearity = None if bent is None else bent.linearity
     if linearity is not None:
         own_m = float(expected_error_m(of_it[:6, :6], field - pivot))
         more["linearity"] = linearity.document() | {"working_error_mm": own_m * 1e3}
@@ -157,15 +155,15 @@ def _result_of(
     )
 
 
-def _bent(fit: MountFit, read: Read, linearity: SensorLinearity) -> tuple[Array, Array]:
+def _bent(fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity) -> tuple[Array, Array]:
     """What mount and linearity say of each other, linearised at a fit.
 
-    The step (n,) of the coefficients to where both are likeliest: the circles' own form tells them
+    The step (n,) of the coefficients to where both are likeliest: the curves' own form tells them
     with their covariance, the mount's residuals the rest. Then what is left unknown of them in the
     covariance (k, k) of the fit's unknowns: that of both together less that where they are known.
     """
-    nothing = np.zeros((COMPONENTS, len(linearity.covariance)))
-    pull = np.array([read.pulled.get(name, nothing) for name in fit.names])
+    pulled = {name: pull for read in reads for name, pull in read.pulled.items()}
+    pull = np.array([pulled[name] for name in fit.names])
     problem = MountProblem(fit.views, fit.noise, fit.state)
     linear = problem.linear(fit.state)
     both = np.concatenate([linear.jacobian, pull], axis=2)
@@ -183,20 +181,22 @@ def _bent(fit: MountFit, read: Read, linearity: SensorLinearity) -> tuple[Array,
     return np.asarray(step), np.asarray((moved @ spread) @ (moved @ spread).T)
 
 
-def _with_linearity(fit: MountFit, read: Read, given: PoseNoise | None) -> tuple[MountFit, Read]:
-    """The fit, and the features without the linearity as mount and circles together have it."""
-    if (linearity := read.linearity) is None:
-        return fit, read
-    step, _ = _bent(fit, read, linearity)
+def _with_linearity(
+    fit: MountFit, reads: list[Read], given: PoseNoise | None
+) -> tuple[MountFit, list[Read]]:
+    """The fit, and the features without the linearity as mount and curves together have it."""
+    linearity = next((read.linearity for read in reads if read.linearity is not None), None)
+    if linearity is None:
+        return fit, reads
+    step, _ = _bent(fit, reads, linearity)
     own = replace(linearity, coefficients=linearity.coefficients + step)
-    s = read.view.sightings
-    moved = np.array([read.pulled[name] @ step for name in s.names])
-    read = replace(
-        read,
-        linearity=own,
-        view=replace(read.view, sightings=replace(s, value=s.value - moved)),
-    )
-    return fit_mount((read.view,), fit.state, given), read
+    without_it = []
+    for read in reads:
+        s = read.view.sightings
+        moved = np.array([read.pulled[name] @ step for name in s.names])
+        view = replace(read.view, sightings=replace(s, value=s.value - moved))
+        without_it.append(replace(read, linearity=own, view=view))
+    return fit_mount(tuple(read.view for read in without_it), fit.state, given), without_it
 
 
 def field_of(data: HandEyeData) -> Array:
@@ -471,9 +471,7 @@ def held_out(
 
     Raises `TooFewSamplesError` when no shot shows the target.
     """
-    if isinstance(task, SphereTask):  # what it was solved with
-        task = replace(task, linearity=linearity, plain=linearity is None)
-    read = task.read(data, T_flange_sensor)
+    read = read_with(task, data, linearity, T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     return HeldOut(read.view.sightings.names, distances((read.view,), state), read.rejected)
 
@@ -503,14 +501,20 @@ def judged(
 
 
 def verify(
-    task: Task, data: HandEyeData, T_flange_sensor: Array, settings: HandEyeSettings
+    task: Task,
+    data: HandEyeData,
+    T_flange_sensor: Array,
+    settings: HandEyeSettings,
+    linearity: SensorLinearity | None = None,
 ) -> Verification:
     """Hold a mount, find the target with it, and see how far each sighting is off.
+
+    ``linearity``: of the sensor, as it was found with the mount; None where none was.
 
     Raises `TooFewSamplesError` when too few shots show the target; `RankDeficientError` when they
     do not tell where it is.
     """
-    read = task.read(data)
+    read = read_with(task, data, linearity)
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
     rejected = dict(read.rejected)
     view, state = _fit_place(read.view, start, settings.noise() or FIRST_NOISE, rejected)
@@ -592,7 +596,8 @@ def solve_joint(
     views = tuple(read.view for read in reads)
     places = tuple(task.placed(view, X) for task, view in zip(tasks, views, strict=True))
     fit = fit_mount(views, MountState(X, places), settings.noise())
-    require_radius(fit, views)
+    fit, reads = _with_linearity(fit, reads, settings.noise())
+    require_radius(fit, tuple(read.view for read in reads))
     require_seen(fit)
     result = _result_of(tasks, fit, reads, data, settings)
     if not checks:
@@ -604,12 +609,18 @@ def solve_joint(
 
 def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read], Array]:
     """Features of each target, and the pose of the sensor from the one that shows it best alone."""
-    reads, starts, fits = [], [], []
+    starts, fits = [], []
     unseen: list[RobocalError] = []
-    for task, data in parts:
-        reads.append(features(task, data))
+    reads = [features(task, data) for task, data in parts]
+    known = next((read.linearity for read in reads if read.linearity is not None), None)
+    if known is not None:  # one sensor has one
+        reads = [
+            read if read.linearity is known else task.read(data, None, known)
+            for read, (task, data) in zip(reads, parts, strict=True)
+        ]
+    for read, (task, data) in zip(reads, parts, strict=True):
         try:
-            starts.append((reads[-1].view, looked(task, data, reads[-1])[0]))
+            starts.append((read.view, looked(task, data, read)[0]))
         except (TooFewSamplesError, RankDeficientError) as error:
             unseen.append(error)  # others may show more
     for view, near in starts:

@@ -12,6 +12,12 @@ from robocal_ros.estimation.edge import CornerFit, CornerRule, EdgeRule, Kind, f
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Document, Index, transform_document
+from robocal_ros.hand_eye.linearity import (
+    SeenCorner,
+    SeenLine,
+    SensorLinearity,
+    beside_corners,
+)
 from robocal_ros.hand_eye.mount_fit import MountFit, first_look, misfit
 from robocal_ros.hand_eye.mount_problem import CornerModel, MountState, TargetView, in_plane
 from robocal_ros.hand_eye.profiles import Profile
@@ -23,8 +29,8 @@ from robocal_ros.hand_eye.tasks import (
     Read,
     SphereTask,
     Task,
-    fitted,
     sightings_of,
+    straightened,
     usable,
 )
 
@@ -55,13 +61,21 @@ class StepTask(Task):
     fewest = 1
     read_by_poses = True
 
-    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
+    def read(
+        self,
+        data: HandEyeData,
+        T_flange_sensor: Array | None = None,
+        linearity: SensorLinearity | None = None,
+    ) -> Read:
         """Corners, each with its mark."""
         known = self.target.corners
         marks = data.marks or (next(iter(known)),) * len(data.names)
         self.target.require_marks(marks)
         corners = [known[mark] for mark in marks]
-        fits, errors = fitted(data, lambda profile: _corners(profile, self.rule))
+        data, (fits, errors), linearity = straightened(
+            data, lambda profile: _corners(profile, self.rule), _on_surfaces, self,
+            self.rule.towards, linearity,
+        )  # fmt: skip
         rejected = {name: str(error) for name, error in errors.items()}
         usable(fits, rejected, self.fewest, "corners")
         if T_flange_sensor is None:
@@ -77,7 +91,13 @@ class StepTask(Task):
                 rejected[data.names[i]] = "shows no corner where the target's must be"
         view = self._view(data, fits, corners, matches)
         usable(view.sightings.names, rejected, self.fewest, "the corners")
-        return Read(view, rejected)
+        pulled = {}
+        if linearity is not None:
+            rows = [(fits[i], row) for i, match in matches.items() for row in match[0]]
+            for name, (fit, row) in zip(view.sightings.names, rows, strict=True):
+                own = SeenCorner(fit.points[row], fit.sides[row])
+                pulled[name] = linearity.pull(own, self.rule.towards)
+        return Read(view, rejected, linearity=linearity, pulled=pulled)
 
     def _rough(
         self, data: HandEyeData, fits: Mapping[int, CornerFit], corners: Sequence[Array]
@@ -187,6 +207,12 @@ class StepTask(Task):
         if np.any(sigma):
             information = np.diag(np.maximum(sigma, SMALLEST_SIGMA) ** -2.0)
         return CornerModel(corner_user, target.edge_user, target.T_base_user, information)
+
+
+def _on_surfaces(fit: CornerFit, profile: Profile) -> list[SeenLine]:
+    """Points of a profile on each surface."""
+    once = {id(side): side for pair in fit.sides for side in pair}
+    return beside_corners(once.values(), fit.points)
 
 
 @lru_cache(maxsize=PROFILES)
@@ -306,6 +332,6 @@ def task_of(
     if isinstance(target, SphereTarget):
         return SphereTask(target, towards, plain=classic)
     if isinstance(target, StepTarget):
-        return StepTask(target, CornerRule(towards, classic=classic))
+        return StepTask(target, CornerRule(towards, classic=classic), plain=classic)
     kind: Kind = "groove" if feature == "groove" else "edge"
-    return LineTask(target, EdgeRule(towards, kind=kind, classic=classic))
+    return LineTask(target, EdgeRule(towards, kind=kind, classic=classic), plain=classic)

@@ -8,10 +8,7 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from robocal_ros.estimation.edge import (
-    EdgeRule,
-    fit_edge,
-)
+from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.estimation.estimation import solve
 from robocal_ros.estimation.sphere import ArcFit, ArcRule, LargeArcError, fit_arc
 from robocal_ros.ground import frames
@@ -22,7 +19,14 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.hand_eye.linearity import SeenArc, SensorLinearity, fit_linearity
+from robocal_ros.hand_eye.linearity import (
+    SeenArc,
+    SeenCorner,
+    SeenCurve,
+    SensorLinearity,
+    beside_corners,
+    fit_linearity,
+)
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.mount_problem import (
     LineModel,
@@ -105,14 +109,18 @@ class Read:
     pulled: Mapping[str, Array] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
 class Task(ABC):
     """A kind of target.
 
     ``read_by_poses``: whether poses tell which feature of a profile is which.
+    ``plain``: profiles are taken as they are; else the sensor's linearity is taken out of them,
+    where they show it.
     """
 
     kind: ClassVar[TargetKind]
-    read_by_poses = False
+    read_by_poses: ClassVar[bool] = False
+    plain: bool = field(default=False, kw_only=True)
 
     @property
     @abstractmethod
@@ -120,10 +128,16 @@ class Task(ABC):
         """Profiles without which nothing is solved."""
 
     @abstractmethod
-    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
+    def read(
+        self,
+        data: HandEyeData,
+        T_flange_sensor: Array | None = None,
+        linearity: SensorLinearity | None = None,
+    ) -> Read:
         """Features of profiles. Raises `RobocalError` when fewer give any than solving needs.
 
-        Where the sensor is known to sit, one will do.
+        Where the sensor is known to sit, one will do. ``linearity``: of the sensor, where it is
+        known.
         """
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
@@ -189,6 +203,51 @@ def fitted(
     return found, errors
 
 
+def read_with(
+    task: Task,
+    data: HandEyeData,
+    linearity: SensorLinearity | None,
+    T_flange_sensor: Array | None = None,
+) -> Read:
+    """Features by what is known of the sensor: its linearity is not looked for.
+
+    Raises as `Task.read`.
+    """
+    known = replace(task, plain=linearity is None)
+    return known.read(data, T_flange_sensor, linearity)
+
+
+def straightened(
+    data: HandEyeData,
+    fit: Callable[[Profile], Fit],
+    curves: Callable[[Fit, Profile], Sequence[SeenCurve]],
+    task: Task,
+    towards: bool,
+    known: SensorLinearity | None,
+) -> tuple[HandEyeData, tuple[dict[int, Fit], dict[str, RobocalError]], SensorLinearity | None]:
+    """Data, and what is fitted to them, without the sensor's linearity, and this, if there is any.
+
+    ``curves``: what a fit to a profile rests on.
+    """
+    found = fitted(data, fit)
+    if known is None and not task.plain:
+        pose, shown, poses = same_pose(data.T_base_flange), list[SeenCurve](), list[int]()
+        for i, one in found[0].items():
+            if isinstance(profile := data.profiles[i], Profile):
+                own = curves(one, profile)
+                shown += own
+                poses += [int(pose[i])] * len(own)
+        known = fit_linearity(shown, np.array(poses, dtype=np.int64), towards)
+    if known is None:
+        return data, found, None
+    profiles = [
+        replace(one, points=known.corrected(one.points)) if isinstance(one, Profile) else one
+        for one in data.profiles
+    ]
+    data = replace(data, profiles=profiles)
+    return data, fitted(data, fit), known
+
+
 def sightings_of(
     data: HandEyeData, shots: Iterable[int], names: Iterable[str], value: Array, covariance: Array
 ) -> Sightings:
@@ -204,36 +263,29 @@ class SphereTask(Task):
     A circle tells the sphere's centre but for the side: y = +-sqrt(R^2 - r^2). The sides are found
     with the pose: of all patterns of a few profiles, the right one agrees best (with rotation
     columns that are a rotation; the mirrored pattern has the determinant -1). ``towards``: see
-    `ArcRule`. ``plain``: circles as they are seen, as published; else the sensor's ``linearity`` is
-    taken out, where it is known, or the profiles show it.
+    `ArcRule`.
     """
 
     target: SphereTarget
     towards: bool = False
-    plain: bool = False
-    linearity: SensorLinearity | None = None
 
     kind = "sphere"
     fewest = FEWEST_SPHERES
 
-    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
+    def read(
+        self,
+        data: HandEyeData,
+        T_flange_sensor: Array | None = None,
+        linearity: SensorLinearity | None = None,
+    ) -> Read:
         """Circles."""
         radius_m = self.target.radius_m
         # An arc that is a little too large is kept: together they tell that the radius is wrong.
         rule = ArcRule(radius_m, radius_tolerance_m=TOO_LARGE * radius_m, towards=self.towards)
-        arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
-        linearity = None if self.plain else self.linearity or self._linearity(data, arcs)
-        if linearity is not None:
-            data = replace(
-                data,
-                profiles=[
-                    replace(one, points=linearity.corrected(one.points))
-                    if isinstance(one, Profile)
-                    else one
-                    for one in data.profiles
-                ],
-            )
-            arcs, errors = fitted(data, lambda profile: fit_arc(profile.points, rule))
+        data, (arcs, errors), linearity = straightened(
+            data, lambda profile: fit_arc(profile.points, rule),
+            lambda arc, profile: [_on_circle(arc, profile)], self, self.towards, linearity,
+        )  # fmt: skip
         rejected = {name: str(error) for name, error in errors.items()}
         wrong = [error for error in errors.values() if isinstance(error, InputError)]
         if wrong and not arcs:
@@ -243,7 +295,11 @@ class SphereTask(Task):
             raise ResidualError(f"in {len(large)} of {len(data.names)} profiles: {large[0]}")
         usable(arcs, rejected, self.fewest if T_flange_sensor is None else 1, "the sphere")
         names = [data.names[i] for i in arcs]
-        shown = dict(zip(names, _on_circles(data, arcs), strict=True))
+        shown = {
+            name: _on_circle(arc, profile)
+            for name, (i, arc) in zip(names, arcs.items(), strict=True)
+            if isinstance(profile := data.profiles[i], Profile)
+        }
         points = {name: one.points for name, one in shown.items()}
         pulled = {}
         if linearity is not None:
@@ -253,10 +309,6 @@ class SphereTask(Task):
         sightings = sightings_of(data, arcs, names, value, covariance)
         view = TargetView(SphereModel(radius_m), sightings)
         return Read(view, rejected, points, linearity, pulled)
-
-    def _linearity(self, data: HandEyeData, arcs: Mapping[int, ArcFit]) -> SensorLinearity | None:
-        poses = same_pose(data.T_base_flange)[list(arcs)]
-        return fit_linearity(_on_circles(data, arcs), poses, self.towards)
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
         """Circles depend neither on poses nor on the radius."""
@@ -352,15 +404,9 @@ class SphereTask(Task):
         return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
 
 
-def _on_circles(data: HandEyeData, arcs: Mapping[int, ArcFit]) -> list[SeenArc]:
-    """Points of each profile on its circle."""
-    found = []
-    for i, arc in arcs.items():
-        profile = data.profiles[i]
-        if isinstance(profile, Profile):
-            circle = np.append(arc.centre, arc.radius_m)
-            found.append(SeenArc(profile.points[arc.used], circle))
-    return found
+def _on_circle(arc: ArcFit, profile: Profile) -> SeenArc:
+    """Points of a profile on its circle."""
+    return SeenArc(profile.points[arc.used], np.append(arc.centre, arc.radius_m))
 
 
 def _linear_mounts(T_base_flange: Array, centres: Array) -> tuple[Array, Array]:
@@ -406,9 +452,18 @@ class LineTask(Task):
         """Two equations each."""
         return 5 if self.target is None else 3
 
-    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
+    def read(
+        self,
+        data: HandEyeData,
+        T_flange_sensor: Array | None = None,
+        linearity: SensorLinearity | None = None,
+    ) -> Read:
         """Points of the edge."""
-        edges, errors = fitted(data, lambda profile: fit_edge(profile.points, self.rule))
+        towards = self.rule.towards
+        data, (edges, errors), linearity = straightened(
+            data, lambda profile: fit_edge(profile.points, self.rule),
+            lambda edge, _: beside_corners(edge.sides, edge.point[None]), self, towards, linearity,
+        )  # fmt: skip
         rejected = {name: str(error) for name, error in errors.items()}
         usable(edges, rejected, self.fewest if T_flange_sensor is None else 1, "the line")
         value = np.array([[*edge.point, 0.0] for edge in edges.values()])
@@ -416,7 +471,12 @@ class LineTask(Task):
         covariance[:, :2, :2] = [edge.covariance for edge in edges.values()]
         names = [data.names[i] for i in edges]
         sightings = sightings_of(data, edges, names, value, covariance)
-        return Read(TargetView(LineModel(self.target is not None), sightings), rejected)
+        view = TargetView(LineModel(self.target is not None), sightings)
+        pulled = {}
+        if linearity is not None:
+            for name, edge in zip(names, edges.values(), strict=True):
+                pulled[name] = linearity.pull(SeenCorner(edge.point, edge.sides), towards)
+        return Read(view, rejected, linearity=linearity, pulled=pulled)
 
     def starts(self, view: TargetView) -> list[MountState]:
         """The most promising of a fixed set of rotations, and of directions of an unknown line.

@@ -446,7 +446,7 @@ class TestPlan:
         assert list(written.mark) == found["proposed_marks"]
         assert len(written) == len(found["proposed"]) > 1
         for T_base_flange, mark in zip(written.T_base_flange, written.mark, strict=True):
-            T = frames.invert(T_base_flange @ read_flange_mount(mount))
+            T = frames.invert(T_base_flange @ read_flange_mount(mount).T_parent_sensor)
             lit = T[:3, :3] @ STAIRS.middle(mark) + T[:3, 3]
             assert abs(lit[1]) < 1e-3
 

@@ -1,15 +1,20 @@
-"""The sensor's own linearity is found from a sphere's profiles, taken out, and told in um."""
+"""The sensor's own linearity is found from profiles, taken out, and told in um."""
+
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import HandEyeCell, PoseRobot
-from bench.hand_eye_worlds import RADIUS_M, SETTINGS, X, sphere_set
+from bench.hand_eye_worlds import RADIUS_M, SETTINGS, X, edge_set, sphere_set
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.profiles import Profile
-from robocal_ros.hand_eye.solve import solve_task
+from robocal_ros.hand_eye.result import increment
+from robocal_ros.hand_eye.solve import solve_joint, solve_task, verify
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import SphereTask
 
@@ -22,10 +27,10 @@ def bent(linearity_m=BENT_M):
     return ProfileSensor(noise_m=7e-6, linearity_m=linearity_m)
 
 
-def shot_with(sensor, seed):
+def shot_with(sensor, seed, make=sphere_set):
     # A robot that errs by less than the sensor, so that this one is what is seen.
     cell = HandEyeCell(sensor=sensor, robot=PoseRobot(5e-6, 0.0))
-    return sphere_set(cell, np.random.default_rng([33, seed]))
+    return make(cell, np.random.default_rng([33, seed]))
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +38,22 @@ def runs():
     found = []
     for seed in range(RUNS):
         data = shot_with(bent(), seed).data
-        tasks = [SphereTask(SPHERE, True, plain) for plain in (False, True)]
+        tasks = [SphereTask(SPHERE, True, plain=plain) for plain in (False, True)]
         found.append((data, *(solve_task(task, data, "best", SETTINGS) for task in tasks)))
     return found
 
 
-def test_the_field_is_recovered_within_what_is_told_of_it(runs):
+@pytest.fixture(scope="module")
+def edges():
+    """Of which both surfaces beside the edge are seen, straight as they are."""
+    made = [shot_with(bent(), seed, edge_set) for seed in range(RUNS)]
+    return [(one.data, one.solve(), one) for one in made]
+
+
+@pytest.mark.parametrize("shown_by", ["runs", "edges"])
+def test_the_field_is_recovered_within_what_is_told_of_it(shown_by, request):
     left, whole = [], []
-    for data, result, _ in runs:
+    for data, result, _ in request.getfixturevalue(shown_by):
         own = result.linearity
         points = shown(data, own)
         distance = points * [1.0, -1.0] + [0.0, 0.2]
@@ -90,12 +103,34 @@ def test_points_land_where_they_are_and_better_than_without(runs):
     assert with_it < told * chi2.ppf(1.0 - 1e-3, RUNS) / RUNS
 
 
-def test_of_a_straight_sensor_nothing_is_found():
-    """At most one in twelve: three degrees, each with a chance of some 0.2 %."""
-    found = [solve_straight(seed).linearity is not None for seed in range(3)]
+@pytest.mark.parametrize("make", [sphere_set, edge_set])
+def test_of_a_straight_sensor_nothing_is_found(make):
+    """At most one in three: three degrees, each with a chance of some 0.2 %."""
+    straight = bent((0.0, 0.0, 0.0))
+    found = [shot_with(straight, seed, make).solve().linearity is not None for seed in range(3)]
     assert sum(found) <= 1
 
 
-def solve_straight(seed):
-    data = shot_with(bent((0.0, 0.0, 0.0)), seed).data
-    return solve_task(SphereTask(SPHERE, True), data, "best", SETTINGS)
+def test_what_is_in_force_is_taken_not_found_anew(runs):
+    """Of other shots, too few to show it, by the document that a result has."""
+    mount, known = runs[0][1].T_flange_sensor, runs[0][1].linearity
+    told = SensorLinearity.of_document(json.loads(json.dumps(known.document())))
+    data, task = runs[1][0], SphereTask(SPHERE, True)
+    points = data.profiles[0].points
+    assert told.corrected(points) == pytest.approx(known.corrected(points), abs=1e-15)
+    few = replace(
+        data, names=data.names[:7], T_base_flange=data.T_base_flange[:7], profiles=data.profiles[:7]
+    )
+    assert task.read(few).linearity is None
+    with_it, without = (verify(task, few, mount, SETTINGS, one) for one in (told, None))
+    assert np.sqrt(np.mean(with_it.distance_m**2)) < np.sqrt(np.mean(without.distance_m**2))
+
+
+def test_targets_together_have_one(runs, edges):
+    """What the sphere shows is taken out of the edge's profiles too."""
+    parts = [(SphereTask(SPHERE, True), runs[0][0]), (edges[0][2].task(), edges[0][0])]
+    found = solve_joint(parts, SETTINGS)
+    assert found.linearity is not None
+    assert found.working_error_m < runs[0][1].working_error_m
+    step = increment(found.T_flange_sensor, X, found.pivot)
+    assert step @ np.linalg.solve(found.covariance, step) < chi2.ppf(1.0 - 1e-3, 6)
