@@ -104,8 +104,8 @@ $(STAMPS)/editable: $(STAMPS)/wheels $(PYTHON_FILES)
 
 # Compiled kernels are kept beside their source; nodes start 1.5 s sooner with them.
 $(STAMPS)/kernels: $(STAMPS)/editable \
-		$(shell grep -rls --include='*.py' 'robocal_ros.ground.compiled import' robocal_ros) tools/warm_kernels.py
-	$(VENV)/bin/python tools/warm_kernels.py
+		$(shell grep -rls --include='*.py' 'robocal_ros.ground.compiled import' robocal_ros) robocal_ros/cli/warm.py
+	@$(VENV)/bin/python -m robocal_ros.cli.main warm
 	touch $@
 
 # ---- ROS: the two packages in install/ ---------------------------------------------------------

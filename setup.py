@@ -1,5 +1,7 @@
 """Package robocal_ros for ament and pip."""
 
+import re
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,6 +20,26 @@ def shared_files() -> list[tuple[str, list[str]]]:
     return list(folders.items())
 
 
+def requirements(file: str) -> dict[str, str]:
+    """Versions by name, of a file of pins."""
+    lines = Path("requirements", file).read_text().splitlines()
+    found = (re.fullmatch(r"([\w.-]+)==([\w.]+)(;.*)?", line.strip()) for line in lines)
+    return {match[1]: match[2] for match in reversed([*filter(None, found)])}
+
+
+OLDEST, CORE, DEV = map(requirements, ("floor.txt", "core.txt", "dev.txt"))
+# From the version of Ubuntu 24.04 on, below the major one after that which make pins.
+NEEDED = [
+    f"{name}>={OLDEST[name]},<{int(pinned.split('.')[0]) + 1}" for name, pinned in CORE.items()
+]
+CLUSTER = ("dask", "distributed")  # for `robocal validate --scheduler`; versions are dates
+
+# Of ament's layout. In a wheel the second would take the place of pip's own script.
+AMENT_FILES = [
+    ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+    ("bin", ["resource/bin/robocal"]),
+]
+
 setup(
     name=NAME,
     version=ElementTree.parse("package.xml").findtext("version"),
@@ -28,13 +50,16 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "cell_sim/*.csv"]},
     data_files=[
-        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        *([] if "bdist_wheel" in sys.argv else AMENT_FILES),
         (str(SHARE), ["package.xml"]),
-        ("bin", ["resource/bin/robocal"]),
         *shared_files(),
     ],
     python_requires=">=3.11",
-    install_requires=["setuptools"],
+    install_requires=["setuptools", *NEEDED],
+    extras_require={
+        "cluster": [f"{name}>={OLDEST[name]}" for name in CLUSTER],
+        "dev": [f"{name}=={version}" for name, version in DEV.items()],
+    },
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -522,6 +522,9 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "cli.urdf:export_urdf",
         "put a robot file's kinematics, as identified, into a URDF or such a kinematics.yaml",
     ),
+    "warm": CliCommand(
+        "cli.warm:warm", "compile the kernels, which the first start of a node would wait for"
+    ),
 }
 """Each command, in the order of the help."""
 

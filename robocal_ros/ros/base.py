@@ -108,9 +108,9 @@ class HouseNode(EndpointNode):
         self._table.locked = True
         compiled = sys.modules.get("robocal_ros.ground.compiled")  # of nodes that have kernels
         if compiled is not None and compiled.is_cold():
-            self.get_logger().info(
+            self.get_logger().warning(
                 "no machine code of the kernels is kept for this software and processor: they are "
-                "compiled now, which takes up to two minutes once"
+                "compiled now, which takes up to two minutes once; 'robocal warm' does it before"
             )
         self.configure()
 

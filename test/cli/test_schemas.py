@@ -310,6 +310,7 @@ CASES = {
         ["export-urdf", "--robot", "ur10", "--into", "arm.urdf", "--output", "no.urdf"],
         (2, "BAD_INPUT"),
     ),
+    "warm": ("warm.json", ["warm"], ["warm", "ur10"], (2, "BAD_INPUT")),
 }
 
 

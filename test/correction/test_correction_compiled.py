@@ -1,7 +1,6 @@
 """What is compiled before the first command is all that a correction ever calls."""
 
 import gc
-import importlib.util
 import os
 import subprocess
 import sys
@@ -12,11 +11,10 @@ import pytest
 from correction_robot import HOME, NOMINAL, Robot, bent_tool, drifted, good_here_only, offer, swing
 from numba.core.dispatcher import Dispatcher
 
+from robocal_ros.cli import warm
 from robocal_ros.correction.bounds import Policy
 from robocal_ros.correction.interface import RefusedError
 from robocal_ros.correction.session import load_kernels
-
-TOOLS = Path(__file__).parents[2] / "tools"
 
 
 def compiled() -> dict[str, int]:
@@ -77,15 +75,10 @@ def main() -> None:
 
 
 def test_an_installation_compiles_what_a_node_loads(monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = importlib.util.spec_from_file_location("warm_kernels", TOOLS / "warm_kernels.py")
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    assert tool.load_kernels is load_kernels
+    assert warm.load_kernels is load_kernels
     loaded: list[int] = []
-    monkeypatch.setattr(tool, "load_kernels", lambda arm: loaded.append(arm.n))
-    tool.main()
+    monkeypatch.setattr(warm, "load_kernels", lambda arm: loaded.append(arm.n))
+    warm.warming()["joint correction"]()
     assert loaded == [6]
 
 

@@ -1,0 +1,146 @@
+"""``robocal warm``: compile the kernels before a node or a command has to.
+
+Numba keeps the machine code (``ground.compiled`` says where), for the array types that a kernel was
+called with: so each is called once, as nodes and commands do.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robocal_ros.cli.main import CliResult, Document, print_words, progress_console
+from robocal_ros.correction.session import load_kernels
+from robocal_ros.ground import frames, mcap_records, serialized_joints
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.hand_eye.camera_data import PosePairs
+from robocal_ros.hand_eye.camera_fit import fit_pairs
+from robocal_ros.identification import identify, row_kernels
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import inverse
+from robocal_ros.kinematics.joint_functions import JointFunctions
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+POSES = 30
+LINE_EVERY = 10  # kernels, where no terminal shows each
+
+
+def arm_of_six_joints() -> SerialArm:
+    """Return a small arm with a parallel pair; only its shape matters."""
+    turn = np.pi / 2
+    mdh = [
+        (0.3, 0.0, 0.0, turn, 0.0),
+        (0.0, 0.0, -0.6, 0.0, 0.0),
+        (0.1, 0.0, -0.5, turn, 0.0),
+        (0.2, 0.0, 0.0, -turn, 0.0),
+        (0.1, 0.0, 0.0, turn, 0.0),
+        (0.1, 0.0, 0.0, 0.0, 0.0),
+    ]
+    return SerialArm(
+        name="warm",
+        joint_names=tuple(f"joint_{i}" for i in range(6)),
+        mdh=np.array(mdh),
+        sign=np.ones(6),
+        prismatic=np.zeros(6, dtype=np.bool_),
+        lower=np.full(6, -np.pi),
+        upper=np.full(6, np.pi),
+    )
+
+
+def warming() -> Mapping[str, Callable[[], object]]:
+    """What nodes and commands call first, by what it is for; in this order."""
+    arm = arm_of_six_joints()
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-1.5, 1.5, (POSES, 6))
+    names = tuple(str(i) for i in range(POSES))
+
+    def arms() -> None:
+        for made in (arm.jacobian, arm.parameter_jacobian, arm.fk):
+            made(q)
+        functions = JointFunctions(np.zeros(6), np.ones(6), np.zeros((6, 4)), np.zeros(6))
+        turning = replace(arm, functions=functions)
+        turning.jacobian(turning.read(q))
+
+    def back() -> None:
+        here = np.array([0.1, -1.2, 1.0, 0.4, 1.2, 0.3])
+        inverse(arm, arm.fk(here)[None], here)
+
+    def models() -> None:
+        T = arm.fk(q)
+        noise = 1e-5 * rng.standard_normal((POSES, 3))
+        position = T[:, :3, 3] + 0.1 * T[:, :3, 2] + noise
+        data = Measurements(q=q, position=position, target=("tool",) * POSES, sample=names)
+        identify(arm, data).cell.residual(data)
+        row_kernels.load_kernels()
+
+    def cameras() -> None:
+        T = arm.fk(q)
+        fit_pairs(PosePairs(T, frames.invert(T), names))
+
+    def messages() -> None:
+        for serialized in (mcap_records, serialized_joints):
+            serialized.load_kernels()
+
+    return {
+        "the arm": arms,
+        "its inverse": back,
+        "identification": models,
+        "hand-eye": cameras,
+        "joint correction": lambda: load_kernels(arm),
+        "messages": messages,
+    }
+
+
+def add_warm(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``warm``: none."""
+
+
+def run_warm(args: argparse.Namespace) -> CliResult:
+    """Do ``warm``, telling on standard error how far it is."""
+    from numba.core import event
+
+    console, steps, compiled = progress_console(), warming(), list[str]()
+    with console.status("") as status:
+
+        class Progress(event.Listener):
+            def on_start(self, event: Any) -> None:
+                function = event.data["dispatcher"].py_func
+                if not function.__module__.startswith("robocal_ros."):
+                    return  # numba's own
+                compiled.append(function.__name__)
+                words = f"{len(compiled)} kernels, {compiled[-1]}"
+                status.update(words)
+                if not console.is_terminal and len(compiled) % LINE_EVERY == 0:
+                    console.print(words)
+
+            def on_end(self, event: Any) -> None:
+                pass
+
+        done: list[Document] = []
+        with event.install_listener("numba:compile", Progress()):
+            for number, (name, call) in enumerate(steps.items(), start=1):
+                before, begun_s = len(compiled), time.monotonic()
+                call()
+                step = {
+                    "name": name,
+                    "compiled": len(compiled) - before,
+                    "seconds": time.monotonic() - begun_s,
+                }
+                done.append(step)
+                console.print(f"{number} of {len(steps)}: {_in_words(step)}")
+    return CliResult({"steps": done, "compiled": len(compiled), "warnings": []}, _show)
+
+
+def _in_words(step: Document) -> str:
+    return f"{step['name']}, {step['compiled']} kernels compiled, {step['seconds']:.1f} s"
+
+
+def _show(console: "Console", document: Document) -> None:
+    count = document["compiled"]
+    found = f"{count} kernels were compiled" if count else "All kernels were compiled already"
+    print_words(console, f"{found}: nodes and commands load their machine code.")
