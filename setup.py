@@ -9,6 +9,7 @@ from setuptools import find_packages, setup
 
 NAME = "robocal_ros"
 SHARE = Path("share", NAME)
+ROOT = Path(__file__).resolve().parent  # colcon builds in a folder of links to some of the files
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
@@ -22,7 +23,7 @@ def shared_files() -> list[tuple[str, list[str]]]:
 
 def requirements(file: str) -> dict[str, str]:
     """Versions by name, of a file of pins."""
-    lines = Path("requirements", file).read_text().splitlines()
+    lines = (ROOT / "requirements" / file).read_text().splitlines()
     found = (re.fullmatch(r"([\w.-]+)==([\w.]+)(;.*)?", line.strip()) for line in lines)
     return {match[1]: match[2] for match in reversed([*filter(None, found)])}
 
