@@ -214,9 +214,11 @@ def classic_table() -> Table:
 
 def _add_classic(table: Table, name: str, pose_m: float, draw: Draw) -> None:
     runs = outcomes(draw, RUNS if draw in CASES.values() else CLASSIC_RUNS, CLASSIC_RUNS)
-    best, classic = rms_mm(runs.best[:CLASSIC_RUNS]), rms_mm(runs.classic)
+    best = rms_mm(runs.best[:CLASSIC_RUNS])
+    classic = rms_mm(runs.classic) if len(runs.classic) else None
     failed = 100.0 * runs.failed / CLASSIC_RUNS
-    table.add(name, 1e3 * pose_m, best, classic, classic / best, failed)
+    ratio = None if classic is None else classic / best
+    table.add(name, 1e3 * pose_m, best, classic, ratio, failed)
 
 
 @cache

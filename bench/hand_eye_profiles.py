@@ -194,9 +194,12 @@ def _effect(
             failed += 1
         else:
             classic.append(np.sum(increment(old.T_flange_sensor, X, found.pivot)[:3] ** 2))
-    rms = [1e3 * float(np.sqrt(np.mean(each))) for each in (best, expected, classic)]
+    rms = [1e3 * float(np.sqrt(np.mean(each))) for each in (best, expected)]
+    published = 1e3 * float(np.sqrt(np.mean(classic))) if classic else None
     share = 100.0 * lost / shown
-    return rms[0], rms[1], rms[0] / rms[1], float(np.mean(squared)), rms[2], failed, share, refused
+    return (
+        rms[0], rms[1], rms[0] / rms[1], float(np.mean(squared)), published, failed, share, refused,
+    )  # fmt: skip
 
 
 def joint_table() -> Table:
