@@ -228,15 +228,13 @@ def known_model(arm: SerialArm) -> KnownModel:
         sigma[layout.tool_places] = told.target_sigma
     q = np.ascontiguousarray(told.q)
     last = functions.coefficients.shape[1] - np.argmax(functions.coefficients[:, ::-1] != 0, axis=1)
-    torque = gravity_torque(arm, q)
-    terms = JointTerms(
-        before=len(layout.names),
+    terms = replace(
+        JointTerms.cover(q, gravity_torque(arm, q), len(layout.names)),
         first=functions.first,
         step=functions.step,
         count=np.where(told.amplitude > 0.0, last, 0).astype(np.int64),
-        bends=functions.compliance > 0.0,
-        torque_scale=np.ones(arm.n) if torque is None else np.max(np.abs(torque), axis=0),
     )
+    terms = terms.without(told.amplitude <= 0.0, functions.compliance <= 0.0)
     rows = sparse_rows(layout, cell, terms, q, told.target)
     J = rows.J.copy()
     J[:, 3:] *= told.lever
