@@ -9,8 +9,11 @@ import numpy as np
 from bench.tables import Goal, Table
 from bench.ur10_campaigns import data_folder, halves, load_campaign
 from robocal_ros.estimation.assessment import ErrorSummary, summarise
+from robocal_ros.ground.frames import Index
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
+from robocal_ros.identification.full_model import identify_full
 from robocal_ros.identification.judged import Model
+from robocal_ros.identification.planning import WORKING, plan_poses
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.universal_robots import factory_arm, nominal_arm, parse_settings
 
@@ -23,7 +26,8 @@ LARGEST_LATER_MEAN_MM = {
     "full": {"B": 0.24, "C": 0.42, "D": 0.145},
 }
 MODELS: tuple[Model, Model] = ("geometric", "full")
-DRAWS = 10
+DRAWS, PLAN_DRAWS = 10, 3
+PLANNED = (60, 120, 250)
 LARGEST_UR5E_MEAN_MM, LARGEST_UR5E_MAX_MM = 0.0445, 0.081
 WHEN = {"A": "July 2020, grid", "B": "Nov. 2020", "C": "Nov. 2020, random", "D": "March 2021"}
 
@@ -150,6 +154,33 @@ def few_poses_table() -> Table:
     return table
 
 
+def planned_table() -> Table:
+    """Poses that `robocal identify --plan` chooses, beside random ones."""
+    table = Table(
+        "ur10_planned",
+        "UR10, campaign C: planned and random poses, mean errors at the other half, mm",
+        ("poses", "planned", "random", "planned over random", "goal", "planned, predicted rms"),
+        "The poses are of the half that identifies; everything is identified from them alone. "
+        "Planned: chosen one after the other before anything is measured, so that the full model "
+        f"errs least (robocal identify --plan). Random: mean of {PLAN_DRAWS} draws.",
+    )
+    arm, (train, check) = load_robot("ur10"), halves(load_campaign("C"))
+    working = train.q[np.random.default_rng(0).permutation(len(train))[:WORKING]]
+
+    def mean_mm(chosen: Index) -> float:
+        error = identify_full(arm, train.take(chosen)).cell.residual(check)
+        return float(np.mean(np.linalg.norm(error, axis=1))) * 1e3
+
+    plan = plan_poses(arm, train.q, working, max(PLANNED))
+    draws = [np.random.default_rng(i).permutation(len(train)) for i in range(PLAN_DRAWS)]
+    for count in PLANNED:
+        planned = mean_mm(plan.chosen[:count])
+        drawn = float(np.mean([mean_mm(draw[:count]) for draw in draws]))
+        ratio, told = planned / drawn, float(plan.predicted_rms_m[count - 1]) * 1e3
+        table.add(count, planned, drawn, ratio, Goal(ratio, 1.0), told)
+    return table
+
+
 def ur5e_table() -> Table:
     """The factory calibration of a UR5e."""
     table = Table(
@@ -173,4 +204,4 @@ def tables() -> Sequence[Table]:
     if not data_folder().is_dir():
         print(f"no real measurements at {data_folder()} (set ROBOCAL_DATA): their tables left out")
         return []
-    return [campaigns_table(), later_table(), few_poses_table(), ur5e_table()]
+    return [campaigns_table(), later_table(), few_poses_table(), planned_table(), ur5e_table()]

@@ -13,6 +13,7 @@ import numpy as np
 
 from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel, CellProblem, Part
@@ -39,6 +40,7 @@ _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry 
 # The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:
 # these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
+FOLDS = 5  # of few poses, each of which the others must foretell
 SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
 _FREE_ROUNDS = 2  # in which a rejected sample may come back
 _ROUNDS, SETTLED = 12, 0.05  # of solving and judging the samples anew; share of the noise
@@ -280,6 +282,40 @@ def identify_full(
     """
     if "geometry" not in fit:
         return identify(arm, data, fit=fit, method=method)
+    full, rival = _solved(arm, data, fit, method)
+    if full is None:
+        return rival.start
+    needed = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
+    better = full.left_out_rms_m < needed * rival.geometric_left_out()
+    if better and len(data) <= MANY_POSES:
+        better = _foretells(arm, data, fit, method)
+    return full if better else rival.start
+
+
+def _foretells(arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method) -> bool:
+    """Whether full models of some poses foretell the others clearly better than geometric ones.
+
+    What the evidence chooses from few poses is chosen for these, too: a pose is left out of that
+    as well.
+    """
+    errors: list[list[Array]] = [[], []]
+    fold = pose_groups(data.q) % FOLDS
+    for left_out in (fold == i for i in range(FOLDS)):
+        rest = data.take(left_out)
+        try:
+            full, rival = _solved(arm, data.take(~left_out), fit, method)
+            for own, found in zip(errors, (full or rival.start, rival.start), strict=True):
+                own.append(found.cell.residual(rest))
+        except (TooFewSamplesError, RankDeficientError):
+            return False
+    with_functions, without = (rival.rms(np.concatenate(own)) for own in errors)
+    return with_functions < CLEAR_GAIN * without
+
+
+def _solved(
+    arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method
+) -> tuple[FullIdentification | None, _FullProblem]:
+    """The full model, where the evidence wants one, and the problem of the geometric model."""
     start = identify(bare(arm), data, fit=fit, method=method)
     torque = gravity_torque(arm, data.q)
     q = np.ascontiguousarray(data.q)
@@ -292,7 +328,7 @@ def identify_full(
             problem, _FullProblem(held, data, held.lever_m), key=_FullProblem.geometric_left_out
         )
     if 3.0 * len(data) < FEWEST_NUMBERS * before or start.estimate.creeping:
-        return rival.start
+        return None, rival
     at = _Solution(
         start.cell,
         JointTerms.cover(q, torque, before, coarse=True),
@@ -307,7 +343,7 @@ def identify_full(
     functions, bends = _unwanted(at)
     terms = JointTerms.cover(q, torque, before).without(functions, bends)
     if terms.size == before:
-        return rival.start
+        return None, rival
     amplitude = np.where(functions, 0.0, at.prior.amplitude)
     rigid = replace(at.cell, arm=bare(at.cell.arm))
     at = _Solution(rigid, terms, replace(at.prior, amplitude=amplitude))
@@ -321,9 +357,7 @@ def identify_full(
             keep &= last
         if np.array_equal(last, keep) and at.settled(residual):
             break
-    full = _reported(problem, at, last, weight)
-    needed = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
-    return full if full.left_out_rms_m < needed * rival.geometric_left_out() else rival.start
+    return _reported(problem, at, last, weight), rival
 
 
 def _round(
