@@ -41,7 +41,7 @@ from robocal_ros.correction.messages import (
     tail_message,
 )
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
-from robocal_ros.correction.robot_state import RobotTrack, SentPath
+from robocal_ros.correction.robot_state import SentPath
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
@@ -50,7 +50,7 @@ from robocal_ros.correction.settings import (
     reference_arm,
     session_config,
 )
-from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, on_its_path
+from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.driver import HardStopService, StatedController

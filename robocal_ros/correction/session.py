@@ -34,7 +34,7 @@ from robocal_ros.correction.limiter import (
     WORST,
     WORST_OUT,
 )
-from robocal_ros.correction.robot_state import Output, RobotState, SentPath
+from robocal_ros.correction.robot_state import WITHHELD, Output, RobotState, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array, Index
@@ -267,7 +267,7 @@ class CorrectionSession:
         self._interrupted = path, self.stream.phase
         self.stream.phase = StreamPhase.IDLE
         self._goal[:] = q[-1]
-        self._note_withheld(path.known[3], q)
+        self._note_withheld(path.known[WITHHELD], q)
         return corrected
 
     def _note_withheld(self, withheld: Array, q: Array) -> None:

@@ -8,8 +8,17 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
-from robocal_ros.correction.robot_state import LAG_S, STANDING_S, VELOCITY_S, RobotTrack, SentPath
-from robocal_ros.correction.trajectories import AHEAD_S, GIVE_UP_S, PAUSED_S, RobotStop
+from robocal_ros.correction.robot_state import SentPath
+from robocal_ros.correction.trajectories import (
+    AHEAD_S,
+    GIVE_UP_S,
+    LAG_S,
+    PAUSED_S,
+    STANDING_S,
+    VELOCITY_S,
+    RobotStop,
+    RobotTrack,
+)
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan
 

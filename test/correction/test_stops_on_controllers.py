@@ -17,8 +17,7 @@ from robocal_ros.cell_sim.trajectory_controller import (
 )
 from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
-from robocal_ros.correction.robot_state import RobotTrack
-from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, on_its_path
+from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPIES, COPY_S, StatedController
