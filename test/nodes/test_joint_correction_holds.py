@@ -74,6 +74,8 @@ class Moving(Line):
             endpoints.own(endpoints.RELIABLE),
         )
         graph.probe.create_timer(PERIOD_S, self._tick)
+        taught = graph.collect(JointState, f"{NODE}/joint_states")
+        graph.spin_until(lambda: taught, "the node hears the robot")
         graph.spin_for(0.5)
 
     def other(self, name: str, kind: type[Node] = Node, **options: Any) -> Node:
