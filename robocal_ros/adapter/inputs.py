@@ -17,6 +17,7 @@ from robocal_ros.ground.frames import Array
 BOOL, UR_IO, GPIO = "bool", "ur_io", "gpio"
 NS = 1_000_000_000
 ANALOG_HIGH = 0.5  # of a gpio interface, which is a double: 0.0 and 1.0 are its levels
+LONGEST_SCAN_S = 10.0  # to its middle: more is no time
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def scan_profile(message: Any) -> tuple[Array, float]:
     is that frame with its axes (y, z, x). What is out of range is not-a-number. Second: seconds
     from the stamp, which is the first ray's, to the middle of the scan.
 
-    Raises `InputError` when the scan has no rays or no angles.
+    Raises `InputError` when the scan has no rays, no angles or no time.
     """
     ranges = np.asarray(message.ranges, dtype=np.float64)
     step = float(message.angle_increment)
@@ -146,4 +147,6 @@ def scan_profile(message: Any) -> tuple[Array, float]:
     seen = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= farthest)
     ranges = np.where(seen, ranges, np.nan)
     middle_s = 0.5 * (len(ranges) - 1) * float(message.time_increment)
+    if not abs(middle_s) <= LONGEST_SCAN_S:
+        raise InputError(f"a scan whose middle is {middle_s:g} s from its stamp is no profile")
     return ranges[:, None] * np.column_stack([np.sin(angle), np.cos(angle)]), middle_s

@@ -186,6 +186,13 @@ def test_a_scan_of_a_straight_edge_is_a_straight_profile(distance_m: float, slop
     assert seen[-1, 0] > 0.0 > seen[0, 0]  # angles grow to the left
 
 
+@pytest.mark.parametrize("increment_s", [np.nan, np.inf, 1e30, -1e30])
+def test_a_scan_whose_rays_have_no_time_is_refused(increment_s: float) -> None:
+    """Its profile would have no stamp."""
+    with pytest.raises(InputError, match="from its stamp"):
+        scan_profile(scan(ranges=np.ones(81), time_increment=increment_s))
+
+
 def test_rays_without_a_return_are_no_points() -> None:
     ranges = np.full(81, 0.5)
     ranges[[3, 4, 5, 6]] = np.inf, np.nan, 0.01, 2.5
