@@ -23,6 +23,7 @@ from robocal_ros.cli.main import (
     text,
 )
 from robocal_ros.estimation.assessment import Verdict, verdict_document
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, WrongRobotError
 from robocal_ros.ground.files import read_bytes, read_text, write_bytes
 from robocal_ros.ground.frames import Array, transform_document
@@ -376,7 +377,9 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
         )
     lines = []
     if "tool" in args.parts:
-        moved = [(name, T @ shift.T_tool_shift) for name, T in tools]
+        T_first = tools[0][1]  # the shift is that of its axes; others move with the flange
+        T_flange_shift = T_first @ shift.T_tool_shift @ frames.invert(T_first)
+        moved = [(name, T_flange_shift @ T) for name, T in tools]
         lines += [tool_text(args.maker, T, name) for name, T in moved]
     if "base" in args.parts:
         moved = [(name, shift.T_base_shift @ T) for name, T in bases]

@@ -35,7 +35,8 @@ class FrameShift:
     """How two frames move, and what that leaves.
 
     ``T_base_shift`` (4, 4): goes before every base frame, T_base_shift T_base_frame.
-    ``T_tool_shift`` (4, 4): goes behind every tool, T_flange_tool T_tool_shift.
+    ``T_tool_shift`` (4, 4): goes behind the tool of the poses, T_flange_tool T_tool_shift; before
+    any other in the flange's axes, T_flange_tool T_tool_shift T_flange_tool^-1 T_flange_other.
     ``before``, ``after`` (m, 6): twists [m; rad] in base axes from where the tool stands, with the
     frames as they were and as shifted, to where it should.
     """

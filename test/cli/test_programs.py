@@ -166,6 +166,7 @@ def work(folder: Path) -> Path:
 def test_frames_come_out_as_shifted(work: Path, capsys):
     tool, base = "TOOL_DATA[3]=120.5,-14.25,262,30,40,-15", "BASE_DATA[5]=900,-250.5,410.75,12,-3,5"
     frames = ("--tool", tool, "--base", base, "--base", "BASE_DATA[6]=0,0,0,0,0,0")
+    frames += ("--tool", "TOOL_DATA[4]=0,0,0,0,0,0")
     status, document = shifted(capsys, "--maker", "kuka", *frames, "--output", "frames.src")
     assert status == 0
     assert document["verdict"]["code"] == "ACCEPT"
@@ -177,6 +178,7 @@ def test_frames_come_out_as_shifted(work: Path, capsys):
     T_base, T_tool = (frames_of(document[name]) for name in ("T_base_shift", "T_tool_shift"))
     for name, expected in (
         ("TOOL_DATA[3]", T_FLANGE_TOOL @ T_tool),
+        ("TOOL_DATA[4]", T_FLANGE_TOOL @ T_tool @ np.linalg.inv(T_FLANGE_TOOL)),
         ("BASE_DATA[5]", T_base @ T_BASE_FRAME),
         ("BASE_DATA[6]", T_base),
     ):
