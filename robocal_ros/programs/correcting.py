@@ -132,9 +132,10 @@ class ProgramCorrection:
         T_base_frame, tool = ends
         nominal = self._models.nominal
         if point.joints:
+            count = len(point.fields)
+            if count != nominal.n:
+                raise LimitError(f"{count} joints, {nominal.name} has {nominal.n}")
             q = self._dialect.to_arm(np.array(point.numbers) * point.joint_unit)
-            if len(q) != nominal.n:
-                raise LimitError(f"{len(q)} joints, {nominal.name} has {nominal.n}")
         else:
             T = pose_of(self._dialect.maker, point.numbers)
             T_base_flange = T_base_frame @ T @ frames.invert(tool)

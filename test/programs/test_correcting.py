@@ -257,6 +257,14 @@ def test_a_pose_out_of_reach_and_one_in_another_posture():
     assert found == ["no joints reach it in the configuration that it says", ""]
 
 
+def test_axes_of_another_machine_are_left():
+    axes = "   GP1:\n\tUF : 2, UT : 4,\n\tJ1= 1.000 deg, J2= 2.000 deg\n"
+    text = f"/PROG A\n/POS\nP[1]{{\n{axes}}};\n/END\n"
+    done = ProgramCorrection(dialect_of(".ls"), MODELS).correct(text)
+    assert [one.reason for one in done.points] == [f"2 joints, {NOMINAL.name} has 6"]
+    assert done.text == text
+
+
 def test_without_a_configuration_the_posture_is_that_of_the_point_before():
     program = WRITTEN["ur"]
     bare = re.sub(r"get_inverse_kin\((\w+), qnear=\w+\)", r"\1", program.text)
