@@ -44,6 +44,7 @@ _ABSOLUTE = (
 )
 MOVES = r"S?(?:PTP|LIN|CIRC|SPL)"
 
+_NUMBERED = re.compile(r"\[\d+\]$")
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ASSIGNED = re.compile(
     r"(?:\b(?P<type>E6POS|POS|FRAME|E6AXIS|AXIS)\s+)?(?P<name>\$?[A-Za-z_]\w*(?:\[[^\]\r\n]*\])?)"
@@ -87,6 +88,7 @@ class KrlDialect(Dialect):
         inline = {found[1].upper(): found[2] for found in _FDAT.finditer(clean)}
         set_above = list(_settings(text, clean, frames))
         used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
+        used |= {name.partition("[")[0] for name in used if not _NUMBERED.search(name)}
         points: list[ProgramPoint] = []
         for braces in _BRACES.finditer(clean):
             point = _point(text, clean, braces, used)
@@ -155,7 +157,8 @@ def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> Prog
     line = line_of(text, braces.start())
     if assigned:
         name = assigned["name"].upper()
-        target = (assigned["type"] or "").upper() in TARGETS or name in used
+        target = (assigned["type"] or "").upper() in TARGETS
+        target = target or name in used or name.partition("[")[0] in used
         if not target or name.startswith(("$", "TOOL_DATA", "BASE_DATA")):
             return None
         title = assigned["name"]
@@ -210,28 +213,28 @@ class _Set:
     """Tool and base that are set from a place in the text on."""
 
     at: int
-    names: dict[str, str | None] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
 
 
 def _settings(text: str, clean: str, frames: dict[str, Array]) -> Iterator[_Set]:
-    now: dict[str, str | None] = {}
+    now: dict[str, str] = {}
     for found in _SET.finditer(clean):
+        here = f"of line {line_of(text, found.start())}"  # of what is not read here: unknown
         if found["bas"]:
             kind, number = found["bas"].upper(), found["number"].strip()
             if kind == "INITMOV":
                 now = {}
             else:
-                now = now | {kind: f"{kind}_DATA[{number}]" if number.isdigit() else None}
+                plain = f"{kind}_DATA[{number}]"
+                now = now | {kind: plain if number.isdigit() else f"${kind} {here}"}
         else:
             kind, value = found["kind"].upper(), found["value"].strip()
-            name: str | None = value.upper()
-            if value.startswith("{"):
-                T = _frame(value[1:-1])
-                name = None if T is None else f"${kind} of line {line_of(text, found.start())}"
-                if T is not None and name is not None:
-                    frames[name] = T
-            elif found["part"] or not re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
-                name = None
+            name = f"${kind} {here}"
+            T = _frame(value[1:-1]) if value.startswith("{") else None
+            if T is not None:
+                frames[name] = T
+            elif not found["part"] and re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
+                name = value.upper()
             now = now | {kind: name}
         yield _Set(found.start(), now)
 
@@ -253,7 +256,7 @@ def _framed(
             tool=None if tool is None else f"TOOL_DATA[{tool.text.strip()}]",
             frame=None if base is None else f"BASE_DATA[{base.text.strip()}]",
         )
-    names: dict[str, str | None] = {}
+    names: dict[str, str] = {}
     for one in set_above:
         if one.at < at:
             names = one.names

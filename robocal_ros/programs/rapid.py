@@ -43,6 +43,7 @@ _DECLARED = re.compile(
     re.I,
 )
 _ASSIGNED = re.compile(r"(?:^|[;\n])\s*(?P<name>\w+)\s*(?:\{[^}]*\})?\s*:=\s*(?=\[)")
+_SET = re.compile(r"(?<![\\.\w])(\w+)\s*:=")
 _MOVES = re.compile(
     r"\b((?:Move|Trigg|Arc|Spot|Search|Paint|Disp)\w*)\b([^;:]*(?::=[^;:]*)*);", re.I
 )
@@ -68,7 +69,7 @@ class RapidDialect(Dialect):
         frames = {"tool0": np.eye(4), "wobj0": np.eye(4)}
         problems: dict[str, str] = {}
         points: list[tuple[str, ProgramPoint]] = []
-        taken = set()
+        taken, declared = set(), set()
         for pattern in (_DECLARED, _ASSIGNED):
             for found in pattern.finditer(clean):
                 if found.end() in taken:
@@ -78,9 +79,14 @@ class RapidDialect(Dialect):
                 kind = (found.groupdict().get("type") or "").lower()
                 name = found["name"].lower()
                 if kind in ("tooldata", "wobjdata"):
+                    declared.add(found.start("name"))
                     _read_frame(kind, name, tree, frames, problems)
                 else:
                     points += _points(text, found["name"], name, tree)
+        for found in _SET.finditer(clean):
+            name, line = found[1].lower(), line_of(text, found.start(1))
+            if found.start(1) not in declared and name in frames.keys() | problems.keys():
+                problems[name] = f"{name} is set again in line {line}"
         uses = _uses(text, clean, frames, points)
         framed = [_framed(name, point, uses, problems) for name, point in points]
         framed.sort(key=lambda point: point.fields[0].start)
@@ -207,7 +213,7 @@ def _uses(
     uses: dict[str, tuple[str, str]] = {}
     for found in _MOVES.finditer(clean):
         parts = arguments(clean, found.start(2), found.end(2))
-        parts = [part for part in parts if part.text]
+        parts = [part for part in parts if part.text and not re.fullmatch(r"\\\s*\w+", part.text)]
         plain = [re.sub(r"\s*\\.*", "", part.text, flags=re.S) for part in parts]
         if not parts:
             continue

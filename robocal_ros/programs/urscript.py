@@ -63,9 +63,15 @@ class UrScriptDialect(Dialect):
             point = _point(text, clean, at, lists.get(at), goals[at], values)
             if point is not None:
                 points.append(point)
-        computed = tuple(
-            (line_of(text, found.start()), f"{found[1]}(…)") for found in _COMPUTED.finditer(clean)
-        )
+        made = [(found.start(), f"{found[1]}(…)") for found in _COMPUTED.finditer(clean)]
+        made += [
+            (target.at, target.word)
+            for target in targets
+            if not (
+                _LIST.match(target.word) or target.word in values or _COMPUTED.match(target.word)
+            )
+        ]
+        computed = tuple((line_of(text, at), words) for at, words in sorted(made))
         return Program(text, tuple(points), frames, computed)
 
 
@@ -87,21 +93,28 @@ def _targets(text: str, clean: str, frames: dict[str, Array]) -> list[_Target]:
         parts = arguments(clean, call.end() + 1, matching(clean, call.end()))
         if call[1] == "set_tcp":
             fields = _fields(clean, parts[0].start)
-            tool = None
+            tool = f"set_tcp of line {line_of(text, call.start())}"
             if fields is not None and len(fields) == 6 and not require_numbers(fields):
-                tool = f"set_tcp of line {line_of(text, call.start())}"
                 frames[tool] = pose_of("ur", [part.value for part in fields])
             continue
         for part in parts[: TARGETS[call[1]]]:
-            word, near = part, None
-            inverse = re.match(r"get_inverse_kin\s*(?=\()", part.text)
+            word, near, own = _unnamed(part), None, tool
+            inverse = re.match(r"get_inverse_kin\s*(?=\()", word.text)
             if inverse:
-                at = part.start + inverse.end()
+                at = word.start + inverse.end()
                 inner = arguments(clean, at + 1, matching(clean, at))
-                word = inner[0]
+                word = _unnamed(inner[0])
                 near = inner[1] if len(inner) > 1 else None
-            found.append(_Target(word.start, word.text, tool, call.start(), near))
+                if len(inner) > 4 or any(re.match(r"tcp\s*=", one.text) for one in inner[1:]):
+                    own = f"tcp of get_inverse_kin in line {line_of(text, at)}"
+            found.append(_Target(word.start, word.text, own, call.start(), near))
     return found
+
+
+def _unnamed(part: Field) -> Field:
+    """An argument without its name (q=, pose=)."""
+    name = re.match(r"\w+\s*=\s*(?!=)", part.text)
+    return part if name is None else Field(part.start + name.end(), part.text[name.end() :])
 
 
 def _fields(clean: str, at: int) -> list[Field] | None:

@@ -150,7 +150,8 @@ def test_what_a_program_changes_itself_is_told():
     found = dialect_of(".src").read(krl)
     words = {line: text for line, text in found.computed}
     assert words == {1: "BASE_DATA[2].Z=5", 3: "XP1.X = XP1.X + 10", 6: "$TOOL.Z=250"}
-    assert found.points[0].tool is None  # no longer what it was
+    assert found.points[0].tool == "$TOOL of line 6"  # no longer what it was
+    assert "$TOOL of line 6" not in found.frames
     rapid = (
         "p10.trans.z:=p10.trans.z+5;\npNow := CRobT(\\Tool:=tGun);\nPDispOn p10,p20,tGun;\n"
         "wFix.uframe := DefFrame(p1,\n p2,p3);\n"
@@ -160,6 +161,49 @@ def test_what_a_program_changes_itself_is_told():
     fanuc = "/MN\n 1: UFRAME[2]=PR[3] ;\n 2: P[4]=LPOS ;\n 3:L P[4] 9mm/sec FINE ;\n/POS\n/END\n"
     words = [text for _, text in dialect_of(".ls").read(fanuc).computed]
     assert words == ["UFRAME[2]=PR[3]", "P[4]=LPOS"]
+
+
+POINT = "{X 1,Y 2,Z 3,A 0,B 0,C 0}"
+
+
+def test_points_in_an_array_are_found_whatever_counts_them():
+    text = f"P[1]={POINT}\nQ[1]={POINT}\nR[1]={POINT}\nFOR I=1 TO 2\nPTP P[I]\nLIN Q[1]\nENDFOR\n"
+    assert [point.name for point in dialect_of(".src").read(text).points] == ["P[1]", "Q[1]"]
+
+
+def test_a_frame_that_is_set_but_not_read_is_unknown():
+    """Not one that nothing is said of: for such the caller names what is taken."""
+    krl = f"$BASE=BASE_DATA[1]:off\nLIN {POINT}\nBAS(#BASE,n)\nLIN {POINT}\n"
+    found = dialect_of(".src").read(krl)
+    assert [point.frame for point in found.points] == ["$BASE of line 1", "$BASE of line 3"]
+    frame = '[FALSE,TRUE,"",[[0,0,0],[1,0,0,0]],[[0,0,0],[1,0,0,0]]]'
+    rapid = f"PERS wobjdata w1:={frame};\nPERS wobjdata w2:={frame};\nw1:=w2;\n"
+    target = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    rapid += f"MoveL {target},v,z,tool0\\WObj:=w1;\nMoveL {target},v,z,tool0\\WObj:=w2;\n"
+    found = dialect_of(".mod").read(rapid)
+    assert [point.problem for point in found.points] == ["w1 is set again in line 3", ""]
+    script = "set_tcp(a)\nmovel(p[1,2,3,0,0,0])\nset_tcp(b)\nmovel(p[1,2,3,0,0,0])\n"
+    script += "movej(get_inverse_kin(p[1,2,3,0,0,0], tcp=c))\n"
+    tools = ["set_tcp of line 1", "set_tcp of line 3", "tcp of get_inverse_kin in line 5"]
+    found = dialect_of(".script").read(script)
+    assert [point.tool for point in found.points] == tools
+    assert not found.frames.keys() & set(tools)
+
+
+def test_a_switch_before_the_point_of_a_motion():
+    target = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    rapid = f"CONST robtarget p1:={target};\nMoveL \\Conc, p1, v100, z10, tool0\\WObj:=w1;\n"
+    (point,) = dialect_of(".mod").read(rapid).points
+    assert (point.tool, point.frame) == ("tool0", "w1")
+
+
+def test_urscript_with_named_arguments_and_targets_that_are_not_read():
+    script = (
+        "movel(pose=p[1,2,3,0,0,0], a=1)\nl=[p[1,2,3,0,0,0]]\nmovel(l[0])\nmovej(q=[0,1,2,3,4,5])\n"
+    )
+    found = dialect_of(".script").read(script)
+    assert [(point.line, point.joints) for point in found.points] == [(1, False), (4, True)]
+    assert found.computed == ((3, "l[0]"),)
 
 
 def test_krl_with_a_tool_that_stands_and_an_exact_robot():
