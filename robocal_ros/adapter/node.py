@@ -161,8 +161,13 @@ class AdapterNode(HouseNode):
     def _take_levels(self, kind: str, of: dict[str, str], message: Any, info: Any) -> None:
         told_ns, levels = self._told_ns(message, info), LEVELS[kind](message)
         high_is_blocked = self.settings["blocked_level"] == "high"
+        missing: InputError | None = None
         for beam, source in of.items():
-            high = level_of(levels, source)
+            try:
+                high = level_of(levels, source)
+            except InputError as error:  # the other beam is heard all the same
+                missing = missing or error
+                continue
             change = self._levels[beam].hear(high is high_is_blocked, told_ns)
             if change is not None:
                 self._edges += 1
@@ -174,6 +179,8 @@ class AdapterNode(HouseNode):
                         stamp_sigma_s=change.sigma_s,
                     )
                 )
+        if missing is not None:
+            raise missing
 
     def _told_ns(self, message: Any, info: Any) -> int:
         """Its stamp, else when its publisher sent it, of which DDS knows the wall clock's time."""

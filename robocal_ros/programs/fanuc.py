@@ -39,6 +39,7 @@ _GROUP = re.compile(r"\bGP(\d+)\s*:")
 _FIELD = re.compile(r"\b([XYZWPR]|J\d|E\d)\s*=(\s*[-+.\d*]+)\s*(?:mm|deg)")
 _FRAMES = re.compile(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
 _CONFIG = re.compile(r"CONFIG\s*:\s*'([^']*)'")
+_WORDS = re.compile(r"\s*[NF]\s+[UD]\s+[TB]\s*(?:,\s*-?\d+\s*){3}")
 _RELATIVE = re.compile(r"\bP\[\s*(\d+)[^\]]*\][^;\n]*\bINC\b")
 _COMPUTED = re.compile(
     r"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\][^;\n]*\b(?:Tool_)?Offset\b[^;\n]*"
@@ -144,18 +145,18 @@ def _point(text: str, name: str, line: int, start: int, end: int) -> ProgramPoin
     config = _CONFIG.search(text, start, end)
     if config is None:
         return point
+    if not _WORDS.fullmatch(config[1]):
+        problem = f"its configuration '{config[1]}' is none of three letters and three turns"
+        return replace(point, problem=problem)
     marks = {"CONFIG": Field(config.start(1), config[1])}
     return replace(point, marks=marks, posture=_posture(config[1]))
 
 
 def _posture(config: str) -> Posture:
+    """Of a text that `_WORDS` matches."""
     words = config.replace(",", " ").split()
     ranges = np.tile([-np.inf, np.inf], (6, 1))
-    if words[:1] and words[0] in "NF":
-        ranges[4] = (-np.inf, 0.0) if words[0] == "N" else (0.0, np.inf)
-    for joint, word in zip(TURN_OF, words[3:6], strict=False):
-        if re.fullmatch(r"-?\d+", word):
-            ranges[joint] = (2.0 * int(word) + np.array([-1.0, 1.0])) * HALF_TURN
-    above = {"U": True, "D": False}.get(words[1] if len(words) > 1 else "")
-    behind = {"T": False, "B": True}.get(words[2] if len(words) > 2 else "")
-    return Posture(ranges, behind, above)
+    ranges[4] = (-np.inf, 0.0) if words[0] == "N" else (0.0, np.inf)
+    for joint, word in zip(TURN_OF, words[3:], strict=True):
+        ranges[joint] = (2.0 * int(word) + np.array([-1.0, 1.0])) * HALF_TURN
+    return Posture(ranges, words[2] == "B", words[1] == "U")

@@ -324,6 +324,15 @@ end
 """
 
 
+@pytest.mark.parametrize(
+    "config", ["N R U T, 0, 1, 0", "NUT, 0, 0, 0", "N U T, 0, 0", "N U T, 0, x, 0"]
+)
+def test_a_fanuc_configuration_of_another_shape_is_not_guessed(config):
+    point = dialect_of(".ls").read(FANUC.replace("F D B, 0, 1, -1", config)).points[0]
+    assert f"'{config}'" in point.problem
+    assert not point.posture.told
+
+
 def test_urscript_targets():
     found = dialect_of(".script").read(SCRIPT)
     assert [point.name for point in found.points] == ["A_p", "B", "line 9", "line 10"]
