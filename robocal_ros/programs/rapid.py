@@ -195,7 +195,10 @@ def _read_frame(
         rows = _rows(part, 3, 4)
         if rows is None or require_numbers([*rows[0], *rows[1]]):
             return
-        T = T @ pose_of("abb", [part.value for row in rows for part in row])
+        try:
+            T = T @ pose_of("abb", [part.value for row in rows for part in row])
+        except InputError:  # no unit quaternion
+            return
     if kind == "wobjdata" and isinstance(tree[1], Field) and tree[1].text.upper() != "TRUE":
         problems[name] = f"{name}: its user frame is moved by another unit"
         return

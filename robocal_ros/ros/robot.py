@@ -10,7 +10,7 @@ from typing import Any
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import JOINTS, joint_sample
 from robocal_ros.kinematics.robots import RobotDescription, load_description
@@ -101,7 +101,7 @@ class RobotNode(HouseNode):
         topic = self.resolve_topic_name(DESCRIPTION)
         try:
             found = model_difference(self._links(), self.robot.arm, present)
-        except InputError as error:
+        except Exception as error:  # whatever a stranger publishes, the node lives on
             self._doubt = f"{topic} cannot be compared with {self._source()}: {error}"
         else:
             if found is not None:

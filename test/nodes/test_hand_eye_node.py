@@ -432,7 +432,7 @@ def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
 def test_the_error_of_a_turn_alone_is_refused(graph: Any, tmp_path: Path) -> None:
     node = graph.add(HandEyeNode, settings_of(tmp_path, robot_sigma_deg=0.01))
     assert node.state == "unconfigured"
-    assert "robot_sigma_deg is 0.01, but robot_sigma_mm is 0: give both" in node._failure
+    assert "robot_sigma_deg is 0.01, but robot_sigma_mm is 0: give both" in node._failure.message
 
 
 def test_a_status_that_cannot_be_carried_takes_no_answer_from_its_caller(

@@ -107,6 +107,16 @@ class Stream:
 
         self.graph.spin_until(said, f"state {state}", 30.0)
 
+    def is_heard(self) -> None:
+        """The planner stays where it is until the node, which is off, passes that on."""
+        count = len(self.sent)
+
+        def passed() -> bool:
+            self._planner.publish(trajectory([(AHEAD_S, self.taught)]))
+            return len(self.sent) > count
+
+        self.graph.spin_until(passed, "the node hears its planner")
+
     def runs_on(self, rad: float = 0.2) -> None:
         """The planner streams until the robot has gone so far."""
         start, self.runs = self.controller.q, True
@@ -127,6 +137,7 @@ def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
     (profiles := tmp_path / "lease.xml").write_text(SHORT_LEASE)
     stream = Stream(graph, controller, profiles)
     node = stream.start(monkeypatch)
+    stream.is_heard()
     graph.call(SetBool, f"{CORRECTION}/enable", data=True)
     began_s = controller.now_s
     stream.runs_on()
@@ -149,6 +160,7 @@ def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
     graph.spin_for(0.5)
     assert len(stream.sent) == count  # off, and nothing goes out by itself
     assert controller.stands() == pytest.approx(stands, abs=1e-6)
+    stream.is_heard()
     stream.runs_on()
     assert not stream.status[-1].mismatch
     no_jump(stream.fastest(again_s) < FASTEST, "no faster than the stream")

@@ -542,4 +542,4 @@ def test_a_state_that_is_lost_is_a_fault(plc, graph):
 def test_what_cannot_be_driven_is_refused_at_the_start(graph, changes, words):
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG} | changes)
     assert not node.is_active
-    assert words in node._failure
+    assert words in node._failure.message
