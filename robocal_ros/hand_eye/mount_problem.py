@@ -608,11 +608,12 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
     for axis in NEAR * np.eye(len(best)):
         bend = (likely.at(best + axis)[0] + likely.at(best - axis)[0] - 2.0 * least) / NEAR**2
         width.append(np.sqrt(2.0 / max(bend, 2.0 / WIDEST**2)))
-    total, weights = np.zeros_like(normal), 0.0
+    spread, weight = [], []
     for nodes in product(NODES, repeat=len(best)):
         away = np.array(width) * nodes
         cost, normal, step = likely.at(best + away)[:3]
-        weight = float(np.exp(0.5 * (least - cost) + away.sum()))
-        total += weight * (np.linalg.inv(normal) + np.outer(step, step))
-        weights += weight
-    return np.asarray(total / weights)
+        spread.append(np.linalg.inv(normal) + np.outer(step, step))
+        weight.append(0.5 * (least - cost) + away.sum())
+    # The noise found need not be the likeliest, where the search for it ended early.
+    weights = np.exp(np.array(weight) - np.max(weight))
+    return np.asarray(np.tensordot(weights, spread, 1) / np.sum(weights))

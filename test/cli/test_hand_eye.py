@@ -80,7 +80,10 @@ class TestRecovered:
         sigma = np.sqrt(np.diag(found["covariance"]))
         assert found["sigma"]["xyz_mm"] == pytest.approx(sigma[:3] * 1e3)
         assert found["sigma"]["rot_deg"] == pytest.approx(np.degrees(sigma[3:]))
-        assert found["rejected"] == found["held_out"]["rejected"] == []
+        assert found["held_out"]["rejected"] == []
+        # Of one edge in ten or so the sensor sees one side only.
+        assert len(found["rejected"]) <= (SHOTS // 4 if action == "line" else 0)
+        assert all("both of its sides" in why for why in found["rejected_because"].values())
         # three axes of the robot's scatter, the corners' machining and the mount's own error
         expected = np.hypot(np.sqrt(3.0) * ROBOT_M * 1e3, found["working_error_mm"])
         aim = found.get("aim_sigma_mm", 0.0) * np.sqrt(2.0)
@@ -303,7 +306,7 @@ class TestMistakes:
         folder = self.copy(made, tmp_path)
         for file in (folder / "profiles").iterdir():
             file.write_text("x_mm,z_mm\n")
-        words = ("0 profiles show the sphere", "12 show none", "empty")
+        words = ("0 profiles show the sphere", f"{SHOTS} show none", "empty")
         self.refused("TOO_FEW_SAMPLES", *words, run=self.sphere(folder))
 
     @pytest.mark.parametrize(("kind", "fewest"), [("sphere", 5), ("line", 5)])

@@ -35,7 +35,7 @@ RADIUS_M = 0.02
 CENTRE = np.array([0.837, -0.059, 0.045])
 T_BASE_USER = frames.transform(frames.exp_rotation([0.01, -0.02, -2.1]), [0.84, -0.02, 0.03])
 STAIRS = TrueStairs(T_BASE_USER)
-SHOTS, CHECKS = 12, 4
+SHOTS, CHECKS = 20, 4
 
 
 def known_stairs() -> StepTarget:
@@ -44,8 +44,8 @@ def known_stairs() -> StepTarget:
     return StepTarget(T_BASE_USER, same.marked_corners(), same.edge_user)
 
 
-def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 2) -> SimulatedShots:
-    """Shots of a target; of this seed each shows what it is to show."""
+def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 0) -> SimulatedShots:
+    """Shots of a target."""
     rng = np.random.default_rng(seed)
     if kind == "sphere":
         return sphere_shots(CELL, CENTRE, RADIUS_M, count, rng)
