@@ -116,6 +116,28 @@ def level_of(levels: Mapping[str, bool], source: str) -> bool:
     return levels[source]
 
 
+def changes_in(
+    levels: Mapping[str, bool],
+    beams: Mapping[str, tuple[BeamLevel, str]],
+    high_is_blocked: bool,
+    told_ns: int,
+) -> tuple[Mapping[str, LevelChange], InputError | None]:
+    """Edges of beams, each with its input, in levels told at once; what one of them lacks.
+
+    A beam that cannot be heard leaves the others to be heard.
+    """
+    found: dict[str, LevelChange] = {}
+    wrong: InputError | None = None
+    for beam, (level, source) in beams.items():
+        try:
+            change = level.hear(level_of(levels, source) is high_is_blocked, told_ns)
+        except InputError as error:
+            wrong = wrong or error
+        else:
+            found |= {} if change is None else {beam: change}
+    return found, wrong
+
+
 def source_fault(kind: str, beams: Sequence[str], sources: Sequence[str]) -> str:
     """What is wrong with the inputs that are named for the beams; empty: nothing."""
     if len(sources) != len(beams) or not beams or len(set(beams)) < len(beams):

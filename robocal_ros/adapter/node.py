@@ -17,7 +17,7 @@ from robocal_ros.adapter.inputs import (
     UR_IO,
     BeamLevel,
     InputTiming,
-    level_of,
+    changes_in,
     scan_profile,
     source_fault,
 )
@@ -159,28 +159,22 @@ class AdapterNode(HouseNode):
         self._topics[topic] = self.add_input(kind, topic, act, profile, **how).topic_name, kind
 
     def _take_levels(self, kind: str, of: dict[str, str], message: Any, info: Any) -> None:
-        told_ns, levels = self._told_ns(message, info), LEVELS[kind](message)
+        beams = {beam: (self._levels[beam], source) for beam, source in of.items()}
         high_is_blocked = self.settings["blocked_level"] == "high"
-        missing: InputError | None = None
-        for beam, source in of.items():
-            try:
-                high = level_of(levels, source)
-            except InputError as error:  # the other beam is heard all the same
-                missing = missing or error
-                continue
-            change = self._levels[beam].hear(high is high_is_blocked, told_ns)
-            if change is not None:
-                self._edges += 1
-                self._events.publish(
-                    BeamEvent(
-                        header=header(change.stamp_ns, self.settings["station"]),
-                        beam=beam,
-                        edge=BeamEvent.BREAK if change.blocked else BeamEvent.RESTORE,
-                        stamp_sigma_s=change.sigma_s,
-                    )
+        told_ns = self._told_ns(message, info)
+        changes, wrong = changes_in(LEVELS[kind](message), beams, high_is_blocked, told_ns)
+        for beam, change in changes.items():
+            self._edges += 1
+            self._events.publish(
+                BeamEvent(
+                    header=header(change.stamp_ns, self.settings["station"]),
+                    beam=beam,
+                    edge=BeamEvent.BREAK if change.blocked else BeamEvent.RESTORE,
+                    stamp_sigma_s=change.sigma_s,
                 )
-        if missing is not None:
-            raise missing
+            )
+        if wrong is not None:
+            raise wrong
 
     def _told_ns(self, message: Any, info: Any) -> int:
         """Its stamp, else when its publisher sent it, of which DDS knows the wall clock's time."""

@@ -8,13 +8,13 @@ import argparse
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robocal_ros.cli.main import CliResult, Document, print_words, progress_console
 from robocal_ros.correction.session import load_kernels
-from robocal_ros.ground import frames, mcap_records, serialized_joints
+from robocal_ros.ground import compiled, frames, mcap_records, serialized_joints
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import fit_pairs
@@ -102,38 +102,29 @@ def add_warm(parser: argparse.ArgumentParser) -> None:
 
 def run_warm(args: argparse.Namespace) -> CliResult:
     """Do ``warm``, telling on standard error how far it is."""
-    from numba.core import event
-
-    console, steps, compiled = progress_console(), warming(), list[str]()
+    console, steps, names = progress_console(), warming(), list[str]()
     with console.status("") as status:
 
-        class Progress(event.Listener):
-            def on_start(self, event: Any) -> None:
-                function = event.data["dispatcher"].py_func
-                if not function.__module__.startswith("robocal_ros."):
-                    return  # numba's own
-                compiled.append(function.__name__)
-                words = f"{len(compiled)} kernels, {compiled[-1]}"
-                status.update(words)
-                if not console.is_terminal and len(compiled) % LINE_EVERY == 0:
-                    console.print(words)
-
-            def on_end(self, event: Any) -> None:
-                pass
+        def tell(name: str) -> None:
+            names.append(name)
+            words = f"{len(names)} kernels, {name}"
+            status.update(words)
+            if not console.is_terminal and len(names) % LINE_EVERY == 0:
+                console.print(words)
 
         done: list[Document] = []
-        with event.install_listener("numba:compile", Progress()):
+        with compiled.compiling(tell):
             for number, (name, call) in enumerate(steps.items(), start=1):
-                before, begun_s = len(compiled), time.monotonic()
+                before, begun_s = len(names), time.monotonic()
                 call()
                 step = {
                     "name": name,
-                    "compiled": len(compiled) - before,
+                    "compiled": len(names) - before,
                     "seconds": time.monotonic() - begun_s,
                 }
                 done.append(step)
                 console.print(f"{number} of {len(steps)}: {_in_words(step)}")
-    return CliResult({"steps": done, "compiled": len(compiled), "warnings": []}, _show)
+    return CliResult({"steps": done, "compiled": len(names), "warnings": []}, _show)
 
 
 def _in_words(step: Document) -> str:

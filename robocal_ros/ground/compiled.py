@@ -15,7 +15,8 @@ import os
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
@@ -23,11 +24,13 @@ from typing import Any, Literal, TypeVar, cast
 import llvmlite.binding as untyped_llvm
 import numba
 from numba.core import caching as untyped
+from numba.core import event as untyped_event
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 caching: Any = untyped  # numba is typed here and there
 llvm: Any = untyped_llvm
+events: Any = untyped_event
 THIS_FILE = Path(__file__)
 PACKAGE = THIS_FILE.parents[1]
 MARK = b"\nfrom robocal_ros.ground.compiled import "  # how a module that has kernels is known
@@ -64,6 +67,23 @@ def _compiled(
     if made is not function:  # as it is with NUMBA_DISABLE_JIT
         made._cache = _KeptCode(function)
     return cast(Function, made)
+
+
+@contextmanager
+def compiling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell the name of each kernel that is compiled meanwhile; none that is loaded."""
+
+    class Listener(events.Listener):  # type: ignore[misc]
+        def on_start(self, event: Any) -> None:
+            function = event.data["dispatcher"].py_func
+            if function.__module__.startswith("robocal_ros."):  # else numba's own
+                tell(function.__name__)
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with events.install_listener("numba:compile", Listener()):
+        yield
 
 
 def is_cold() -> bool:

@@ -103,13 +103,12 @@ class RobotNode(HouseNode):
             found = model_difference(self._links(), self.robot.arm, present)
         except Exception as error:  # whatever a stranger publishes, the node lives on
             self._doubt = f"{topic} cannot be compared with {self._source()}: {error}"
+            self._log(DESCRIPTION, error)
         else:
             if found is not None:
                 self.robot_fault = f"{topic} is another robot than {self._source()}: {found}"
         if self.robot_fault:
             self.get_logger().error(self.robot_fault)
-        elif self._doubt:
-            self.get_logger().warning(self._doubt)
         if self.robot_fault and present is None and self._present is None:
             self._present = self.create_subscription(
                 JointState, JOINTS, self._take_present, endpoints.own(endpoints.NEWEST)

@@ -15,6 +15,7 @@ from robocal_ros.adapter.inputs import (
     UR_IO,
     BeamLevel,
     InputTiming,
+    changes_in,
     gpio_levels,
     level_of,
     scan_profile,
@@ -135,6 +136,17 @@ def test_edges_of_an_input_that_is_read_every_period_are_known_by_their_sigma() 
     # The period of most, which two jitters make longer or shorter by 14 %.
     usual_s = np.hypot(jitter_s, period_s / np.sqrt(12.0))
     assert np.median(sigma_s) == pytest.approx(usual_s, rel=0.14)
+
+
+@pytest.mark.parametrize("silent", ["x", "y"])
+def test_a_beam_that_cannot_be_heard_leaves_the_other_to_be_heard(silent: str) -> None:
+    beams = {name: (BeamLevel(InputTiming(0.0, 1e-3)), name) for name in "xy"}
+    assert changes_in({"x": False, "y": False}, beams, True, NS) == ({}, None)
+    levels = {"x": True, "y": True}
+    del levels[silent]
+    changes, wrong = changes_in(levels, beams, True, 2 * NS)
+    assert list(changes) == list(levels)
+    assert f"no input '{silent}'" in str(wrong)
 
 
 def test_messages_out_of_order_are_told_and_the_level_counts_from_there() -> None:

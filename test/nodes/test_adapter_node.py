@@ -27,6 +27,11 @@ from robocal_ros.ros.endpoints import ERROR, OK, WARN
 LATE_MS = 40.0
 
 
+def events_heard(node: Any) -> bool:
+    """Whether somebody listens to its events."""
+    return bool(node.count_subscribers("/beam_events"))
+
+
 def test_each_change_of_a_bool_is_an_edge_at_its_time(graph: Any) -> None:
     """By when it was published, which DDS knows: between the clock before and after that."""
     settings = {"input": "bool", "latency_ms": LATE_MS, "jitter_ms": 0.5, "blocked_level": "low"}
@@ -34,7 +39,7 @@ def test_each_change_of_a_bool_is_an_edge_at_its_time(graph: Any) -> None:
     assert node.health().level == WARN
     events = graph.collect(BeamEvent, "/beam_events")
     beam = graph.publisher(Bool, "/beam_y", endpoints.RELIABLE)
-    graph.spin_for(0.2)
+    graph.spin_until(lambda: beam.get_subscription_count() and events_heard(node), "each other")
     sent = []
     for high in (True, True, False, False, True):
         before = graph.probe.get_clock().now().nanoseconds
@@ -62,7 +67,8 @@ class CellOfBools(LiveCell):
         self.adapter = graph.add(AdapterNode, settings | {"station": self.station})
         self.clock = graph.publisher(Clock, "/clock", endpoints.RELIABLE)
         self.beams = {beam: graph.publisher(Bool, f"/beam_{beam}") for beam in "xy"}
-        graph.spin_for(0.2)
+        ends = [self.clock, *self.beams.values()]
+        graph.spin_until(lambda: all(end.get_subscription_count() for end in ends), "the adapter")
         for beam in self.beams:
             self.tell(1, beam, False)
 
@@ -103,8 +109,8 @@ class SensorOfClouds(LiveSensor):
         self.adapter = graph.add(AdapterNode, late)
         super().__init__(graph, folder)
         graph.probe.destroy_publisher(self._publishers[PROFILE])
-        self._publishers[PROFILE] = graph.publisher(PointCloud2, "cloud", STREAM)
-        graph.spin_for(0.2)
+        cloud = self._publishers[PROFILE] = graph.publisher(PointCloud2, "cloud", STREAM)
+        graph.spin_until(cloud.get_subscription_count, "the adapter")
 
     def publish(self, message: Recorded) -> None:
         if message.kind == PROFILE:
