@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Cell, Goal, Table
+from bench.ur10_campaigns import data_folder, halves, load_campaign
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel, identify
 from robocal_ros.identification.cell_model import CellProblem, make_layout
+from robocal_ros.identification.full_model import identify_full
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.universal_robots import link_transform
@@ -403,6 +405,30 @@ def identification_table() -> Table:
     return table
 
 
+def full_model_table() -> Table:
+    """The full model of a real robot, from few and from many poses."""
+    table = Table(
+        "full_model_speed",
+        "The full model of the UR10 (geometry, joint functions, compliances)",
+        ("poses", "s", "goal", "first call in a process, s"),
+        "Poses of campaigns C and A of its training halves. The first call also imports Numba "
+        "and SciPy's linear algebra and loads the compiled kernels.",
+    )
+    for series, count, limit, rounds in (("C", 250, 0.3, 5), ("A", None, 5.0, 1)):
+        data, _ = halves(load_campaign(series))
+        data = data.take(np.random.default_rng(0).permutation(len(data))[:count])
+        arm, durations = load_robot("ur10"), []
+        for _ in range(1 + rounds):
+            start = time.process_time()
+            identify_full(arm, data)
+            durations.append(time.process_time() - start)
+        median = float(np.median(durations[1:]))
+        first = durations[0] if series == "C" else None
+        table.add(len(data), median, Goal(median, limit), first)
+    return table
+
+
 def tables() -> Sequence[Table]:
-    """All tables of this module."""
-    return [kinematics_table(), identification_table()]
+    """All tables of this module; the full model's first, since it tells a process's first call."""
+    first = [full_model_table()] if data_folder().is_dir() else []
+    return [*first, kinematics_table(), identification_table()]

@@ -364,8 +364,7 @@ def _round(
     problem: _FullProblem, at: _Solution, residual: Array, rows: Rows, weight: Array
 ) -> _Solution:
     evidence = problem.evidence(at, residual, rows, weight)
-    prior = evidence.maximise(at.prior)
-    posterior = evidence.posterior(prior)
+    prior, posterior = evidence.maximise(at.prior)
     cell = problem.moved(at.cell, at.terms, posterior.mean)
     step = np.append(posterior.mean - problem.values(at.cell, at.terms), 0.0)  # of column -1
     linear = residual + np.einsum("mch,mh->mc", rows.J, step[rows.column])

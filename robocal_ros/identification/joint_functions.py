@@ -30,6 +30,7 @@ MOST_SPLINES = 1200
 MARGIN = 3  # splines beyond the measured angles, on which a function returns to zero
 _JITTER = 1e-8
 LEAST_NOISE_SHARE = 1e-2  # of the noise before: what functions leave at least
+_STEPS, LONGEST_STEP = 20, 1.5  # of the search, in logarithms
 FLAT, FLAT_SHARE = 0.1, 3e-6  # change of the log evidence that means nothing, also relative
 
 
@@ -293,66 +294,100 @@ class JointEvidence:
         inverse, _ = lapack.dpotri(R, lower=1, overwrite_c=1)
         return _Whitened(factors, slopes, inverse, z, determinant, float(whitened @ z))
 
-    def _cost(self, prior: FunctionPrior) -> tuple[float, Array]:
-        """Minus the log evidence, and its derivatives by the logarithms that are searched.
+    def _likelihood(self, prior: FunctionPrior) -> tuple[float, Array, Array, "_Whitened"]:
+        """Minus the log evidence, its slope (h,), Fisher's information (h, h), and all whitened.
 
-        Those of length and amplitude of each block, and of the noise.
+        By the logarithms that are searched: length and amplitude of each block, and the noise.
         """
         at, variance = self._whitened(prior), prior.noise**2
-        told, z = self.count - float(np.sum(self.flat)), at.mean
+        z = at.mean
+        told, p = self.count - float(np.sum(self.flat)), len(at.mean)
         loss = self._reduced[2] - at.explained
         cost = 0.5 * (told * np.log(variance) + at.determinant + loss / variance)
-        by = []
-        for (_, block), slope in zip(self._blocks, at.slopes, strict=True):
-            gained = np.eye(block.stop - block.start) - at.own(block)
-            pulled = z[block]
-            by.append(0.5 * (float(np.sum(gained * slope)) - float(pulled @ slope @ pulled)))
-            by.append(float(np.trace(gained)) - float(pulled @ pulled))
-        by.append(told - at.taken - loss / variance + float(z @ z))
-        return cost, np.array(by)
+        C = np.tril(at.inverse) + np.tril(at.inverse, -1).T
+        gained = np.eye(p) - C  # what the data tell, of one
+        by_length = np.empty_like(C)
+        slope, with_noise = [], []
+        for (_, block), change in zip(self._blocks, at.slopes, strict=True):
+            by_length[block] = change @ gained[block]
+            pulled, told_here = z[block], float(np.trace(gained[block, block]))
+            length_here = float(np.trace(by_length[block, block]))
+            slope.append(0.5 * (length_here - float(pulled @ change @ pulled)))
+            slope.append(told_here - float(pulled @ pulled))
+            with_noise.append(length_here - float(np.sum(by_length[block] * gained[block])))
+            with_noise.append(2.0 * (told_here - float(np.sum(gained[block] ** 2))))
+        slope.append(told - at.taken - loss / variance + float(z @ z))
+        first = [block.start for _, block in self._blocks]
 
-    def maximise(self, start: FunctionPrior) -> FunctionPrior:
-        """The prior under which the data are most likely."""
-        from scipy.optimize import minimize
+        def summed(product: Array) -> Array:
+            """Its sums over pairs of blocks."""
+            part = product[first[0] :, first[0] :]
+            places = np.array(first) - first[0]
+            return np.asarray(np.add.reduceat(np.add.reduceat(part, places, 0), places, 1))
 
+        h = len(slope)
+        fisher = np.zeros((h, h))
+        fisher[:-1:2, :-1:2] = 0.5 * summed(by_length * by_length.T)
+        fisher[:-1:2, 1:-1:2] = summed(by_length * gained)
+        fisher[1:-1:2, :-1:2] = fisher[:-1:2, 1:-1:2].T
+        fisher[1:-1:2, 1:-1:2] = 2.0 * summed(gained**2)
+        fisher[-1, :-1] = fisher[:-1, -1] = with_noise
+        fisher[-1, -1] = 2.0 * (told - p + float(np.sum(C**2)))
+        return cost, np.array(slope), fisher, at
+
+    def maximise(self, start: FunctionPrior) -> tuple[FunctionPrior, Posterior]:
+        """The prior under which the data are most likely, and what is known under it.
+
+        By Fisher's scoring over the logarithms of lengths, amplitudes and noise.
+        """
         joints = [joint for joint, _ in self._blocks]
-        centre = np.tile(np.log([LENGTH_RAD, AMPLITUDE_RAD]), len(joints))
-        width = np.tile([LENGTH_FACTOR, AMPLITUDE_FACTOR], len(joints))
-
-        # the curvature that each logarithm has where the data tell it: steps of like size
-        counts = self.terms.count[joints].astype(np.float64)
-        size = np.sqrt(np.append(np.stack([counts, 2.0 * counts], axis=1), 2.0 * self.count))
-
-        def prior_at(x: Array) -> FunctionPrior:
-            length, amplitude = start.length.copy(), start.amplitude.copy()
-            length[joints], amplitude[joints] = np.exp(x[:-1:2]), np.exp(x[1:-1:2])
-            return FunctionPrior(length, amplitude, float(np.exp(x[-1])))
-
-        def cost(scaled: Array) -> tuple[float, Array]:
-            x = scaled / size
-            value, slope = self._cost(prior_at(x))
-            away = (x[:-1] - centre) / width
-            slope[:-1] += away / width
-            return value + 0.5 * float(away @ away), slope / size
-
-        x = np.empty(2 * len(joints) + 1)
-        x[:-1:2], x[1:-1:2] = np.log(start.length[joints]), np.log(start.amplitude[joints])
-        x[-1] = np.log(start.noise)
-        lower, upper = np.full(len(x), np.log(1e-7)), np.full(len(x), np.log(5e-3))
+        h = 2 * len(joints) + 1
+        centre, precision = np.zeros(h), np.zeros(h)
+        centre[:-1] = np.tile(np.log([LENGTH_RAD, AMPLITUDE_RAD]), len(joints))
+        precision[:-1] = np.tile([LENGTH_FACTOR**-2, AMPLITUDE_FACTOR**-2], len(joints))
+        lower, upper = np.full(h, np.log(1e-7)), np.full(h, np.log(5e-3))
         lower[:-1:2], upper[:-1:2] = np.log(0.5 * self.terms.step[joints]), np.log(np.pi)
         lower[-1] = np.log(max(self.noise_least, LEAST_NOISE_SHARE * start.noise))
         upper[-1] = np.inf
-        flat = max(FLAT_SHARE, FLAT / max(abs(cost(x * size)[0]), 1.0))
-        found = minimize(
-            cost, x * size, jac=True, method="L-BFGS-B",
-            bounds=np.stack([lower * size, upper * size], axis=1),
-            options={"ftol": flat, "maxiter": 40},
-        )  # fmt: skip
-        return prior_at(found.x / size)
+
+        def evaluated(x: Array) -> tuple[FunctionPrior, _Whitened, float, Array, Array]:
+            length, amplitude = start.length.copy(), start.amplitude.copy()
+            length[joints], amplitude[joints] = np.exp(x[:-1:2]), np.exp(x[1:-1:2])
+            prior = FunctionPrior(length, amplitude, float(np.exp(x[-1])))
+            cost, slope, fisher, at = self._likelihood(prior)
+            away = precision * (x - centre)
+            cost += 0.5 * float(away @ (x - centre))
+            return prior, at, cost, slope + away, fisher + np.diag(precision)
+
+        x = np.empty(h)
+        x[:-1:2], x[1:-1:2] = np.log(start.length[joints]), np.log(start.amplitude[joints])
+        x[-1] = np.log(start.noise)
+        x = np.clip(x, lower, upper)
+        prior, at, cost, slope, fisher = evaluated(x)
+        for _ in range(_STEPS):
+            free = ~(((x <= lower) & (slope > 0.0)) | ((x >= upper) & (slope < 0.0)))
+            step = np.zeros(h)
+            step[free] = np.linalg.solve(fisher[np.ix_(free, free)], -slope[free])
+            step *= min(1.0, LONGEST_STEP / float(np.max(np.abs(step))))
+            flat = max(FLAT, FLAT_SHARE * abs(cost))
+            if -0.5 * float(slope @ step) < flat:
+                break
+            last = cost
+            for share in (1.0, 0.3, 0.1):
+                trial = np.clip(x + share * step, lower, upper)
+                found = evaluated(trial)
+                if found[2] < cost:
+                    x, (prior, at, cost, slope, fisher) = trial, found
+                    break
+            if last - cost < flat:
+                break
+        return prior, self._posterior(prior, at)
 
     def posterior(self, prior: FunctionPrior) -> Posterior:
         """What the data and the prior say of all unknowns."""
-        at = self._whitened(prior)
+        return self._posterior(prior, self._whitened(prior))
+
+    def _posterior(self, prior: FunctionPrior, at: "_Whitened") -> Posterior:
         *_, by_rest, flat_covariance = self._reduced
         flat, rest = np.flatnonzero(self.flat), np.flatnonzero(~self.flat)
         inverse = np.tril(at.inverse) + np.tril(at.inverse, -1).T
@@ -398,11 +433,6 @@ class _Whitened:
     mean: Array
     determinant: float
     explained: float
-
-    def own(self, block: slice) -> Array:
-        """The inverse's part of a block."""
-        part = np.tril(self.inverse[block, block])
-        return np.asarray(part + np.tril(part, -1).T)
 
     @property
     def taken(self) -> float:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bent_robot import COMPLIANCE, LOWER, NOISE_M, UPPER, BentRobot
+from scipy.linalg import null_space
 
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import InputError
@@ -219,6 +220,11 @@ def test_sparse_sums_equal_dense_ones():
     assert spread == pytest.approx(own @ (A @ A.T) @ np.swapaxes(own, 1, 2))
 
 
+def prior_at(x):
+    length, amplitude = np.exp(x[[0, 2]]), np.exp(x[[1, 3]])
+    return FunctionPrior(length, amplitude, float(np.exp(x[4])))
+
+
 def test_evidence_is_the_density_of_the_data():
     """Against the normal density of all data, the flat unknown with a wide prior."""
     evidence, J, y, *_ = evidence_of(None)
@@ -226,7 +232,7 @@ def test_evidence_is_the_density_of_the_data():
         FunctionPrior(np.array([0.1, 0.2]), np.array([a, 3e-4]), s)
         for a, s in ((2e-4, 1e-4), (5e-4, 2e-4))
     ]
-    costs = [evidence._cost(prior)[0] for prior in priors]
+    costs = [evidence._likelihood(prior)[0] for prior in priors]
     exact = []
     for prior in priors:
         K = np.zeros((J.shape[1], J.shape[1]))
@@ -243,12 +249,28 @@ def test_evidence_is_the_density_of_the_data():
 def test_evidence_has_the_slope_that_it_tells():
     evidence, *_ = evidence_of(None)
     at = np.log([0.1, 2e-4, 0.2, 3e-4, 1e-4])
-
-    def cost(x):
-        length, amplitude = np.exp(x[[0, 2]]), np.exp(x[[1, 3]])
-        return evidence._cost(FunctionPrior(length, amplitude, float(np.exp(x[4]))))
-
-    slope = cost(at)[1]
+    slope = evidence._likelihood(prior_at(at))[1]
     for i, step in enumerate(1e-4 * np.eye(5)):
-        numeric = (cost(at + step)[0] - cost(at - step)[0]) / 2e-4
-        assert slope[i] == pytest.approx(numeric, rel=1e-4, abs=1e-4)
+        ahead, back = (evidence._likelihood(prior_at(at + s))[0] for s in (step, -step))
+        assert slope[i] == pytest.approx((ahead - back) / 2e-4, rel=1e-4, abs=1e-4)
+
+
+def test_evidence_has_the_information_of_fisher():
+    """Half the trace of S^-1 dS S^-1 dS, with S the covariance of what no flat unknown explains."""
+    evidence, J, *_ = evidence_of(None)
+    at = np.log([0.1, 2e-4, 0.2, 3e-4, 1e-4])
+    flat, rest = np.flatnonzero(evidence.flat), np.flatnonzero(~evidence.flat)
+    apart = null_space(J[:, flat].T).T
+
+    def covariance(x):
+        total = np.exp(2.0 * x[4]) * np.eye(len(apart))
+        for block, L in evidence._factors(prior_at(x))[0]:
+            own = apart @ J[:, rest[block]] @ L
+            total += own @ own.T
+        return total
+
+    inverse = np.linalg.inv(covariance(at))
+    steps = 1e-5 * np.eye(5)
+    by = [inverse @ (covariance(at + s) - covariance(at - s)) / 2e-5 for s in steps]
+    exact = [[0.5 * np.sum(one * other.T) for other in by] for one in by]
+    assert evidence._likelihood(prior_at(at))[2] == pytest.approx(np.array(exact), rel=1e-4)
