@@ -315,8 +315,8 @@ def reach_table() -> Table:
         f"Drift of {DRIFT_M * 1e3:g} mm; random postures with a condition below "
         f"{LARGEST_CONDITION:g} (Jacobian at the tool, m and rad). In full: no joint needs more "
         f"than {np.degrees(LARGEST_SHIFT):.0f} deg; the others are corrected in part. An iteration "
-        "is one Jacobian and its factorisation, and each goes on to the rounding floor; they are more "
-        "than three where a weak direction is damped, and often with a free axis. Left: by forward "
+        "is one Jacobian and its factorisation, and each goes on to the rounding floor: more than "
+        "three where a weak direction is damped, and often with a free axis. Left: by forward "
         "kinematics, with a free axis the angle of the axis.",
     )  # fmt: skip
     for name in ROBOTS:
