@@ -1,6 +1,7 @@
 """Starts all nodes of one robot's cell; needs ros2 launch.
 
-ros2 launch robocal_ros cell.launch.py params:=my_cell.yaml namespace:=robot_1 simulated:=true
+ros2 launch robocal_ros cell.launch.py params:=my_cell.yaml namespace:=robot_1
+ros2 launch robocal_ros cell.launch.py simulated:=true
 
 Each node has its file of config/; what ``params`` says comes after it (config/cell.yaml shows how).
 Trajectories of program, tool measurement and maintenance end at ``controller``. Nothing is
@@ -9,8 +10,9 @@ corrected and nothing moves until it is enabled, armed, or run.
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import IfElseSubstitution, LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
@@ -34,11 +36,38 @@ def in_share(*path):
     return PathJoinSubstitution([FindPackageShare(PACKAGE), *path])
 
 
+ARGUMENTS = {
+    "simulated": (
+        "false",
+        "cell_sim_node in place of robot, sensor and beams; never in the graph of a real robot",
+    ),
+    "params": (
+        IfElseSubstitution(
+            LaunchConfiguration("simulated"),
+            in_share("config", "cells", "kr150_shift.yaml"),
+            in_share("config", "cell.yaml"),
+        ),
+        "Parameter file of the cell, after each node's own; by default config/cell.yaml, "
+        "of a simulated cell config/cells/kr150_shift.yaml",
+    ),
+    "namespace": ("", "Of all nodes, and of all topics without a leading /"),
+    "controller": (CONTROLLER, "Topic where trajectories end: the controller's joint_trajectory"),
+    "action": ("", "The controller's FollowJointTrajectory; empty: of who subscribes controller"),
+    "state": (STATE, "Topic of the controller's state"),
+    "speed_scaling": ("speed_scaling", "Topic of the robot's speed in percent, std_msgs/Float64"),
+    "use_sim_time": ("false", "Take the time from /clock"),
+    "log_level": ("info", "Of all nodes: debug, info, warn, error or fatal"),
+    "use_respawn": ("false", "Start a node anew 2 s after it ended; it then moves nothing unasked"),
+}
+
+
 def cell_node(name, condition=None):
     """Describe a node with its own file, and where its topics lead."""
     simulated = name == "cell_sim_node"
     trajectories = "joint_trajectory" if simulated else "~/joint_trajectory"
     state = "~/controller_state" if simulated else "controller_state"
+    sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    movers = ("tcf_node", "maintenance_node", "joint_correction_node")
     return Node(
         package=PACKAGE,
         executable=name,
@@ -46,16 +75,21 @@ def cell_node(name, condition=None):
         namespace=LaunchConfiguration("namespace"),
         parameters=[
             in_share("config", f"{name}.yaml"),
-            LaunchConfiguration("params"),
-            *([MOTIONS] if name in ("tcf_node", "maintenance_node") else []),
+            ParameterFile(LaunchConfiguration("params"), allow_substs=True),
+            {"use_sim_time": sim_time},
+            *([MOTIONS] if name in movers else []),
         ],
         remappings=[
             (trajectories, LaunchConfiguration("controller")),
             (CONTROLLER, LaunchConfiguration("controller")),  # as recorder_node knows it
             (state, LaunchConfiguration("state")),
+            ("speed_scaling", LaunchConfiguration("speed_scaling")),
             ("kinematic_model", "thermal_node/model"),
             ("tool", "tcf_node/tool"),
         ],
+        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+        respawn=LaunchConfiguration("use_respawn"),
+        respawn_delay=2.0,
         output="screen",
         condition=condition,
     )
@@ -66,12 +100,10 @@ def generate_launch_description():
     simulated = IfCondition(LaunchConfiguration("simulated"))
     return LaunchDescription(
         [
-            DeclareLaunchArgument("params", default_value=in_share("config", "cell.yaml")),
-            DeclareLaunchArgument("namespace", default_value=""),
-            DeclareLaunchArgument("controller", default_value=CONTROLLER),
-            DeclareLaunchArgument("action", default_value=""),
-            DeclareLaunchArgument("state", default_value=STATE),
-            DeclareLaunchArgument("simulated", default_value="false"),
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=meaning)
+                for name, (default, meaning) in ARGUMENTS.items()
+            ),
             *(cell_node(name) for name in NODES),
             cell_node("cell_sim_node", simulated),
         ]

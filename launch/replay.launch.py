@@ -47,9 +47,17 @@ def generate_launch_description():
     )
     return LaunchDescription(
         [
-            DeclareLaunchArgument("bag"),
-            DeclareLaunchArgument("params", default_value=in_share("config", "cell.yaml")),
-            DeclareLaunchArgument("wait_for_subscribers", default_value="[joint_states]"),
+            DeclareLaunchArgument("bag", description="Folder or file of the recording"),
+            DeclareLaunchArgument(
+                "params",
+                default_value=in_share("config", "cell.yaml"),
+                description="Parameter file of the cell",
+            ),
+            DeclareLaunchArgument(
+                "wait_for_subscribers",
+                default_value="[joint_states]",
+                description="It begins when each of these topics has a subscriber",
+            ),
             estimator("thermal_node"),
             estimator("tcf_node"),
             player,

@@ -24,7 +24,8 @@ def generate_launch_description():
         params = f"{robot}_params"
         given = {"namespace": robot, "params": LaunchConfiguration(params)}
         actions += [
-            DeclareLaunchArgument(params),  # each robot has a serial of its own
+            # No default: each robot has a serial of its own.
+            DeclareLaunchArgument(params, description=f"Of the {robot} robot's cell"),
             IncludeLaunchDescription(
                 share("launch", "cell.launch.py"), launch_arguments=given.items()
             ),

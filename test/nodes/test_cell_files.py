@@ -21,7 +21,7 @@ from robocal_ros.thermal.node import ThermalNode, session_config
 from robocal_ros.tool.node import TcfNode
 
 ROOT = Path(__file__).parents[2]
-CELLS = sorted((ROOT / "config" / "cells").glob("*.yaml"))
+CELLS = sorted((ROOT / "config" / "cells").glob("*_shift.yaml"))  # beside their laser files
 SHARED = "/**"
 NODES = {
     f"/**/{n.NAME}": n

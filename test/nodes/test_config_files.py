@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 import yaml
 from lifecycle_msgs.srv import GetState
+from rclpy.context import Context
 from rclpy.qos import ReliabilityPolicy
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
@@ -65,6 +67,14 @@ def settings(node: Any) -> tuple[Setting, ...]:
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)
 def test_the_file_shows_every_parameter_with_its_default(node):
     assert shipped(node) == {s.name: s.default for s in settings(node) if not s.advanced}
+
+
+@pytest.mark.parametrize("file", [*CONFIG.glob("*.yaml"), *CONFIG.glob("cells/kr150_shift.yaml")])
+def test_ros_reads_the_file_as_we_do(file):
+    """Its parser has YAML 1.1: a bare ``y`` is true there, and text for PyYAML."""
+    context = Context()
+    rclpy.init(args=["--ros-args", "--params-file", str(file)], context=context)
+    context.try_shutdown()
 
 
 @pytest.mark.parametrize("node", PAGES, ids=lambda node: node.NAME)
