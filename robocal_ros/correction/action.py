@@ -26,7 +26,7 @@ from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.correction.interface import MOST_POINTS, Reason, RefusedError
-from robocal_ros.correction.robot_state import SentPath
+from robocal_ros.correction.sent_path import SentPath
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.samples import TAUGHT

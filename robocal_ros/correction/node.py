@@ -41,7 +41,8 @@ from robocal_ros.correction.messages import (
     tail_message,
 )
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
-from robocal_ros.correction.robot_state import SentPath
+from robocal_ros.correction.robot_state import DECELERATION
+from robocal_ros.correction.sent_path import SentPath
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
@@ -50,12 +51,13 @@ from robocal_ros.correction.settings import (
     reference_arm,
     session_config,
 )
-from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, RobotTrack, on_its_path
+from robocal_ros.correction.trajectories import AHEAD_S, on_its_path
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.driver import HardStopService, StatedController
-from robocal_ros.motion.plan import REACTION_S, JointPlan
+from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import SpeedScaling
+from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, run
 from robocal_ros.ros.endpoints import Health, trigger_text
@@ -114,18 +116,16 @@ class JointCorrectionNode(RobotNode):
         load_kernels(reference)  # the first command must not wait for it
         if self.settings["enable_on_start"] and not self.robot_fault:
             self._session.enable(True)
-        near = config.start_near(nominal)
-        self._track = RobotTrack(nominal, near, config.joint_state_age_s)
         self._arm_names = names = nominal.joint_names
-        self._controller, fastest = StatedController(), joint_limits(self.settings, self.robot)
-        self._stopping = RobotStop(
-            nominal,
-            fastest[1],
-            self._track,
-            self._send_plan,
-            fastest[0],
-            lambda now: self._controller.reference(names, now, self._scaling),
-        )
+        self._controller, robot = StatedController(), self._session.robot
+        robot.told = lambda now: self._controller.reference(names, now, self._scaling)
+        brakes, slides = joint_limits(self.settings, self.robot)[1], nominal.prismatic
+        assumed = np.where(slides, DECELERATION[True], DECELERATION[False])
+        known = np.isfinite(brakes) & (brakes > 0.0)
+        limits = MotionLimits(stop_deceleration=np.where(known, brakes, assumed))
+        # what comes 60 ms late must not turn back: not by a shorter one
+        self._stopping = WatchedStop(nominal, limits, again_s=SHORTEST_STOP_S)
+        self._stop_why = self._stop_fault = ""  # of the last stop
         self._hard_stop = HardStopService(self, self.settings["hard_stop_service"])
         self._stop_path: SentPath | None = None  # what was put out last when a stop was sent
         self._streams = CommandSources(max(config.stream_gap_s, ONE_SOURCE_S))
@@ -232,7 +232,7 @@ class JointCorrectionNode(RobotNode):
                 self.take_waiting()  # where the robot is
             if self._proxy is not None:
                 self._proxy.end(why)
-            if self._stopping.why:
+            if self._stopping.under_way:
                 self.get_logger().warning(f"{why} while the robot is still being stopped")
         finally:
             self._session.release(Reason.STOPPED)
@@ -345,7 +345,6 @@ class JointCorrectionNode(RobotNode):
         self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         taught = self._session.reading(command, now, age)
-        self._track.read(command, now)
         self._put_out(STATES, message, command, taught)
 
     def _on_path(self, message: PathMessage) -> None:
@@ -414,8 +413,8 @@ class JointCorrectionNode(RobotNode):
         if self._shadow:
             return
         self._rescale(now)
-        path, sent = self._session.output.path, True
-        if path is not None and path.live(now) and not self._track.follows(path, now):
+        path, robot, sent = self._session.output.path, self._session.robot, True
+        if path is not None and path.live(now) and not robot.follows(path, now):
             self._session.stream.end(RefusedError(Reason.STOPPED, why), now)
             sent = self._stop_by_readings(why, now)
         elif (planned := self._session.stop(now, AHEAD_S)) is not None:
@@ -424,33 +423,43 @@ class JointCorrectionNode(RobotNode):
             assert speeds is not None
             plan = on_its_path(path, planned, now)
             sent = self._send_stop(plan, planned.names, why, at_s=AHEAD_S)
-            self._stopping.watch(why, times, np.abs(speeds).max(axis=1), now)
+            self._stop_why, self._stop_fault, measured = why, "", robot.speed(now)
+            fastest = np.append(np.nan_to_num(measured), np.abs(speeds).max(axis=1))
+            lasts = max(SHORTEST_STOP_S / times[-1], 1.0) * times
+            self._stopping.watch(np.append(0.0, lasts), fastest, now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
             sent = self._stop_by_readings(why, now)
         self._arm_tail()
         if not sent and self._proxy is not None:
             self._proxy.cancel(why)
         self._stop_path = self._session.output.path
-        if self._stopping.why:
+        if self._stopping.under_way:
             self._stop_timer.reset()
 
     def _stop_by_readings(self, why: str, now_s: float) -> bool:
         """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
-        self._astray = self._session.output.path
-        self._stop_path = self._astray
-        sent = self._stopping.begin(why, now_s, self._scaling)
-        if sent:
-            self._stop_timer.reset()
-        return sent
+        self._stop_path = self._session.output.path
+        state = self._session.robot.to_stop(now_s)
+        if state is None:
+            self._stopping.forget()
+            self._stop_fault = (
+                f"{why}: no stop can be planned, the joint states are missing or too old"
+            )
+            return False
+        self._astray, self._stop_why, self._stop_fault = self._stop_path, why, ""
+        self._send_plan(self._stopping.begin(state, now_s))
+        self._stop_timer.reset()
+        return True
 
     def _send_plan(self, plan: JointPlan) -> None:
         trusted = self._stopping.sent <= TRUSTED
-        self._send_stop(plan, self._arm_names, self._stopping.why, trusted=trusted)
+        going_on = plan.going_on(REACTION_S)
+        self._send_stop(going_on, self._arm_names, self._stop_why, trusted=trusted)
 
     def _send_stop(self, plan: JointPlan, names: Sequence[str], why: str, **how: Any) -> bool:
         """Send it, worded by what the controller says, else what the joint states do."""
         now = time.monotonic()
-        self._controller.hear(self._track.velocity, len(self._arm_names), now)
+        self._controller.hear(self._session.robot.velocity, len(self._arm_names), now)
         message = self._controller.stop_message(
             plan, names, now, self._scaling, first_s=FIRST_S, **how
         )
@@ -462,8 +471,6 @@ class JointCorrectionNode(RobotNode):
     def _watch_stop(self) -> None:
         if not self._is_stopping():
             self._stop_timer.cancel()
-            if self._stopping.fault:
-                self._hard_stop(self._stopping.fault)
             if self._proxy is not None:
                 self._proxy.end("stopped")
 
@@ -472,9 +479,16 @@ class JointCorrectionNode(RobotNode):
         now = time.monotonic()
         if self._session.output.path is not self._stop_path:
             self._stopping.forget()
-        if self._stopping.look(now, self._scaling, self._controller.held_s):
+        if (plan := self._stopping.look(self._session.robot, now)) is not None:
+            self._send_plan(plan)
+        if self._stopping.under_way:
+            if self._stopping.failed and not self._stop_fault:
+                self._stop_fault = f"{self._stop_why}: {self._stopping.failed}"
+                self._hard_stop(self._stop_fault)
+                if self._proxy is not None:
+                    self._proxy.end(self._stop_fault)
             return True
-        if self._astray is not None and not self._stopping.fault:
+        if self._astray is not None:
             self._astray.end(now)
         self._astray = None
         return False
@@ -508,6 +522,7 @@ class JointCorrectionNode(RobotNode):
         self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
         self._rescale(now)
         self._controller.take(message, self._scaling, now)
+        self._session.robot.held_s = self._controller.held_s
         position = np.array(message.reference.positions, dtype=np.float64)
         stamp = stamp_ns(message.header.stamp)
         self._session.controller(
@@ -544,7 +559,9 @@ class JointCorrectionNode(RobotNode):
     def _judge_graph(self) -> None:
         """Hold the program's commands while somebody else may move the robot."""
         now, before, lost = time.monotonic(), self._violation, self._graph.lost
-        stood_s = self._track.stood_s(now) if self._scaling else 0.0  # one that pauses goes on
+        stood_s = (
+            self._session.robot.stood_s(now) if self._scaling else 0.0
+        )  # one that pauses goes on
         found = self._violation = self._graph.look(now, stood_s)
         if self._graph.lost and not lost:
             self.get_logger().error(self._graph.lost)
@@ -597,7 +614,7 @@ class JointCorrectionNode(RobotNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        faults = [*self._faults(), *filter(None, [self._stopping.fault, self._graph.lost])]
+        faults = [*self._faults(), *filter(None, [self._stop_fault, self._graph.lost])]
         return self._report.health(faults, self._rivals())
 
 

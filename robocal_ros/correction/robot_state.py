@@ -1,17 +1,16 @@
 """Where the robot was read, where its controller is, and what was put out last."""
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import (
     JointCommand,
     Reason,
     RefusedError,
-    TrajectoryCommand,
     require_finite,
 )
 from robocal_ros.correction.joint_correction import StagedCorrection, plain
@@ -26,13 +25,13 @@ from robocal_ros.correction.limiter import (
     TAUGHT,
     OffsetLimiter,
 )
+from robocal_ros.correction.sent_path import RESPONSE_S, SentPath
 from robocal_ros.correction.solution import ordinary
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.motion.robot_watch import STANDS_S
 
-# A robot follows what it was sent within this: drives lag, messages travel, s.
-RESPONSE_S = 0.2
-TRACK_S = 0.01  # between two places that are kept, s
+TRACK_S = 0.01  # between two places of the controller that are kept, s
 # A controller's reference that is older is none, s; of one that moves, which is carried on at its
 # speed: one and a half periods of joint_trajectory_controller's default, 50 Hz.
 REFERENCE_AGE_S, MOVING_AGE_S = 0.1, 0.03
@@ -43,6 +42,13 @@ MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
 AHEAD_S = 0.1
 MOST_LAYOUTS = 16  # of readings, by their joints' names, that are remembered
+# A velocity is of readings of the last so many seconds, of five at least: a wild one is outvoted.
+VELOCITY_S, LEAST = 0.05, 5
+LEAST_TRACK_S = 0.02  # readings that span less tell no speed
+FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
+LAG_S = 0.03  # by so much the robot, and what is known of it, may follow its controller late
+FOLLOWED = 25  # instants of a path that a place is compared with
+DECELERATION = {False: 10.0, True: 1.0}  # turning rad/s^2, sliding m/s^2, where none is known
 
 
 class RobotState:
@@ -50,11 +56,16 @@ class RobotState:
 
     ``age_limit_s``: readings that are older, by stamp or by arrival, tell nothing. ``near`` (n,): a
     robot that moved by less within `RESPONSE_S` stands, rad (prismatic: m).
-    ``measured`` (n,): last readings, NaN before the first. ``scaling``: how fast the controller's
-    clock runs, 0 to 1; 1 where nobody says.
+    ``fastest`` (n,): no joint is faster, rad/s (m/s).
+    ``measured``, ``velocity`` (n,): last readings, NaN before the first, and where there is none.
+    ``scaling``: how fast the controller's clock runs, 0 to 1; 1 where nobody says. ``held_s``: when
+    one that pauses was last seen to give up a motion. ``told``: joints and unscaled velocities (n,)
+    where it is by its own words as they came, whatever its clock says; None: not known.
     """
 
-    def __init__(self, arm: SerialArm, age_limit_s: float, near: Array) -> None:
+    def __init__(
+        self, arm: SerialArm, age_limit_s: float, near: Array, fastest: ArrayLike = np.inf
+    ) -> None:
         self.names, self.count = arm.joint_names, arm.n
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
@@ -68,12 +79,19 @@ class RobotState:
         self._doubtful = np.minimum(self._turns, self._tenfold)
         self._endless = np.full(arm.n, np.finfo(np.float64).max)
         self._continuous = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
-        self.measured = np.full(arm.n, np.nan)
-        self._read_s = np.full(arm.n, -np.inf)
-        self._track: deque[tuple[float, Array]] = deque()
+        changes = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
+        self._turned = 0.5 * VELOCITY_S * changes + near / LEAST_TRACK_S
+        self._fastest = np.broadcast_to(fastest, (arm.n,))
+        self.measured, self.velocity = np.full((2, arm.n), np.nan)
+        self._read_s = np.full(arm.n, -np.inf)  # by stamp too
+        self._heard_s = np.full(arm.n, -np.inf)
+        self._track: deque[tuple[float, Array]] = deque()  # of `RESPONSE_S`
+        self._whole_s = -np.inf  # since when it is without a gap
+        self._place, self._place_s = np.full(arm.n, np.nan), np.inf  # where it stands, since when
         self._reference, self._reference_s = np.full(arm.n, np.nan), np.full(arm.n, -np.inf)
         self._reference_rate = np.zeros(arm.n)
-        self.scaling = 1.0
+        self.scaling, self.held_s = 1.0, -np.inf
+        self.told: Callable[[float], tuple[Array, Array] | None] = lambda now_s: None
 
     def index(self, names: tuple[str, ...]) -> Index:
         """Numbers (k,) of the arm's joints; raises `RefusedError` for a name that is no such."""
@@ -154,14 +172,28 @@ class RobotState:
         self.require_positions(names, index, state.position[column][None])
         return index, column
 
-    def read(self, index: Index, position: Array, now_s: float, age_s: float) -> None:
+    def read(
+        self,
+        index: Index,
+        position: Array,
+        now_s: float,
+        age_s: float = 0.0,
+        velocity: Array | None = None,
+    ) -> None:
         """Take readings (k,) that were ``age_s`` old by their stamp when they came."""
-        self.measured[index] = position
+        blind = self.blind(now_s)
+        if blind:
+            self._whole_s = now_s
+        self.measured[index], self._heard_s[index] = position, now_s
+        self.velocity[index] = np.nan if velocity is None else velocity
         if age_s < -AHEAD_S:  # where the robot is cannot be told by a clock that is wrong
             age_s = np.inf
         self._read_s[index] = now_s - max(age_s, 0.0)
-        if _due(self._track, now_s):
-            self._track.append((now_s, self.measured.copy()))
+        while len(self._track) > 1 and self._track[1][0] <= now_s - RESPONSE_S:
+            self._track.popleft()
+        self._track.append((now_s, self.measured.copy()))
+        if blind or not (np.abs(self.measured - self._place) < self._near).all():
+            self._place, self._place_s = self.measured.copy(), now_s
 
     def controller(
         self,
@@ -235,168 +267,98 @@ class RobotState:
         fresh = np.all(now_s - self._read_s[index] <= self._age_limit_s)
         if not track or track[0][0] > now_s - RESPONSE_S + TRACK_S or not fresh:
             return False
-        here = self.measured[index]
-        moved = [self.unwrapped(index, q[index], here) - here for _, q in track]
+        here, places = self.measured[index], np.array([q for _, q in track])
+        moved = self.unwrapped(index, places[:, index], here) - here
         return bool(np.all(np.abs(moved) < self._near[index]))
 
     def unwrapped(self, index: Index, position: Array, q: Array) -> Array:
-        """Positions (k,), those of joints without limits at the turn nearest to ``q`` (k,)."""
+        """Positions (..., k), those of joints without limits at the turn nearest to ``q`` (k,)."""
         turns = np.where(self._continuous[index], np.round((q - position) / (2.0 * np.pi)), 0.0)
         return np.asarray(position + 2.0 * np.pi * turns)
 
+    # By when readings came, and gaps in them: what a stop is planned from and watched by, see
+    # `motion.stopping`.
 
-def _due(track: deque[tuple[float, Array]], now_s: float) -> bool:
-    """Let go of places of before the response time; whether another one is to be kept now."""
-    while len(track) > 1 and track[1][0] <= now_s - RESPONSE_S:
-        track.popleft()
-    return not track or now_s - track[-1][0] >= TRACK_S or now_s < track[-1][0]
+    def blind(self, now_s: float) -> bool:
+        """Whether a joint has not come for longer than the age limit."""
+        return not now_s - float(self._heard_s.min()) <= self._age_limit_s
+
+    def here(self, now_s: float) -> tuple[Array, Array] | None:
+        """Joints and speeds (n,) now; None where they were not all read lately.
+
+        Those read last, where the readings of before bear them out; else those of most readings
+        (Theil-Sen: the medians of the slopes of pairs, and of where each reading puts it): a stop
+        from a single wild reading would be a motion of its own.
+        """
+        if self.blind(now_s):
+            return None
+        read = self.measured.clip(-FARTHEST, FARTHEST)
+        # some drivers say 0 in motion
+        place, speed = read, self.velocity if self.velocity.any() else np.nan * self.velocity
+        track = [row for row in self._track if row[0] >= self._whole_s]
+        since_s = track[-1][0] - VELOCITY_S
+        recent = track[-max(sum(at_s >= since_s for at_s, _ in track), LEAST) :]
+        times, q = np.array([at_s for at_s, _ in recent]), np.array([place for _, place in recent])
+        q = q.clip(-FARTHEST, FARTHEST)
+        i, j = np.triu_indices(len(times), 1)
+        apart = times[j] - times[i] >= LEAST_TRACK_S
+        if apart.any():
+            i, j = i[apart], j[apart]
+            slope = np.median((q[j] - q[i]) / (times[j] - times[i])[:, None], axis=0)
+            middle = np.median(q + (times[-1] - times)[:, None] * slope, axis=0)
+            speed = np.where(np.abs(speed - slope) <= self._turned, speed, slope)
+            beside = self._turned * max(float(times[-1] - times[0]), LEAST_TRACK_S)
+            place = np.where(np.abs(read - middle) <= beside, read, middle)
+        here = place + speed * (now_s - float(np.min(self._heard_s)))
+        return (here, speed) if np.isfinite(here).all() else None
+
+    def to_stop(self, now_s: float) -> tuple[Array, Array] | None:
+        """Joints and speeds (n,) to stop from: the controller's, where the robot follows it.
+
+        None where nobody knows where the robot is. One that pauses is held.
+        """
+        here, told = self.here(now_s), self.told(now_s)
+        if here is None:
+            return None
+        if told is not None:  # but for its lag
+            reach = LAG_S * (np.abs(told[1]) + np.abs(here[1])) + self._near
+            here = told if np.all(np.abs(told[0] - here[0]) < reach) else here
+        q, qd = here
+        return q, np.clip(qd, -self._fastest, self._fastest) * (self.scaling > 0.0)
+
+    def speed(self, now_s: float) -> float:
+        """Of the fastest joint, as read; NaN where that is not known."""
+        here = self.here(now_s)
+        return float("nan") if here is None else float(np.max(np.abs(here[1])))
+
+    def seen_s(self, now_s: float) -> float:
+        """What the robot is sent shows so late."""
+        return LAG_S
+
+    def at_rest(self, now_s: float) -> bool:
+        """Whether all joints were read lately, and have not moved for `STANDS_S`."""
+        return self.stood_s(now_s) >= STANDS_S
+
+    def stood_s(self, now_s: float) -> float:
+        """How long the joints have stood in one place; 0 where they were not all read lately."""
+        return 0.0 if self.blind(now_s) else now_s - self._place_s
+
+    def follows(self, path: SentPath, now_s: float) -> bool:
+        """Whether the robot is where a path has it, or was lately; True where it is not known."""
+        if self.blind(now_s):
+            return True
+        heard_s = float(np.min(self._heard_s))
+        times = np.linspace(heard_s - RESPONSE_S, now_s + LAG_S, FOLLOWED)
+        places = np.array([path.place(t) for t in times])
+        near = self._near[path.index]
+        q = self.unwrapped(path.index, self.measured[path.index], places[-1])
+        return bool(np.all((q > places.min(axis=0) - near) & (q < places.max(axis=0) + near)))
 
 
 def _require_single(names: tuple[str, ...]) -> None:
     if len(set(names)) != len(names):
         doubled = next(name for name in names if names.count(name) > 1)
         raise RefusedError(Reason.DOUBLED_JOINT, doubled)
-
-
-# of what is known of a path: its offset, that one's rate and acceleration, what the limiter adds
-OFFSETS, RATES, BENDS, WITHHELD = range(4)
-
-
-@dataclass
-class SentPath:
-    """A trajectory that was put out, and the controller's clock on it."""
-
-    command: TrajectoryCommand  # as put out
-    index: Index  # (k,) its joints
-    begin_s: float  # from when its times count, on the session's clock
-    known_times: Array  # (r,) of the next rows: its points, before them where it leads in
-    known: Array  # (4, r, n)
-    stage: StagedCorrection | None  # that it was made with
-    led_from: Array  # (k,) where the controller leads in from
-    put_s: float  # since when
-    at_once: bool  # it begins as it goes out
-    replaced: "SentPath | None" = None  # by it, until the controller accepts it
-    rejected: bool = False
-    _scaling: float = 1.0
-    _lost_s: float = 0.0  # by a clock that runs slower
-    _since_s: float = -np.inf
-    _stopped_s: float = np.inf
-
-    def begin(self, now_s: float) -> None:
-        """It goes out now: one that begins at once begins now, not when it was corrected."""
-        if self.at_once:
-            self.begin_s = now_s
-
-    def end(self, now_s: float) -> None:
-        """It ended early: the controller stays where it is on it."""
-        self._stopped_s = min(self._stopped_s, now_s)
-
-    def scale(self, scaling: float, now_s: float) -> None:
-        """From now on the controller's clock runs so fast, 0 to 1."""
-        since = max(self._since_s, self.begin_s)
-        if now_s > since:
-            self._lost_s += (1.0 - self._scaling) * (now_s - since)
-        self._since_s, self._scaling = now_s, scaling
-
-    def time(self, now_s: float) -> float:
-        """Where the controller's clock is on it, s from its begin."""
-        now_s = min(now_s, self._stopped_s)
-        if now_s == np.inf:  # when it has been driven, at whatever speed
-            return np.inf
-        since = max(self._since_s, self.begin_s)
-        lost = self._lost_s + (1.0 - self._scaling) * max(now_s - since, 0.0)
-        return now_s - self.begin_s - lost
-
-    def live(self, now_s: float) -> bool:
-        """Whether the robot may still be moving by it."""
-        return self.time(now_s) <= self.lasts_s + RESPONSE_S and (
-            now_s <= self._stopped_s + RESPONSE_S
-        )
-
-    @property
-    def lasts_s(self) -> float:
-        """Time of its last point."""
-        return float(self.command.time_from_start_s[-1])
-
-    def place(self, now_s: float) -> Array:
-        """Where the controller is (k,), between the points as it drives there."""
-        t, times, out = self.time(now_s), self.command.time_from_start_s, self.command.position
-        if t < times[0]:
-            lead = times[0] + self.begin_s - self.put_s
-            part = np.clip((times[0] - t) / lead, 0.0, 1.0) if lead > 0.0 else 0.0
-            return np.asarray(out[0] + part * (self.led_from - out[0]))
-        return driven(times, out, self.command.velocity, self.command.acceleration, t)
-
-    def withheld(self, now_s: float) -> Array:
-        """What of the offset the limiter adds now (n,)."""
-        return self._at(WITHHELD, now_s)
-
-    def _at(self, row: int, now_s: float) -> Array:
-        t, times, rows = self.time(now_s), self.known_times, self.known[row]
-        k = int(np.searchsorted(times, t, side="right")) - 1
-        if not 0 <= k < len(times) - 1:
-            return rows[max(k, 0)].copy()
-        return np.asarray(
-            rows[k] + (t - times[k]) / (times[k + 1] - times[k]) * (rows[k + 1] - rows[k])
-        )
-
-    def offset(self, now_s: float) -> tuple[Array, Array]:
-        """Offset and its rate (n,) now, as the controller drives them between the points."""
-        t, times = self.time(now_s), self.known_times
-        k = int(np.searchsorted(times, t, side="right")) - 1
-        if self.command.velocity is None or not 0 <= k < len(times) - 1:
-            return self._at(OFFSETS, now_s), self._at(RATES, now_s)
-        offsets, rates, bends, _ = self.known[:, k : k + 2]
-        # it comes in by a cubic
-        comes_in = k < len(times) - len(self.command)
-        quintic = self.command.acceleration is not None and not comes_in
-        return spline(times, offsets, rates, bends if quintic else None, k, t)
-
-
-def driven(
-    times: Array, points: Array, rates: Array | None, bends: Array | None, t: float
-) -> Array:
-    """Where a controller is (k,) at ``t`` between points (m, k), from the first one on."""
-    k = int(np.searchsorted(times, t, side="right")) - 1
-    if k + 1 >= len(times):
-        return points[-1].copy()
-    ends = slice(k, k + 2)
-    rates, bends = (None if rows is None else rows[ends] for rows in (rates, bends))
-    return spline(times, points[ends], rates, bends, k, t)[0]
-
-
-def spline_terms(
-    way: Array, v0: Array, v1: Array, bends: Array | None
-) -> tuple[Array, Array, Array, Array]:
-    """Factors of u^2 to u^5 of a cubic, with ``bends`` (2, ...) a quintic, from u = 0 to 1."""
-    if bends is None:
-        return 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0 * way, 0.0 * way
-    b0, b1 = bends
-    return (
-        0.5 * b0,
-        10.0 * way - 6.0 * v0 - 4.0 * v1 - 1.5 * b0 + 0.5 * b1,
-        -15.0 * way + 8.0 * v0 + 7.0 * v1 + 1.5 * b0 - b1,
-        6.0 * way - 3.0 * (v0 + v1) - 0.5 * (b0 - b1),
-    )
-
-
-def spline(
-    times: Array, ends: Array, rates: Array | None, bends: Array | None, k: int, t: float
-) -> tuple[Array, Array]:
-    """Place and speed (n,) at ``t`` between the points k and k + 1, as a controller drives.
-
-    ``ends``, ``rates`` and ``bends`` (2, n) are those of the two: a line through the places, a
-    cubic with their speeds, a quintic with their accelerations too.
-    """
-    h = times[k + 1] - times[k]
-    u, way = (t - times[k]) / h, ends[1] - ends[0]
-    if rates is None:
-        return ends[0] + u * way, way / h
-    v0, v1 = rates * h
-    c2, c3, c4, c5 = spline_terms(way, v0, v1, None if bends is None else bends * (h * h))
-    place = ends[0] + u * (v0 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
-    speed = v0 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))
-    return place, speed / h
 
 
 class Output:
@@ -475,8 +437,11 @@ class Output:
 
     def note_place(self, now_s: float) -> None:
         """Keep where the controller is sent now, for robots that lag."""
-        if _due(self._track, now_s):
-            self._track.append((now_s, self._sent(now_s)))
+        track = self._track
+        while len(track) > 1 and track[1][0] <= now_s - RESPONSE_S:
+            track.popleft()
+        if not track or now_s - track[-1][0] >= TRACK_S or now_s < track[-1][0]:
+            track.append((now_s, self._sent(now_s)))
 
     def _sent(self, now_s: float) -> Array:
         """Where the controller was sent by now (n,); NaN where nothing was."""

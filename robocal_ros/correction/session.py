@@ -34,7 +34,8 @@ from robocal_ros.correction.limiter import (
     WORST,
     WORST_OUT,
 )
-from robocal_ros.correction.robot_state import WITHHELD, Output, RobotState, SentPath
+from robocal_ros.correction.robot_state import Output, RobotState
+from robocal_ros.correction.sent_path import WITHHELD, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array, Index
@@ -67,7 +68,8 @@ class CorrectionSession:
     one for a program made off line, the calibrated cold one for a taught program.
     ``serial``: the robot's.
 
-    The caller asks the ``stream`` of targets for what goes out without a message.
+    The caller asks the ``stream`` of targets for what goes out without a message, and the ``robot``
+    where it is.
     """
 
     def __init__(
@@ -86,13 +88,12 @@ class CorrectionSession:
         config = replace(config, velocity_limits=speed, acceleration_limits=acceleration)
         self._reference, self._config = reference, config
         self._gate = CorrectionGate(nominal, reference, serial, config)
-        self._state = RobotState(reference, config.joint_state_age_s, config.start_near(reference))
+        near = config.start_near(reference)
+        self.robot = RobotState(reference, config.joint_state_age_s, near, speed)
         self._desired = DesiredOffset(reference, config)
-        self.output = Output(reference, config, self._state)
-        self.stream = TargetStream(reference, config, self._state, self._desired, self.output)
-        self._paths = TrajectoryCorrector(
-            reference, config, self._state, self._desired, self.output
-        )
+        self.output = Output(reference, config, self.robot)
+        self.stream = TargetStream(reference, config, self.robot, self._desired, self.output)
+        self._paths = TrajectoryCorrector(reference, config, self.robot, self._desired, self.output)
         self._enabled, self._robot_fault = False, ""
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
@@ -134,9 +135,9 @@ class CorrectionSession:
 
         What moves the robot goes on, and the next command must begin on it.
         """
-        path, stands = self.output.path, self._state.stands(np.arange(self._reference.n), now_s)
+        path, stands = self.output.path, self.robot.stands(np.arange(self._reference.n), now_s)
         driven = path is not None and path.live(now_s)
-        if self.stream.runs(now_s) or (driven and not (stands and self._state.scaling == 1.0)):
+        if self.stream.runs(now_s) or (driven and not (stands and self.robot.scaling == 1.0)):
             self.output.mismatch = ""
         elif self.output.mismatch:
             self.output.acknowledge(now_s)
@@ -185,7 +186,7 @@ class CorrectionSession:
         path = self.output.path
         busy = self.stream.runs(now_s) or (path is not None and path.live(now_s))
         waits = self._gate.tools.waiting is not None
-        if waits and not busy and self._state.stands(everything, now_s):
+        if waits and not busy and self.robot.stands(everything, now_s):
             self._adopt_tool()
 
     def _adopt_tool(self) -> None:
@@ -208,11 +209,11 @@ class CorrectionSession:
         try:
             self._require_order("target", command, (), now_s)
             self._require_released()
-            index = self._state.index(command.names)
-            self._state.require_positions(command.names, index, command.position[None])
+            index = self.robot.index(command.names)
+            self.robot.require_positions(command.names, index, command.position[None])
             if command.velocity is not None:
-                self._state.require_velocities(command.names, index, command.velocity)
-            q = self._state.complete(index, command.position[None], self._taught, now_s)[0]
+                self.robot.require_velocities(command.names, index, command.velocity)
+            q = self.robot.complete(index, command.position[None], self._taught, now_s)[0]
             if self._config.shadow:
                 self._shadow(q[None])
                 corrected = command
@@ -244,9 +245,9 @@ class CorrectionSession:
             self._require_order("trajectory", replace(command, stamp_ns=0), (), now_s)
             self._require_released()
             require_times(command)
-            index = self._state.index(command.names)
-            self._state.require_positions(command.names, index, command.position)
-            q = self._state.complete(index, command.position, self._taught, now_s)
+            index = self.robot.index(command.names)
+            self.robot.require_positions(command.names, index, command.position)
+            q = self.robot.complete(index, command.position, self._taught, now_s)
             if waiting[0] is not None:
                 self._adopt_tool()
             if self._config.shadow:
@@ -262,7 +263,7 @@ class CorrectionSession:
                 self._want()
             raise self._count(error) from None
         path.replaced = self.output.path if may_be_rejected else None
-        path.scale(self._state.scaling, now_s)
+        path.scale(self.robot.scaling, now_s)
         self.output.path = path
         self._interrupted = path, self.stream.phase
         self.stream.phase = StreamPhase.IDLE
@@ -296,7 +297,7 @@ class CorrectionSession:
         if stopped is None:
             return None
         command, path = stopped
-        path.scale(self._state.scaling, now_s)
+        path.scale(self.robot.scaling, now_s)
         self.output.path = path
         return command
 
@@ -317,8 +318,12 @@ class CorrectionSession:
         """
         try:
             self._require_order("reading", state, state.names, now_s)
-            index, column = self._state.find(state)
-            self._state.read(index, state.position[column], now_s, age_s)
+            index, column = self.robot.find(state)
+            velocity = state.velocity
+            if velocity is not None:
+                whole = len(velocity) == len(state.names)
+                velocity = velocity[column] if whole else None
+            self.robot.read(index, state.position[column], now_s, age_s, velocity)
             self.output.note_place(now_s)
             q, position, velocity = self._uncorrected(state, index, column, now_s)
         except RefusedError as error:
@@ -335,14 +340,14 @@ class CorrectionSession:
         position is not finite, a joint is named twice, or numbers differ.
         """
         state = JointCommand(names, position, velocity)
-        index, column = self._state.find(state)
+        index, column = self.robot.find(state)
         return self._uncorrected(state, index, column, now_s)[1:]
 
     def _uncorrected(
         self, state: JointCommand, index: Index, column: Index, now_s: float
     ) -> tuple[Array, Array, Array | None]:
         """All taught joints (n,), and the state's positions and velocities, un-corrected."""
-        measured, velocity = self._state.measured.copy(), state.velocity
+        measured, velocity = self.robot.measured.copy(), state.velocity
         measured[index] = state.position[column]
         if velocity is not None and not (
             len(velocity) == len(state.names) and np.isfinite(velocity).all()
@@ -376,20 +381,20 @@ class CorrectionSession:
         arm = self._reference.joint_names
         known = [i for i, name in enumerate(names) if name in arm and i < len(position)]
         known = [i for i in known if np.isfinite(position[i])]
-        index = self._state.index(tuple(names[i] for i in known)) if known else np.zeros(0, int)
+        index = self.robot.index(tuple(names[i] for i in known)) if known else np.zeros(0, int)
         rate = None
         if velocity is not None and len(velocity) == len(position):
             rate = velocity[known] if np.isfinite(velocity[known]).all() else None
-        before = self._state.scaling
-        self._state.controller(index, position[known], rate, scaling, now_s - max(age_s, 0.0))
-        path = self.output.path if self._state.scaling != before else None
+        before = self.robot.scaling
+        self.robot.controller(index, position[known], rate, scaling, now_s - max(age_s, 0.0))
+        path = self.output.path if self.robot.scaling != before else None
         while path is not None:  # the one that it may go on with, too
-            path.scale(self._state.scaling, now_s)
+            path.scale(self.robot.scaling, now_s)
             path = path.replaced
 
     def offset(self, now_s: float) -> Offset:
         """What is added to the taught joints now, and what of it the limiter withholds."""
-        output, measured = self.output, self._state.measured
+        output, measured = self.output, self.robot.measured
         withheld = np.zeros(self._reference.n)
         if self._config.shadow:
             stage = self._desired.stage

@@ -12,13 +12,8 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.motion.cell import MotionCell, along, departure, joint_way, raised_way
 from robocal_ros.motion.plan import JointPlan, joined, start_near, stop_time
-from robocal_ros.motion.robot_watch import (
-    VELOCITY_S,
-    LeftPlanError,
-    MotionReport,
-    RobotWatch,
-    WatchedStop,
-)
+from robocal_ros.motion.robot_watch import VELOCITY_S, LeftPlanError, MotionReport, RobotWatch
+from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.tool.driving import least_s
 
 # Home and the measuring poses are a ring: home is 0, the poses are 1 to k in their order, and a

@@ -34,7 +34,8 @@ from robocal_ros.motion.plan import (
     ramp_of,
     start_near,
 )
-from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch, WatchedStop
+from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch
+from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
 from robocal_ros.tool.laser_frame import FEWEST_READINGS, JointPath
 from robocal_ros.tool.run import PlannedStep, ToolRun

@@ -31,7 +31,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
-from robocal_ros.correction.robot_state import SentPath
+from robocal_ros.correction.sent_path import SentPath
 
 WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
 

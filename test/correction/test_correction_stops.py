@@ -8,19 +8,13 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
-from robocal_ros.correction.robot_state import SentPath
-from robocal_ros.correction.trajectories import (
-    AHEAD_S,
-    GIVE_UP_S,
-    LAG_S,
-    PAUSED_S,
-    STANDING_S,
-    VELOCITY_S,
-    RobotStop,
-    RobotTrack,
-)
+from robocal_ros.correction.robot_state import LAG_S, VELOCITY_S, RobotState
+from robocal_ros.correction.sent_path import SentPath
+from robocal_ros.correction.trajectories import AHEAD_S
 from robocal_ros.kinematics.robots import load_description
-from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan
+from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits
+from robocal_ros.motion.robot_watch import STANDS_S
+from robocal_ros.motion.stopping import GIVE_UP_S, MOST_SENT, REPEAT_S, WatchedStop
 
 LIMIT = NOMINAL.upper[0] - 0.02  # of the program, which leaves room for the correction
 REACH = np.array([0.9, -0.3, 0.4, 0.6, -0.4, 0.8])
@@ -169,11 +163,6 @@ DELAY_S = 0.01  # of trajectories, and of readings
 SPEED = np.array([0.9, -0.4, 0.5, 1.0, -0.2, 0.3])
 
 
-def lasts_s(plan: JointPlan) -> float:
-    """How long a stop lasts from its arrival on."""
-    return plan.duration_s - REACTION_S
-
-
 class SimulatedController:
     """Drives on at constant speed; a trajectory is a cubic from where it is, after `DELAY_S`.
 
@@ -188,14 +177,27 @@ class SimulatedController:
     def __init__(self, losses: int = 0, reports: str = "measured", scaling: float = 1.0) -> None:
         self.now_s, self.losses, self.reports, self.scaling = 100.0, losses, reports, scaling
         self.q, self.qd = HOME.copy(), SPEED.copy()
-        self.track = RobotTrack(ARM, np.full(6, 3.5e-4), 0.2)
-        self.stop = RobotStop(ARM, ROBOT.max_acceleration, self.track, self._take)
+        self.state = RobotState(ARM, 0.2, np.full(6, 3.5e-4), ROBOT.max_velocity)
+        limits = MotionLimits(stop_deceleration=ROBOT.max_acceleration)
+        self.stop = WatchedStop(ARM, limits, again_s=SHORTEST_STOP_S)
         self.plans: list = []
         self.out: list = []
         self._coming: list = []
         self._spline, self._began_s, self._clock_s = None, 0.0, 0.0
 
-    def _take(self, plan) -> None:
+    def begins(self, at_s: float | None = None) -> JointPlan:
+        at_s = self.now_s if at_s is None else at_s
+        self._take(plan := self.stop.begin(self.state.to_stop(at_s), at_s))
+        return plan
+
+    def looks(self) -> bool:
+        """Look after the stop; whether it is under way."""
+        self.state.scaling = self.scaling
+        if (plan := self.stop.look(self.state, self.now_s)) is not None:
+            self._take(plan)
+        return self.stop.under_way
+
+    def _take(self, plan: JointPlan) -> None:
         self.plans.append(plan)
         if self.losses:
             self.losses -= 1
@@ -206,7 +208,7 @@ class SimulatedController:
         self.now_s += CYCLE_S
         while self._coming and self._coming[0][0] <= self.now_s:
             plan = self._coming.pop(0)[1]
-            ends = np.array([0.0, lasts_s(plan)])
+            ends = np.array([0.0, plan.duration_s])
             self._spline = CubicHermiteSpline(
                 ends, [self.q, plan.q[-1]], [self.scaling * self.qd, 0.0 * self.qd]
             )
@@ -225,7 +227,7 @@ class SimulatedController:
             "nan": np.full(6, np.nan),
             "zero": np.zeros(6),
         }[self.reports]
-        self.track.read(JointCommand(ARM.joint_names, self.q.copy(), told), self.now_s)
+        self.state.read(np.arange(6), self.q.copy(), self.now_s, velocity=told)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / CYCLE_S)):
@@ -233,10 +235,9 @@ class SimulatedController:
 
     def stops(self) -> float:
         """Time from the stop's begin until the robot stands."""
-        began_s = self.now_s
-        assert self.stop.begin("a test", self.now_s)
-        moved_s = began_s
-        while self.stop.look(self.now_s, self.scaling):
+        began_s = moved_s = self.now_s
+        self.begins()
+        while self.looks():
             before = self.q
             self.cycle()
             moved_s = self.now_s if np.any(np.abs(self.q - before) > 1e-9) else moved_s
@@ -249,13 +250,13 @@ def test_a_stop_goes_on_in_its_direction_and_ends_at_rest(reports):
     robot.run(0.3)
     begin = len(robot.out)
     took_s = robot.stops()
-    assert not robot.stop.fault
+    assert not robot.stop.failed
     assert robot.stop.sent == 1
-    assert took_s <= 1.05 * lasts_s(robot.plans[0]) + DELAY_S + CYCLE_S
+    assert took_s <= 1.05 * robot.plans[0].duration_s + DELAY_S + CYCLE_S
     ways = np.diff(robot.out[begin - 1 :], axis=0)
     assert np.all(ways * SPEED >= -1e-9)  # never back
     rates = ways / CYCLE_S
-    most = 2.0 * np.abs(SPEED) / lasts_s(robot.plans[0])  # a cubic's own is 1.5 at its steepest
+    most = 2.0 * np.abs(SPEED) / robot.plans[0].duration_s  # a cubic's own is 1.5 at its steepest
     assert np.all(np.abs(np.diff(rates, axis=0)) <= most * CYCLE_S)
 
 
@@ -265,8 +266,8 @@ def test_a_stop_that_is_lost_is_sent_again(losses):
     robot.run(0.3)
     took_s = robot.stops()
     assert robot.stop.sent == losses + 1
-    assert not robot.stop.fault
-    assert took_s <= 1.5 * lasts_s(robot.plans[0])
+    assert not robot.stop.failed
+    assert took_s <= 1.5 * robot.plans[0].duration_s
 
 
 @pytest.mark.parametrize("scaling", [0.1, 0.5])
@@ -275,25 +276,47 @@ def test_a_controller_that_runs_slowly_is_waited_for(scaling):
     robot.run(0.3)
     robot.stops()
     assert robot.stop.sent == 1
-    assert not robot.stop.fault
+    assert not robot.stop.failed
 
 
 def test_a_robot_that_does_not_stop_is_told():
     robot = SimulatedController(losses=10_000)
     robot.run(0.3)
-    robot.stops()
-    assert "the robot still moves" in robot.stop.fault
-    assert robot.stop.sent > 5
+    robot.begins()
+    while robot.looks() and not robot.stop.failed:
+        robot.cycle()
+    assert "the robot does not stop: it still moves" in robot.stop.failed
+    assert robot.stop.sent == MOST_SENT + 1
+    assert robot.looks()  # others stop it, and it is watched until it stands
+    robot.losses = 0
+    while robot.looks():
+        robot.cycle()
+    assert robot.state.at_rest(robot.now_s)
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_robot_that_is_not_seen_to_stand_is_told(silent):
+    """Also where its stop is asked for again and again."""
+    robot = SimulatedController(losses=10_000)
+    robot.run(0.3)
+    planned_s = robot.begins().duration_s
+    began_s = robot.now_s
+    while not robot.stop.failed:
+        if silent:
+            robot.now_s += CYCLE_S
+        else:
+            robot.cycle()
+            robot.begins()
+        assert robot.looks()
+    assert robot.now_s - began_s <= GIVE_UP_S + max(planned_s, SHORTEST_STOP_S) + 2.0 * CYCLE_S
 
 
 def test_without_readings_no_stop_is_planned():
     robot = SimulatedController()
-    assert not robot.stop.begin("a test", robot.now_s)
-    assert "joint states are missing or too old" in robot.stop.fault
+    assert robot.state.to_stop(robot.now_s) is None
     robot.run(0.3)
-    assert robot.stop.begin("a test", robot.now_s)
-    assert not robot.stop.fault
-    assert not robot.stop.begin("a test", robot.now_s + 0.3)
+    assert robot.state.to_stop(robot.now_s) is not None
+    assert robot.state.to_stop(robot.now_s + 0.3) is None
 
 
 def test_a_robot_that_stands_holds_where_it_is():
@@ -307,19 +330,19 @@ def test_a_robot_that_stands_holds_where_it_is():
 
 def test_how_long_a_robot_has_stood():
     robot = SimulatedController()
-    assert robot.track.stood_s(robot.now_s) == 0.0
+    assert robot.state.stood_s(robot.now_s) == 0.0
     robot.run(0.5)
-    assert robot.track.stood_s(robot.now_s) < 2.0 * CYCLE_S
+    assert robot.state.stood_s(robot.now_s) < 2.0 * CYCLE_S
     robot.qd = np.full(6, 1e-3)  # it creeps
     robot.run(2.0)
-    assert robot.track.stood_s(robot.now_s) < 0.4
+    assert robot.state.stood_s(robot.now_s) < 0.4
     robot.qd = np.zeros(6)
     robot.run(2.0)
-    assert robot.track.stood_s(robot.now_s) == pytest.approx(2.0, abs=0.4)
-    assert robot.track.stood_s(robot.now_s + 0.3) == 0.0  # not read now
+    assert robot.state.stood_s(robot.now_s) == pytest.approx(2.0, abs=0.4)
+    assert robot.state.stood_s(robot.now_s + 0.3) == 0.0  # not read now
     robot.now_s += 1.0
     robot.run(0.1)
-    assert robot.track.stood_s(robot.now_s) < 0.1  # what it did meanwhile is not known
+    assert robot.state.stood_s(robot.now_s) < 0.1  # what it did meanwhile is not known
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
@@ -333,15 +356,15 @@ def test_whether_a_robot_follows_its_path(late_s):
         known=np.zeros((4, 2, 6)), stage=None,
         led_from=HOME, put_s=began_s, at_once=True,
     )  # fmt: skip
-    assert robot.track.follows(path, robot.now_s)  # nothing tells otherwise
+    assert robot.state.follows(path, robot.now_s)  # nothing tells otherwise
     robot.qd = np.zeros(6)
     robot.run(late_s)
     robot.qd = SPEED.copy()
     robot.run(0.5)
-    assert robot.track.follows(path, robot.now_s)
+    assert robot.state.follows(path, robot.now_s)
     path.scale(0.0, robot.now_s)
     robot.run(1.0)
-    assert not robot.track.follows(path, robot.now_s)
+    assert not robot.state.follows(path, robot.now_s)
 
 
 # ---- pauses -------------------------------------------------------------------------------------
@@ -349,11 +372,11 @@ def test_whether_a_robot_follows_its_path(late_s):
 
 def pauses(robot: SimulatedController, seconds: float, held_s: float = -np.inf) -> bool:
     """Watch a stop while the controller's clock stands; whether it is still under way."""
-    robot.scaling = 0.0
+    robot.scaling, robot.state.held_s = 0.0, held_s
     for _ in range(round(seconds / CYCLE_S)):
         robot.cycle()
-        robot.stop.look(robot.now_s, 0.0, held_s)
-    return bool(robot.stop.why)
+        robot.looks()
+    return robot.stop.under_way
 
 
 @pytest.mark.parametrize("losses", [1, 2, 10_000])
@@ -364,17 +387,18 @@ def test_a_stop_that_is_lost_in_a_pause_is_sent_until_the_robot_stands_by_itself
     robot.scaling = 0.0
     robot.run(0.3)
     paused, robot.losses = robot.q, losses
-    assert robot.stop.begin("a test", robot.now_s, 0.0)
+    robot.state.scaling = 0.0
+    robot.begins()
     assert pauses(robot, 12.0)  # longer than what still moves is given
-    assert not robot.stop.fault
+    assert not robot.stop.failed
     assert 2.0 * GIVE_UP_S < 12.0
-    assert 12.0 / PAUSED_S - 2 <= robot.stop.sent <= 12.0 / PAUSED_S + 2
+    assert 12.0 / REPEAT_S - 2 <= robot.stop.sent <= 12.0 / REPEAT_S + 2
     robot.scaling, robot.losses = 1.0, 0
     went_on_s = robot.now_s
-    while robot.stop.look(robot.now_s):
+    while robot.looks():
         robot.cycle()
-    assert robot.now_s - went_on_s > STANDING_S
-    assert not robot.stop.fault
+    assert robot.now_s - went_on_s > STANDS_S
+    assert not robot.stop.failed
     # Held in the pause it stays. Where each message was lost its motion goes on, is seen to within
     # the time that readings take to tell a speed, and slows down as any stop that was lost once.
     far = np.abs(robot.q - paused)
@@ -389,7 +413,8 @@ def test_a_stop_that_a_controller_is_seen_to_take_in_a_pause_is_over():
     robot.scaling = 0.0
     robot.run(0.3)
     before_s = robot.now_s
-    assert robot.stop.begin("a test", robot.now_s, 0.0)
+    robot.state.scaling = 0.0
+    robot.begins()
     assert pauses(robot, 0.2, held_s=before_s - 0.1)  # that was an earlier motion
     assert not pauses(robot, 0.2, held_s=robot.now_s)
 
@@ -407,11 +432,10 @@ def test_a_velocity_that_the_positions_do_not_bear_out_is_not_stopped_from(joint
     robot.run(0.3)
     odd = robot.qd.copy()
     odd[joint] = told
-    robot.track.read(JointCommand(ARM.joint_names, robot.q, odd), robot.now_s)
-    assert robot.stop.begin("a test", robot.now_s)
-    plan = robot.plans[0]
+    robot.state.read(np.arange(6), robot.q, robot.now_s, velocity=odd)
+    plan = robot.begins()
     assert plan.qd[0] == pytest.approx(robot.qd, abs=1e-6)
-    assert plan.duration_s <= np.max(np.abs(SPEED) / ROBOT.max_acceleration) + REACTION_S
+    assert plan.duration_s <= np.max(np.abs(SPEED) / ROBOT.max_acceleration) + 1e-6
 
 
 @pytest.mark.parametrize("away", [-2.0, 0.3, 1e12])
@@ -419,8 +443,8 @@ def test_a_single_wild_position_is_not_stopped_from(away):
     robot = SimulatedController(reports="nan")
     robot.run(0.3)
     wild = robot.q + CYCLE_S * SPEED + away * np.eye(6)[3]
-    robot.track.read(JointCommand(ARM.joint_names, wild), robot.now_s + CYCLE_S)
-    assert robot.stop.begin("a test", robot.now_s + CYCLE_S)
+    robot.state.read(np.arange(6), wild, robot.now_s + CYCLE_S)
+    robot.begins(robot.now_s + CYCLE_S)
     assert robot.plans[0].q[0] == pytest.approx(robot.q + CYCLE_S * SPEED, abs=1e-3)
     assert robot.plans[0].qd[0] == pytest.approx(SPEED, abs=1e-2)
 
@@ -428,14 +452,10 @@ def test_a_single_wild_position_is_not_stopped_from(away):
 def test_a_stop_keeps_to_the_joints_speeds_and_limits():
     """Even where all readings say that the robot is faster, and as good as at its limits."""
     robot = SimulatedController()
-    robot.stop = RobotStop(
-        ARM, ROBOT.max_acceleration, robot.track, robot._take, ROBOT.max_velocity
-    )
     robot.qd = 5.0 * ROBOT.max_velocity
     robot.q = ARM.upper - 0.01 - 0.1 * robot.qd
     robot.run(0.1)
-    assert robot.stop.begin("a test", robot.now_s)
-    plan = robot.plans[0]
+    plan = robot.begins().going_on(REACTION_S)
     assert np.all(plan.qd <= ROBOT.max_velocity + 1e-12)
     between, _ = plan.at(np.linspace(0.0, plan.duration_s, 50))
     assert np.all(between <= ARM.upper + REACTION_S * ROBOT.max_velocity)
@@ -444,13 +464,11 @@ def test_a_stop_keeps_to_the_joints_speeds_and_limits():
 def test_a_stop_begins_where_the_controller_is_while_the_robot_follows_it():
     robot = SimulatedController()
     told = [HOME, SPEED]
-    robot.stop = RobotStop(
-        ARM, ROBOT.max_acceleration, robot.track, robot._take, reference=lambda now: tuple(told)
-    )
+    robot.state.told = lambda now: tuple(told)
     robot.run(0.3)
     told[0] = robot.q + 0.014 * SPEED  # by which drives lag
-    assert robot.stop.begin("a test", robot.now_s)
+    robot.begins()
     assert robot.plans[0].q[0] == pytest.approx(told[0], abs=1e-12)
     told[0] = robot.q + 0.3  # a robot that is held, or another one's controller
-    assert robot.stop.begin("a test", robot.now_s)
+    robot.begins()
     assert robot.plans[1].q[0] == pytest.approx(robot.q, abs=1e-6)

@@ -30,7 +30,7 @@ from test_correction_over_time import Watch
 
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
-from robocal_ros.correction.robot_state import spline
+from robocal_ros.correction.sent_path import spline
 
 SECOND = 1_000_000_000
 

@@ -15,14 +15,16 @@ from robocal_ros.cell_sim.trajectory_controller import (
     JointMotion,
     Trajectory,
 )
-from robocal_ros.correction.interface import JointCommand, TrajectoryCommand
+from robocal_ros.correction.interface import TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
-from robocal_ros.correction.trajectories import AHEAD_S, RobotStop, RobotTrack, on_its_path
+from robocal_ros.correction.robot_state import RobotState
+from robocal_ros.correction.trajectories import AHEAD_S, on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPIES, COPY_S, StatedController
 from robocal_ros.motion.plan import MotionLimits, stop
-from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch, WatchedStop
+from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch
+from robocal_ros.motion.stopping import WatchedStop
 
 SPEED = 1.0  # rad/s of the first joint
 BRAKES = load_description("kr150_r3100").max_acceleration[0]
@@ -50,7 +52,8 @@ class Driven:
         self.motion = JointMotion(Q[0], names=NAMES, options=options, lag_s=lag_s)
         self.motion.take(REACTION_S, Trajectory.of(NAMES, T[1:], Q[1:], QD[1:]))
         self.stated = StatedController()
-        self.track = RobotTrack(NOMINAL, np.full(6, 3.5e-4), 0.2)
+        self.state = RobotState(NOMINAL, 0.2, np.full(6, 3.5e-4))
+        self.state.told = lambda now: self.stated.reference(NAMES, now, 1.0)
         for at_s in np.arange(1.8, 2.0, STATES_S):
             self.pass_to(float(at_s), told)
         robot.now = self.begin_s + 2.0
@@ -61,7 +64,7 @@ class Driven:
         q, qd, _, _, desired, rate, _ = self.motion.last()[1]
         now_s, state = self.begin_s + at_s, np.floor(at_s / CYCLE_S + 1e-9) * CYCLE_S
         speeds = qd if self.velocities else np.full(6, np.nan)
-        self.track.read(JointCommand(NAMES, q, speeds), now_s)
+        self.state.read(np.arange(6), q, now_s, velocity=speeds)
         if told:
             stamp = SimpleNamespace(sec=int(state), nanosec=round(state % 1 * 1e9))
             self.stated.take(
@@ -110,12 +113,10 @@ def by_its_path(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
 
 def by_readings(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
     """Of a robot that is elsewhere than its path, or drives on."""
-    now_s, plans = driven.robot.now, []
-    reference = lambda now: driven.stated.reference(NAMES, now, 1.0)  # noqa: E731
-    acceleration = load_description("kr150_r3100").max_acceleration
-    stopping = RobotStop(NOMINAL, acceleration, driven.track, plans.append, reference=reference)
-    assert stopping.begin("a test", now_s)
-    message = driven.stated.stop_message(plans[0], NAMES, now_s, 1.0, first_s=FIRST_S)
+    now_s, brakes = driven.robot.now, load_description("kr150_r3100").max_acceleration
+    stopping = WatchedStop(NOMINAL, MotionLimits(stop_deceleration=brakes))
+    plan = stopping.begin(driven.state.to_stop(now_s), now_s).going_on(REACTION_S)
+    message = driven.stated.stop_message(plan, NAMES, now_s, 1.0, first_s=FIRST_S)
     return driven.obeys(message, late_s), bool(message.header.stamp.sec)
 
 

@@ -11,15 +11,8 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig
 from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, JointPlan, MotionLimits, stop
-from robocal_ros.motion.robot_watch import (
-    REPEAT_S,
-    REST_RAD,
-    SEEN_S,
-    STANDS_S,
-    MotionReport,
-    RobotWatch,
-    WatchedStop,
-)
+from robocal_ros.motion.robot_watch import REST_RAD, SEEN_S, STANDS_S, MotionReport, RobotWatch
+from robocal_ros.motion.stopping import REPEAT_S, WatchedStop
 from robocal_ros.session.events import TOOL_STEP
 from robocal_ros.tool.driving import DrivePhase
 

@@ -505,8 +505,8 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
     graph.spin_until(lambda: len(robot.goals) > 1 and robot.cancels, "stop and cancel")
     assert slows_down(robot.goals[1].trajectory.points)
     if deaf:
-        fault = "the robot still moves"
-        graph.spin_until(lambda: fault in node._stopping.fault, fault, 10.0)
+        fault = "the robot does not stop: it still moves"
+        graph.spin_until(lambda: fault in node._stop_fault, fault, 10.0)
         graph.spin_until(lambda: called, "the hard stop")
         assert path.live(time.monotonic())
     else:
