@@ -92,7 +92,7 @@ PYTHON_FILES := setup.py setup.cfg pyproject.toml package.xml
 $(STAMPS)/wheels: requirements/ros.txt requirements/core.txt requirements/dev.txt \
 		requirements/constraints.txt tools/mend_wheels.py
 	@echo "Installing ROS 2 Jazzy and the other wheels into $(VENV) (about a minute, once)"
-	tools/make_venv $(VENV) 3.11 $(LOCKED) \
+	tools/make_venv $(VENV) "3.11 3.12" $(LOCKED) \
 		-r requirements/ros.txt -r requirements/core.txt -r requirements/dev.txt
 	$(VENV)/bin/python tools/mend_wheels.py
 	mkdir -p $(STAMPS)
@@ -135,7 +135,7 @@ $(STAMPS)/robocal_ros: $(STAMPS)/interfaces $(PYTHON_FILES) $(shell find config 
 # ---- Other venvs -------------------------------------------------------------------------------
 $(VENV)-bench/.stamp: requirements/bench.txt requirements/core.txt requirements/constraints.txt
 	@echo "Installing the libraries to compare with into $(VENV)-bench (once)"
-	tools/make_venv $(VENV)-bench 3.11 $(LOCKED) -r requirements/core.txt -r requirements/bench.txt
+	tools/make_venv $(VENV)-bench "3.11 3.12" $(LOCKED) -r requirements/core.txt -r requirements/bench.txt
 	touch $@
 
 $(VENV)-floor/.stamp: requirements/floor.txt

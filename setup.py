@@ -13,11 +13,21 @@ ROOT = Path(__file__).resolve().parent  # colcon builds in a folder of links to 
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
-    """List what lies in config/ and launch/, by folder, with its place in the share folder."""
+    """List what the share folder has, by folder."""
     folders: dict[str, list[str]] = {}
     for path in sorted([*Path("config").rglob("*"), *Path("launch").glob("*.launch.py")]):
         if path.is_file():
             folders.setdefault(str(SHARE / path.parent), []).append(str(path))
+    folders[str(SHARE / "schemas")] = sorted(map(str, Path("docs/schemas").glob("*.json")))
+    return list(folders.items())
+
+
+def demo_files() -> list[tuple[str, list[str]]]:
+    """The demo, a recording to try things on, and of the benches what the demo needs."""
+    bench = [Path("bench", *name.split(".")).with_suffix(".py") for name in DEMO_NEEDS]
+    folders = {str(SHARE / "bags"): ["bags/demo_shift.mcap"]}
+    for path in (Path("bags/demo.py"), Path("bags/demo_output.py"), *bench):
+        folders.setdefault(str(SHARE / "demo" / path.parent), []).append(str(path))
     return list(folders.items())
 
 
@@ -35,11 +45,20 @@ NEEDED = [
 ]
 CLUSTER = ("dask", "distributed")  # for `robocal validate --scheduler`; versions are dates
 
+DEMO_NEEDS = (
+    "__init__", "cell_samples", "demo", "measured_runs", "processes", "startup", "tables",
+    "closed_loop.__init__", "closed_loop.carrying", "closed_loop.plant", "closed_loop.setting",
+    "closed_loop.suite", "closed_loop.words",
+    "live.__init__", "live.cell", "live.graph", "live.plc", "live.running",
+)  # fmt: skip
+
 # Of ament's layout. In a wheel the second would take the place of pip's own script.
 AMENT_FILES = [
     ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
     ("bin", ["resource/bin/robocal"]),
+    *demo_files(),
 ]
+WHEEL = {"bdist_wheel", "editable_wheel"} & {*sys.argv}
 
 setup(
     name=NAME,
@@ -51,7 +70,7 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "cell_sim/*.csv"]},
     data_files=[
-        *([] if "bdist_wheel" in sys.argv else AMENT_FILES),
+        *([] if WHEEL else AMENT_FILES),
         (str(SHARE), ["package.xml"]),
         *shared_files(),
     ],
@@ -74,6 +93,7 @@ setup(
             "maintenance_node = robocal_ros.maintenance.node:main",
             "replay_node = robocal_ros.bags.replay_node:main",
             "recorder_node = robocal_ros.bags.recorder_node:main",
+            *([] if WHEEL else ["demo = robocal_ros.cli.demo:main"]),
         ]
     },
 )

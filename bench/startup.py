@@ -18,7 +18,11 @@ from pathlib import Path
 from bench.tables import Goal, Table
 
 ROOT = Path(__file__).resolve().parents[1]
-EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
+# Of the workspace that is sourced; else of the one that make has built.
+MADE = ROOT / "install" / "robocal_ros"
+SOURCED = (Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(":"))
+PREFIX = next((p for p in SOURCED if (p / "lib" / "robocal_ros").is_dir()), MADE)
+EXECUTABLES = PREFIX / "lib" / "robocal_ros"
 SIX = "[0.0, -90.0, 90.0, 0.0, 90.0, 0.0]"
 ROBOT = ("-p", "robot:=ur10")
 NODES: dict[str, tuple[str, ...]] = {  # with the parameters that they do not start without

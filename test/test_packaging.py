@@ -41,6 +41,44 @@ def metadata(wheel: Path) -> Message:
         return Parser().parsestr(file.read(name).decode())
 
 
+@pytest.mark.ros
+def test_the_installed_demo_has_all_that_it_imports(tmp_path: Path) -> None:
+    """Copied as colcon does without --symlink-install; none of it may come from this checkout."""
+    made = tmp_path / "install"
+    copy = [sys.executable, "setup.py", "-q", "install_data", "--install-dir", str(made)]
+    source = tmp_path / "source"
+    for part in (*PARTS, "docs/schemas", "bags", "bench"):
+        shutil.copytree(ROOT / part, source / part, ignore=shutil.ignore_patterns("__pycache__"))
+    for file in FILES:
+        shutil.copy(ROOT / file, source / file)
+    subprocess.run(copy, cwd=source, check=True, capture_output=True)
+    shutil.rmtree(source)
+    (made / "lib" / "robocal_ros").mkdir(parents=True)
+    share = made / "share" / "robocal_ros"
+    asked = f"""
+import sys
+sys.path.insert(0, {str(share / "demo" / "bags")!r})
+import demo
+from bench.live.cell import PARAMETERS
+from bench.startup import EXECUTABLES
+found = [m.__file__ for name, m in sys.modules.items() if name.split(".")[0] == "bench"]
+print(all(file.startswith({str(share)!r}) for file in found), len(found), EXECUTABLES, PARAMETERS)
+"""
+    path = f"{made}{os.pathsep}{os.environ['AMENT_PREFIX_PATH']}"
+    given = os.environ | {"AMENT_PREFIX_PATH": path}
+    done = subprocess.run(
+        [sys.executable, "-c", asked],
+        cwd=tmp_path, env=given, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    ours, count, executables, parameters = done.stdout.split()
+    assert ours == "True"
+    assert int(count) > 10
+    assert executables == str(made / "lib" / "robocal_ros")
+    assert Path(parameters).name == "kr150_shift.yaml"
+    assert (share / "bags" / "demo_shift.mcap").is_file()
+    assert (share / "schemas" / "common.json").is_file()
+
+
 def pins(file: str) -> dict[str, str]:
     text = (ROOT / "requirements" / file).read_text()
     return dict(re.findall(r"^([\w.-]+)==([\w.]+)", text, re.MULTILINE))

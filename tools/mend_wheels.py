@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-BUILT_AT = "/opt/python/cp311-cp311"
+MAJOR, MINOR = sys.version_info[:2]
+BUILT_AT = f"/opt/python/cp{MAJOR}{MINOR}-cp{MAJOR}{MINOR}"
+PYTHON = f"python{MAJOR}.{MINOR}"
 HERE = {
-    f"{BUILT_AT}/include/python3.11": sysconfig.get_path("include"),
-    f"{BUILT_AT}/lib/python3.11/site-packages/numpy/_core/include": np.get_include(),
+    f"{BUILT_AT}/include/{PYTHON}": sysconfig.get_path("include"),
+    f"{BUILT_AT}/lib/{PYTHON}/site-packages/numpy/_core/include": np.get_include(),
 }
 
 

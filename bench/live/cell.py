@@ -20,15 +20,15 @@ from bench.closed_loop import setting
 from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
 from bench.live.graph import LiveError
-from bench.startup import ROOT
 from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.faults import Fault
+from robocal_ros.ground.files import share_folders
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot, save_robot
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 
 ROBOT, SERIAL = "kr150_r3100", setting.SERIAL
-PARAMETERS = ROOT / "config" / "cells" / "kr150_shift.yaml"
+PARAMETERS = share_folders("robocal_ros", "config/cells", "config/cells")[0] / "kr150_shift.yaml"
 SEED = 1
 WARM_H = 3.0  # so long ago the cell was commissioned and began to work
 PROGRAM, CONTROLLER = "/program/joint_trajectory", "/robot/joint_trajectory"

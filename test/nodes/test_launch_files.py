@@ -129,6 +129,7 @@ def test_the_page_of_a_cell_shows_every_argument():
         ("ur", {}, CELL),
         ("thermal", {}, {"thermal_node", "joint_correction_node"}),
         ("replay", {"bag": "x"}, {"thermal_node", "tcf_node", "replay_node"}),
+        ("demo", {}, {"demo"}),
     ],
 )
 def test_nodes_take_the_parameters_that_it_gives(file, given, nodes):
