@@ -78,6 +78,7 @@ setup(
     install_requires=["setuptools", *NEEDED],
     extras_require={
         "cluster": [f"{name}>={OLDEST[name]}" for name in CLUSTER],
+        "plc": [f"asyncua~={OLDEST['asyncua']}"],  # its inner parts are used
         "dev": [f"{name}=={version}" for name, version in DEV.items()],
     },
     zip_safe=False,
@@ -88,6 +89,7 @@ setup(
             "hand_eye_node = robocal_ros.hand_eye.node:main",
             "thermal_node = robocal_ros.thermal.node:main",
             "joint_correction_node = robocal_ros.correction.node:main",
+            "plc_bridge_node = robocal_ros.plc.node:main",
             "adapter_node = robocal_ros.adapter.node:main",
             "cell_sim_node = robocal_ros.cell_sim.node:main",
             "maintenance_node = robocal_ros.maintenance.node:main",

@@ -89,6 +89,8 @@ def endurance(amount: Amount) -> Table:
         lambda: not _pytest("test/nodes/soak_stalls.py"))  # fmt: skip
     add("real measurements through live nodes and their replay, bit for bit", 2,
         lambda: not _pytest("test/nodes/test_real_replay.py", ROBOCAL_SERIES="B D"))  # fmt: skip
+    add("hostile requests to the PLC's server", 1000,
+        lambda: not _pytest("test/plc/test_server.py", ROBOCAL_PLC_REQUESTS="1000"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test", "--ignore=test/nodes")

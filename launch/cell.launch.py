@@ -41,6 +41,7 @@ ARGUMENTS = {
         "false",
         "cell_sim_node in place of robot, sensor and beams; never in the graph of a real robot",
     ),
+    "plc": ("false", "plc_bridge_node too, the PLC's OPC UA server; params has its security_dir"),
     "params": (
         IfElseSubstitution(
             LaunchConfiguration("simulated"),
@@ -98,6 +99,7 @@ def cell_node(name, condition=None):
 def generate_launch_description():
     """Describe the nodes."""
     simulated = IfCondition(LaunchConfiguration("simulated"))
+    plc = IfCondition(LaunchConfiguration("plc"))
     return LaunchDescription(
         [
             *(
@@ -105,6 +107,7 @@ def generate_launch_description():
                 for name, (default, meaning) in ARGUMENTS.items()
             ),
             *(cell_node(name) for name in NODES),
+            cell_node("plc_bridge_node", plc),
             cell_node("cell_sim_node", simulated),
         ]
     )

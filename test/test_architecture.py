@@ -31,6 +31,7 @@ MAY_IMPORT = {
     "motion": GROUND | {"ros"},
     "bags": GROUND | {"ros", "motion"},
     "adapter": {"ground", "ros"},
+    "plc": {"ground", "ros", "adapter"},
     **dict.fromkeys(CAPABILITIES, BELOW),
     "maintenance": BELOW | CAPABILITIES,
     "report": ABOVE,

@@ -522,6 +522,19 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "cli.urdf:export_urdf",
         "put a robot file's kinematics, as identified, into a URDF or such a kinematics.yaml",
     ),
+    "plc": CliGroup(
+        "who may talk to plc_bridge_node",
+        {
+            "certificates": CliCommand(
+                "plc.cli:certificates",
+                "make the folder that plc_bridge_node reads, with its certificate, or one for a "
+                "client",
+            ),
+            "user": CliCommand(
+                "plc.cli:user", "add a user, give another password or role, or take a user out"
+            ),
+        },
+    ),
     "warm": CliCommand(
         "cli.warm:warm", "compile the kernels, which the first start of a node would wait for"
     ),

@@ -8,7 +8,7 @@ A node names its parameters in ``SETTINGS`` and fills in four hooks:
   and when the process ends.
 
 Attributes of a subclass must not be named ``_parameters``, ``_clock``, ``_logger``, ``_timers``,
-``_services``, ``_callbacks`` or ``_context``: those are rclpy's own.
+``_services``, ``_clients``, ``_callbacks`` or ``_context``: those are rclpy's own.
 """
 
 import gc

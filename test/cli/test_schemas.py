@@ -11,6 +11,7 @@ from drift_tables import fixed_tables
 from hand_eye_bag import hand_eye_bag
 from hand_eye_tables import TRUE, hand_eye_tables
 from joint_errors import with_joint_errors
+from plc_client import security_folder
 from recordings import plain_bag, recorded_bag, shift
 from robot_programs import KUKA_FRAMES, krl, postures
 from tool_runs import run_tables
@@ -310,6 +311,24 @@ CASES = {
         ["export-urdf", "--robot", "ur10", "--into", "arm.urdf", "--output", "no.urdf"],
         (2, "BAD_INPUT"),
     ),
+    "plc": (
+        "plc.json",
+        ["plc", "certificates", "plc.yaml", "--host", "127.0.0.1"],
+        ["plc", "certificates", "plc.yaml", "--days", "0"],
+        (2, "BAD_INPUT"),
+    ),
+    "plc client": (
+        "plc.json",
+        ["plc", "certificates", "made.yaml", "--client", "robot"],
+        ["plc", "certificates", "made.yaml", "--client", "../evil"],
+        (2, "BAD_INPUT"),
+    ),
+    "plc user": (
+        "plc.json",
+        ["plc", "user", "made.yaml", "ada", "--remove"],
+        ["plc", "user", "made.yaml", "eve", "--remove"],
+        (2, "BAD_INPUT"),
+    ),
     "warm": ("warm.json", ["warm"], ["warm", "ur10"], (2, "BAD_INPUT")),
 }
 
@@ -337,6 +356,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shots = (folder / "sphere" / "poses.csv").read_text().splitlines()
     (folder / "sphere" / "few.csv").write_text("\n".join(shots[:4]) + "\n")
     (folder / "mount.yaml").write_text(json.dumps({"T_flange_sensor": transform_document(TRUE)}))
+    security_folder(folder / "made.yaml")
     camera_tables(folder)
     tracker_files(folder, prp_cell(load_description("p1r2p3").arm))
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]

@@ -24,6 +24,7 @@ from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.driver import MOTION
+from robocal_ros.plc.node import PlcBridgeNode
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.parameters import SHARED, Setting
 from robocal_ros.thermal.drift_following import ThermalConfig
@@ -43,6 +44,7 @@ NODES = (
     MaintenanceNode,
     JointCorrectionNode,
     AdapterNode,
+    PlcBridgeNode,
 )
 PAGES = {
     ThermalNode: "thermal_node",

@@ -18,7 +18,7 @@ from unittest.mock import patch
 READ = ["robocal_ros.cli.main", "rich.table", "scipy.optimize", "scipy.spatial.transform"]
 READ += ["warm_command"]
 NODES = ["thermal.node", "tool.node", "hand_eye.node", "correction.node", "maintenance.node"]
-NODES += ["cell_sim.node", "bags.replay_node", "bags.recorder_node", "adapter.node"]
+NODES += ["cell_sim.node", "bags.replay_node", "bags.recorder_node", "adapter.node", "plc.node"]
 PR_SET_PDEATHSIG = 1
 
 

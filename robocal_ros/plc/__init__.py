@@ -1,0 +1,1 @@
+"""The cell as a PLC sees it by OPC UA."""

@@ -1,0 +1,319 @@
+"""The bridge to a PLC: an OPC UA server with the cell's state, its calls, the gap and the beams.
+
+docs/plc.md.
+"""
+
+import contextlib
+import queue
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus, ToolFrame
+from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
+from std_srvs.srv import Trigger
+
+from robocal_ros.adapter.inputs import InputTiming
+from robocal_ros.ground.errors import Code, InputError
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.base import HouseNode, run
+from robocal_ros.ros.conversions import header
+from robocal_ros.ros.endpoints import ERROR, WARN, Health
+from robocal_ros.ros.parameters import Setting, number
+
+GAP_OPEN, EVENTS = "gap_open", "beam_events"
+SHOW_ANSWERS_S = 1.0  # how often calls that nobody waits for any more are let go
+LATE_S = 0.5  # an older heartbeat opens no gap: maintenance_node's own limit
+EXPIRES_DAYS = 30  # warned of so long before
+SERVICES: Mapping[str, Any] = {
+    "run": RunMaintenanceCycle,
+    "status": GetMaintenance,
+    "cancel_trigger": Trigger,
+    "accept": Decide,
+    "reject": Decide,
+    "rollback": Decide,
+    "acknowledge": Acknowledge,
+}
+MESSAGES: Mapping[str, Any] = {
+    "accuracy_state": AccuracyState,
+    "maintenance_node/status": MaintenanceStatus,
+    "tcf_node/tool_frame": ToolFrame,
+}
+
+
+def constants(message: type) -> dict[str, int]:
+    """Constants of a message, by name."""
+    names = [name for name in dir(type(message)) if name[0].isalpha() and name.isupper()]
+    return {name: int(getattr(message, name)) for name in names}
+
+
+def enumerations() -> dict[str, dict[str, int]]:
+    """The enumeration types of the cell, of the messages' own tables."""
+    return {
+        "Code": {code.name: int(code) for code in Code},
+        "AccuracyLevel": constants(AccuracyState),
+        "MaintenanceState": constants(MaintenanceStatus),
+        "ToolState": constants(ToolFrame),
+        "ToolAnswer": constants(MeasureTool.Result),
+    }
+
+
+def _beam_names(names: list[str]) -> str | None:
+    wrong = [name for name in names if name and not name.replace("_", "").isalnum()]
+    if wrong or len(set(names)) < len(names):
+        return "each a name of its own, of letters, digits and _"
+    return None
+
+
+SETTINGS = (
+    Setting(
+        "security_dir",
+        "",
+        "Folder of certificates and users, as `robocal plc certificates` makes it",
+    ),
+    Setting("host", "0.0.0.0", "Address of this machine to listen at; 0.0.0.0: all of them"),
+    number("port", 4840, "TCP port; OPC UA's own is 4840", 1, 65535),
+    Setting(
+        "beams", [""], "Beams whose levels the PLC writes; none: it writes none", check=_beam_names
+    ),
+    Setting("station", "station", "Name of the station, frame_id of beam_events"),
+    number(
+        "beam_latency_ms",
+        0.0,
+        "From an edge to the time that the PLC gives it; it is subtracted",
+        0.0,
+        1000.0,
+    ),
+    number(
+        "beam_jitter_ms",
+        1.0,
+        "Standard deviation of that; of an input that is looked at each T: T / sqrt(12)",
+        1e-3,
+        1000.0,
+    ),
+)
+
+
+class PlcBridgeNode(HouseNode):
+    """Serves the cell by OPC UA; acts for maintenance_node's PLC while it is active."""
+
+    NAME = "plc_bridge_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        self._server: Any = None
+        self._handed: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._wake: Any = None
+        self._pending: dict[Any, tuple[float, Any]] = {}
+        self._heartbeat_s = float("-inf")
+        self._notice: tuple[float, str] | None = None
+        super().__init__(**options)
+
+    def configure(self) -> None:
+        """Read certificate and users, start the server; it shows the state from here on.
+
+        Raises `InputError` where the folder is not complete.
+        """
+        try:
+            from robocal_ros.plc.access import document, read_certificate
+            from robocal_ros.plc.server import ServerSettings, ServerThread
+        except ImportError as error:
+            raise InputError(
+                f"{error}: pip install 'robocal_ros[plc]', which brings asyncua"
+            ) from error
+        settings = self.settings
+        if not settings["security_dir"]:
+            raise InputError(
+                "security_dir is empty: make a folder by `robocal plc certificates DIR`, users by "
+                "`robocal plc user DIR NAME`, and name it"
+            )
+        folder = Path(settings["security_dir"]).expanduser()
+        found = document(folder)
+        self._expires = read_certificate(folder / "server.der").not_valid_after_utc
+        if not found["users"]:
+            self.get_logger().warning(f"{folder}: nobody can log in: robocal plc user DIR NAME")
+        self._gap = self.add_output(GapOpen, GAP_OPEN, endpoints.HEARTBEAT)
+        beams = tuple(settings["beams"])
+        self._edges = self.add_output(BeamEvent, EVENTS, endpoints.RELIABLE) if beams else None
+        self._calls = {
+            name: self.add_client(kind, f"maintenance_node/{name}")
+            for name, kind in SERVICES.items()
+        }
+        self._wake = self.create_guard_condition(self._take)
+        self._release.append(lambda: self.destroy_guard_condition(self._wake))
+        timing = InputTiming(settings["beam_latency_ms"] * 1e-3, settings["beam_jitter_ms"] * 1e-3)
+        self._server = ServerThread(
+            ServerSettings(
+                settings["host"], settings["port"], folder, beams, timing, enumerations()
+            ),
+            self._hand,
+        )
+        for topic, kind in MESSAGES.items():
+            self._watch(kind, topic)
+        self.add_timer(SHOW_ANSWERS_S, self._let_go, steady=True)
+
+    def _watch(self, kind: type, topic: str) -> None:
+        """Show a topic; not by `add_input`: it is shown while nothing acts."""
+        subscription = self.create_subscription(
+            kind, topic, partial(self._show, topic), endpoints.own(endpoints.LATCHED)
+        )
+        self._release.append(lambda: self.destroy_subscription(subscription))
+
+    def activate(self) -> None:
+        """Let the gap and the methods act."""
+        self._server.set_active(True)
+
+    def deactivate(self) -> None:
+        """Close the gap, refuse methods; the state is shown on."""
+        self._server.set_active(False)
+        self._gap.publish(GapOpen(open=False))
+
+    def cleanup(self) -> None:
+        """End the server."""
+        server, self._server = self._server, None
+        if server is not None:
+            server.stop()
+        self._pending.clear()
+
+    # ---- from the cell to the PLC ---------------------------------------------------------------
+
+    def _show(self, topic: str, message: Any) -> None:
+        from robocal_ros.plc.model import values_of
+
+        if self._server is None:
+            return
+        try:
+            stamp = message.header.stamp
+            at = datetime.fromtimestamp(stamp.sec + 1e-9 * stamp.nanosec, UTC)
+            values, now_s = values_of(topic, message), time.monotonic()
+            self._server.post(lambda model: model.show(topic, values, at, now_s))
+        except Exception as error:  # whatever a stranger publishes, the node lives on
+            self._log(topic, error)
+
+    # ---- from the PLC to the cell ---------------------------------------------------------------
+
+    def _hand(self, handed: Any) -> None:
+        """Take what the server's thread hands over; carried out in the executor's."""
+        self._handed.put(handed)
+        with contextlib.suppress(Exception):  # the node is being destroyed
+            self._wake.trigger()
+
+    def _take(self) -> None:
+        from robocal_ros.plc.inputs import Heartbeat
+        from robocal_ros.plc.server import EdgeWritten, MethodCalled, Notice
+
+        while True:
+            try:
+                handed = self._handed.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                match handed:
+                    case Heartbeat():
+                        self._pass_heartbeat(handed)
+                    case EdgeWritten(beam=beam, edge=edge):
+                        self._pass_edge(beam, edge)
+                    case MethodCalled():
+                        self._call(handed)
+                    case Notice(words=words):
+                        self._tell(words)
+            except Exception as error:
+                self._log("a PLC's request", error)
+
+    def _pass_heartbeat(self, heartbeat: Any) -> None:
+        late_s = time.monotonic() - heartbeat.at_s
+        if not self.is_active or (heartbeat.echo and late_s > LATE_S):
+            return
+        self._heartbeat_s = heartbeat.at_s
+        message = GapOpen(open=heartbeat.echo > 0, echo=heartbeat.echo)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._gap.publish(message)
+
+    def _pass_edge(self, beam: str, edge: Any) -> None:
+        if self._edges is not None and self.is_active:
+            self._edges.publish(
+                BeamEvent(
+                    header=header(edge.stamp_ns, self.settings["station"]),
+                    beam=beam,
+                    edge=BeamEvent.BREAK if edge.blocked else BeamEvent.RESTORE,
+                    stamp_sigma_s=edge.sigma_s,
+                )
+            )
+
+    def _call(self, called: Any) -> None:
+        client = self._calls[called.method.service]
+        if not self.is_active:
+            called.answer("BadInvalidState")
+        elif not client.service_is_ready():
+            called.answer("BadNoCommunication")
+        else:
+            request = SERVICES[called.method.service].Request(**called.fields)
+            if hasattr(request, "by"):
+                request.by = called.user
+            future = client.call_async(request)
+            self._pending[future] = time.monotonic(), client
+            future.add_done_callback(partial(self._answered, called))
+
+    def _answered(self, called: Any, future: Any) -> None:
+        self._pending.pop(future, None)
+        try:
+            response = future.result()
+            outputs = [item.variant(item.value(response)) for item in called.method.outputs]
+        except Exception as error:
+            self._log(called.method.name, error)
+            called.answer("BadUnexpectedError")
+            return
+        called.answer(outputs)
+        words = f"{called.user} called {called.method.name}: {response.message}"
+        self.get_logger().info(words)
+
+    def _let_go(self) -> None:
+        """Forget calls that were not answered: the PLC was told so."""
+        now_s = time.monotonic()
+        for future, (began_s, client) in list(self._pending.items()):
+            if now_s - began_s > SHOW_ANSWERS_S:
+                del self._pending[future]
+                client.remove_pending_request(future)
+
+    def _tell(self, words: str) -> None:
+        self._notice = time.monotonic(), words
+        if self._log_limit.allows("a PLC", words, time.monotonic()):
+            self.get_logger().warning(words)
+
+    def identity(self) -> list[str]:
+        """Where it is served."""
+        at = f"opc.tcp://{self.settings['host']}:{self.settings['port']}/robocal"
+        return [f"OPC UA at {at}", *super().identity()]
+
+    def health(self) -> Health:
+        """Tell who is there, and what was refused."""
+        health, now_s = Health(), time.monotonic()
+        state = self._server.state
+        beat_s = now_s - self._heartbeat_s
+        health.values = {
+            "sessions": ", ".join(state.sessions) or "none",
+            "heartbeat": f"{beat_s:.1f} s ago" if beat_s < 3600.0 else "none",
+            "certificate valid until": f"{self._expires:%Y-%m-%d}",
+        }
+        if self._notice is not None:
+            at_s, words = self._notice
+            health.values["last notice"] = f"{now_s - at_s:.0f} s ago: {words}"
+        if state.trouble:
+            health.worsen(ERROR if state.trouble != "starts" else WARN, state.trouble)
+        days = (self._expires - datetime.now(UTC)).days
+        if days < EXPIRES_DAYS:
+            words = "has expired" if days < 0 else f"expires in {days} days"
+            health.worsen(WARN, f"the server's certificate {words}: make another one")
+        for info in self.get_publishers_info_by_topic(GAP_OPEN):
+            if info.node_name != self.get_name():
+                health.worsen(ERROR, f"{info.node_name} publishes {GAP_OPEN} too: one PLC alone")
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(PlcBridgeNode)

@@ -1,0 +1,616 @@
+"""The OPC UA server: who gets in, what may be asked, and the thread that it runs in.
+
+asyncua (2.1) leaves some doors open, which are closed here; docs/plc.md names each with its place
+in asyncua's source. Its loop has a thread of its own; what a PLC wants goes to the node as
+`Handover` takes it, and comes back by `ServerThread.post`.
+"""
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from asyncua import Server, ua
+from asyncua.common.connection import TransportLimits
+from asyncua.common.utils import ServiceError
+from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.crypto.uacrypto import x509_from_der
+from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
+from asyncua.server.internal_server import InternalServer
+from asyncua.server.internal_session import InternalSession
+from cryptography.hazmat.primitives import serialization
+
+from robocal_ros.adapter.inputs import InputTiming, LevelChange
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
+from robocal_ros.plc.access import (
+    KEY,
+    SERVER,
+    Role,
+    Trust,
+    Users,
+    application_uri,
+    read_certificate,
+)
+from robocal_ros.plc.inputs import GOOD, BeamInput, Heartbeat, HeartbeatInput
+from robocal_ros.plc.model import (
+    ACTIVE,
+    BEAMS,
+    BLOCKED,
+    HEARTBEAT,
+    METHODS_NODE,
+    TIME,
+    InformationModel,
+    Method,
+    arguments_of,
+)
+
+ANSWER_S = 0.45  # maintenance_node answers within, or the call may come again
+AGAIN_S = 2.0  # between two trials to listen, or to start anew after a defect
+LOOK_S = 0.5
+STOP_S = 3.0
+CHUNK_BYTES = 65535
+MESSAGE_BYTES = 2 * CHUNK_BYTES
+MOST_CONNECTIONS = 30
+MOST_ITEMS, MOST_BROWSED, MOST_CALLS = 500, 100, 10  # of one request
+LOCKED_AFTER, LOCKED_S = 5, 10.0  # wrong passwords of a name, and how long nobody has it then
+NS = 1_000_000_000
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class EdgeWritten:
+    """An edge of a beam."""
+
+    beam: str
+    edge: LevelChange
+
+
+@dataclass(frozen=True)
+class MethodCalled:
+    """A call that waits; ``answer``: with the outputs, or the name of a status; thread-safe."""
+
+    method: Method
+    user: str
+    fields: Mapping[str, Any]
+    answer: "Callable[[list[ua.Variant] | str], None]"
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something a person should read, such as who was turned away."""
+
+    words: str
+
+
+Handed = Heartbeat | EdgeWritten | MethodCalled | Notice
+
+
+class Handover(Protocol):
+    """Takes what comes from the server's thread; returns at once, raises nothing."""
+
+    def __call__(self, handed: Handed) -> None:
+        """Take it."""
+
+
+@dataclass(frozen=True)
+class ServerSettings:
+    """Where it listens and what it works with."""
+
+    host: str
+    port: int
+    folder: Path
+    beams: tuple[str, ...]
+    timing: InputTiming
+    enumerations: Mapping[str, Mapping[str, int]]
+
+
+@dataclass
+class PlcUser(User):
+    """Who has logged in."""
+
+    role: UserRole = UserRole.User  # of asyncua: may not change nodes
+    rights: Role = Role.OPERATOR
+
+
+class Door:
+    """Lets users in whose client is trusted and whose password is right (asyncua's UserManager).
+
+    asyncua checks a certificate only where CreateSession carries one, and not that it is the secure
+    channel's; what is checked here is the one that the channel was opened with.
+    """
+
+    def __init__(self, folder: Path, hand: Handover) -> None:
+        self._folder, self._hand = folder, hand
+        self._trust = Trust(folder)
+        self._wrong: dict[str, list[float]] = {}
+
+    def untrusted(self, certificate: bytes | None) -> str:
+        """Why a client with this certificate is turned away; empty: it is not."""
+        if not certificate:
+            return "without a certificate"
+        try:
+            return self._trust.refusal(certificate)
+        except (OSError, InputError) as error:
+            return str(error)
+
+    def get_user(
+        self,
+        iserver: InternalServer,
+        username: str | None = None,
+        password: str | None = None,
+        certificate: bytes | None = None,
+    ) -> PlcUser | None:
+        """Log a user in; None: refused."""
+        if why := self.untrusted(certificate):
+            self._hand(Notice(f"a client is turned away: {why}"))
+            return None
+        name = (username or "")[:100]
+        now_s = time.monotonic()
+        wrong = [at_s for at_s in self._wrong.get(name, ()) if now_s - at_s < LOCKED_S]
+        if len(wrong) >= LOCKED_AFTER:
+            self._hand(Notice(f"login of {quoted(name)} is locked: {len(wrong)} wrong passwords"))
+            return None
+        try:
+            rights = Users(self._folder).login(name, password or "")
+        except InputError as error:
+            self._hand(Notice(f"nobody can log in: {error}"))
+            return None
+        if rights is None:
+            if len(self._wrong) > 100:  # names that somebody makes up
+                self._wrong.clear()
+            self._wrong[name] = [*wrong, now_s]
+            self._hand(Notice(f"login of {quoted(name)} is refused: no such user, or password"))
+            return None
+        self._wrong.pop(name, None)
+        return PlcUser(name=name, rights=rights)
+
+
+class Cell:
+    """What sessions act on: carries out their writes and calls, while the bridge is active."""
+
+    def __init__(self, settings: ServerSettings, hand: Handover) -> None:
+        self.settings, self._hand = settings, hand
+        self.active = False  # set by the node's thread
+        self._heartbeat = HeartbeatInput()
+        self.beams = {name: BeamInput(settings.timing) for name in settings.beams}
+        self.model: InformationModel
+
+    def restart(self) -> None:
+        """What was written before counts no more."""
+        for beam in self.beams.values():
+            beam.restart()
+
+    def end(self, session: "CellSession") -> None:
+        """A session is gone."""
+        self._heartbeat.end(session.label)
+
+    async def write(
+        self, session: "CellSession", items: Sequence[ua.WriteValue]
+    ) -> list[ua.StatusCode]:
+        """Carry out the writes of one request; each has its status."""
+        times = {
+            self.model.writable[item.NodeId]: item.Value.Value.Value
+            for item in items
+            if self._fault(item) == GOOD and self._path(item).endswith(f".{TIME}")
+        }
+        results = []
+        for item in items:
+            status = self._fault(item)
+            if status == GOOD:
+                status = self._judge(session, item, times)
+            if status == GOOD:
+                await self.model.set(self._path(item), item.Value.Value, item.Value.SourceTimestamp)
+            results.append(ua.StatusCode(getattr(ua.StatusCodes, status)))
+        return results
+
+    def _path(self, item: ua.WriteValue) -> str:
+        return self.model.writable.get(item.NodeId, "")
+
+    def _fault(self, item: ua.WriteValue) -> str:
+        path, sent = self._path(item), item.Value
+        if not path:
+            return "BadNotWritable" if self.model.knows(item.NodeId) else "BadNodeIdUnknown"
+        if item.AttributeId != ua.AttributeIds.Value or item.IndexRange:
+            return "BadWriteNotSupported"
+        wanted = self.model.input_types[path]
+        if sent is None or sent.Value is None or sent.Value.VariantType is not wanted:
+            return "BadTypeMismatch"
+        if sent.Value.is_array or sent.Value.Value is None:
+            return "BadTypeMismatch"
+        if sent.StatusCode is not None and not sent.StatusCode.is_good():
+            return "BadWriteNotSupported"  # a value that its writer does not stand by
+        return GOOD if self.active else "BadInvalidState"
+
+    def _judge(
+        self, session: "CellSession", item: ua.WriteValue, times: Mapping[str, datetime]
+    ) -> str:
+        path, value = self._path(item), item.Value.Value.Value
+        source_ns = _ns(item.Value.SourceTimestamp)
+        if path == HEARTBEAT:
+            came = self._heartbeat.write(session.label, value, source_ns, time.monotonic())
+            if came.passed is not None:
+                self._hand(came.passed)
+            if came.words:
+                self._hand(Notice(f"heartbeat of {session.label}: {came.words}"))
+            return came.status
+        name, _, part = path.removeprefix(f"{BEAMS}.").rpartition(".")
+        if part == BLOCKED:
+            at_ns = source_ns or _ns(times.get(f"{BEAMS}.{name}.{TIME}"))
+            found = self.beams[name].write(value, at_ns, time.time_ns())
+            if found.edge is not None:
+                self._hand(EdgeWritten(name, found.edge))
+            if found.words:
+                self._hand(Notice(f"beam {name} of {session.label}: {found.words}"))
+            return found.status
+        return GOOD
+
+    async def call(self, session: "CellSession", request: ua.CallMethodRequest) -> Any:
+        """Carry out one call; answered within `ANSWER_S`."""
+        method = self.model.methods.get(request.MethodId)
+        sent = request.InputArguments or []
+        if method is None or request.ObjectId != self.model.node_id(METHODS_NODE):
+            return _call_result("BadMethodInvalid")
+        if session.rights < method.role:
+            words = f"{session.label} may not call {method.name}: it takes an {method.role.name}"
+            self._hand(Notice(words.lower()))
+            return _call_result("BadUserAccessDenied")
+        fields, status, each = arguments_of(method, sent)
+        if status:
+            return _call_result(status, each)
+        if not self.active:
+            return _call_result("BadInvalidState")
+        loop = asyncio.get_running_loop()
+        answered: asyncio.Future[list[ua.Variant] | str] = loop.create_future()
+
+        def settle(outputs: list[ua.Variant] | str) -> None:
+            if not answered.done():
+                answered.set_result(outputs)
+
+        def answer(outputs: list[ua.Variant] | str) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+                loop.call_soon_threadsafe(settle, outputs)
+
+        self._hand(MethodCalled(method, session.user_name, fields, answer))
+        try:
+            outputs = await asyncio.wait_for(answered, ANSWER_S)
+        except TimeoutError:
+            return _call_result("BadTimeout")
+        if isinstance(outputs, str):
+            return _call_result(outputs)
+        return ua.CallMethodResult(OutputArguments=outputs)
+
+
+def _call_result(status: str, each: Sequence[str] = ()) -> ua.CallMethodResult:
+    return ua.CallMethodResult(
+        StatusCode=ua.StatusCode(getattr(ua.StatusCodes, status)),
+        InputArgumentResults=[ua.StatusCode(getattr(ua.StatusCodes, one)) for one in each],
+    )
+
+
+def _ns(at: datetime | None) -> int | None:
+    if at is None:
+        return None
+    since = at.replace(tzinfo=at.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1000
+
+
+class CellSession(InternalSession):
+    """A client's session: bounded requests, writes and calls by `Cell`."""
+
+    iserver: "CellInternalServer"
+
+    @property
+    def rights(self) -> Role | int:
+        """Of the user who is logged in; 0: nobody is."""
+        return self.user.rights if isinstance(self.user, PlcUser) else 0
+
+    @property
+    def user_name(self) -> str:
+        """Who is logged in."""
+        return (self.user and self.user.name) or "nobody"
+
+    @property
+    def label(self) -> str:
+        """The session in words; no other one has it."""
+        return f"{self.user_name} (session {self.session_id.Identifier})"
+
+    async def create_session(
+        self, params: ua.CreateSessionParameters, sockname: tuple[str, int] | None = None
+    ) -> ua.CreateSessionResult:
+        """Begin; refused for a client that is not trusted."""
+        try:
+            found = x509_from_der(params.ClientCertificate)
+            sent = None if found is None else found.public_bytes(serialization.Encoding.DER)
+        except ValueError as error:
+            raise ServiceError(ua.StatusCodes.BadCertificateInvalid) from error
+        if why := self.iserver.door.untrusted(sent):
+            self.iserver.hand(Notice(f"{self.name}: {why}"))
+            raise ServiceError(ua.StatusCodes.BadCertificateUntrusted)
+        return await super().create_session(params, sockname)
+
+    async def close_session(self, delete_subs: bool = True) -> None:
+        """End, with what it wrote; asyncua keeps one with subscriptions when its socket goes."""
+        self.iserver.cell.end(self)
+        await super().close_session(True)
+
+    async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
+        """Read."""
+        _bounded(params.NodesToRead, MOST_ITEMS)
+        return await super().read(params)
+
+    async def browse(self, params: ua.BrowseParameters) -> list[ua.BrowseResult]:
+        """Browse."""
+        _bounded(params.NodesToBrowse, MOST_BROWSED)
+        return await super().browse(params)
+
+    async def translate_browsepaths_to_nodeids(
+        self, params: list[ua.BrowsePath]
+    ) -> list[ua.BrowsePathResult]:
+        """Find nodes by their paths."""
+        _bounded(params, MOST_BROWSED)
+        return await super().translate_browsepaths_to_nodeids(params)
+
+    async def create_monitored_items(
+        self, params: ua.CreateMonitoredItemsParameters
+    ) -> list[ua.MonitoredItemCreateResult]:
+        """Watch."""
+        _bounded(params.ItemsToCreate, MOST_ITEMS)
+        return await super().create_monitored_items(params)
+
+    async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
+        """Write."""
+        return await self.iserver.cell.write(self, _bounded(params.NodesToWrite, MOST_ITEMS))
+
+    async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:
+        """Call, one after the other."""
+        requests = _bounded(params, MOST_CALLS)
+        return [await self.iserver.cell.call(self, request) for request in requests]
+
+    async def history_read(self, params: ua.HistoryReadParameters) -> list[ua.HistoryReadResult]:
+        """There is none."""
+        raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
+
+
+def _bounded(items: list[T] | None, most: int) -> list[T]:
+    if not items:
+        raise ServiceError(ua.StatusCodes.BadNothingToDo)
+    if len(items) > most:
+        raise ServiceError(ua.StatusCodes.BadTooManyOperations)
+    return items
+
+
+class CellInternalServer(InternalServer):
+    """asyncua's inner server, whose sessions are `CellSession`."""
+
+    def __init__(self, cell: Cell, door: Door, hand: Handover) -> None:
+        super().__init__(user_manager=door)
+        self.cell, self.door, self.hand = cell, door, hand
+        self.supported_tokens = (ua.UserNameIdentityToken,)
+        self.allow_remote_admin = False
+        self.match_discovery_source_ip = False
+        self.max_connections = MOST_CONNECTIONS
+        self.max_pending_activation_seconds = 5.0
+        self.max_pending_messages_per_connection = 100
+        self.max_session_timeout_ms = 60_000.0
+        self.max_subscriptions = 2 * MOST_CONNECTIONS
+        self.max_monitored_item_queue_size = 100
+        self.max_unacked_messages_per_subscription = 100
+        self.max_lifetime_count = self.max_keep_alive_count = 3_000
+        self.sessions: set[CellSession] = set()
+
+    def create_session(
+        self, name: str, user: User | None = None, external: bool = False
+    ) -> InternalSession:
+        """A session of a client."""
+        return CellSession(
+            self, self.aspace, self.subscription_service, name, user or User(), external=external
+        )
+
+    def register_external_session(self, session: InternalSession) -> None:
+        """Know a session, but let no other connection take it over.
+
+        asyncua gives whoever names its token, a counter, the session before it has looked at
+        signature and password, and leaves it to him when these are wrong.
+        """
+        if isinstance(session, CellSession):
+            self.sessions.add(session)
+
+    def unregister_external_session(self, session: InternalSession) -> None:
+        """Forget it."""
+        self.sessions.discard(session)
+
+    def lookup_external_session(self, auth_token: ua.NodeId) -> InternalSession | None:
+        """No session but one's own: see `register_external_session`."""
+        return None
+
+    def register_server(self, server: Any, conf: Any = None) -> None:
+        """Refused, as this is no discovery server; asyncua takes the request from anybody."""
+        raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
+
+
+class CellProtocol(OPCUAProtocol):
+    """A connection; asyncua gathers what comes for a message of any size that its header names."""
+
+    _buffer: bytes
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; who sends more than a chunk without an end is cut off."""
+        super().data_received(data)
+        if len(self._buffer) > CHUNK_BYTES and self.transport is not None:
+            self._buffer = b""
+            self.transport.close()
+
+
+class CellBinaryServer(BinaryServer):
+    """Listens."""
+
+    def _make_protocol(self) -> OPCUAProtocol:
+        return CellProtocol(
+            self.iserver, self._policies, self.clients, self.closing_tasks, self.limits
+        )
+
+
+class CellServer(Server):
+    """asyncua's server with one endpoint, signed and encrypted, for users with passwords."""
+
+    iserver: CellInternalServer
+
+    def __init__(self, settings: ServerSettings, cell: Cell, door: Door, hand: Handover) -> None:
+        super().__init__(iserver=CellInternalServer(cell, door, hand))
+        self._settings = settings
+        self.name = "robocal cell"
+        self.manufacturer_name, self.product_uri = "robocal_ros", "urn:robocal_ros:plc_bridge"
+        self.application_type = ua.ApplicationType.Server
+        self.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+        self.set_endpoint(f"opc.tcp://{settings.host}:{settings.port}/robocal")
+        self.limits = TransportLimits(CHUNK_BYTES, CHUNK_BYTES, 4, MESSAGE_BYTES)
+
+    async def prepare(self) -> None:
+        """Read the certificate, make the nodes."""
+        folder = self._settings.folder
+        await self.init()
+        await self.load_certificate(folder / SERVER)
+        await self.load_private_key(folder / KEY)
+        await self.set_application_uri(application_uri(read_certificate(folder / SERVER)))
+        model = InformationModel(self, self._settings.enumerations, self._settings.beams)
+        await model.build()
+        self.iserver.cell.model = model
+
+    async def start(self) -> None:
+        """Listen. Raises `OSError` where the port is taken; it may then be tried again."""
+        if not self._policies:
+            await self._setup_server_nodes()
+            await self.iserver.start()
+        self.bserver = CellBinaryServer(
+            self.iserver, self._settings.host, self._settings.port, self.limits
+        )
+        self.bserver.set_policies(self._policies)
+        await self.bserver.start()
+
+
+class _Notices(logging.Handler):
+    """What asyncua logs, such as requests that make no sense, for the node's own log."""
+
+    def __init__(self, hand: Handover) -> None:
+        super().__init__(logging.WARNING)
+        self._hand = hand
+
+    def emit(self, record: logging.LogRecord) -> None:
+        found = record.exc_info[1] if record.exc_info else None
+        cause = f": {type(found).__name__}: {found}" if found else ""
+        self._hand(Notice(f"OPC UA: {record.getMessage()[:200]}{cause[:200]}"))
+
+
+@dataclass
+class ServerState:
+    """How the server is; written by its thread, read by the node's."""
+
+    listening: bool = False
+    trouble: str = "starts"
+    sessions: tuple[str, ...] = field(default_factory=tuple)
+
+
+class ServerThread:
+    """Runs the server until `stop`; a defect in it ends neither the process nor the thread."""
+
+    def __init__(self, settings: ServerSettings, hand: Handover) -> None:
+        self.state = ServerState()
+        self.cell = Cell(settings, hand)
+        self._settings, self._hand = settings, hand
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ending: asyncio.Event | None = None
+        self._stopped = False
+        self._tasks: set[asyncio.Future[Any]] = set()
+        self._log = _Notices(hand)
+        self._thread = threading.Thread(target=self._run, name="opc_ua", daemon=True)
+        self._thread.start()
+
+    def post(self, act: Callable[[InformationModel], Any]) -> None:
+        """Let the loop await ``act`` of the model; nothing while there is none. Thread-safe."""
+        if self._loop is not None and self.state.listening:
+            with contextlib.suppress(RuntimeError):  # it has ended meanwhile
+                self._loop.call_soon_threadsafe(self._begin, act)
+
+    def _begin(self, act: Callable[[InformationModel], Any]) -> None:
+        task = asyncio.ensure_future(act(self.cell.model))
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: "asyncio.Future[Any]") -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._hand(Notice(f"a defect of this software: {type(error).__name__}: {error}"))
+
+    def set_active(self, active: bool) -> None:
+        """Methods and writes act, or are refused; what is shown goes on."""
+        self.cell.restart()
+        self.cell.active = active
+
+    def stop(self) -> None:
+        """End the server and its thread."""
+        self._stopped = True
+        self.cell.active = False
+        if self._loop is not None and self._ending is not None:
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._ending.set)
+        self._thread.join(STOP_S + AGAIN_S)
+
+    def _run(self) -> None:
+        logger = logging.getLogger("asyncua")
+        logger.addHandler(self._log)
+        logger.propagate = False
+        logger.setLevel(logging.WARNING)
+        while not self._stopped:
+            try:
+                asyncio.run(self._serve())
+            except Exception as error:
+                self.state.trouble = f"{type(error).__name__}: {error}"
+                self._hand(Notice(f"the OPC UA server starts anew: {self.state.trouble}"))
+                time.sleep(AGAIN_S)
+        logger.removeHandler(self._log)
+
+    async def _serve(self) -> None:
+        self._ending = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        door = Door(self._settings.folder, self._hand)
+        server = CellServer(self._settings, self.cell, door, self._hand)
+        await server.prepare()
+        try:
+            await self._listen(server)
+            while not self._stopped:
+                await self._look(server)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._ending.wait(), LOOK_S)
+        finally:
+            self.state.listening = False
+            self.state.sessions = ()
+            if server.bserver is not None:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(server.stop(), STOP_S)
+
+    async def _listen(self, server: CellServer) -> None:
+        assert self._ending is not None
+        while not self._stopped:
+            try:
+                await server.start()
+            except OSError as error:
+                self.state.trouble = f"cannot listen: {error.strerror or error}"
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._ending.wait(), AGAIN_S)
+            else:
+                self.state.listening, self.state.trouble = True, ""
+                return
+
+    async def _look(self, server: CellServer) -> None:
+        model = self.cell.model
+        await model.look(time.monotonic())
+        await model.set(ACTIVE, ua.Variant(self.cell.active))
+        names = [s.label for s in server.iserver.sessions if s.is_activated()]
+        self.state.sessions = tuple(sorted(names))

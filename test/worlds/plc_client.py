@@ -1,0 +1,143 @@
+"""A PLC as asyncua's own client: its certificate, its user, its program's heartbeat, its calls."""
+
+import asyncio
+import logging
+import socket
+import threading
+import time
+from collections.abc import Coroutine
+from concurrent.futures import Future
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from asyncua import Client, ua
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+
+from robocal_ros.plc import access
+from robocal_ros.plc.access import Role, Users
+
+OPERATOR, ENGINEER = ("plc", "a plc's password"), ("ada", "an engineer's password")
+PASSWORDS = dict((OPERATOR, ENGINEER))
+PROGRAM_S = 0.05  # the program's cycle
+NAMESPACE = "urn:robocal_ros:cell"
+logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+
+
+def security_folder(folder: Path) -> Path:
+    """As `robocal plc` makes it: an operator, an engineer, two clients that are trusted."""
+    access.make_server_certificate(folder, ["localhost", "127.0.0.1"], 30)
+    for name in ("line", "panel"):
+        access.make_client_certificate(folder, name, 30)
+    users = Users(folder)
+    users.put(OPERATOR[0], Role.OPERATOR, OPERATOR[1])
+    users.put(ENGINEER[0], Role.ENGINEER, ENGINEER[1])
+    return folder
+
+
+def free_port() -> int:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+class PlcClient:
+    """One PLC; all of it goes on in a thread of its own, as a PLC does."""
+
+    def __init__(self, folder: Path, port: int, user: str = "plc", name: str = "line") -> None:
+        self.folder, self.port, self.user, self.name = folder, port, user, name
+        self.beating, self.is_open, self.stamped = False, True, False
+        self.written: list[int] = []
+        self.refused: list[str] = []
+        self.index = 2
+        self.client: Client
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    def start(self, work: Coroutine[Any, Any, Any]) -> "Future[Any]":
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def do(self, work: Coroutine[Any, Any, Any], within_s: float = 15.0) -> Any:
+        """Do it, while the graph of this thread stands still."""
+        return self.start(work).result(within_s)
+
+    def made(self, user: str | None = None, password: str | None = None) -> Client:
+        """A client that has not connected yet."""
+        client = Client(f"opc.tcp://127.0.0.1:{self.port}/robocal", timeout=5)
+        client.application_uri = f"urn:robocal_ros:client:{self.name}"
+        name = user or self.user
+        client.set_user(name)
+        client.set_password(PASSWORDS[name] if password is None else password)
+        return client
+
+    async def secured(self, client: Client) -> Client:
+        own = self.folder / access.CLIENTS / f"{self.name}.der"
+        await client.set_security(
+            SecurityPolicyBasic256Sha256,
+            str(own),
+            str(own.with_name(f"{self.name}_key.pem")),
+            server_certificate=str(self.folder / access.SERVER),
+        )
+        return client
+
+    async def connect(self) -> None:
+        self.client = await self.secured(self.made())
+        await self.client.connect()
+        self.index = await self.client.get_namespace_index(NAMESPACE)
+
+    async def connect_once_there(self, within_s: float = 20.0) -> None:
+        """Again and again, as a PLC does."""
+        until_s = time.monotonic() + within_s
+        while True:
+            try:
+                await self.connect()
+                return
+            except Exception:
+                if time.monotonic() > until_s:
+                    raise
+                await asyncio.sleep(0.2)
+
+    def node(self, path: str) -> Any:
+        return self.client.get_node(ua.NodeId(f"Cell.{path}", self.index))
+
+    async def read(self, path: str) -> Any:
+        return await self.node(path).read_value()
+
+    async def write(self, path: str, value: ua.Variant, at: datetime | None = None) -> None:
+        await self.node(path).write_value(ua.DataValue(value, SourceTimestamp=at))
+
+    async def call(self, method: str, *arguments: Any) -> list[Any]:
+        sent = [ua.Variant(a, ua.VariantType.UInt32) if type(a) is int else a for a in arguments]
+        answer = await self.node("Methods").call_method(f"{self.index}:{method}", *sent)
+        return list(answer)
+
+    async def program(self) -> None:
+        """The PLC's program: it copies the beat while the robot may be moved."""
+        while True:
+            await asyncio.sleep(PROGRAM_S)
+            if not self.beating:
+                continue
+            try:
+                echo = await self.read("Gap.Beat") if self.is_open else 0
+                at = datetime.now(UTC) if self.stamped else None
+                await self.write("Gap.Heartbeat", ua.Variant(echo or 0, ua.VariantType.UInt32), at)
+                self.written.append(echo)
+            except Exception as error:
+                self.refused.append(type(error).__name__)
+
+    def close(self) -> None:
+        async def leave() -> None:
+            self.beating = False
+            for task in asyncio.all_tasks() - {asyncio.current_task()}:
+                if getattr(task.get_coro(), "__name__", "") == "program":
+                    task.cancel()
+            if hasattr(self, "client"):
+                await asyncio.wait_for(self.client.disconnect(), 3.0)
+
+        try:
+            self.do(leave(), 5.0)
+        except Exception as error:  # the server may be gone
+            logging.getLogger(__name__).debug("leaves: %s", error)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(5.0)
