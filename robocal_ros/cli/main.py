@@ -420,6 +420,10 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
             ),
         },
     ),
+    "correct-points": CliCommand(
+        "thermal.cli_sensors:correct_points",
+        "carry what a sensor on the flange measured to base, with the model of the robot as it is",
+    ),
     "tool": CliGroup(
         "place light beams, measure a tool with them or by touching a point, hand it to a "
         "controller",

@@ -67,8 +67,8 @@ def _joints(value: str) -> Array:
         raise argparse.ArgumentTypeError(f"'{value}' is no list of joints in degrees") from error
 
 
-def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Offer the robot, and the model that it is corrected for."""
+def add_given_model(parser: argparse.ArgumentParser) -> None:
+    """Offer the robot, and the model that it truly has."""
     parser.add_argument(
         "--robot",
         required=True,
@@ -89,6 +89,11 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
     )
+
+
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """Offer the robot, the model that it is corrected for, and that of a taught program."""
+    add_given_model(parser)
     parser.add_argument(
         "--reference",
         type=Path,
@@ -105,17 +110,21 @@ def given_models(args: argparse.Namespace) -> tuple[CorrectionModels, list[str]]
     """
     robot, warnings = describe_robot(args.robot)
     nominal = robot.arm
-    if args.model:
-        actual = read_model(args.model, nominal)
-    else:
-        with _history(args, nominal) as history:
-            chosen = history.head(THERMAL).calibration_id
-            if chosen is None:
-                words = f"no model is in force for {args.robot_serial}: accept one first"
-                raise InputError(words, file=str(history.path))
-            actual = arm_of(history.model(chosen), nominal)
+    actual = given_model(args, nominal)
     reference = nominal if args.reference is None else read_model(args.reference, nominal)
     return CorrectionModels(nominal, actual, reference), warnings
+
+
+def given_model(args: argparse.Namespace, nominal: SerialArm) -> SerialArm:
+    """The model of `add_given_model`. Raises as `given_models`."""
+    if args.model:
+        return read_model(args.model, nominal)
+    with model_history(args, nominal) as history:
+        chosen = history.head(THERMAL).calibration_id
+        if chosen is None:
+            words = f"no model is in force for {args.robot_serial}: accept one first"
+            raise InputError(words, file=str(history.path))
+        return arm_of(history.model(chosen), nominal)
 
 
 def read_model(path: Path, nominal: SerialArm) -> SerialArm:
@@ -141,7 +150,8 @@ def read_model(path: Path, nominal: SerialArm) -> SerialArm:
     return arm
 
 
-def _history(args: argparse.Namespace, nominal: SerialArm) -> CalibrationHistory:
+def model_history(args: argparse.Namespace, nominal: SerialArm) -> CalibrationHistory:
+    """The history of ``--robot-serial``."""
     folder = state_folder() if args.state is None else args.state.absolute()
     return CalibrationHistory.open(
         args.robot_serial,
@@ -420,7 +430,7 @@ def _shift_in_force(
     args: argparse.Namespace, models: CorrectionModels, q: Array, T_flange_tool: Array
 ) -> FrameShiftInForce | None:
     """The shift in force; None where the frames are as they were."""
-    with _history(args, models.nominal) as history:
+    with model_history(args, models.nominal) as history:
         head = history.head(FRAME_SHIFT)
         if head.calibration_id is None:
             return None
@@ -468,7 +478,7 @@ def _keep(
 ) -> int:
     """Put a shift into the history; its number there."""
     now = time.time_ns()
-    with _history(args, models.nominal) as history:
+    with model_history(args, models.nominal) as history:
         thermal = history.head(THERMAL)
         return history.propose(
             Proposal(

@@ -545,6 +545,26 @@ class JointStream:
         low, high = np.searchsorted(stamps, from_ns), np.searchsorted(stamps, to_ns, side="right")
         return stamps[low:high].copy(), self._q[low:high].copy()
 
+    def at(self, stamp_ns: int, gap_s: float) -> Array:
+        """Joints (n,) at an instant, on the line between the readings before and after it.
+
+        Raises `InputError` when these are missing, or more than ``gap_s`` apart.
+        """
+        stamps = self._stamp[: self._size]
+        after = int(np.searchsorted(stamps, stamp_ns, side="left"))
+        if after == self._size or (after == 0 and stamps[0] != stamp_ns):
+            raise InputError("no joint readings about the measurement")
+        if stamps[after] == stamp_ns:
+            return np.array(self._q[after])
+        before = after - 1
+        pause_ns = int(stamps[after] - stamps[before])
+        if pause_ns > gap_s * 1e9:
+            raise InputError(
+                f"joint readings pause for {pause_ns * 1e-9:.3f} s (allowed {gap_s:.3f} s)"
+            )
+        share = (stamp_ns - int(stamps[before])) / pause_ns
+        return np.asarray((1.0 - share) * self._q[before] + share * self._q[after])
+
     def standstill(self, stamp_ns: int, rule: StandstillRule) -> Reading | None:
         """Joints at an instant at which the robot stands still; None while readings are to come.
 

@@ -40,6 +40,7 @@ from robocal_ros.thermal.cell_setup import (
     sensor_document,
     write_sensor,
 )
+from robocal_ros.thermal.drift_following import ARRANGEMENTS, FIXED, FLANGE
 from robocal_ros.thermal.flange_sensor import (
     flange_sensor_document,
     identify_and_judge_flange_sensor,
@@ -117,7 +118,6 @@ def _show_calibrate_sensor(console: "Console", document: Document) -> None:
     print_output(console, document)
 
 
-FIXED, FLANGE = "fixed-sensor", "flange-sensor"
 _FIXED_ONLY = ("sensor", "cold", "warm", "prior", "parameters")
 
 
@@ -126,7 +126,7 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--arrangement",
-        choices=(FIXED, FLANGE),
+        choices=ARRANGEMENTS,
         default=FIXED,
         help="where the sensor is: fixed with the sphere on the flange (default), or on the flange "
         "with spheres fixed in the cell",

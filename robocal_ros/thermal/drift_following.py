@@ -31,6 +31,10 @@ from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_
 from robocal_ros.thermal.tracking import DriftProcess, DriftState, Heat, TrackedCycle, track_cycle
 
 Prior = Literal["default", "learned"]
+Arrangement = Literal["fixed-sensor", "flange-sensor"]
+FIXED: Arrangement = "fixed-sensor"
+FLANGE: Arrangement = "flange-sensor"
+ARRANGEMENTS = FIXED, FLANGE
 METHODS: tuple[Method, ...] = ("map", "lsq")
 PRIORS: tuple[Prior, ...] = ("default", "learned")
 SPHERE_RADIUS_M = 0.01905  # 1.5 inches across, the usual reference sphere
@@ -46,6 +50,8 @@ EXPECTED = "expected"  # of a reference's model: the learned process, None for t
 class ThermalConfig:
     """Settings of a thermal session.
 
+    ``arrangement``: a fixed sensor sees targets on the flange, or a sensor on the flange spheres
+    that are fixed in the cell.
     ``method``: estimator where a command names none.
     ``prior``: ``default``, or ``learned`` from the shifts in the history.
     ``sigma_m``: standard deviation of one measured coordinate in one visit of a pose.
@@ -80,6 +86,7 @@ class ThermalConfig:
     target: str = DEFAULT_TARGET
     standstill: StandstillRule = field(default_factory=StandstillRule)
     sphere: SphereRule = field(default_factory=lambda: SphereRule(SPHERE_RADIUS_M))
+    arrangement: Arrangement = FIXED
 
     @cached_property
     def work(self) -> Work:

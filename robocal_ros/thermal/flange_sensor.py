@@ -14,6 +14,7 @@ import numpy as np
 
 from robocal_ros.estimation import estimation
 from robocal_ros.estimation.assessment import (
+    LARGEST_RMS_M,
     Judgement,
     gross,
     hold_out,
@@ -26,12 +27,19 @@ from robocal_ros.estimation.assessment import (
 )
 from robocal_ros.estimation.estimation import describe
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.errors import (
+    InputError,
+    RankDeficientError,
+    ResidualError,
+    TooFewSamplesError,
+)
 from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell_model import CellModel
 from robocal_ros.identification.solve import default_prior, fitted_prior, random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import parameters_document
+from robocal_ros.kinematics.arm import model_document, parameters_document
+from robocal_ros.thermal.reference import ColdReference, SpheresInCell
 
 _HAND_EYE = (
     "sensor_x_mm",
@@ -416,3 +424,50 @@ def flange_sensor_document(judged: JudgedFlangeSensor) -> Document:
         "converged": result.estimate.converged,
         "verdict": verdict_document(judged.verdict),
     }
+
+
+def flange_sensor_model(found: FlangeSensorIdentification) -> Document:
+    """``model_document`` of the identified arm, with its parameters' covariance (SI)."""
+    count = found.problem.count
+    return model_document(found.cell.arm) | {
+        "parameters": list(found.problem.names[:count]),
+        "covariance": found.estimate.covariance[:count, :count].tolist(),
+    }
+
+
+def capture_on_flange(arm: SerialArm, data: Measurements, frame: str = "") -> ColdReference:
+    """Place sensor and spheres from a cold visit with the cold model ``arm``: its reference.
+
+    ``frame``: the sensor's.
+    Each pose's static error stays with the point of the flange that saw the sphere, and cancels
+    when the pose is visited again.
+
+    Raises `TooFewSamplesError` or `RankDeficientError` when the visit cannot place them;
+    `ResidualError` when it misses the arm by more than 5 mm rms.
+    """
+    found = identify_flange_sensor(arm, data, geometry=False)
+    robot = found.cell
+    rms_m = summarise(robot.scatter(data.take(~np.isin(data.sample, found.rejected)))).rms_m
+    if rms_m > LARGEST_RMS_M:
+        raise ResidualError(
+            f"the cold visit misses the model by {rms_m * 1e3:.1f} mm rms, more than any robot's "
+            f"static error ({LARGEST_RMS_M * 1e3:.0f} mm): check robot file, units, joint signs, "
+            "whether the sensor is on the flange, and the spheres' names"
+        )
+    index = data.target_index(robot.spheres)
+    _, first, spot = np.unique(
+        pose_groups(data.q) * len(robot.spheres) + index, return_index=True, return_inverse=True
+    )
+    mean = np.zeros((len(first), len(data)))
+    mean[spot, np.arange(len(data))] = 1.0 / np.bincount(spot)[spot]
+    places = frames.transform(np.eye(3), np.zeros(3))[None].repeat(len(first), axis=0)
+    places[:, :3, 3] = mean @ frames.apply(robot.T_flange_sensor, data.position)
+    sphere = tuple(data.target[i] for i in first)
+    cell = CellModel(
+        arm, np.eye(4), tuple(f"{name}@{i}" for i, name in enumerate(sphere, 1)), places
+    )
+    spheres = SpheresInCell(
+        robot.T_flange_sensor, sphere, robot.centres[index[first]], mean @ data.q, frame
+    )
+    placed = spheres.placed(cell, data)
+    return ColdReference(cell, placed, found.rejected, spheres=spheres)

@@ -348,7 +348,8 @@ SENSOR_WANDER_M = 1e-5  # a sensor that warms up moves by so much without a knoc
 class Cause:
     """Something that may have moved.
 
-    ``name``: ``sensor`` (or the robot's base, which looks the same), ``sphere``, or a joint's name.
+    ``name``: ``sensor`` (or the robot's base, which looks the same), ``sphere``, or a joint's name;
+    of a measuring robot ``spheres`` (or the base), and ``mounting`` of the sensor.
     ``words``: what moved and by how much.
     """
 
@@ -389,17 +390,28 @@ def possible_causes(
     """
     target = spots.target[spots.match(warm)]
     parameters, setup = spots.rows(warm.q, target)
-    lever = warm.position - warm.position.mean(axis=0)
-    unit = np.broadcast_to(np.eye(3), (len(warm), 3, 3))
-    rigid = np.concatenate([unit, -frames.skew(lever)], axis=2)
+    world, own = setup[:, :, :3], setup[:, :, 3:]
+    if spots.on_flange:  # a single sphere shows no turn of the cell, each pose one of the sensor
+        seen = spots.cell.T_flange_target[target, :3, 3]
+        own = np.concatenate([own, -own @ frames.skew(seen)], axis=2)
+        moving = (
+            ("spheres", "spheres and robot base moved against each other", world),
+            ("mounting", "the sensor moved on the flange", own),
+        )
+    else:
+        lever = warm.position - warm.position.mean(axis=0)
+        world = np.concatenate([world, -frames.skew(lever)], axis=2)
+        moving = (
+            (SENSOR, "sensor and robot base moved against each other", world),
+            ("sphere", "the sphere moved on the flange", own),
+        )
     found = []
-    if (moved := _explains(rigid, deviation, covariance)) is not None:
-        turned = float(np.degrees(np.linalg.norm(moved[3:])))
-        by = f"{np.linalg.norm(moved[:3]) * 1e3:.2f} mm and {turned:.3f} deg"
-        found.append(Cause(SENSOR, f"sensor and robot base moved against each other by {by}"))
-    if (moved := _explains(setup[:, :, 3:], deviation, covariance)) is not None:
-        by = f"{np.linalg.norm(moved) * 1e3:.2f} mm"
-        found.append(Cause("sphere", f"the sphere moved on the flange by {by}"))
+    for name, words, rows in moving:
+        if (moved := _explains(rows, deviation, covariance)) is not None:
+            by = f"{np.linalg.norm(moved[:3]) * 1e3:.2f} mm"
+            if len(moved) > 3:
+                by += f" and {np.degrees(np.linalg.norm(moved[3:])):.3f} deg"
+            found.append(Cause(name, f"{words} by {by}"))
     arm = spots.cell.arm
     names = arm.parameters.names
     for i, joint in enumerate(arm.joint_names, start=1):

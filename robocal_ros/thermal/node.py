@@ -75,9 +75,18 @@ from robocal_ros.session.events import (
 )
 from robocal_ros.thermal.accuracy import Accuracy
 from robocal_ros.thermal.cell_setup import POSES, SensorField, placed_of, plan_cycle
-from robocal_ros.thermal.drift_following import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
+from robocal_ros.thermal.drift_following import (
+    ARRANGEMENTS,
+    FIXED,
+    FLANGE,
+    METHODS,
+    PRIORS,
+    SPHERE_RADIUS_M,
+    ThermalConfig,
+)
 from robocal_ros.thermal.identification import require_parameters
 from robocal_ros.thermal.proposing import SENSOR
+from robocal_ros.thermal.services import MeasuringRobotTopics
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
 
 ACCURACY_S = 1.0
@@ -104,6 +113,13 @@ SETTINGS = (
     STATE_DIR,
     Setting("measuring_frame", "", "Frame of the measurements; empty: that of the first one used"),
     Setting("target", DEFAULT_TARGET, "Target where a measurement's frame_id names none"),
+    Setting(
+        "arrangement",
+        FIXED,
+        "A fixed sensor and targets on the flange, or a sensor on the flange and spheres fixed in "
+        "the cell",
+        choices=ARRANGEMENTS,
+    ),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("prior", PRIORS[0], "Expected drift: by default or as learned", choices=PRIORS),
     Setting(
@@ -231,6 +247,7 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig
         work_poses=tuple(tuple(pose) for pose in poses),
         tip_m=() if tip_mm == ORIGIN else tuple(value * MM for value in tip_mm),
         lateness_s=settings["lateness_s"],
+        arrangement=settings["arrangement"],
         measuring_frame=settings["measuring_frame"],
         target=settings["target"],
         standstill=standstill_rule(settings),
@@ -442,6 +459,10 @@ class ThermalNode(SessionNode[ThermalSession]):
         self._data_clock = DataClock()
         ask = self._desk.ask
         ThermalServices(self.add_service, ask, history, self._nominal, settings, self._prior)
+        self._measuring: MeasuringRobotTopics | None = None
+        if self._config.arrangement == FLANGE:
+            frame = settings["base_frame"]
+            self._measuring = MeasuringRobotTopics(self, frame, lambda: self._session)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
 
     def new_session(self, history: CalibrationHistory) -> ThermalSession:
@@ -457,6 +478,8 @@ class ThermalNode(SessionNode[ThermalSession]):
     def take(self, session: ThermalSession, kind: str, message: Any) -> None:
         """Give a message of the input ``kind`` to the session."""
         take_message(session, kind, message)
+        if self._measuring is not None and kind == JOINTS:
+            self._measuring.joints_came(session)
         if session.waiting:
             self._desk.step()
 

@@ -1,6 +1,8 @@
 """From the measurements of a command to a proposal in the history."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,11 +28,18 @@ from robocal_ros.thermal.cell_setup import (
 )
 from robocal_ros.thermal.drift_following import (
     EXPECTED,
+    FLANGE,
     METHODS,
     DriftFollower,
     InForce,
     ThermalConfig,
     default_process,
+)
+from robocal_ros.thermal.flange_sensor import (
+    capture_on_flange,
+    flange_sensor_document,
+    flange_sensor_model,
+    identify_and_judge_flange_sensor,
 )
 from robocal_ros.thermal.identification import (
     cycle_document,
@@ -137,6 +146,14 @@ class Proposer:
         """
         current, reference = self._current, self._current.reference
         if reference is None or follower is None:
+            if self._config.arrangement == FLANGE:
+                judged = identify_and_judge_flange_sensor(
+                    self._nominal, [data], share=self._config.hold_out, seed=self._config.seed
+                )
+                document = flange_sensor_document(judged)
+                model = flange_sensor_model(judged.identification)
+                verdict = judged.verdict
+                return self._keep(command, document, model, verdict, "map", data, {}, wall_ns)
             found = identify_and_hold_out(
                 self._nominal,
                 data,
@@ -149,6 +166,7 @@ class Proposer:
             model = identified_model_document(found.identification)
             document = identification_document(found)
             return self._keep(command, document, model, found.verdict, method, data, {}, wall_ns)
+        data = reference.placed(data)
         with follower.attempt():
             solution = self._drift(follower, reference, data, beside, method)
             kept = follower.kept(beside.temperature)
@@ -227,7 +245,7 @@ class Proposer:
         return _load_of(reference)
 
     def capture(
-        self, command: Command, data: Measurements, beside: Beside, wall_ns: int
+        self, command: Command, data: Measurements, beside: Beside, frame: str, wall_ns: int
     ) -> Outcome:
         """Make the cold reference of these measurements and bring it into force.
 
@@ -237,7 +255,7 @@ class Proposer:
         Raises `RobocalError` when they cannot be one, or the history refuses.
         """
         current = self._current
-        visit, which_arm = self._visit(data)
+        visit, which_arm = self._visit(data, frame)
         reference = replace(visit, fixed=beside.fixed, temperature=beside.temperature)
         rms_mm = summarise(reference.cell.residual(reference.used)).rms_m * 1e3
         message = (
@@ -261,19 +279,22 @@ class Proposer:
             }
         )
         chosen = self._propose(
-            REFERENCE, command, wall_ns, "lsq", verdict, document, model, data.arrays()
+            REFERENCE, command, wall_ns, "lsq", verdict, document, model, visit.data.arrays()
         )
         self._accept(chosen, command, "captured", wall_ns)
         return Outcome(command, Code.ACCEPT, message, calibration_id=chosen, samples=len(data))
 
-    def _visit(self, data: Measurements) -> tuple[ColdReference, str]:
+    def _visit(self, data: Measurements, frame: str) -> tuple[ColdReference, str]:
         """The measurements with the arm that they were made with, and words that tell which.
 
         A robot that has cooled is the commissioned one; after a knock of the sensor it is as warm
         as before, and with the cold arm its drift would be lost.
         """
         current, sigma_m = self._current, self._config.sigma_m
-        visit, reference = capture_reference(current.commissioned, data), current.reference
+        captured: Callable[..., ColdReference] = capture_reference
+        if self._config.arrangement == FLANGE:
+            captured = partial(capture_on_flange, frame=frame)
+        visit, reference = captured(current.commissioned, data), current.reference
         if reference is None or not current.drifted:
             return visit, ""
         if (size_m := drift_size_m(visit, current.arm)) <= sigma_m:
@@ -295,7 +316,7 @@ class Proposer:
                 f"model in force; capture when it has cooled, or {remedy} if it is cold"
             )
         if found.warm:
-            visit = capture_reference(current.arm, data)
+            visit = captured(current.arm, data)
             return visit, f"; the robot is as warm as the model in force ({shown})"
         return visit, (
             f"; the robot is cold ({shown}), and the model in force still holds that drift: "
@@ -322,6 +343,10 @@ class Proposer:
 
         Raises `RobocalError` when the measurements cannot place them, or the history refuses.
         """
+        if self._config.arrangement == FLANGE:
+            raise InputError(
+                "a sensor on the flange is placed with the cold reference: call capture_reference"
+            )
         named = str(command.arguments.get("method") or SENSOR_METHODS[0])
         method = next((m for m in SENSOR_METHODS if m == named), None)
         if method is None:

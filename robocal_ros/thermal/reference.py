@@ -38,6 +38,7 @@ class ColdSpots:
     ``visits`` (s,): how many cold measurements went into it.
     ``first`` (s,): the first of them.
     ``rejected``: names of cold measurements that other visits of the same spot contradict.
+    ``on_flange``: whether the sensor is on the flange: see `SpheresInCell`.
     """
 
     cell: CellModel
@@ -47,9 +48,10 @@ class ColdSpots:
     visits: Index
     first: Index
     rejected: tuple[str, ...] = ()
+    on_flange: bool = False
 
     @classmethod
-    def of(cls, cell: CellModel, data: Measurements) -> "ColdSpots":
+    def of(cls, cell: CellModel, data: Measurements, *, on_flange: bool = False) -> "ColdSpots":
         """Average the visits of each pose and target, without those that others contradict."""
         target = data.target_index(cell.targets)
         _, spot = np.unique(pose_groups(data.q) * len(cell.targets) + target, return_inverse=True)
@@ -64,7 +66,8 @@ class ColdSpots:
         mean[spot[keep], np.flatnonzero(keep)] = 1.0 / visits[spot[keep]]
         first = np.array([int(np.flatnonzero(spot == s)[0]) for s in range(len(visits))])
         rejected = tuple(data.sample[i] for i in np.flatnonzero(~keep))
-        return cls(cell, mean @ data.q, target[first], mean @ error, visits, first, rejected)
+        q, static = mean @ data.q, mean @ error
+        return cls(cell, q, target[first], static, visits, first, rejected, on_flange)
 
     def knows(self, q: Array) -> NDArray[np.bool_]:
         """Which joint readings (m, n) are those of a cold visit: all joints within 0.5 deg."""
@@ -162,6 +165,66 @@ class ColdSpots:
         return J, np.concatenate([np.broadcast_to(np.eye(3), own.shape), own], axis=2)
 
 
+@dataclass(frozen=True, eq=False)
+class SpheresInCell:
+    """What the sensor of a measuring robot saw of spheres that are fixed in the cell, when cold.
+
+    The point of the flange at which a sphere was seen from a pose stands for a target there, one
+    for each pose and sphere: while the arm is cold it comes to the sphere's centre, and where it
+    comes to later tells the drift, as of a sphere on the flange. The measuring frame is the base.
+
+    ``T_flange_sensor`` (4, 4).
+    ``sphere``, ``centre``: of each target of the cell, its name, and (t, 3) in base, m.
+    ``q`` (t, n): joints of the cold visits.
+    ``frame``: the sensor's.
+    """
+
+    T_flange_sensor: Array
+    sphere: tuple[str, ...]
+    centre: Array
+    q: Array
+    frame: str = ""
+
+    def placed(self, cell: CellModel, data: Measurements) -> Measurements:
+        """Centres (m, 3) in the sensor, as places of the cell's targets in base.
+
+        Raises `InputError` when a sphere was not seen from its pose when cold.
+        """
+        spheres = tuple(dict.fromkeys(self.sphere))
+        own = np.array([spheres.index(name) for name in self.sphere])
+        away = np.max(np.abs(data.q[:, None] - self.q), axis=2)
+        away[data.target_index(spheres)[:, None] != own] = np.inf
+        spot = np.argmin(away, axis=1)
+        lost = np.flatnonzero(away[np.arange(len(data)), spot] >= SAME_VISIT_RAD)
+        if len(lost):
+            i = int(lost[0])
+            raise InputError(
+                f"sample {data.sample[i]}: sphere '{data.target[i]}' was not seen from this pose "
+                "in the cold reference: visit the reference poses, or capture a new reference"
+            )
+        seen = frames.apply(self.T_flange_sensor, data.position)
+        short = cell.T_flange_target[spot, :3, 3] - seen
+        R = cell.arm.fk(data.q)[:, :3, :3]
+        return replace(
+            data,
+            position=self.centre[spot] + np.einsum("mij,mj->mi", R, short),
+            target=tuple(cell.targets[i] for i in spot),
+        )
+
+    def seen(self, cell: CellModel, data: Measurements) -> Measurements:
+        """The centres in the sensor again, of what `placed` made."""
+        spot = data.target_index(cell.targets)
+        R = cell.arm.fk(data.q)[:, :3, :3]
+        short = np.einsum("mji,mj->mi", R, data.position - self.centre[spot])
+        position = cell.T_flange_target[spot, :3, 3] - short
+        T_sensor_flange = frames.invert(self.T_flange_sensor)
+        return replace(
+            data,
+            position=frames.apply(T_sensor_flange, position),
+            target=tuple(self.sphere[i] for i in spot),
+        )
+
+
 @dataclass(frozen=True)
 class ColdReference:
     """Cold visit of the measuring poses.
@@ -172,6 +235,7 @@ class ColdReference:
     ``temperature`` (n,): of the motors, degrees Celsius; None where they were not read.
     ``fixed`` (n, 3): centres of a sphere fixed in the cell, measured at the same visit, m; n may be
     0.
+    ``spheres``: of a measuring robot, whose ``data`` are placed; None of a fixed sensor.
     """
 
     cell: CellModel
@@ -179,6 +243,14 @@ class ColdReference:
     rejected: tuple[str, ...] = ()
     temperature: Array | None = None
     fixed: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    spheres: SpheresInCell | None = None
+
+    def placed(self, data: Measurements) -> Measurements:
+        """Measurements as places of the cell's targets: they are, but of a measuring robot.
+
+        Raises as `SpheresInCell.placed`.
+        """
+        return data if self.spheres is None else self.spheres.placed(self.cell, data)
 
     @property
     def used(self) -> Measurements:
@@ -188,7 +260,7 @@ class ColdReference:
     @cached_property
     def spots(self) -> ColdSpots:
         """Each pose and target of the visit once."""
-        return ColdSpots.of(self.cell, self.data)
+        return ColdSpots.of(self.cell, self.data, on_flange=self.spheres is not None)
 
 
 def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
@@ -231,18 +303,34 @@ def reference_document(reference: ColdReference) -> Document:
     """A cold reference in full precision, SI; ``reference_of`` reads it back to the last bit."""
     cell, data = reference.cell, reference.data
     model = model_document(cell.arm)
-    return {key: model[key] for key in ("mdh", "functions", "load") if key in model} | {
-        "T_frame_base": cell.T_frame_base.tolist(),
-        "targets": list(cell.targets),
-        "T_flange_target": cell.T_flange_target.tolist(),
-        "q": data.q.tolist(),
-        "position": data.position.tolist(),
-        "target": list(data.target),
-        "sample": list(data.sample),
-        "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
-        "fixed": reference.fixed.tolist(),
-        "temperature": None if reference.temperature is None else reference.temperature.tolist(),
-    }
+    return (
+        {key: model[key] for key in ("mdh", "functions", "load") if key in model}
+        | {
+            "T_frame_base": cell.T_frame_base.tolist(),
+            "targets": list(cell.targets),
+            "T_flange_target": cell.T_flange_target.tolist(),
+            "q": data.q.tolist(),
+            "position": data.position.tolist(),
+            "target": list(data.target),
+            "sample": list(data.sample),
+            "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
+            "fixed": reference.fixed.tolist(),
+            "temperature": None
+            if reference.temperature is None
+            else reference.temperature.tolist(),
+        }
+        | (
+            {}
+            if (spheres := reference.spheres) is None
+            else {
+                "T_flange_sensor": spheres.T_flange_sensor.tolist(),
+                "sphere": list(spheres.sphere),
+                "centre": spheres.centre.tolist(),
+                "spot_q": spheres.q.tolist(),
+                "sensor_frame": spheres.frame,
+            }
+        )
+    )
 
 
 def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
@@ -261,12 +349,18 @@ def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
         sample=tuple(document["sample"]),
         stamp_ns=None if stamps is None else np.array(stamps, dtype=np.int64),
     )
-    warmth = document["temperature"]
+    warmth, spheres = document["temperature"], None
+    if "T_flange_sensor" in document:
+        parts = np.array(document["centre"]), np.array(document["spot_q"])
+        sensor = np.array(document["T_flange_sensor"])
+        names = tuple(document["sphere"])
+        spheres = SpheresInCell(sensor, names, *parts, frame=document["sensor_frame"])
     return ColdReference(
         cell,
         data,
         fixed=np.array(document["fixed"]).reshape(-1, 3),
         temperature=None if warmth is None else np.array(warmth),
+        spheres=spheres,
     )
 
 
@@ -407,7 +501,11 @@ def drift_share(
     ``sigma_m``: standard deviation of one coordinate of one visit.
     """
     spots, cold = reference.spots, visit.cell.arm
-    again = spots.common(visit.used)
+    used = visit.used
+    if visit.spheres is not None and reference.spheres is not None:
+        seen = visit.spheres.seen(visit.cell, used)
+        used = reference.placed(seen.take(spots.knows(seen.q)))
+    again = spots.common(used)
     again = again.take(~np.isin(again.sample, visit.spots.rejected))
     if len(spots.visited(again.q)) < FEWEST_GROUPS:
         return DriftShare()

@@ -47,6 +47,7 @@ from robocal_ros.session.events import (
 )
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel
 from robocal_ros.thermal.drift_following import (
+    FLANGE,
     DriftFollower,
     FollowerState,
     Following,
@@ -195,7 +196,8 @@ class ThermalSession(SessionBase):
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         data, fixed = self.windows.of(command)
         beside = self._beside(command, data, fixed)
-        outcome = self._proposer.capture(command, data, beside, wall_ns)
+        frame = self.desk.frame or ""
+        outcome = self._proposer.capture(command, data, beside, frame, wall_ns)
         self._close_cycle(command)
         return outcome
 
@@ -212,6 +214,8 @@ class ThermalSession(SessionBase):
         until_ns = min(data.middle_ns, (command.marks or {}).get(TEMPERATURES, -1))
         after_ns = 0 if self.follower is None else self.follower.read_ns
         readings = self.temperatures.between(after_ns, until_ns)
+        if self.config.arrangement == FLANGE:  # all spheres are fixed, and targets
+            fixed = fixed[:0]
         return Beside(fixed, readings, self.temperatures.at(until_ns))
 
     def _close_cycle(self, command: Command) -> None:

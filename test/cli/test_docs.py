@@ -26,10 +26,11 @@ def commands(page: str) -> list[list[str]]:
 
 def test_the_thermal_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("bags").symlink_to(ROOT / "bags")
     make = [sys.executable, ROOT / "docs/examples/make_thermal.py", "out/thermal"]
     subprocess.run(make, check=True, env=environment())
     typed = commands("docs/thermal.md")
-    assert len(typed) == 5
+    assert len(typed) == 7
     printed = {}
     for words in typed:
         done = robocal(*words)

@@ -68,6 +68,7 @@ CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
            "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
 CORRECT = ["correct-program", "--robot", ROBOT, "--model", "full.yaml"]
+POINTS = ["correct-points", "--robot", ROBOT, "--model", "full.yaml", "--data", "data.csv"]
 SHIFT = ["frame-shift", "--robot", ROBOT, "--model", "full.yaml"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
@@ -273,6 +274,12 @@ CASES = {
         "correct-program.json",
         [*CORRECT, "weld.dat", "--frames", "frames.dat", "--output", "weld_corrected.dat"],
         [*CORRECT, "weld.urp"],
+        (2, "BAD_INPUT"),
+    ),
+    "correct-points": (
+        "correct-points.json",
+        [*POINTS, "--mount", "mount.yaml", "--output", "in_base.csv"],
+        POINTS,
         (2, "BAD_INPUT"),
     ),
     "frame-shift": (

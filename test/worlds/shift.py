@@ -93,15 +93,43 @@ class Shift:
         for step in range(steps):
             yield self._joints(target)
             if step == 2 * steps // 3:
-                ball = (T_SENSOR_BASE @ arm.fk(target) @ BALL)[:3]
                 frame, _, name = self.frame.partition("/")
-                measured = ball + NOISE_M * self.rng.normal(size=3)
-                yield PointSample(self.now_ns - 3_000_000, frame, name or "tool", measured)
+                for sphere, ball in self.seen(arm, target, name or "tool").items():
+                    measured = ball + NOISE_M * self.rng.normal(size=3)
+                    yield PointSample(self.now_ns - 3_000_000, frame, sphere, measured)
+
+    def seen(self, arm: SerialArm, q: np.ndarray, name: str) -> dict[str, np.ndarray]:
+        """Targets (3,) in the sensor's frame, m."""
+        return {name: (T_SENSOR_BASE @ arm.fk(q) @ BALL)[:3]}
 
     def _joints(self, q: np.ndarray) -> JointSample:
         self.now_ns += PERIOD_NS
         noisy = q + 1e-7 * self.rng.normal(size=len(q))
         return JointSample(self.now_ns, self.names, noisy)
+
+
+T_FLANGE_SENSOR = frames.transform(frames.exp_rotation([0.1, -0.4, 0.8]), [0.08, -0.05, 0.22])
+SPHERES = {"a": np.array([1.6, 0.2, 0.6]), "b": np.array([1.2, -0.8, 0.9])}
+
+
+@dataclass
+class MeasuringShift(Shift):
+    """The sensor rides on the flange and sees the spheres of the cell."""
+
+    frame: str = "scanner"
+    spheres: dict[str, np.ndarray] = field(default_factory=lambda: dict(SPHERES))
+    T_flange_sensor: np.ndarray = field(default_factory=lambda: T_FLANGE_SENSOR)
+
+    def seen(self, arm: SerialArm, q: np.ndarray, name: str) -> dict[str, np.ndarray]:
+        T = frames.invert(arm.fk(q) @ self.T_flange_sensor)
+        return {sphere: T[:3, :3] @ c + T[:3, 3] for sphere, c in self.spheres.items()}
+
+
+def looking(count: int, seed: int = 3) -> np.ndarray:
+    """Postures about one from which the sensor looks at the spheres."""
+    middle = np.radians([0.0, -70.0, 110.0, 0.0, -40.0, 0.0])
+    reach = np.radians([60.0, 25.0, 30.0, 150.0, 60.0, 170.0])
+    return middle + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 6))
 
 
 def of_kind(samples: Sequence[Sample], kind: type) -> list[Sample]:

@@ -1,0 +1,105 @@
+"""Topics of a measuring robot: where the flange truly is, and what its sensor sees in base."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point, PointStamped, PoseStamped
+from sensor_msgs.msg import PointCloud2
+
+from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.samples import cloud_points, stamp_ns
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.conversions import cloud, header, pose_message
+from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, SensorShot
+from robocal_ros.thermal.session import ThermalSession
+
+POINT, CLOUD = "point", "cloud"
+UNPLACED = "the sensor is not placed: capture the cold reference"
+
+
+class MeasuringRobotTopics:
+    """``point`` and ``cloud`` in, the same in base out, and the flange beside them.
+
+    ``session``: of the node; None while it is inactive. It counts what cannot be placed.
+    """
+
+    def __init__(
+        self,
+        node: EndpointNode,
+        base_frame: str,
+        session: Callable[[], ThermalSession | None],
+    ) -> None:
+        self._base, self._session = base_frame, session
+        self._queue: PointQueue | None = None
+        self._arm: tuple[int, SerialArm] | None = None
+        node.add_input(PointStamped, POINT, self._take_point, endpoints.STREAM)
+        node.add_input(PointCloud2, CLOUD, self._take_cloud, endpoints.STREAM)
+        self._pose = node.add_output(PoseStamped, "~/flange_pose", endpoints.STREAM)
+        self._point = node.add_output(PointStamped, "~/corrected_point", endpoints.RELIABLE)
+        self._cloud = node.add_output(PointCloud2, "~/corrected_cloud", endpoints.RELIABLE)
+
+    def joints_came(self, session: ThermalSession) -> None:
+        """Tell where the flange is by the model in force, and place what waited for joints."""
+        newest = session.desk.stream.newest_ns
+        if newest is None:
+            return
+        _, q = session.desk.stream.window(newest, newest)
+        T = self._model(session).fk(q[0])
+        self._pose.publish(PoseStamped(header=header(newest, self._base), pose=pose_message(T)))
+        self._publish(session)
+
+    def _model(self, session: ThermalSession) -> SerialArm:
+        revision = session.in_force.revision
+        if self._arm is None or self._arm[0] != revision:
+            self._arm = revision, session.current.arm
+        return self._arm[1]
+
+    def _take_point(self, message: Any) -> None:
+        p = message.point
+        self._take(message, np.array([[p.x, p.y, p.z]]), POINT)
+
+    def _take_cloud(self, message: Any) -> None:
+        points = cloud_points(message)
+        self._take(message, points[np.all(np.isfinite(points), axis=1)], CLOUD)
+
+    def _take(self, message: Any, points: np.ndarray, name: str) -> None:
+        session = self._session()
+        if session is None:
+            return
+        try:
+            reference = session.reference
+            if reference is None or reference.spheres is None:
+                raise InputError(UNPLACED)
+            frame, known = message.header.frame_id.lstrip("/"), reference.spheres.frame
+            if frame != known:
+                raise InputError(f"frame '{frame}' is not the placed sensor's, '{known}'")
+            if self._queue is None or self._queue.stream is not session.desk.stream:
+                self._queue = PointQueue(session.desk.stream)
+            self._queue.add(SensorShot(stamp_ns(message.header.stamp), frame, points, name))
+        except RobocalError as error:
+            session.refuse(name, error)
+            return
+        self._publish(session)
+
+    def _publish(self, session: ThermalSession) -> None:
+        reference = session.reference
+        if self._queue is None or reference is None or reference.spheres is None:
+            return
+        sensor = reference.spheres.T_flange_sensor
+        for shot, placed in self._queue.ready(self._model(session), sensor):
+            if isinstance(placed, PlacedShot):
+                self._send(placed)
+            else:
+                session.refuse(shot.name, placed)
+
+    def _send(self, placed: PlacedShot) -> None:
+        shot = placed.shot
+        if shot.name == CLOUD:
+            self._cloud.publish(cloud(shot.stamp_ns, self._base, placed.points))
+            return
+        x, y, z = placed.points[0].tolist()
+        told = PointStamped(header=header(shot.stamp_ns, self._base), point=Point(x=x, y=y, z=z))
+        self._point.publish(told)
