@@ -7,6 +7,7 @@ own: a `Job` goes in, a `Validated` comes out, no message between.
 import math
 import tempfile
 from array import array
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -119,12 +120,15 @@ def validate_bag(job: Job) -> Validated:
             truth = BagTruth(reader)
             sessions = [_SessionReplay(job, recording, truth).judged() for recording in recordings]
             courses = cell_courses(reader, truth)
+            told = [document for document, _ in sessions]
+            places = [truth.state_topic(above(above(one.events or ""))) for one in recordings]
+        cells = []
+        for course in courses:
+            own = [d for d, place in zip(told, places, strict=True) if place == course.topic]
+            cells.append(course.document(changes_of(course.faults, own, start_ns * 1e-9)))
         found = {
-            "sessions": [document for document, _ in sessions],
-            "other_decisions": others,
-            "skipped": skipped,
-            "cells": [course.document() for course in courses],
-        }
+            "sessions": told, "other_decisions": others, "skipped": skipped, "cells": cells,
+        }  # fmt: skip
         require_finite(found, job.path)
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
@@ -578,6 +582,37 @@ def shift_errors(cycles: Sequence[ReplayedCycle]) -> ShiftErrors | None:
         after=np.array([true.after for _, true in judged]),
         held=np.array([true.in_force for _, true in judged]),
     )
+
+
+FORCE = {"thermal": "drift measured and accepted", "tool": "tool measured and accepted"}
+
+
+def changes_of(
+    faults: Sequence[Document], sessions: Sequence[Document], start_s: float
+) -> list[tuple[float, str]]:
+    """What changed a cell's state, in hours since ``start_s``, and in words.
+
+    Every fault and rollback; of the acceptances of a kind the first one after the beginning and
+    after each fault, for a shift has a hundred.
+    """
+    changes = [
+        (one["hours"], f"{one['fault'].replace('_', ' ')} {one['told'] or 'ends'}")
+        for one in faults
+    ]
+    begins = sorted(hours for hours, _ in changes)
+    for session in sessions:
+        seen = set()
+        for one in session["decisions"]:
+            hours = (one["stamp"] - start_s) / 3600.0
+            since = bisect_right(begins, hours)
+            if one["code"] != Code.ACCEPT.name or session["kind"] not in FORCE:
+                continue
+            if one["command"] == events.ROLLBACK:
+                changes.append((hours, f"{session['kind']}: rolled back"))
+            elif one["command"] == events.ACCEPT and since not in seen:
+                seen.add(since)
+                changes.append((hours, FORCE[session["kind"]]))
+    return changes
 
 
 def cell_courses(reader: BagReader, truth: BagTruth) -> list[CellCourse]:

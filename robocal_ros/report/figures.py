@@ -292,16 +292,38 @@ class CellCourse:
     tolerance_mm: float | None
     faults: Sequence[Document]
 
-    def document(self) -> Document:
-        """Figures of the whole, and of each hour."""
+    def document(self, changes: Sequence[tuple[float, str]] = ()) -> Document:
+        """Figures of the whole, of each hour, and of each state between ``changes``."""
         hour = self.hours.astype(int)
         return {
             "topic": self.topic,
+            "states": self._states(changes),
             **self._figures(np.ones(len(hour), dtype=bool)),
             "tolerance_mm": self.tolerance_mm,
             "faults": list(self.faults),
             "by_hour": [{"hour": int(h) + 1, **self._figures(hour == h)} for h in np.unique(hour)],
         }
+
+    def _states(self, changes: Sequence[tuple[float, str]]) -> list[Document]:
+        """Before the first change and after each: as told last before the next one, or the end.
+
+        ``changes``: hours since the recording began, and words. A change after which nothing was
+        told before the next one is named with that.
+        """
+        begins = [(0.0, "at the beginning"), *sorted(changes)]
+        ends = [*(hours for hours, _ in begins[1:]), np.inf]
+        series = {"rms_without_mm": self.without_mm, "rms_with_mm": self.with_mm}
+        series |= {"p95_mm": self.p95_mm, "bound_mm": self.bound_mm}
+        states, unseen = [], []
+        for (begin, words), end in zip(begins, ends, strict=True):
+            (told,) = np.nonzero((self.hours >= begin) & (self.hours < end))
+            unseen.append(words)
+            if len(told) or end == np.inf:
+                values = {name: s[told[-1]] if len(told) else np.nan for name, s in series.items()}
+                shown = {n: float(v) if np.isfinite(v) else None for n, v in values.items()}
+                states.append({"state": ", ".join(unseen), "hours": begin, **shown})
+                unseen = []
+        return states
 
     def _figures(self, chosen: NDArray[np.bool_]) -> Document:
         known = chosen & np.isfinite(self.bound_mm) & np.isfinite(self.p95_mm)

@@ -221,21 +221,23 @@ p { max-width: 46rem; }
   letter-spacing: .06em; text-transform: uppercase; }
 .faint, figcaption { color: var(--faint); font-size: .9rem; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums;
-  font-size: .93rem; }
-th, td { text-align: right; padding: .42rem .7rem; border-bottom: 1px solid var(--line);
+  font-size: .9rem; }
+th, td { text-align: right; padding: .42rem .45rem; border-bottom: 1px solid var(--line);
   vertical-align: top; }
 th { color: var(--faint); font-weight: 600; }
 th:first-child, td:first-child, td.words, th.words { text-align: left; }
-td:first-child { white-space: nowrap; }
+td:first-child { min-width: 6.5rem; }
+td:first-child, td.words { overflow-wrap: anywhere; }
 figure { margin: 1rem 0 0; }
 figure svg { width: 100%; height: auto; display: block; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .25rem 1.2rem; margin: 0;
   font-size: .93rem; }
 dt { color: var(--faint); }
 dd { margin: 0; overflow-wrap: anywhere; }
-@media (max-width: 40rem) { .wide { overflow-x: auto; } }
+@media (max-width: 62rem) { .wide { overflow-x: auto; } }
 @media print { body { max-width: none; padding: 0; font-size: 10.5pt; }
-  figure, tr { break-inside: avoid; } h2 { break-after: avoid; } }
+  table { font-size: 8pt; } th, td { padding: .2rem .25rem; } td:first-child { min-width: 4.5rem; }
+  figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } }
 """
 
 
@@ -294,41 +296,49 @@ def _share(value: Any) -> str:
 
 
 Columns = Mapping[str, Callable[[Document], str]]
-OVERVIEW: Mapping[str, tuple[Columns, str]] = {
+OVERVIEW: Mapping[str, tuple[tuple[Columns, ...], str]] = {
     "thermal": (
-        {
-            "judged by": lambda row: row["judged_by"],
-            "accepted": lambda row: f"{row['accepted']} of {row['cycles']}",
-            "rms without": lambda row: _mm(row["rms_without_mm"]),
-            "rms in force": lambda row: _mm(row["rms_in_force_mm"]),
-            "rms after": lambda row: _mm(row["rms_after_mm"]),
-            "rms candidate": lambda row: _mm(row["rms_candidate_mm"]),
-            "λ without": lambda row: _share(row["lambda_without"]),
-            "λ in force": lambda row: _share(row["lambda_in_force"]),
-            "λ after": lambda row: _share(row["lambda_after"]),
-            "below bound": lambda row: _share(row["share_below_bound"]),
-        },
+        (
+            {
+                "judged by": lambda row: row["judged_by"],
+                "accepted": lambda row: f"{row['accepted']} of {row['cycles']}",
+                "rms without": lambda row: _mm(row["rms_without_mm"]),
+                "rms in force": lambda row: _mm(row["rms_in_force_mm"]),
+                "rms after": lambda row: _mm(row["rms_after_mm"]),
+                "rms candidate": lambda row: _mm(row["rms_candidate_mm"]),
+            },
+            {
+                "λ without": lambda row: _share(row["lambda_without"]),
+                "λ in force": lambda row: _share(row["lambda_in_force"]),
+                "λ after": lambda row: _share(row["lambda_after"]),
+                "below bound": lambda row: _share(row["share_below_bound"]),
+            },
+        ),
         ERRORS_NOTE,
     ),
     "tool": (
-        {
-            "runs": lambda row: str(row["runs"]),
-            "largest change, mm": lambda row: _mm(row["largest_change_mm"]),
-            "largest true error, mm": lambda row: _mm(row["largest_true_error_mm"]),
-        },
+        (
+            {
+                "runs": lambda row: str(row["runs"]),
+                "largest change, mm": lambda row: _mm(row["largest_change_mm"]),
+                "largest true error, mm": lambda row: _mm(row["largest_true_error_mm"]),
+            },
+        ),
         "",
     ),
     "hand_eye": (
-        {
-            "calibrations": lambda row: str(row["calibrations"]),
-            "residual, mm": lambda row: _mm(row["residual_rms_mm"]),
-            "expected error, mm": lambda row: _mm(row["predicted_rms_mm"]),
-            "true error, mm": lambda row: _mm(row["true_error_mm"]),
-        },
+        (
+            {
+                "calibrations": lambda row: str(row["calibrations"]),
+                "residual, mm": lambda row: _mm(row["residual_rms_mm"]),
+                "expected error, mm": lambda row: _mm(row["predicted_rms_mm"]),
+                "true error, mm": lambda row: _mm(row["true_error_mm"]),
+            },
+        ),
         "",
     ),
 }
-"""Of each kind of session: what each column of its table shows of a row, and a note."""
+"""Of each kind of session: what the columns of its tables show of a row, and a note."""
 
 
 def page(report: Document, figures: Figures) -> str:
@@ -345,6 +355,7 @@ def page(report: Document, figures: Figures) -> str:
         f"<h1>{title}</h1>",
         f'<p class="faint">{escape(report["created"])} · {escape(report["software"])} {mark}</p>',
         f'<p class="lead">{_answer(rows, bags)}</p>',
+        *_states(bags),
         *_overview(rows),
     ]
     for bag in bags:
@@ -375,14 +386,15 @@ def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
     answers = []
     for bag in bags:
         for cell in bag.get("cells", []):
-            name = bag["bag"] + (f", {cell['topic']}" if len(bag["cells"]) > 1 else "")
-            share = ""
-            if cell["lambda_with"] is not None:
-                share = f", {_share(cell['lambda_with'])} of all directions within "
-                share += f"{TOLERANCE_MM:g} mm"
+            first, now = cell["states"][0], cell["states"][-1]
+            bound = ""
+            if now["bound_mm"] is not None:
+                bound = f"; 95 % of the errors were told to be below {_mm(now['bound_mm'])} mm"
             answers.append(
-                f"{escape(name)}: true rms error of the tool {_mm(cell['rms_without_mm'])} mm "
-                f"without correction, <b>{_mm(cell['rms_with_mm'])} mm</b> with it{share}."
+                f"{escape(_name_of(bag, cell))}: at the end the tool is off by "
+                f"<b>{_mm(now['rms_with_mm'])} mm</b> (true, rms), without correction by "
+                f"{_mm(now['rms_without_mm'])} mm{bound}. At the beginning it was off by "
+                f"{_mm(first['rms_without_mm'])} mm."
             )
     for row in rows:
         if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
@@ -400,6 +412,39 @@ def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
     return "<br>".join(answers) or "No thermal cycle in these bags."
 
 
+def _name_of(bag: Document, cell: Document) -> str:
+    return f"{bag['bag']}, {cell['topic']}" if len(bag["cells"]) > 1 else str(bag["bag"])
+
+
+def _states(bags: Sequence[Document]) -> list[str]:
+    """Of each simulated cell: the state before, after each event, and now."""
+    parts = []
+    head = ["state", "from", "rms without", "rms with", "95 % below", "bound told"]
+    for bag in bags:
+        for cell in bag.get("cells", []):
+            body = [
+                [one["state"], _after(one["hours"]),
+                 *(_mm(one[n]) for n in ("rms_without_mm", "rms_with_mm", "p95_mm", "bound_mm"))]
+                for one in cell["states"]
+            ]  # fmt: skip
+            name = escape(_name_of(bag, cell))
+            parts += [
+                f"<h2>Before, after each event, and now: {name}</h2>",
+                table(head, body, (0,)),
+            ]
+    note = (
+        '<p class="faint">True errors of the tool at the working poses, mm, as they were when '
+        "the next event came, in the last row at the end. With: of what was commanded last. 95 % "
+        "below: of these errors; bound told: what the line could read then, below which 95 % were "
+        "to be.</p>"
+    )
+    return [*parts, note] if parts else []
+
+
+def _after(hours: float) -> str:
+    return f"{hours:.2f} h" if hours >= 1.0 else f"{hours * 60.0:.1f} min"
+
+
 def _overview(rows: Sequence[Document]) -> list[str]:
     """A table of each kind of session; its last columns: does the replay give what was live?"""
     parts = []
@@ -407,20 +452,27 @@ def _overview(rows: Sequence[Document]) -> list[str]:
     if failed:
         cells = [[row["bag"], row["error"]["code"], row["error"]["message"]] for row in failed]
         parts += ["<h2>Not validated</h2>", table(["bag", "code", "why"], cells, words=(1, 2))]
-    for kind, (columns, note) in OVERVIEW.items():
-        body = []
-        for row in rows:
-            if row["kind"] == kind:
-                live = NOTHING
-                if row["as_recorded"]:
-                    live = f"{row['differs']} differ" if row["differs"] else "equal"
-                own = [shown(row) for shown in columns.values()]
-                body.append([row["bag"], *own, live, str(row["refused"]), str(row["warnings"])])
-        if body:
-            head = ["bag", *columns, "live", "refused", "warnings"]
-            parts += [f"<h2>{TITLES[kind]}</h2>", table(head, body)]
-            parts += [f'<p class="faint">{note}</p>'] if note else []
+    for kind, (tables, note) in OVERVIEW.items():
+        own = [row for row in rows if row["kind"] == kind]
+        if not own:
+            continue
+        parts.append(f"<h2>{TITLES[kind]}</h2>")
+        for columns in tables:
+            shown = dict(columns)
+            if columns is tables[-1]:
+                shown |= {"live": _live, "refused": lambda row: str(row["refused"])}
+                shown |= {"warnings": lambda row: str(row["warnings"])}
+            body = [[row["bag"], *(cell(row) for cell in shown.values())] for row in own]
+            parts.append(table(["bag", *shown], body))
+        parts += [f'<p class="faint">{note}</p>'] if note else []
     return parts
+
+
+def _live(row: Document) -> str:
+    """Does the replay give what was live?"""
+    if not row["as_recorded"]:
+        return NOTHING
+    return f"{row['differs']} differ" if row["differs"] else "equal"
 
 
 def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
@@ -459,13 +511,15 @@ def _cell(cell: Document) -> list[str]:
         "expected below it; p95: 95 % truly were; below bound: share of the time in which p95 was. "
         f"λ: share of all directions within {TOLERANCE_MM:g} mm.</p>"
     )
+    # Of a recording within an hour its states tell more than the mean of all of them.
+    hours = [table(head, body), note] if len(body) > 1 else []
     faults = []
     for one in cell["faults"]:
-        hours = one["hours"]
-        after = f"{hours:.2f} h" if hours >= 1.0 else f"{hours * 60.0:.1f} min"
-        faults.append((after, f"{one['fault'].replace('_', ' ')} {one['told'] or 'ends'}"))
+        faults.append(
+            (_after(one["hours"]), f"{one['fault'].replace('_', ' ')} {one['told'] or 'ends'}")
+        )
     shown = ["<h3>Faults that were simulated</h3>", listed(faults)] if faults else []
-    return [table(head, body), note, *shown]
+    return [*hours, *shown]
 
 
 def _session(session: Document) -> list[str]:

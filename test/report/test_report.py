@@ -4,11 +4,15 @@ import csv
 import io
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from robocal_ros.cli.validating import changes_of
+from robocal_ros.ground.errors import Code
 from robocal_ros.report import figures
 from robocal_ros.report.figures import (
     CellCourse,
@@ -265,14 +269,57 @@ def test_the_course_of_a_cell_hour_by_hour():
     json.dumps(found, allow_nan=False)
 
 
+def test_the_states_of_a_cell_are_as_told_last_before_the_next_event():
+    changes = [
+        (1.0, "collision 2 mm"),
+        (0.6, "unseen"),
+        (0.9, "drift accepted"),
+        (1.6, "rolled back"),
+    ]
+    before, bent, now = COURSE.document(changes)["states"]
+    assert (before["state"], before["hours"]) == ("at the beginning", 0.0)
+    assert (before["rms_without_mm"], before["rms_with_mm"], before["bound_mm"]) == (0.4, 0.04, 0.2)
+    # nothing was told between 0.6 h and the collision
+    assert bent["state"] == "unseen, drift accepted, collision 2 mm"
+    assert (bent["hours"], bent["rms_without_mm"], bent["rms_with_mm"]) == (1.0, 2.0, None)
+    # what came after the last truth claims nothing
+    assert (now["state"], now["rms_without_mm"], now["rms_with_mm"]) == ("rolled back", None, None)
+
+
+def test_acceptances_count_once_between_faults():
+    def decided(kind, *commands):
+        decisions = [
+            {"stamp": 1e9 + 3600.0 * hours, "command": command, "code": code}
+            for hours, command, code in commands
+        ]
+        return {"kind": kind, "decisions": decisions}
+
+    ok = Code.ACCEPT.name
+    thermal = decided(
+        "thermal", (0.1, "accept", ok), (0.2, "accept", ok), (1.1, "accept", "CONFLICT"),
+        (1.2, "accept", ok), (1.3, "accept", ok), (1.4, "identify", ok),
+    )  # fmt: skip
+    tool = decided("tool", (1.5, "accept", ok), (1.6, "rollback", ok))
+    changes = changes_of(COURSE.faults, [thermal, tool], 1e9)
+    assert sorted((round(hours, 6), words.split(" ")[0]) for hours, words in changes) == [
+        (0.1, "drift"), (1.0, "collision"), (1.2, "drift"), (1.5, "tool"), (1.6, "tool:"),
+    ]  # fmt: skip
+
+
 def test_the_page_tells_of_the_cell():
-    told = bag("one.mcap", simulated=True) | {"cells": [COURSE.document()]}
+    collided = [(1.0, "collision 2 mm")]
+    cell = replace(COURSE, with_mm=np.array([0.03, 0.04, 2.0, 0.055])).document(collided)
+    told = bag("one.mcap", simulated=True) | {"cells": [cell]}
     html = page(REPORT | {"bags": [told]}, {"one.mcap": [[cell_drawn(COURSE)]]})
     assert html.count("<svg") == 1
     assert "The cell, by the truth of /left/truth/state</h3>" in html
-    assert "one.mcap: true rms error" in html
-    for said in ("collision 2 mm", "95.0%", "1.00 h", "<b>1.155 mm</b> with it"):
+    (lead,) = re.findall(r'<p class="lead">.*</p>', html)
+    assert "one.mcap: at the end the tool is off by <b>0.055 mm</b> (true, rms)" in lead
+    assert "told to be below 0.200 mm. At the beginning it was off by 0.400 mm." in lead
+    for said in ("collision 2 mm", "95.0%", "1.00 h"):
         assert said in html
+    # before every other table
+    assert html.index("Before, after each event, and now: one.mcap") < html.index("rms with</th>")
     (row, _) = csv.DictReader(io.StringIO(hours_table([told])))
     assert float(row["lambda_with"]) == pytest.approx(0.95)
     without = hours_table([bag("two.mcap")])
@@ -287,8 +334,7 @@ def test_the_page_names_each_of_two_cells():
     html = page(REPORT | {"bags": [told]}, {"two.mcap": [[cell_drawn(cell) for cell in cells]]})
     assert html.count("<svg") == 2
     for said in (
-        "two.mcap, /left/truth/state: true rms error", "<b>1.155 mm</b> with it",
-        "two.mcap, /right/truth/state: true rms error", "<b>2.310 mm</b> with it",
+        "two.mcap, /left/truth/state: at the end", "two.mcap, /right/truth/state: at the end",
         "by the truth of /left/truth/state</h3>", "by the truth of /right/truth/state</h3>",
     ):  # fmt: skip
         assert said in html
@@ -307,3 +353,31 @@ def test_many_runs_are_drawn_over_time():
     (drawn,) = tool_figures(runs)
     assert "run 39" not in drawn.svg
     assert drawn.svg != tool_figures(runs[:39])[0].svg
+
+
+@pytest.mark.parametrize(("paper", "width"), [(False, 1280), (False, 1000), (True, 718)])
+def test_no_table_is_wider_than_the_page(tmp_path, paper, width):
+    """Measured by a browser; 718 pixels are A4 within margins of 10 mm, by CSS 96 to an inch."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("there is no Chromium")
+    long = "robocal_2026-11-25T23-53-23Z_of_the_cell_at_the_north_end.mcap"
+    told = bag(long, THERMAL, TOOL, simulated=True) | {"cells": [COURSE.document([(1.0, long)])]}
+    html = page(REPORT | {"bags": [told]}, {long: [[cell_drawn(COURSE)], [], []]})
+    if paper:
+        html = html.replace("@media print", "@media all")
+    measure = (
+        "<script>document.title = [...document.querySelectorAll('table')].map("
+        "t => t.scrollWidth + '/' + t.parentElement.clientWidth).join(' ')</script></body>"
+    )
+    file = tmp_path / "page.html"
+    file.write_text(html.replace("</body>", measure))
+    done = subprocess.run(
+        [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900",
+         "--dump-dom", file.as_uri()],
+        capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    (title,) = re.findall("<title>(.*)</title>", done.stdout)
+    sizes = [[int(part) for part in pair.split("/")] for pair in title.split()]
+    assert len(sizes) == html.count("<table")
+    assert all(table <= room for table, room in sizes), sizes
