@@ -22,15 +22,21 @@ node = Executable("cell_sim_node", {{}}, {{}}, Path(sys.argv[1]))
 print(node.pid, flush=True)
 time.sleep(600)
 """
-TESTS = f"""
+
+
+def of_tests(forked: bool) -> str:
+    return f"""
 {FOLDERS}
 import os, time
 from conftest import EXECUTABLES, Executable
-node = Executable("cell_sim_node", [str(EXECUTABLES / "cell_sim_node")], dict(os.environ))
+command = [str(EXECUTABLES / "cell_sim_node")]
+node = Executable("cell_sim_node", command, dict(os.environ), forked={forked})
 print(node.process.pid, flush=True)
 time.sleep(600)
 """
-FORKED = TESTS.replace("os.environ))", "os.environ), forked=True)")
+
+
+SCRIPTS = {"bench": BENCH, "tests": of_tests(forked=False), "forked": of_tests(forked=True)}
 
 
 def lives(pid: int) -> bool:
@@ -42,7 +48,7 @@ def lives(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGKILL])
-@pytest.mark.parametrize("script", [BENCH, TESTS, FORKED], ids=["bench", "tests", "forked"])
+@pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
 def test_a_node_ends_with_what_started_it(script: str, by: signal.Signals, tmp_path: Path) -> None:
     with free_domain() as domain:
         starter = subprocess.Popen(
