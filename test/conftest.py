@@ -1,5 +1,6 @@
 """What all tests share: the place of the real measurements, and which tests can run here."""
 
+import gc
 import importlib.util
 import os
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+gc.disable()  # until all tests are read: nothing of them is garbage
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "test" / "worlds"))  # what tests share: cells, robots, recordings
 from measured_cell import cell, known_set_up, make_cell_fixture  # noqa: E402, F401
@@ -54,6 +56,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("data"):
             item.add_marker(absent)
+
+
+def pytest_collection_finish() -> None:
+    """Each look for garbage, those of node tests too, is at what the tests made alone."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

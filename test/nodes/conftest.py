@@ -332,10 +332,3 @@ def next_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[]
             return last.enter_context(private_graph(tmp_path_factory.mktemp("state")))
 
         yield begin
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _imports_stay() -> None:
-    """Each `gc.collect` looks at what the tests made alone."""
-    gc.collect()
-    gc.freeze()

@@ -1,7 +1,6 @@
 """Processes forked from one that has read the code: each saves a second and more of a core."""
 
 import ctypes
-import gc
 import os
 import runpy
 import signal
@@ -14,19 +13,13 @@ from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from unittest.mock import patch
 
-# The command first: it sets the threads of what NumPy loads. What is not there is left out.
-READ = ["robocal_ros.cli.main", "rich.table", "scipy.optimize", "scipy.spatial.transform"]
-READ += ["warm_command"]
-NODES = ["thermal.node", "tool.node", "hand_eye.node", "correction.node", "maintenance.node"]
-NODES += ["cell_sim.node", "bags.replay_node", "bags.recorder_node", "adapter.node", "plc.node"]
 PR_SET_PDEATHSIG = 1
 
 
 @cache
 def forks() -> ForkServerContext:
     """Of the process that has read the code; it ends with this one."""
-    nodes = [f"robocal_ros.{name}" for name in NODES] if "ROS_DOMAIN_ID" in os.environ else []
-    forkserver.set_forkserver_preload([*READ, *nodes])
+    forkserver.set_forkserver_preload(["read_ahead"])
     given = ("ROBOCAL_STATE", "COLUMNS")  # by whoever runs the tests
     plain = {name: value for name, value in os.environ.items() if name not in given}
     here = Path(__file__).parent
@@ -49,8 +42,6 @@ def _as_script(words: list[str], environment: Mapping[str, str], folder: Path, l
     # What it holds of this would keep the process that it is forked from, its parent, alive.
     os.close(forkserver._forkserver._forkserver_alive_fd)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-    # A collection would touch, and so copy, all that was read: a stall of 0.1 s amid a motion.
-    gc.freeze()
     become(environment, folder, [log, log])
     sys.stdout.reconfigure(line_buffering=True)
     sys.argv = words

@@ -1,0 +1,28 @@
+"""What processes of tests need, read once by the one that they are forked from (`forked`)."""
+
+import gc
+import os
+from contextlib import suppress
+from importlib import import_module
+
+# A look for garbage amid so many new objects, which all stay, takes a third of the time; and in a
+# fork it would touch, and so copy, all of them: a stall of 0.1 s amid a motion.
+gc.disable()
+# The command first: it sets the threads of what NumPy loads.
+READ = ["robocal_ros.cli.main", "rich.table", "scipy.optimize", "scipy.spatial.transform"]
+NODES = ["thermal.node", "tool.node", "hand_eye.node", "correction.node", "maintenance.node"]
+NODES += ["cell_sim.node", "bags.replay_node", "bags.recorder_node", "adapter.node", "plc.node"]
+if "ROS_DOMAIN_ID" in os.environ:
+    READ += [f"robocal_ros.{name}" for name in NODES]
+for name in READ:
+    with suppress(ImportError):  # rclpy is not everywhere
+        import_module(name)
+
+import numpy as np  # noqa: E402
+
+from robocal_ros.kinematics.robots import load_robot  # noqa: E402
+
+_ur10 = load_robot("ur10")
+_ur10.fk(np.zeros((2, _ur10.n)))  # loads the compiled kernels
+gc.freeze()
+gc.enable()
