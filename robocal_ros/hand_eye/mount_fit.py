@@ -45,6 +45,7 @@ ARBITRARY_RAD = 0.17  # a turn so uncertain is arbitrary: its covariance no long
 
 CLEARLY = 0.4  # of the misfit as given: below it the undone data may be the right ones
 FITS_M = 5e-4  # misfit of data that are right
+FAR_START = 10.0  # times what fits; the closed form of right data is off by noise alone
 FITS = 5.0  # times the rms of the others
 FARTHEST_M, NEAREST_M = 20.0, 0.02  # of a flange from its base
 
@@ -371,15 +372,20 @@ def undone(T_base_flange: Array) -> Iterator[tuple[str, Array]]:
         yield words, frames.transform(T[:, :3, :3], 1e-3 * T[:, :3, 3])
 
 
-def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: float) -> str | None:
+def explain(
+    suspects: Iterable[tuple[str, float, Callable[[], float]]], as_given_m: float
+) -> str | None:
     """The words of the suspect with the smallest misfit, m; None where none fits.
 
-    A mistake is recognised because undoing it makes everything fit.
+    A mistake is recognised because undoing it makes everything fit. ``suspects``: their words, the
+    misfit of a closed form, and what it is when followed; the nearest is followed first.
     """
     best, least = None, min(CLEARLY * as_given_m, FITS_M)
-    for words, misfit in suspects:
+    for words, start_m, followed in sorted(suspects, key=lambda suspect: suspect[1]):
+        if start_m > as_given_m or (best is not None and start_m > FAR_START * least):
+            break
         try:
-            found = misfit()
+            found = followed()
         except RobocalError:
             continue
         if found < least:

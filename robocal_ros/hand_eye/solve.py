@@ -402,31 +402,32 @@ def _name_mistake(
 ) -> None:
     """Raise with the mistake that explains a misfit, m, or an error; nothing where none does."""
 
-    def followed(task: Task, view: TargetView) -> float:
-        if not _shown(view, data):
-            return np.inf
-        first = task.starts(view)[0]
-        if (off := misfit((view,), first)) > as_given:  # not worth following
-            return off
-        return misfit((view,), first_look((view,), first))
-
-    def with_poses(T_base_flange: Array) -> float:
+    def posed(T_base_flange: Array) -> TargetView:
         other = replace(data, T_base_flange=T_base_flange)
-        view = task.read(other).view if read is None else task.posed(read.view, other)
-        return followed(task, view)
+        return task.read(other).view if read is None else task.posed(read.view, other)
 
-    def with_target(other: Task) -> float:
+    def of_target(other: Task) -> TargetView:
         if read is None or task.read_by_poses:
-            return followed(other, other.read(data).view)
-        return followed(other, other.posed(read.view, data))
+            return other.read(data).view
+        return other.posed(read.view, data)
 
-    def suspects() -> Iterator[tuple[str, Callable[[], float]]]:
+    def undoing() -> Iterator[tuple[str, Task, Callable[[], TargetView]]]:
         for words, poses in undone(data.T_base_flange):
-            yield words, partial(with_poses, poses)
+            yield words, task, partial(posed, poses)
         if read is not None and error is not None and not task.read_by_poses:
             return  # open directions lie in the poses, whatever is told of the target
         for words, other in task.suspects():
-            yield words, partial(with_target, other)
+            yield words, other, partial(of_target, other)
+
+    def suspects() -> Iterator[tuple[str, float, Callable[[], float]]]:
+        for words, other, seen in undoing():
+            try:
+                view = seen()
+                if _shown(view, data):
+                    start = other.starts(view)[0]
+                    yield words, misfit((view,), start), partial(_followed, view, start)
+            except RobocalError:
+                continue
 
     words = explain(suspects(), as_given)
     if words is None:
@@ -434,6 +435,10 @@ def _name_mistake(
     if not np.isfinite(as_given):
         raise ResidualError(f"the samples do not fit: {words}") from error
     raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")
+
+
+def _followed(view: TargetView, start: MountState) -> float:
+    return misfit((view,), first_look((view,), start))
 
 
 @dataclass(frozen=True, eq=False)
