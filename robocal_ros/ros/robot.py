@@ -7,6 +7,7 @@ robot_state_publisher publishes its parameter: at its start, and again whenever 
 
 from typing import Any
 
+import numpy as np
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -37,6 +38,7 @@ class RobotNode(HouseNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._described = self._doubt = ""
+        self._texts: set[int] = set()  # that were described
         self._awaits = False
         self._present: Any = None  # subscription, until it has told where the robot stands
         # Not of `add_input`: it is heard while nothing is configured.
@@ -79,6 +81,7 @@ class RobotNode(HouseNode):
         if message.data == self._described:
             return
         self._described = message.data
+        self._texts.add(hash(message.data))
         if self._awaits and self.state == "unconfigured":
             self.autostart()
         elif self.state in ("inactive", "active"):
@@ -100,13 +103,18 @@ class RobotNode(HouseNode):
         self.robot_fault = self._doubt = ""
         topic = self.resolve_topic_name(DESCRIPTION)
         try:
-            found = model_difference(self._links(), self.robot.arm, present)
+            links = self._links()
+            found = model_difference(links, self.robot.arm, present)
+            beyond = limits_beyond(links, self.robot) if found is None else ""
         except Exception as error:  # whatever a stranger publishes, the node lives on
             self._doubt = f"{topic} cannot be compared with {self._source()}: {error}"
             self._log(DESCRIPTION, error)
         else:
             if found is not None:
                 self.robot_fault = f"{topic} is another robot than {self._source()}: {found}"
+            if beyond:
+                self._doubt = f"{self._source()} allows more than {topic}: {beyond}"
+                self.get_logger().warning(self._doubt)
         if self.robot_fault:
             self.get_logger().error(self.robot_fault)
         if self.robot_fault and present is None and self._present is None:
@@ -137,4 +145,42 @@ class RobotNode(HouseNode):
             health.worsen(ERROR, self.robot_fault)
         if self._doubt:
             health.worsen(WARN, self._doubt)
+        if len(self._texts) > 1:  # else it does not matter who said it
+            topic = self.resolve_topic_name(DESCRIPTION)
+            infos = self.get_publishers_info_by_topic(topic)
+            if len(infos) > 1:
+                who = sorted(f"{i.node_namespace.rstrip('/')}/{i.node_name}" for i in infos)
+                health.worsen(
+                    WARN,
+                    f"{' and '.join(who)} describe different robots on {topic}: the last counts",
+                )
         return health
+
+
+_LIMIT = 1e-4  # relative; a description's numbers are rounded
+
+
+def limits_beyond(links: Chain, robot: RobotDescription) -> str:
+    """Joints that ``robot`` lets go further, or faster, than the description does; empty: none.
+
+    A file that allows less is somebody's choice; what the description leaves open is no limit.
+    """
+    words = []
+    rows = zip(links.moving, robot.arm.lower, robot.arm.upper, robot.max_velocity, strict=True)
+    for joint, lower, upper, velocity in rows:
+        factor, unit = (1e3, "mm") if joint.kind == "prismatic" else (np.degrees(1.0), "deg")
+        told = [joint.lower, joint.upper, joint.velocity]
+        beyond = np.array([joint.lower - lower, upper - joint.upper, velocity - joint.velocity])
+        beyond[~np.isfinite(told)] = 0.0
+        if (beyond[:2] > _LIMIT * np.abs(told[:2]) + 1e-9).any():
+            ours, theirs = factor * np.array([lower, upper]), factor * np.array(told[:2])
+            words.append(
+                f"{joint.name} may lie within {ours[0]:.4g} to {ours[1]:.4g} {unit}, "
+                f"not {theirs[0]:.4g} to {theirs[1]:.4g}"
+            )
+        if beyond[2] > _LIMIT * joint.velocity:
+            words.append(
+                f"{joint.name} may turn by {factor * velocity:.4g} {unit}/s, "
+                f"not {factor * joint.velocity:.4g}"
+            )
+    return "; ".join(words)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState
+from rclpy.node import Node
 from robocal_msgs.msg import CorrectionStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -295,3 +296,56 @@ def test_a_description_without_the_robot_is_a_doubt_alone(graph: Any, described:
     described.describe(TEXT)
     words = "cannot be compared with"
     described.becomes("thermal_node", "active", words, DiagnosticStatus.WARN)
+
+
+def test_limits_beyond_those_of_the_description_are_told(graph: Any, described: Described) -> None:
+    """A UR whose elbow the cell's description keeps within half a turn, and slower."""
+
+    def edit(top: ElementTree.Element) -> None:
+        limit = top.find("joint[@name='elbow_joint']/limit")
+        assert limit is not None
+        limit.set("lower", "-3.14159265")
+        limit.set("upper", "3.14159265")
+        limit.set("velocity", "1.0")
+
+    node = graph.add(ThermalNode, {"robot": "ur10"})
+    described.describe(edited(edit))
+    words = "elbow_joint may lie within -360 to 360 deg, not -180 to 180; elbow_joint may turn by"
+    described.becomes(
+        "thermal_node", "active", f"ur10 allows more than /robot_description: {words}"
+    )
+    assert described.status("thermal_node").level == DiagnosticStatus.WARN
+    assert node.robot_fault == ""
+
+
+def test_a_file_that_allows_less_is_somebodys_choice(graph: Any, described: Described) -> None:
+    def edit(top: ElementTree.Element) -> None:
+        for limit in top.iter("limit"):
+            limit.set("velocity", "10.0")
+
+    node = graph.add(ThermalNode, {"robot": "ur10"})
+    described.describe(edited(edit))
+    graph.spin_until(lambda: node._described, "it has been described")
+    graph.spin_for(1.2)  # one round of diagnostics
+    assert "allows more" not in described.status("thermal_node").message
+
+
+def test_two_who_describe_different_robots_are_named(graph: Any, described: Described) -> None:
+    node = graph.add(ThermalNode, {"robot": ""})
+    described.describe(TEXT)
+    graph.spin_until(lambda: node.state == "active", "its robot has come")
+    other = Node("other_publisher", context=graph.context, start_parameter_services=False)
+    try:
+        profile = endpoints.own(endpoints.LATCHED)
+        publisher = other.create_publisher(String, "robot_description", profile)
+        graph.spin_until(
+            lambda: len(node.get_publishers_info_by_topic("/robot_description")) == 2, "two"
+        )
+        publisher.publish(String(data=TEXT))
+        graph.spin_for(1.2)
+        assert "different" not in described.status("thermal_node").message  # the same text
+        publisher.publish(String(data=TEXT + "<!-- edited -->"))
+        words = "/other_publisher and /probe describe different robots on /robot_description"
+        described.becomes("thermal_node", "active", words)
+    finally:
+        other.destroy_node()
