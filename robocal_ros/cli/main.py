@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, RobocalError
-from robocal_ros.ground.files import quoted
+from robocal_ros.ground.files import nearest, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -93,8 +93,25 @@ class CommandParser(argparse.ArgumentParser):
         )
 
     def error(self, message: str) -> NoReturn:
-        """Raise a `UsageError`; argparse itself would leave with text alone."""
+        """Raise a `UsageError`, with what may have been meant; argparse would leave with text."""
+        typed = re.search(r"(invalid choice: '|unrecognized arguments: )([\w-]+)", message)
+        if typed:
+            options, commands = _known_to(self)
+            message += nearest(typed[2], options if typed[2].startswith("-") else commands)
         raise UsageError(message, self.format_usage())
+
+
+def _known_to(parser: argparse.ArgumentParser) -> tuple[list[str], list[str]]:
+    """Options of a parser and of those below it, and its own commands."""
+    options: list[str] = []
+    commands: list[str] = []
+    for action in parser._actions:
+        options += action.option_strings
+        if isinstance(action, argparse._SubParsersAction):
+            commands += action.choices
+            for below in action.choices.values():
+                options += _known_to(below)[0]
+    return options, commands
 
 
 def with_negative_values(arguments: Sequence[str]) -> list[str]:

@@ -62,6 +62,20 @@ class TestUsage:
             assert document["error"]["code"] == "BAD_INPUT"
             assert document["error"]["message"] in plain.stderr or place < len(arguments)
 
+    @pytest.mark.parametrize(
+        ("arguments", "meant"),
+        [
+            ("identfy", "identify"),
+            ("tool crosed", "crossed"),
+            ("identify --hold-ot 0.5 --robot ur10 --data x.csv", "--hold-out"),
+        ],
+    )
+    def test_what_was_meant_is_named(self, arguments, meant):
+        assert f"(did you mean '{meant}'?)" in robocal(*arguments.split()).stderr
+
+    def test_what_is_like_nothing_is_not_guessed(self):
+        assert "did you mean" not in robocal("zzzz").stderr
+
     def test_help_and_version(self):
         done = robocal("--version")
         assert (done.returncode, done.stdout) == (0, f"robocal {__version__}\n")

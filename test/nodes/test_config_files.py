@@ -79,6 +79,20 @@ def test_ros_reads_the_file_as_we_do(file):
     context.try_shutdown()
 
 
+def test_the_aggregator_has_each_node_once():
+    """A GenericAnalyzer takes the items whose names contain one of its words."""
+    file = yaml.safe_load((CONFIG / "diagnostics_aggregator.yaml").read_text())
+    analyzers = file["analyzers"]["ros__parameters"]
+    assert analyzers.pop("path") == "robocal"
+    for node in NODES:
+        taking = [
+            name
+            for name, analyzer in analyzers.items()
+            if any(word in f"robot_1/{node.NAME}" for word in analyzer["contains"])
+        ]
+        assert len(taking) == 1, (node.NAME, taking)
+
+
 @pytest.mark.parametrize("node", PAGES, ids=lambda node: node.NAME)
 def test_the_page_shows_every_advanced_parameter(node):
     rows = [
