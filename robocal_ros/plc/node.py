@@ -268,8 +268,9 @@ class PlcBridgeNode(HouseNode):
             called.answer("BadUnexpectedError")
             return
         called.answer(outputs)
-        words = f"{called.user} called {called.method.name}: {response.message}"
-        self.get_logger().info(words)
+        if called.method.name != "Status":  # which a PLC asks again and again
+            words = f"{called.user} called {called.method.name}: {response.message}"
+            self.get_logger().info(words)
 
     def _let_go(self) -> None:
         """Forget calls that were not answered: the PLC was told so."""

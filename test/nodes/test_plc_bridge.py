@@ -57,7 +57,7 @@ class Line:
         self.do(client, client.connect_once_there())
         return client
 
-    def do(self, client: PlcClient, work: Coroutine[Any, Any, Any], within_s: float = 30.0) -> Any:
+    def do(self, client: PlcClient, work: Coroutine[Any, Any, Any], within_s: float = 70.0) -> Any:
         """Let a PLC do something while the graph goes on."""
         done = client.start(work)
         self.graph.spin_until(done.done, "the PLC's request", within_s)
