@@ -395,6 +395,9 @@ class CliGroup:
 
 COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
     "fk": CliCommand("cli.robot:fk", "pose of the flange, and of the tool, at given joint values"),
+    "info": CliCommand(
+        "cli.info:info", "what a bag, table or file holds, and what can be done with it"
+    ),
     "identify": CliCommand(
         "cli.identify:identify",
         "identify a robot's model from a table of measurements, and judge it on unseen ones",

@@ -78,6 +78,12 @@ CASES = {
         ["fk", "--robot", ROBOT, "--joints-deg", "0,-90"],
         (2, "BAD_INPUT"),
     ),
+    "info": (
+        "info.json",
+        ["info", "hand_eye.mcap"],
+        ["info", "nowhere.csv"],
+        (2, "BAD_INPUT"),
+    ),
     "identify": (
         "identify.json",
         ["identify", "--robot", ROBOT, "--data", "data.csv"],

@@ -1,0 +1,109 @@
+"""``robocal info``: each kind of file is known, and the commands that it names take it."""
+
+import argparse
+import shlex
+from pathlib import Path
+
+import pytest
+from command import ROOT, robocal, robocal_json
+from recordings import plain_bag, shift
+from tool_runs import run_tables
+
+from robocal_ros.cli import main
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_description, load_robot
+from robocal_ros.kinematics.urdf import urdf_of
+
+UR10 = load_description("ur10")
+EXAMPLES = ROOT / "docs" / "examples"
+FILES = {
+    str(ROOT / "bags" / "tool_runs.mcap"): ("bag", "session: tool of UR10"),
+    str(ROOT / "bags" / "demo_shift.mcap"): ("bag", "the bag is simulated"),
+    str(EXAMPLES / "measured.csv"): ("measurements: joints, and where", "joints: 6"),
+    str(EXAMPLES / "positions.csv"): ("no kind that is known", "rows:"),
+    str(ROOT / "config" / "robots" / "ur10.yaml"): ("robot file", "model hash"),
+    str(ROOT / "config" / "cells" / "kr150_laser.yaml"): ("laser file", "serial: SIM-KR150"),
+    str(ROOT / "config" / "thermal_node.yaml"): ("parameter file", "/**/thermal_node"),
+}
+
+
+def takes(command: str) -> None:
+    """Fail unless the command line is one: words in capitals stand for files and names."""
+    words = shlex.split(command)
+    if words[0] == "robocal":
+        parser = main.CommandParser(prog="robocal")
+        numbers = {"UP": "400", "DOWN": "360"}
+        arguments = [numbers.get(word, word) for word in words[1:]]
+        named = [word for word in arguments if not word.startswith("-")]
+        main._declare(parser, "command", main.COMMANDS, named)
+        assert isinstance(parser.parse_args(arguments), argparse.Namespace)
+    else:
+        assert words[:3] in (["ros2", "launch", "robocal_ros"], ["ros2", "run", "robocal_ros"])
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_file_of_this_repository_is_known(file):
+    kind, fact = FILES[file]
+    done = robocal("info", file)
+    assert done.returncode == 0, done.stderr
+    assert kind in done.stdout.splitlines()[0]
+    assert fact in done.stdout
+    for command in robocal_json("info.json", "info", file)["commands"]:
+        takes(command)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Files that commands and nodes write, and what people bring."""
+    folder = tmp_path_factory.mktemp("info")
+    plain_bag(folder / "plain.mcap", shift())
+    run_tables(folder)
+    (folder / "robot.urdf").write_text(urdf_of(UR10.arm, UR10.max_velocity))
+    (folder / "broken.urdf").write_text("<robot name='x'><link name='a'/></robot>")
+    (folder / "kinematics.yaml").write_text("kinematics: {shoulder: {x: 0.0}, hash: calib_1}\n")
+    (folder / "prog.src").write_bytes(b"DEF w()\n; N\xe4he\nEND\n")  # not UTF-8
+    (folder / "bad.yaml").write_text("convention: dh\njoints: []\n")
+    (folder / "result.json").write_text('{"verdict": {"code": "ACCEPT", "reason": "good"}}')
+    nominal = load_robot("ur10")
+    with CalibrationHistory.open("R7", model_hash=nominal.model_hash, state_dir=folder):
+        pass
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "fact"),
+    [
+        ("plain.mcap", "bag", "commands of a node were not recorded"),
+        ("run.csv", "table of beam edges", "columns: "),
+        ("joints.csv", "joint readings over time", "joints: 6"),
+        ("robot.urdf", "description of a robot (URDF)", "base to flange, 6 joints"),
+        ("broken.urdf", "gives no arm", "fault: "),
+        ("kinematics.yaml", "kinematics of a Universal Robots arm", "hash: calib_1"),
+        ("prog.src", "program of kuka", "lines: "),
+        ("bad.yaml", "robot file that is not valid", "fault: "),
+        ("result.json", "result of a robocal command", "ACCEPT: good"),
+        ("R7.sqlite", "history of the robot with serial R7", "calibrations: 0"),
+    ],
+)
+def test_a_file_that_was_made_is_known(made, name, kind, fact):
+    document = robocal_json("info.json", "info", made / name)
+    assert kind in document["kind"]
+    assert fact in "".join(f"{one['name']}: {one['value']}\n" for one in document["facts"])
+    for command in document["commands"]:
+        takes(command)
+
+
+def test_what_it_names_runs_as_printed(made, monkeypatch):
+    monkeypatch.chdir(made)
+    for file in ("robot.urdf", "R7.sqlite"):
+        command = robocal_json("info.json", "info", file)["commands"][0]
+        done = robocal(*shlex.split(command)[1:])
+        assert done.returncode == 0, (command, done.stderr)
+
+
+def test_what_is_of_no_kind_is_said(tmp_path: Path):
+    file = tmp_path / "notes.odt"
+    file.write_text("hello")
+    done = robocal("info", file)
+    assert done.returncode == 2
+    assert "is of no kind that is known" in done.stderr
