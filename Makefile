@@ -1,4 +1,4 @@
-# make demo | test | bench | soak | lint | test-floor: each does all the set-up that it needs.
+# make demo | test | bench | docs | soak | lint | test-floor: each does all the set-up that it needs.
 # A step's stamp is written only after the step succeeded; an interrupted one is simply done again.
 
 SHELL := /bin/bash
@@ -26,7 +26,7 @@ $(shell rm -rf $(VENV) $(VENV)-* build install log)
 endif
 endif
 
-.PHONY: help demo test bench figures soak lint test-floor setup clean
+.PHONY: help demo test bench figures docs soak lint test-floor setup clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -64,6 +64,11 @@ bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed besid
 
 figures: setup $(VENV)-bench/.stamp  ## bench, kept as the figures of docs/
 	$(ROS) $(VENV)-bench/bin/python -m bench --keep
+
+docs: setup $(VENV)-docs/.stamp  ## the pages as a site in out/site, with a reference; links checked
+	$(ROS) python tools/site_pages.py out/docs
+	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
+	@echo out/site/index.html
 
 soak: setup  ## hours: kills, random work, a live graph under load, more simulated robots
 	$(ROS) python -m bench.soak $(SOAK)
@@ -136,6 +141,11 @@ $(STAMPS)/robocal_ros: $(STAMPS)/interfaces $(PYTHON_FILES) $(shell find config 
 $(VENV)-bench/.stamp: requirements/bench.txt requirements/core.txt requirements/constraints.txt
 	@echo "Installing the libraries to compare with into $(VENV)-bench (once)"
 	tools/make_venv $(VENV)-bench "3.11 3.12" $(LOCKED) -r requirements/core.txt -r requirements/bench.txt
+	touch $@
+
+$(VENV)-docs/.stamp: requirements/docs.txt
+	@echo "Installing what makes the site into $(VENV)-docs (once)"
+	tools/make_venv $(VENV)-docs "3.11 3.12" -r requirements/docs.txt
 	touch $@
 
 $(VENV)-floor/.stamp: requirements/floor.txt

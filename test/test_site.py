@@ -1,0 +1,82 @@
+"""The site: every page has its place, and its reference is what the programs declare."""
+
+import importlib.util
+import os
+import re
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from robocal_ros.cli.main import COMMANDS, CliGroup
+
+ROOT = Path(__file__).parents[1]
+MKDOCS = ROOT / ".venv-docs" / "bin" / "mkdocs"
+
+
+def test_every_page_has_its_place() -> None:
+    placed = re.findall(r"- (?:[\w ]+: )?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
+    assert len(placed) == len(set(placed))
+    pages = {str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")}
+    assert {page for page in placed if page.startswith("docs/")} == pages
+
+
+@pytest.fixture(scope="module")
+def pages() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("site_pages", ROOT / "tools" / "site_pages.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.ros
+def test_the_reference_has_every_parameter(pages: ModuleType) -> None:
+    text = pages.parameters()
+    found = pages.nodes()
+    scripts = re.findall(r'"(\w+_node) = ', (ROOT / "setup.py").read_text())
+    assert sorted(scripts) == [node.NAME for node in found]
+    for node in found:
+        (_, section) = text.split(f"## {node.NAME}\n")
+        section = section.split("\n## ")[0]
+        for setting in node.SETTINGS:
+            assert f"| `{setting.name}` | " in section
+
+
+def test_the_reference_has_every_command(
+    pages: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    text = pages.commands()
+    for name, command in COMMANDS.items():
+        assert f"## robocal {name}\n" in text
+        for action in command.actions if isinstance(command, CliGroup) else ():
+            assert f"### robocal {name} {action}\n" in text
+
+
+def test_the_reference_has_every_interface(pages: ModuleType) -> None:
+    text = pages.interfaces()
+    files = [path for kind in pages.KINDS for path in (ROOT / "msg_defs" / kind).iterdir()]
+    assert files
+    for file in files:
+        assert f"### {file.stem}\n" in text
+        assert file.read_text().rstrip() in text
+
+
+@pytest.mark.ros
+@pytest.mark.skipif(not MKDOCS.exists(), reason="make docs has not installed mkdocs")
+def test_it_is_built_without_a_warning(pages: ModuleType, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("sys.argv", ["site_pages.py", str(tmp_path / "out" / "docs")])
+    monkeypatch.setenv("COLUMNS", "100")
+    pages.main()
+    (tmp_path / "mkdocs.yml").write_text((ROOT / "mkdocs.yml").read_text())
+    done = subprocess.run(
+        [MKDOCS, "build", "--strict"],
+        cwd=tmp_path, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    assert (tmp_path / "out" / "site" / "index.html").is_file()

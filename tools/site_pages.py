@@ -1,0 +1,117 @@
+"""Lay out in a folder what `make docs` makes a site of: pages where they lie, and the reference.
+
+The reference is written from what the programs themselves declare: parameters of the nodes, help of
+the commands, definitions of the messages. Run with the nodes' Python and ROS (tools/with_ros).
+"""
+
+import contextlib
+import io
+import os
+import re
+import shutil
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "docs")
+LINKED = ("config", "launch", "bench", "msg_defs")  # that pages lead to, shown as they are
+KINDS = {"msg": "Messages", "srv": "Services", "action": "Actions"}
+
+
+def nodes() -> list[Any]:
+    """The class of every executable node, in the order of their names."""
+    from robocal_ros.ros.base import HouseNode
+
+    text = (ROOT / "setup.py").read_text()
+    modules = sorted(re.findall(r'"\w+_node = (robocal_ros[\w.]+):main"', text))
+    found = []
+    for name in modules:
+        members = vars(import_module(name)).values()
+        classes = [c for c in members if isinstance(c, type) and issubclass(c, HouseNode)]
+        (own,) = [c for c in classes if c.__module__ == name and "NAME" in vars(c)]
+        found.append(own)
+    return sorted(found, key=lambda node: node.NAME)
+
+
+def parameters() -> str:
+    """A table of each node's parameters."""
+    from robocal_ros.ros.base import AUTOSTART, SERIAL
+
+    parts = [
+        "# Parameters of the nodes",
+        "As the nodes declare them; `ros2 param describe` says the same. *Live* ones may change while "
+        "a node works, all others while it is unconfigured.",
+    ]
+    for node in nodes():
+        rows = [
+            f"## {node.NAME}",
+            "| parameter | default | allowed | meaning |",
+            "|---|---|---|---|",
+        ]
+        for setting in (AUTOSTART, SERIAL, *node.SETTINGS):
+            cells = [
+                f"`{setting.name}`", f"`{setting.default}` {setting.unit}".strip(), setting.bounds,
+                setting.description + " (live)" * setting.live + " (advanced)" * setting.advanced,
+            ]  # fmt: skip
+            rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        parts += [f"## {node.NAME}", "\n".join(rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def commands() -> str:
+    """The help of each command and action."""
+    from robocal_ros.cli.main import COMMANDS, CliGroup, main
+
+    os.environ["COLUMNS"] = "100"
+    parts = ["# Commands", "As `robocal … --help` prints it."]
+    for name, command in COMMANDS.items():
+        actions = list(command.actions) if isinstance(command, CliGroup) else []
+        for level, words in ((2, [name]), *((3, [name, action]) for action in actions)):
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
+                main([*words, "--help"])
+            parts += [
+                f"{'#' * level} robocal {' '.join(words)}",
+                f"```text\n{printed.getvalue()}```",
+            ]
+    return "\n\n".join(parts) + "\n"
+
+
+def interfaces() -> str:
+    """Every message, service and action, as it is defined."""
+    parts = [
+        "# Interfaces",
+        "Of the package `robocal_msgs`. Fields and numbers are only ever added.",
+    ]
+    for kind, title in KINDS.items():
+        parts.append(f"## {title}")
+        for path in sorted((ROOT / "msg_defs" / kind).iterdir()):
+            parts += [f"### {path.stem}", f"```text\n{path.read_text().rstrip()}\n```"]
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    """Lay it out in the folder that is given."""
+    folder = Path(sys.argv[1])
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    ignored = shutil.ignore_patterns("__pycache__", "*.py", "results")
+    for name in (*PAGES, *LINKED):
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=None if name == "launch" else ignored)
+        else:
+            shutil.copy(source, folder / name)
+    reference = folder / "reference"
+    reference.mkdir()
+    for name, text in (
+        ("parameters", parameters()), ("commands", commands()), ("interfaces", interfaces()),
+    ):  # fmt: skip
+        (reference / f"{name}.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
