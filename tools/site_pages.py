@@ -42,15 +42,11 @@ def parameters() -> str:
 
     parts = [
         "# Parameters of the nodes",
-        "As the nodes declare them; `ros2 param describe` says the same. *Live* ones may change while "
-        "a node works, all others while it is unconfigured.",
+        "As the nodes declare them; `ros2 param describe` says the same. Those that are live may "
+        "change while a node works, all others while it is unconfigured.",
     ]
     for node in nodes():
-        rows = [
-            f"## {node.NAME}",
-            "| parameter | default | allowed | meaning |",
-            "|---|---|---|---|",
-        ]
+        rows = ["| parameter | default | allowed | meaning |", "|---|---|---|---|"]
         for setting in (AUTOSTART, SERIAL, *node.SETTINGS):
             cells = [
                 f"`{setting.name}`", f"`{setting.default}` {setting.unit}".strip(), setting.bounds,
