@@ -9,6 +9,7 @@ import numpy as np
 from bench.tables import Goal, Table
 from bench.ur10_campaigns import data_folder, halves, load_campaign
 from robocal_ros.estimation.assessment import ErrorSummary, summarise
+from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.frames import Index
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.full_model import identify_full
@@ -181,6 +182,39 @@ def planned_table() -> Table:
     return table
 
 
+def stated_table() -> Table:
+    """How true the errors are that a full model states of itself."""
+    table = Table(
+        "ur10_stated",
+        "UR10: squared error at held-out poses over its predicted variance",
+        ("campaign", "poses", "draws", "inner 99 %", "goal", "goal ", "all", "inside 95 %, %"),
+        "The full model; variance of covariance and noise, 1 expected. Inner: without the farthest "
+        "one of a hundred rows. Half of a campaign, or draws from it, judged by the other half.",
+    )
+    arm = load_robot("ur10")
+    for series, count in product("ABCD", (None, 60, 120, 250)):
+        train, check = halves(load_campaign(series))
+        found = []
+        for seed in range(1 if count is None else PLAN_DRAWS):
+            chosen = np.random.default_rng(seed).permutation(len(train))[:count]
+            few = count is not None
+            full = (
+                identify_full(arm, train.take(chosen)) if few else own_half(series).identification
+            )
+            error = full.cell.residual(check)
+            target = np.zeros(len(check), dtype=np.int64)
+            variance = full.predicted_variance(check.q, target) + full.noise_m**2 * np.eye(3)
+            ratio = np.sum(error**2, axis=1) / np.trace(variance, axis1=1, axis2=2)
+            whitened = np.linalg.solve(variance, error[..., None])[..., 0]
+            inside = np.sum(error * whitened, axis=1) < chi2_quantile(0.95, 3)
+            inner = np.sort(ratio)[: int(0.99 * len(ratio))]
+            found.append((inner.mean(), ratio.mean(), 100.0 * inside.mean()))
+        inner, every, inside = np.mean(found, axis=0).tolist()
+        least, most = Goal(inner, 0.8, at_least=True), Goal(inner, 1.25)
+        table.add(series, count or len(train), len(found), inner, least, most, every, inside)
+    return table
+
+
 def ur5e_table() -> Table:
     """The factory calibration of a UR5e."""
     table = Table(
@@ -204,4 +238,7 @@ def tables() -> Sequence[Table]:
     if not data_folder().is_dir():
         print(f"no real measurements at {data_folder()} (set ROBOCAL_DATA): their tables left out")
         return []
-    return [campaigns_table(), later_table(), few_poses_table(), planned_table(), ur5e_table()]
+    return [
+        campaigns_table(), later_table(), few_poses_table(), stated_table(), planned_table(),
+        ur5e_table(),
+    ]  # fmt: skip

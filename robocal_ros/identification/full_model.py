@@ -40,10 +40,12 @@ _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry 
 # The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:
 # these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
+INNER, INNER_SQUARES = 0.99, 2.894  # mean of chi-square of 3 below its quantile of 0.99
 FOLDS = 5  # of few poses, each of which the others must foretell
 SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
 _FREE_ROUNDS = 2  # in which a rejected sample may come back
 _ROUNDS, SETTLED = 12, 0.05  # of solving and judging the samples anew; share of the noise
+MOST_LEVERAGE = 1.0 - SETTLED**2  # so that what is not settled is one sigma of an error left out
 
 
 @dataclass(frozen=True)
@@ -71,13 +73,14 @@ class FullIdentification(Identification):
 
 @dataclass(frozen=True)
 class _Solution:
-    """Where the rounds stand, and the residuals (m, c) that a linear model would have there."""
+    """Where the rounds stand: solved for ``rows``, with residuals ``linear`` (m, c) by these."""
 
     cell: CellModel
     terms: JointTerms
     prior: FunctionPrior
     posterior: Posterior | None = None
     linear: Array | None = None
+    rows: Rows | None = None
 
     def settled(self, residual: Array) -> bool:
         """Whether residuals (m, c) are those of the linear model, but for a part of the noise."""
@@ -171,6 +174,13 @@ class _FullProblem:
         """Number (m,) of each sample's pose: visits of one pose share it."""
         return pose_groups(self.data.q)
 
+    @cached_property
+    def visit(self) -> Index:
+        """Number (m,) of each sample's pose and target."""
+        target = self.data.target_index(self.start.cell.targets)
+        own = self.pose * (1 + int(target.max())) + target
+        return np.asarray(np.unique(own, return_inverse=True)[1])
+
     def visit_share(self, residual: Array, weight: Array) -> Array:
         """What each visit (m,) of a pose tells, of one sample, when ``weight`` (m,) are in use.
 
@@ -188,28 +198,36 @@ class _FullProblem:
             rho = float(np.clip(shared / each, 0.0, 1.0))
         return np.asarray(1.0 / (1.0 + np.maximum(visits[self.pose] - 1.0, 0.0) * rho))
 
-    def left_out(
-        self, residual: Array, rows: Rows, at: _Solution, weight: Array
-    ) -> tuple[Array, Array]:
+    def left_out(self, at: _Solution, weight: Array) -> tuple[Array, Array]:
         """Residuals (m, c) of a fit without each sample's own pose, and their covariances.
 
-        By the fit with it, of Gaussian unknowns (`weight` zero: it was not in use).
+        By the fit with it, of Gaussian unknowns (`weight` zero: it was not in use): what visits of
+        a pose have in common pulled the fit towards them. Rows and covariance are of one linear
+        model, for a step along what is hardly known changes rows by more than is known of them.
         """
         from robocal_ros.identification import row_kernels
 
         assert at.posterior is not None
+        assert at.linear is not None
+        assert at.rows is not None
+        residual, rows = at.linear, at.rows
         m, c = residual.shape
         spread = np.empty((m, c, c))
         row_kernels.spreads(rows.J, rows.column, at.posterior.covariance, spread)
-        variance, unit = at.prior.noise**2, np.eye(c)
+        variance = at.prior.noise**2
         total = np.bincount(self.pose, weight)[self.pose]
-        pose_variance = (variance / np.where(total > 0.0, total, 1.0))[:, None, None] * unit
-        used = (weight > 0.0)[:, None, None]
-        loose = (1.0 + 1e-6) * pose_variance
-        gain = pose_variance @ np.linalg.inv(np.where(used, loose - spread, pose_variance))
-        error = (gain @ residual[..., None])[..., 0]
-        expected = np.where(used, gain @ pose_variance - pose_variance, spread) + variance * unit
-        return np.asarray(error), np.asarray(expected)
+        own = variance / np.where(total > 0.0, total, 1.0)
+        size, axes = np.linalg.eigh(spread)
+        used = (weight > 0.0)[:, None]
+        leverage = np.where(used, np.minimum(size / own[:, None], MOST_LEVERAGE), 0.0)
+        pulled, turned = leverage / (1.0 - leverage), np.swapaxes(axes, 1, 2)
+        share = weight / np.maximum(np.bincount(self.visit, weight)[self.visit], 1e-300)
+        mean = np.stack([np.bincount(self.visit, share * r) for r in residual.T], axis=1)
+        error = (
+            residual + (axes @ (pulled[..., None] * (turned @ mean[self.visit][..., None])))[..., 0]
+        )
+        left = np.where(used, own[:, None] * pulled, size) + variance
+        return error, np.asarray((axes * left[:, None]) @ turned)
 
     def geometric_left_out(self) -> float:
         """The same of the geometric model: rms error, m, at poses left out one by one."""
@@ -224,8 +242,8 @@ class _FullProblem:
         posterior = Posterior(zeros, start.estimate.covariance, zeros, zeros, 0.0)
         weight = np.where(start.estimate.rejected, 0.0, 1.0)
         weight *= self.visit_share(residual, weight)
-        at = _Solution(start.cell, terms, prior, posterior)
-        return self.rms(self.left_out(residual, rows, at, weight)[0])
+        at = _Solution(start.cell, terms, prior, posterior, residual, rows)
+        return self.rms(self.left_out(at, weight)[0])
 
     def rms(self, error: Array) -> float:
         """Rms length, m, of position errors (m, c), by Huber's loss."""
@@ -285,36 +303,62 @@ def identify_full(
     full, rival = _solved(arm, data, fit, method)
     if full is None:
         return rival.start
-    needed = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
-    better = full.left_out_rms_m < needed * rival.geometric_left_out()
-    if better and len(data) <= MANY_POSES:
-        better = _foretells(arm, data, fit, method)
-    return full if better else rival.start
+    left_out, squared = full.left_out
+    many = len(data) > MANY_POSES
+    if left_out >= (GAIN if many else CLEAR_GAIN) * rival.geometric_left_out():
+        return rival.start
+    if not many:
+        foretold = _foretold(arm, data, fit, method)
+        if foretold is None:
+            return rival.start
+        squared = foretold
+    return full.reported(_stretch(squared))
 
 
-def _foretells(arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method) -> bool:
-    """Whether full models of some poses foretell the others clearly better than geometric ones.
+def _foretold(
+    arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method
+) -> Array | None:
+    """Squared errors (m,), over their covariances, of full models of the poses of other folds.
 
     What the evidence chooses from few poses is chosen for these, too: a pose is left out of that
-    as well.
+    as well. None where they do not foretell clearly better than geometric models.
     """
     errors: list[list[Array]] = [[], []]
+    squared = np.empty(len(data))
     fold = pose_groups(data.q) % FOLDS
     for left_out in (fold == i for i in range(FOLDS)):
         rest = data.take(left_out)
         try:
             full, rival = _solved(arm, data.take(~left_out), fit, method)
-            for own, found in zip(errors, (full or rival.start, rival.start), strict=True):
-                own.append(found.cell.residual(rest))
         except (TooFewSamplesError, RankDeficientError):
-            return False
+            return None
+        chosen = rival.start if full is None else full.reported(1.0)
+        for own, found in zip(errors, (chosen, rival.start), strict=True):
+            own.append(found.cell.residual(rest))
+        given = np.ones(len(rest)) if rest.sigma is None else rest.sigma
+        noise = (chosen.estimate.scale * given) ** 2
+        variance = chosen.predicted_variance(rest.q, rest.target_index(chosen.cell.targets))
+        squared[left_out] = _squared(errors[0][-1], variance + noise[:, None, None] * np.eye(3))
     with_functions, without = (rival.rms(np.concatenate(own)) for own in errors)
-    return with_functions < CLEAR_GAIN * without
+    return squared if with_functions < CLEAR_GAIN * without else None
+
+
+def _stretch(squared: Array) -> float:
+    """By how much sigmas grow, for left-out errors whose squares (m,) over covariances are given.
+
+    Errors that no model explains have longer tails than the normal distribution: sigmas that fit
+    their squares are too small for bounds of 95 %, those that fit bounds too large for the squares.
+    Between the two, nearer to the bounds; the farthest in a hundred is left out of the squares.
+    """
+    inner = np.sort(squared)[: int(np.ceil(INNER * len(squared)))]
+    by_squares = float(np.mean(inner)) / INNER_SQUARES
+    by_bounds = float(np.quantile(squared, 0.95)) / chi2_quantile(0.95, 3)
+    return float(max(1.0, (by_squares * by_bounds**2) ** (1.0 / 6.0)))
 
 
 def _solved(
     arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method
-) -> tuple[FullIdentification | None, _FullProblem]:
+) -> tuple["_Solved | None", _FullProblem]:
     """The full model, where the evidence wants one, and the problem of the geometric model."""
     start = identify(bare(arm), data, fit=fit, method=method)
     torque = gravity_torque(arm, data.q)
@@ -339,7 +383,7 @@ def _solved(
         weight = problem.robust_weight(residual)
         weight *= problem.visit_share(residual, weight)
         at = _round(problem, at, residual, rows, weight)
-    keep = problem.inliers(*problem.left_out(*problem.linearise(at.cell, at.terms), at, weight))
+    keep = problem.inliers(*problem.left_out(at, weight))
     functions, bends = _unwanted(at)
     terms = JointTerms.cover(q, torque, before).without(functions, bends)
     if terms.size == before:
@@ -347,17 +391,19 @@ def _solved(
     amplitude = np.where(functions, 0.0, at.prior.amplitude)
     rigid = replace(at.cell, arm=bare(at.cell.arm))
     at = _Solution(rigid, terms, replace(at.prior, amplitude=amplitude))
+    residual, rows = problem.linearise(at.cell, at.terms)
     for attempt in range(_ROUNDS):
-        residual, rows = problem.linearise(at.cell, at.terms)
         weight = keep * problem.visit_share(residual, keep.astype(np.float64))
         at = _round(problem, at, residual, rows, weight)
         residual, rows = problem.linearise(at.cell, at.terms)
-        last, keep = keep, problem.inliers(*problem.left_out(residual, rows, at, weight))
+        last, keep = keep, problem.inliers(*problem.left_out(at, weight))
         if attempt >= _FREE_ROUNDS:  # a sample at the limit must not come and go for ever
             keep &= last
+        if 2 * np.sum(keep) < len(keep):
+            return None, rival
         if np.array_equal(last, keep) and at.settled(residual):
             break
-    return _reported(problem, at, last, weight), rival
+    return _Solved(problem, at, last, weight, residual), rival
 
 
 def _round(
@@ -368,7 +414,7 @@ def _round(
     cell = problem.moved(at.cell, at.terms, posterior.mean)
     step = np.append(posterior.mean - problem.values(at.cell, at.terms), 0.0)  # of column -1
     linear = residual + np.einsum("mch,mh->mc", rows.J, step[rows.column])
-    return _Solution(cell, at.terms, prior, posterior, linear)
+    return _Solution(cell, at.terms, prior, posterior, linear, rows)
 
 
 def _unwanted(at: _Solution) -> tuple[Mask, Mask]:
@@ -387,46 +433,49 @@ def _unwanted(at: _Solution) -> tuple[Mask, Mask]:
     return (gain <= 0.0) | (not shown), stiff
 
 
-def _reported(
-    problem: _FullProblem, at: _Solution, keep: Mask, weight: Array
-) -> FullIdentification:
-    """Put together what is reported, with covariances that samples left out confirm.
+@dataclass(frozen=True)
+class _Solved:
+    """Where the rounds end: samples kept (m,), their weights (m,) and residuals (m, c)."""
 
-    Errors that no model explains are neither equal everywhere nor normal: where more than one in
-    twenty left-out samples lies beyond its bound of 95 %, all sigmas grow until it is one.
-    """
-    assert at.posterior is not None
-    start, data, k = problem.start, problem.data, at.terms.before
-    residual, rows = problem.linearise(at.cell, at.terms)
-    error, expected = problem.left_out(residual, rows, at, weight)
-    squared = np.maximum(_squared(error[:, :3], expected[:, :3, :3]), 0.0)
-    stretch = max(1.0, np.sqrt(float(np.quantile(squared, 0.95)) / chi2_quantile(0.95, 3)))
-    known = _known(problem, at, weight, stretch)
-    estimate = replace(
-        start.estimate,
-        state=known.cell,
-        covariance=known.covariance[:k, :k],
-        scale=stretch * at.prior.noise,
-        freedom=at.posterior.left,
-        residual=residual,
-        rejected=~keep,
-    )
-    plain = {field.name: getattr(start, field.name) for field in fields(Identification)}
-    plain |= {
-        "estimate": estimate,
-        "cell": known.cell,
-        "rejected": tuple(data.sample[i] for i in np.flatnonzero(~keep)),
-        "noise_m": known.prior.noise,
-    }
-    if data.sigma is not None:
-        used = weight @ np.sum(residual[:, :3] ** 2, axis=1)
-        plain["sigma_ratio"] = float(np.sqrt(used / max(at.posterior.left, 1.0)))
-    return FullIdentification(
-        **plain,
-        known=known,
-        gain=at.posterior.gain,
-        left_out_rms_m=problem.rms(error),
-    )
+    problem: _FullProblem
+    at: _Solution
+    keep: Mask
+    weight: Array
+    residual: Array
+
+    @cached_property
+    def left_out(self) -> tuple[float, Array]:
+        """Rms error, m, of samples left out, and its squares (m,) over their covariances."""
+        error, expected = self.problem.left_out(self.at, self.weight)
+        return self.problem.rms(error), _squared(error[:, :3], expected[:, :3, :3])
+
+    def reported(self, stretch: float) -> FullIdentification:
+        """Put together what is reported, sigmas ``stretch`` times as large."""
+        assert self.at.posterior is not None
+        start, data, k = self.problem.start, self.problem.data, self.at.terms.before
+        residual, left = self.residual, self.at.posterior.left
+        known = _known(self.problem, self.at, self.weight, stretch)
+        estimate = replace(
+            start.estimate,
+            state=known.cell,
+            covariance=known.covariance[:k, :k],
+            scale=stretch * self.at.prior.noise,
+            freedom=left,
+            residual=residual,
+            rejected=~self.keep,
+        )
+        plain = {field.name: getattr(start, field.name) for field in fields(Identification)}
+        plain |= {
+            "estimate": estimate,
+            "cell": known.cell,
+            "rejected": tuple(data.sample[i] for i in np.flatnonzero(~self.keep)),
+            "noise_m": known.prior.noise,
+        }
+        if data.sigma is not None:
+            used = self.weight @ np.sum(residual[:, :3] ** 2, axis=1)
+            plain["sigma_ratio"] = float(np.sqrt(used / max(left, 1.0)))
+        gain = self.at.posterior.gain
+        return FullIdentification(**plain, known=known, gain=gain, left_out_rms_m=self.left_out[0])
 
 
 def _known(problem: _FullProblem, at: _Solution, weight: Array, stretch: float) -> KnownModel:

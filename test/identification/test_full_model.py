@@ -11,7 +11,7 @@ from scipy.linalg import null_space
 from robocal_ros.estimation.descent import chi2_quantile
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification import identify, identify_and_judge, row_kernels
+from robocal_ros.identification import full_model, identify, identify_and_judge, row_kernels
 from robocal_ros.identification import known_model as model_knowledge
 from robocal_ros.identification.full_model import FullIdentification, identify_full
 from robocal_ros.identification.joint_functions import (
@@ -166,6 +166,33 @@ def test_visits_of_one_pose_are_no_new_poses():
     told = [np.sqrt(np.mean(f.predicted_variance(check.q, target))) for f in (once, again)]
     assert told[1] == pytest.approx(told[0], rel=0.2)
     assert rms_mm(again, check) == pytest.approx(rms_mm(once, check), rel=0.1)
+
+
+def test_a_pose_left_out_errs_as_by_a_fit_without_it():
+    """All visits of a pose left out together, by normal equations that never had them."""
+    robot = BentRobot(4)
+    data = robot.measured(np.repeat(robot.poses(60), 3, axis=0))
+    solved, _ = full_model._solved(robot.nominal, data, ("base", "tool", "geometry"), "map")
+    problem, at, weight = solved.problem, solved.at, solved.weight
+    error, expected = problem.left_out(at, weight)
+    residual, rows, k = at.linear, at.rows, at.terms.size
+    x = problem.values(at.cell, at.terms)
+    for pose in range(0, 60, 7):
+        out = problem.pose == pose
+        normal, pull = np.zeros((k, k)), np.zeros(k)
+        none = np.where(out, 0.0, weight)
+        row_kernels.normal_equations(rows.J, rows.column, -residual, none, normal, pull)
+        evidence = replace(
+            problem.evidence(at, residual, rows, weight), normal=normal, pull=pull + normal @ x
+        )
+        without = evidence.posterior(at.prior)
+        step = np.append(without.mean - x, 0.0)
+        by_fit = residual + np.einsum("mch,mh->mc", rows.J, step[rows.column])
+        spread = np.empty((len(data), 3, 3))
+        row_kernels.spreads(rows.J, rows.column, without.covariance, spread)
+        spread += at.prior.noise**2 * np.eye(3)
+        assert error[out] == pytest.approx(by_fit[out], rel=0.02, abs=2e-7)
+        assert expected[out] == pytest.approx(spread[out], rel=0.02, abs=1e-11)
 
 
 def test_without_a_load_there_are_functions_alone(bent):

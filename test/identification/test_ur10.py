@@ -1,6 +1,7 @@
 """Real measurements of a UR10 over eight months: what the model is worth at unseen poses."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -173,3 +174,34 @@ def test_a_mirrored_tracker_frame_is_refused(halved):
 
     result = identify_and_judge(load_robot("ur10"), *(mirrored(half) for half in halved["D"]))
     assert result.verdict.code is Code.RESIDUAL_TOO_LARGE
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_few_poses_of_one_orientation_are_not_taken_for_outliers(halved, seed):
+    """D's flange hardly turns: what is known of base and target changes much from step to step."""
+    train, check = halved["D"]
+    few = train.take(np.random.default_rng(seed).permutation(len(train))[:60])
+    found, plain = (solved(load_robot("ur10"), few) for solved in (identify_full, identify))
+    assert found.rejected == ()
+    full, geometric = (
+        np.mean(np.linalg.norm(f.cell.residual(check), axis=1)) for f in (found, plain)
+    )
+    assert full < 0.6 * geometric
+
+
+def test_the_error_stated_from_few_poses_comes_true(halved):
+    """Each draw of 60 poses tells its own scale to a fifth or so: in the mean of twelve."""
+    ratios, inside = [], []
+    for series, seed in product(POSES, range(3)):
+        train, check = halved[series]
+        few = train.take(np.random.default_rng(seed).permutation(len(train))[:60])
+        found = identify_full(load_robot("ur10"), few)
+        error = found.cell.residual(check)
+        variance = found.predicted_variance(check.q, np.zeros(len(check), dtype=np.int64))
+        variance = variance + found.noise_m**2 * np.eye(3)
+        squared = np.sum(error * np.linalg.solve(variance, error[..., None])[..., 0], axis=1)
+        inside.append(np.mean(squared < chi2_quantile(0.95, 3.0)))
+        ratio = np.sum(error**2, axis=1) / np.trace(variance, axis1=1, axis2=2)
+        ratios.append(np.mean(np.sort(ratio)[: int(0.99 * len(ratio))]))
+    assert 0.8 < np.mean(ratios) < 1.25
+    assert abs(np.mean(inside) - 0.95) < 0.02 + 1.96 * np.std(inside) / np.sqrt(len(inside))
