@@ -79,7 +79,7 @@ class HouseNode(EndpointNode):
         return Health()
 
     def identity(self) -> list[str]:
-        """What an active node works for."""
+        """What a configured node works for, and with what."""
         return [f"serial {serial}"] if (serial := self.settings[SERIAL.name]) else []
 
     def autostart(self) -> None:
@@ -99,9 +99,15 @@ class HouseNode(EndpointNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Validate the parameters, then `configure`; undone when it fails."""
         result = self._attempt("configure", self._configure)
-        if result != TransitionCallbackReturn.SUCCESS:
+        if result == TransitionCallbackReturn.SUCCESS:
+            self._log_identity("configured")
+        else:
             self._clean_up()
         return result
+
+    def _log_identity(self, became: str) -> None:
+        said = ", ".join(self.identity())
+        self.get_logger().info(f"{became}: {said}" if said else became)
 
     def _configure(self) -> None:
         self.settings = self._table.read()
@@ -119,8 +125,7 @@ class HouseNode(EndpointNode):
         super().on_activate(state)
         result = self._attempt("activate", self.activate)
         if result == TransitionCallbackReturn.SUCCESS:
-            said = ", ".join(self.identity())
-            self.get_logger().info(f"active: {said}" if said else "active")
+            self._log_identity("active")
         else:
             super().on_deactivate(state)
         return result

@@ -414,6 +414,15 @@ class SessionNode(RobotNode, Generic[SessionT]):
             self.get_logger().warning(words)
         self.show(outcome)
 
+    def identity(self) -> list[str]:
+        """Robot and serial, and what is in force of it."""
+        try:
+            heads = self._history.heads() if self._history is not None else ()
+        except RobocalError as error:  # no reason not to start
+            return [*super().identity(), str(error)]
+        told = [f"{h.kind} revision {h.revision} in force" for h in heads if h.calibration_id]
+        return [*super().identity(), *(told or ["nothing measured is in force"])]
+
     def health(self) -> Health:
         """Tell what is in force, what was lost or ignored, what is wrong."""
         session, history, health = self._session, self._history, Health()

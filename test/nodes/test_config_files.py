@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
+from histories import BY
+from history_workers import proposal
 from lifecycle_msgs.srv import GetState
 from rclpy.context import Context
 from rclpy.qos import ReliabilityPolicy
@@ -22,6 +24,9 @@ from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.driver import MOTION
 from robocal_ros.plc.node import PlcBridgeNode
@@ -160,7 +165,20 @@ def test_a_node_takes_the_file(graph, tmp_path):
     state = graph.call(GetState, "/thermal_node/get_state")
     assert state.current_state.label == "active", process.output
     graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
-    assert "active: robot UR10 of ur10, serial R7" in process.output
+    for became in ("configured", "active"):
+        words = f"{became}: robot UR10 of ur10, serial R7, nothing measured is in force"
+        assert process.output.count(words) == 1
+
+
+def test_the_log_says_what_is_in_force(graph):
+    """At the start, of all kinds that the robot's history has."""
+    arm = load_robot("ur10")
+    made = proposal(model_hash=arm.model_hash, model=model_document(arm))
+    with CalibrationHistory.open("R7", model_hash=arm.model_hash, state_dir=graph.state) as history:
+        history.accept(history.propose(made), **BY)
+    process = graph.start("thermal_node", {"robot": "ur10", "serial": "R7"})
+    words = "active: robot UR10 of ur10, serial R7, thermal revision 1 in force"
+    graph.spin_until(lambda: words in process.output, words)
 
 
 @pytest.mark.parametrize("node", [ThermalNode, TcfNode], ids=lambda node: node.NAME)
