@@ -92,6 +92,13 @@ class CommandParser(argparse.ArgumentParser):
             help="print one JSON document on standard output",
         )
 
+    def format_help(self) -> str:
+        """Options, and an example in one line, which can be copied."""
+        from robocal_ros.cli.examples import EXAMPLES
+
+        example = EXAMPLES.get(self.prog.removeprefix("robocal "))
+        return super().format_help() + (f"\nexample:\n  {example}\n" if example else "")
+
     def error(self, message: str) -> NoReturn:
         """Raise a `UsageError`, with what may have been meant; argparse would leave with text."""
         typed = re.search(r"(invalid choice: '|unrecognized arguments: )([\w-]+)", message)

@@ -10,17 +10,18 @@ from recordings import plain_bag, shift
 from tool_runs import run_tables
 
 from robocal_ros.cli import main
+from robocal_ros.cli.examples import EXAMPLES
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.kinematics.urdf import urdf_of
 
 UR10 = load_description("ur10")
-EXAMPLES = ROOT / "docs" / "examples"
+TABLES = ROOT / "docs" / "examples"
 FILES = {
     str(ROOT / "bags" / "tool_runs.mcap"): ("bag", "session: tool of UR10"),
     str(ROOT / "bags" / "demo_shift.mcap"): ("bag", "the bag is simulated"),
-    str(EXAMPLES / "measured.csv"): ("measurements: joints, and where", "joints: 6"),
-    str(EXAMPLES / "positions.csv"): ("no kind that is known", "rows:"),
+    str(TABLES / "measured.csv"): ("measurements: joints, and where", "joints: 6"),
+    str(TABLES / "positions.csv"): ("no kind that is known", "rows:"),
     str(ROOT / "config" / "robots" / "ur10.yaml"): ("robot file", "model hash"),
     str(ROOT / "config" / "cells" / "kr150_laser.yaml"): ("laser file", "serial: SIM-KR150"),
     str(ROOT / "config" / "thermal_node.yaml"): ("parameter file", "/**/thermal_node"),
@@ -91,6 +92,21 @@ def test_a_file_that_was_made_is_known(made, name, kind, fact):
     assert fact in "".join(f"{one['name']}: {one['value']}\n" for one in document["facts"])
     for command in document["commands"]:
         takes(command)
+
+
+def test_the_help_of_each_command_has_an_example_that_it_takes():
+    leaves = set()
+    for name, command in main.COMMANDS.items():
+        actions = command.actions if isinstance(command, main.CliGroup) else {}
+        leaves |= {f"{name} {action}" for action in actions} or {name}
+    longer = {"correct-program", "frame-shift"}
+    assert set(EXAMPLES) == leaves - longer
+    for name in leaves:
+        text = robocal(*name.split(), "--help").stdout
+        assert "xample" in text, name
+        if name not in longer:
+            assert text.endswith(f"\nexample:\n  {EXAMPLES[name]}\n")
+            takes(EXAMPLES[name])
 
 
 def test_what_it_names_runs_as_printed(made, monkeypatch):
