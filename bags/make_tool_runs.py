@@ -66,7 +66,9 @@ def lose_an_edge(step: PlannedStep, edges: list[BeamEdge]) -> list[BeamEdge]:
 class Recorder:
     """A cell, its tool session, and the bag in which all of it is written."""
 
-    def __init__(self, bag: BagWriter, history: CalibrationHistory) -> None:
+    def __init__(
+        self, bag: BagWriter, history: CalibrationHistory, mandrel: np.ndarray | None = None
+    ) -> None:
         arm = load_robot("ur10")
         station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), INPUT, NOISE)
         # To the bits that come back from a laser file, which is in millimetres.
@@ -77,6 +79,8 @@ class Recorder:
             taught=rows_of(TAUGHT),
             station=STATION,
             input=InputRule(sample_period_s=INPUT.sample_period_s),
+            mandrel=None if mandrel is None else rows_of(mandrel),
+            mandrel_radius_m=RADIUS_M,
         )
         self.session = ToolSession(arm, history, config, __version__)
         healthy = RoundTool.cylinder(TAUGHT, RADIUS_M)
@@ -84,7 +88,7 @@ class Recorder:
         self.program = RobotProgram(cell, healthy, rng, START_NS, STATION)
         self._bag, self._now_ns = bag, START_NS
         self._events = EventLog(bag, EVENTS)
-        self._shown: tuple[int, int] | None = None
+        self._shown: tuple[int, ...] | None = None
         self._show_in_force()
 
     def run(self, mode: str, cycle_id: str) -> Outcome:
@@ -128,7 +132,8 @@ class Recorder:
 
     def _show_in_force(self) -> None:
         current = self.session.current
-        shown = current.head.revision, current.healthy.revision
+        heads = current.head, current.healthy, current.station
+        shown = tuple(head.revision for head in heads)
         if shown != self._shown:
             self._shown = shown
             topics = {JOINTS: f"/{JOINTS}", EDGES: f"/{EDGES}"}

@@ -43,6 +43,7 @@ EXAMPLES = {
         "robocal tool beams --data beams.csv --radius-mm 2.5 --robot ur10 --station cell_1 "
         "--output laser.yaml"
     ),
+    "tool station": ("robocal tool station --robot ur10 --robot-serial K7 --output laser.yaml"),
     "tool crossed": (
         "robocal tool crossed --events events.csv --joints joints.csv --robot ur10 "
         "--laser laser.yaml"

@@ -19,6 +19,7 @@ from robocal_ros.history.history_records import (
     BEFORE_ANY,
     FRAME_SHIFT,
     HEALTHY_TOOL,
+    LASER_FRAME,
     MANDREL,
     THERMAL,
     TOOL,
@@ -157,7 +158,7 @@ def _time(stamp_ns: int) -> str:
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
-_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL, FRAME_SHIFT)
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL, LASER_FRAME, FRAME_SHIFT)
 
 
 def _kind(value: str) -> str:

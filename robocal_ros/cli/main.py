@@ -459,6 +459,11 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
                 "tool.cli:beams",
                 "place two crossed light beams from the edges A1 to D4 of a cylinder at the flange",
             ),
+            "station": CliCommand(
+                "tool.cli:station",
+                "how a beam station has moved since it was first measured with the mandrel; its "
+                "new laser file",
+            ),
             "crossed": CliCommand(
                 "tool.cli:crossed",
                 "find a tool from the edges of a whole run, or its axis from one circle at "

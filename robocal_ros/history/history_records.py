@@ -33,6 +33,7 @@ TOOL = "tool"
 REFERENCE = "reference"  # the cold reference
 HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
 MANDREL = "mandrel_reference"  # how the mandrel measures while the beam station stands right
+LASER_FRAME = "laser_frame"  # where the mandrel found the beams of a station
 FRAME_SHIFT = "frame_shift"  # of a controller's base and tool frame, for one thermal model
 HAND_EYE = "hand_eye"  # where a sensor sits; see `hand_eye_kind`
 # What is in force before anything was accepted; of other kinds nothing.

@@ -19,6 +19,7 @@ from robocal_ros.cli.main import (
     describe_robot,
     positive,
     print_output,
+    print_table,
     print_text,
     print_verdict,
     spaced,
@@ -29,6 +30,9 @@ from robocal_ros.cli.main import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import transform_document
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_file import state_folder
+from robocal_ros.history.history_records import LASER_FRAME
 from robocal_ros.programs.conventions import Load
 from robocal_ros.tool.circle import CircleMotion, classic_from_path, fit_circle
 from robocal_ros.tool.crossed_model import estimate_tool
@@ -52,6 +56,7 @@ from robocal_ros.tool.files import (
 )
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
 from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
+from robocal_ros.tool.station import measurement_of, station_shift, station_trend
 from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
 
 if TYPE_CHECKING:
@@ -429,3 +434,92 @@ def run_export(args: argparse.Namespace) -> CliResult:
         "T_flange_tool": transform_document(T_flange_tool),
     }
     return CliResult(document, print_text)
+
+
+MOST_LISTED = 1_000_000
+
+
+def add_station(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``station``."""
+    parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
+    parser.add_argument(
+        "--robot-serial", required=True, type=text, metavar="S", help="whose history is read"
+    )
+    parser.add_argument(
+        "--state",
+        type=Path,
+        metavar="DIR",
+        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="write the last measurement as a laser file"
+    )
+
+
+def run_station(args: argparse.Namespace) -> CliResult:
+    """Do ``station``. Raises `RobocalError` for what a user can mend."""
+    robot, warnings = describe_robot(args.robot)
+    folder = state_folder() if args.state is None else args.state.absolute()
+    with CalibrationHistory.open(
+        args.robot_serial,
+        model_hash=robot.arm.model_hash,
+        state_dir=folder,
+        create=False,
+        owner=False,
+    ) as history:
+        entries = [e for e in reversed(history.list(MOST_LISTED)) if e.kind == LASER_FRAME]
+        models = [history.model(entry.id) for entry in entries]
+        path = str(history.path)
+    if not entries:
+        raise InputError("no laser frame was measured: mode LASER_FRAME of tcf_node", file=path)
+    same = [m["made_with"] == models[-1]["made_with"] for m in models]
+    same = [
+        own and m["mandrel"] == models[-1]["mandrel"] for own, m in zip(same, models, strict=True)
+    ]
+    kept = [(e, m) for e, m, own in zip(entries, models, same, strict=True) if own]
+    first = measurement_of(kept[0][1])
+    later = [(entry, measurement_of(model)) for entry, model in kept[1:]]
+    shifts = [station_shift(first, found) for _, found in later]
+    stamps = [entry.stamp_ns for entry, _ in later]
+    last = measurement_of(kept[-1][1])
+    document: Document = {
+        "robot": robot.arm.name,
+        "model_hash": robot.arm.model_hash,
+        "station": kept[-1][1]["made_with"]["station"],
+        **laser_document(last.laser),
+        "first_stamp_ns": kept[0][0].stamp_ns,
+        "measured": [
+            {"stamp_ns": stamp, "calibration": entry.id} | shift.document()
+            for stamp, (entry, _), shift in zip(stamps, later, shifts, strict=True)
+        ],
+        "trend": station_trend(stamps, shifts),
+        "output": None,
+        "warnings": warnings,
+    }
+    if args.output is not None:
+        station, arm = document["station"], robot.arm
+        write_laser(
+            args.output,
+            LaserFile(last.laser, station, arm.name, arm.model_hash, args.robot_serial),
+        )
+        document["output"] = str(args.output)
+    return CliResult(document, _show_station)
+
+
+def _show_station(console: "Console", document: Document) -> None:
+    rows = [
+        [
+            f"{(row['stamp_ns'] - document['first_stamp_ns']) / 3.6e12:.2f}",
+            spaced(row["shift_mm"], 3),
+            spaced(row["shift_sigma_mm"], 3),
+            spaced(row["turn_deg"], 3),
+            "yes" if row["moved"] else "",
+        ]
+        for row in document["measured"]
+    ]
+    head = ("hours", "shift x y z, mm", "sigma", "turn, deg", "moved")
+    print_table(console, "Station since it was first measured, in its own axes", head, rows)
+    if document["trend"]["per_day_mm"] is not None:
+        per_day, sigma = document["trend"]["per_day_mm"], document["trend"]["sigma_mm"]
+        console.print(f"Trend, mm a day: {spaced(per_day, 3)} (sigma {spaced(sigma, 3)})")
+    print_output(console, document)

@@ -22,7 +22,15 @@ from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError
 from robocal_ros.ground.frames import Array
-from robocal_ros.tool.edges import BEAMS, FEWEST_EDGES, BeamEdge, BeamError, StepKind, edges_of
+from robocal_ros.tool.edges import (
+    BEAMS,
+    FEWEST_EDGES,
+    Beam,
+    BeamEdge,
+    BeamError,
+    StepKind,
+    edges_of,
+)
 from robocal_ros.tool.laser_frame import (
     FlangePath,
     LaserFrame,
@@ -59,6 +67,7 @@ class BeamStep:
     name: str
     kind: StepKind
     edges: Sequence[BeamEdge]
+    beams: Sequence[Beam] = BEAMS  # those that are broken
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +100,13 @@ def across(axis: Array) -> Array:
 class Held:
     """What a run need not determine: how far it may be from the taught tool (sigma); None: free.
 
-    ``tilt_rad`` of the axis, each way; ``along_m`` of the tip along the axis.
+    ``tilt_rad`` of the axis, each way; ``along_m`` of the tip along the axis, ``across_m`` each way
+    across it.
     """
 
     tilt_rad: float | None = None
     along_m: float | None = None
+    across_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +147,7 @@ class RunProblem:
     def undetermined(self) -> int:
         """How many unknowns have no prior."""
         held = 2 * (self.held.tilt_rad is not None) + (self.held.along_m is not None)
+        held += 2 * (self.held.across_m is not None)
         return 6 + 2 * self.circles - held
 
     @property
@@ -158,6 +170,9 @@ class RunProblem:
         if self.held.along_m is not None:
             axis = self.taught.axis
             information[:3, :3] += np.outer(axis, axis) / self.held.along_m**2
+        if self.held.across_m is not None:
+            sides = across(self.taught.axis)
+            information[:3, :3] += sides @ sides.T / self.held.across_m**2
         return information
 
     def deviation(self, state: ToolState) -> Array:
@@ -397,17 +412,7 @@ def run_problem(
     held: Held | None = None,
 ) -> tuple[RunProblem, ToolState]:
     """The problem of a run and the state at which to begin; raises BeamError as `estimate_tool`."""
-    rows: list[Row] = []
-    circles = 0
-    for i, each in enumerate(steps):
-        own = circles if each.kind == "circle" else -1
-        circles += each.kind == "circle"
-        for b, name in enumerate(BEAMS):
-            try:
-                found = edges_of(each.edges, name, FEWEST_EDGES[each.kind])
-            except BeamError as error:
-                raise BeamError(f"{each.name}: {error}") from error
-            rows += [(b, i, own, edge) for edge in found]
+    rows, circles = _edge_rows(steps)
     beam, step, circle = (np.array([row[k] for row in rows]) for k in range(3))
     time = np.array([edge.time_s for *_, edge in rows])
     breaks = np.array([edge.blocked for *_, edge in rows])
@@ -449,6 +454,30 @@ def run_problem(
     return problem, start
 
 
+def _edge_rows(steps: Sequence[BeamStep]) -> tuple[list[Row], int]:
+    """Edges of all steps, beam by beam, and how many circles there are."""
+    rows: list[Row] = []
+    circles = 0
+    for i, each in enumerate(steps):
+        own = circles if each.kind == "circle" else -1
+        circles += each.kind == "circle"
+        for b, name in enumerate(BEAMS):
+            if name not in each.beams:
+                if any(edge.beam == name for edge in each.edges):
+                    raise BeamError(
+                        f"{each.name}: beam {name} was broken too, where only "
+                        f"{', '.join(each.beams)} is: it is moved by millimetres, or thicker than "
+                        "the circle's radius leaves room for"
+                    )
+                continue
+            try:
+                found = edges_of(each.edges, name, FEWEST_EDGES[each.kind])
+            except BeamError as error:
+                raise BeamError(f"{each.name}: {error}") from error
+            rows += [(b, i, own, edge) for edge in found]
+    return rows, circles
+
+
 def _require_order(steps: Sequence[BeamStep], rows: Sequence[Row], rate: Array) -> None:
     """Refuse arcs that do not alternate, and a plunge that breaks on its way up."""
     for (b, i, circle, edge), speed in zip(rows, rate, strict=True):
@@ -460,12 +489,12 @@ def _require_order(steps: Sequence[BeamStep], rows: Sequence[Row], rate: Array) 
                 "both of them clear"
             )
     for i, step in enumerate(steps):
-        for b, beam in enumerate(BEAMS):
+        for b, beam in enumerate(BEAMS if step.kind == "circle" else ()):
             own = [k for k, row in enumerate(rows) if row[:2] == (b, i)]
             turned = np.sign(rate[own])
             passes = np.cumsum([rows[k][3].blocked for k in own])
             wanted = turned[0] * (-1.0) ** (passes - passes[0])
-            if step.kind == "circle" and np.any(turned != wanted):
+            if np.any(turned != wanted):
                 raise BeamError(
                     f"{step.name}: the shadows on beam {beam} do not alternate between the two "
                     "ways across it: edges were lost, or the robot was moved by hand; repeat it"

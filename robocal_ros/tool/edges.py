@@ -227,12 +227,14 @@ class StepWatch:
     run is over with its last edge.
 
     ``up`` (3,): the laser's z, base.
+    ``beams``: those that the step breaks.
     ``first_edge_s``: time of the first edge; None before.
     """
 
     kind: StepKind
     last: bool
     up: Array
+    beams: Sequence[Beam] = BEAMS
     first_edge_s: float | None = None
     _edges: Counter[Beam] = field(default_factory=Counter)
     _newest_edge_s: float = -np.inf
@@ -258,7 +260,7 @@ class StepWatch:
             return False
         if self._start is None:
             self._start = flange
-        complete = all(self._edges[beam] >= FEWEST_EDGES[self.kind] for beam in BEAMS)
+        complete = all(self._edges[beam] >= FEWEST_EDGES[self.kind] for beam in self.beams)
         even = all(self._edges[beam] % 2 == 0 for beam in BEAMS)
         if complete and even and (self.last or rests_s > 0.0):
             return True

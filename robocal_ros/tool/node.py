@@ -43,6 +43,7 @@ from robocal_ros.tool.run import MeasuringMotion, PlannedStep, ToolConfig, Trait
 from robocal_ros.tool.services import ANSWERS, MODES, MOTION_SETTINGS, TcfMotion, TcfOutputs
 from robocal_ros.tool.session import (
     FULL,
+    LASER,
     QUICK,
     REFERENCE,
     ToolSession,
@@ -171,6 +172,7 @@ def session_config(
         reach_m=(float(laser.reach[0]), float(laser.reach[1])),
         station=station,
         beams=tuple(settings["beams"]),
+        mandrel_radius_m=settings["mandrel_radius_mm"] * 1e-3,
         taper=settings["taper"],
         spin_rad=float(np.radians(settings["spin_deg"])),
         step_timeout_s=settings["step_timeout_s"],
@@ -212,6 +214,7 @@ class TcfServices:
         add(Trigger, "~/measure_trigger", self._starter(FULL))
         add(Trigger, "~/quick_check_trigger", self._starter(QUICK))
         add(Trigger, "~/measure_reference_trigger", self._starter(REFERENCE))
+        add(Trigger, "~/laser_frame_trigger", self._starter(LASER))
         add(Trigger, "~/cancel_trigger", self._cancel_twin)
         add(Trigger, "~/result_trigger", self._result)
         DecisionServices(add, ask, history, TOOL)
@@ -367,7 +370,7 @@ class TcfNode(SessionNode[ToolSession]):
         super().activate()
         self.last: Outcome | None = None
         self.run_end: Future = Future()
-        self._shown: tuple[int, int, int] | None = None
+        self._shown: tuple[int, ...] | None = None
         self._silence = Silence()
         if self._motion is not None and self._session is not None:
             self._motion.activate(self._session)
@@ -459,7 +462,9 @@ class TcfNode(SessionNode[ToolSession]):
             try:
                 if outcome.calibration_id and self._history is not None:
                     model = self._history.model(outcome.calibration_id)
-                    self._outputs.candidate(model, outcome.command.stamp_ns or 0)
+                    of_laser = "points_m" in model
+                    show = self._outputs.laser if of_laser else self._outputs.candidate
+                    show(model, outcome.command.stamp_ns or 0)
                 self._outputs.quality(outcome)
             except RobocalError as error:  # the caller is answered all the same
                 self.get_logger().error(f"the run has ended but was not published: {error}")
@@ -481,6 +486,8 @@ class TcfNode(SessionNode[ToolSession]):
         if self._history is None:
             return ToolFrame()
         model = self._history.model(outcome.calibration_id)
+        if "points_m" in model:
+            return ToolFrame()
         return self._outputs.frame(model, outcome.command.stamp_ns or 0)
 
     def show_in_force(self) -> None:
@@ -489,7 +496,8 @@ class TcfNode(SessionNode[ToolSession]):
         if session is None or history is None:
             return
         current = session.current
-        shown = current.head.revision, current.thermal.revision, current.healthy.revision
+        heads = current.head, current.thermal, current.healthy, current.station
+        shown = tuple(head.revision for head in heads)
         if self._shown == shown and not self._outputs.events.need_configuration:
             return
         if self._shown != shown:

@@ -33,11 +33,17 @@ from robocal_ros.tool.edges import (
 from robocal_ros.tool.judging import BendRule, CheckRule, ToolLimits
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, upright_pose
 
-Mode = Literal["full", "quick"]
+Mode = Literal["full", "quick", "laser"]
 STEPS: Mapping[Mode, tuple[str, ...]] = {
     "full": ("low", "high", "upright", "plunge_1", "plunge_2"),
     "quick": ("circle", "plunge"),
+    "laser": (
+        *(f"circle_{i}" for i in range(1, 5)),
+        *(f"plunge_{point}{i}" for i in (1, 2) for point in "abcd"),
+    ),
 }
+# Of a plunge beside the crossing: along which beam, and which way.
+BESIDE: Mapping[str, tuple[int, int]] = {"a": (0, -1), "b": (0, 1), "c": (1, -1), "d": (1, 1)}
 START_RAD = float(np.pi / 4.0)  # in mid-quadrant: no circle begins on a beam
 
 
@@ -79,6 +85,7 @@ class PlannedStep:
     ``radius_m``, ``speed_m_s``: of a circle; ``direction`` +1 counter-clockwise about the laser's
     z.
     ``depth_m``: of a plunge; its speed is ``speed_m_s``.
+    ``beams``: those that the step breaks.
     """
 
     name: str
@@ -92,13 +99,14 @@ class PlannedStep:
     direction: int = 1
     start_rad: float = START_RAD
     depth_m: float = 0.0
+    beams: tuple[Beam, ...] = BEAMS
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuringPlan:
     """The steps of a run.
 
-    ``T_flange_tool`` (4, 4): the taught tool (full) or the stored one (quick).
+    ``T_flange_tool`` (4, 4): the taught tool (full), the stored one (quick), the mandrel (laser).
     ``spin_rad``: turn of the flange about the laser's z: with 0 its x lies along the laser's x.
     """
 
@@ -135,6 +143,11 @@ class MeasuringPlan:
         if name == "high":
             # Straight below the first circle: the tool is not set upright yet.
             T[:3, 3] -= self.motion.height_m * self.laser.T_base_laser[:3, 2]
+        beams: tuple[Beam, ...] = BEAMS
+        if self.mode == "laser" and plunge:  # as far from the other beam as a circle ever is
+            beam, way = BESIDE[name[-2]]
+            T[:3, 3] += way * self.motion.radius_m * self.laser.direction[beam]
+            beams = (BEAMS[beam],)
         return PlannedStep(
             name=name,
             kind="plunge" if plunge else "circle",
@@ -146,6 +159,7 @@ class MeasuringPlan:
             radius_m=0.0 if plunge else self.motion.radius_m,
             direction=1 if number % 2 else -1,
             depth_m=self.motion.plunge_depth_m if plunge else 0.0,
+            beams=beams,
         )
 
     def needs_tool(self, number: int) -> bool:
@@ -319,6 +333,7 @@ class ToolConfig:
     ``station``: frame_id of the beams' edges; empty: any.
     ``beams``: names of the x- and the y-beam in the edges.
     ``mandrel``: rows of T_flange_mandrel (4, 4), z along its axis to its end; None: there is none.
+    ``mandrel_radius_m``: as certified, where it places the beams.
     ``taper``: growth of the tool's radius per length above the tip.
     ``spin_rad``: turn of the flange about the laser's z while it measures.
     ``step_timeout_s``: a step without any edge for so long ends the run.
@@ -327,6 +342,7 @@ class ToolConfig:
     points_m: Rows
     taught: Rows
     mandrel: Rows | None = None
+    mandrel_radius_m: float = 0.01
     laser_sigma_m: float = 0.0
     reach_m: tuple[float, float] = (0.0, 0.0)
     station: str = ""
@@ -490,7 +506,8 @@ class ToolRun:
         if self.healthy is not None and (readings := self._readings):
             count, span_s = np.sum(readings, axis=0).tolist()
             self.healthy.require_readings(int(count), span_s, self.config.traits)
-        self.steps.append(BeamStep(step.name, step.kind, debounced(found, rule.debounce_s)))
+        edges_found = debounced(found, rule.debounce_s)
+        self.steps.append(BeamStep(step.name, step.kind, edges_found, step.beams))
         if self.complete:
             return
         if self.plan.needs_tool(len(self.steps) + 1):
@@ -559,7 +576,8 @@ class ToolRun:
     def _watched(self) -> StepWatch:
         if self._watch is None:
             step = self.awaited
-            self._watch = StepWatch(step.kind, step.number == step.of, step.R_base_laser[:, 2])
+            last, up = step.number == step.of, step.R_base_laser[:, 2]
+            self._watch = StepWatch(step.kind, last, up, step.beams)
         return self._watch
 
     def _seconds(self, stamp_ns: int) -> float:

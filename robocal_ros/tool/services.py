@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Quaternion, TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformStamped
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import CalibrationQuality, MaintenanceStatus, ToolFrame, ToolStep
 from std_srvs.srv import SetBool
@@ -40,14 +40,25 @@ from robocal_ros.tool.driving import ToolDriver
 from robocal_ros.tool.edges import RESTORE
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.run import PlannedStep
-from robocal_ros.tool.session import FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE, ToolSession
+from robocal_ros.tool.session import (
+    FULL,
+    LASER,
+    QUICK,
+    REFERENCE,
+    WITNESS,
+    WITNESS_REFERENCE,
+    ToolSession,
+)
+from robocal_ros.tool.station import measurement_of
 
+LASER_GOAL = 6  # MeasureTool.Goal.LASER_FRAME
 MODES = {
     MeasureTool.Goal.FULL: FULL,
     MeasureTool.Goal.QUICK: QUICK,
     MeasureTool.Goal.REFERENCE: REFERENCE,
     MeasureTool.Goal.WITNESS: WITNESS,
     MeasureTool.Goal.WITNESS_REFERENCE: WITNESS_REFERENCE,
+    LASER_GOAL: LASER,
 }
 ANSWERS = {
     "pass": MeasureTool.Result.PASS,
@@ -143,6 +154,7 @@ class TcfOutputs:
         self._tool = add(ToolFrame, "~/tool", endpoints.LATCHED)
         self._frame = add(TransformStamped, "~/tool_frame", endpoints.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", endpoints.LATCHED)
+        self._laser = add(PoseWithCovarianceStamped, "~/laser_frame", endpoints.LATCHED)
         self.events = SessionEvents(add)
         self._tf = StaticTf(add)
         self.missing = self._tf.missing
@@ -177,6 +189,14 @@ class TcfOutputs:
     def candidate(self, model: Document, stamp_ns: int) -> None:
         """Show what was measured."""
         self._candidate.publish(self.frame(model, stamp_ns))
+
+    def laser(self, model: Document, stamp_ns: int) -> None:
+        """Show where the beams were found."""
+        found = measurement_of(model)
+        message = PoseWithCovarianceStamped(header=conversions.header(stamp_ns, self._base))
+        message.pose.pose = pose_message(found.laser.T_base_laser)
+        message.pose.covariance = found.frame_covariance.ravel()
+        self._laser.publish(message)
 
     def quality(self, outcome: Outcome) -> None:
         """Show the verdict on a run."""

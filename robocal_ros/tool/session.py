@@ -7,12 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.estimation.assessment import Verdict
+from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head, Proposal
+from robocal_ros.history.history_records import (
+    HEALTHY_TOOL,
+    LASER_FRAME,
+    MANDREL,
+    THERMAL,
+    TOOL,
+    Head,
+    Proposal,
+)
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
@@ -66,13 +74,20 @@ from robocal_ros.tool.run import (
     ToolRun,
     made_with,
 )
+from robocal_ros.tool.station import (
+    StationMeasurement,
+    measure_station,
+    measurement_document,
+    measurement_of,
+    station_shift,
+)
 
 
 class ToolInForce(HistoryFollower):
     """What the history has in force for a tool, as of the last look.
 
-    ``head``, ``thermal``, ``healthy``, ``mandrel``: heads of the tools, of the thermal models and
-    of the measurements of the healthy tool and of the mandrel.
+    ``head``, ``thermal``, ``healthy``, ``mandrel``, ``station``: heads of the tools, of the thermal
+    models and of the measurements of the healthy tool, of the mandrel and of the beams.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
@@ -86,6 +101,7 @@ class ToolInForce(HistoryFollower):
         self.thermal: Head = self._history.head(THERMAL)
         self.healthy: Head = self._history.head(HEALTHY_TOOL)
         self.mandrel: Head = self._history.head(MANDREL)
+        self.station: Head = self._history.head(LASER_FRAME)
 
     @property
     def arm(self) -> SerialArm:
@@ -127,13 +143,21 @@ class ToolInForce(HistoryFollower):
         return KnownTool.of_document(model) if model["mandrel"] == self._mandrel else None
 
     @property
+    def commissioned_station(self) -> StationMeasurement | None:
+        """The first measurement of the beams with this mandrel and laser file; None before it."""
+        model = self.station.model
+        if model is None or model["made_with"] != self._made_with:
+            return None
+        return measurement_of(model["first"]) if model["mandrel"] == self._mandrel else None
+
+    @property
     def _healthy_model(self) -> dict[str, Any] | None:
         model = self.healthy.model
         return None if model is None or model["made_with"] != self._made_with else model
 
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"
-OF_MANDREL = WITNESS, WITNESS_REFERENCE = "witness", "witness reference"
+WITNESS, WITNESS_REFERENCE, LASER = OF_MANDREL = "witness", "witness reference", "laser"
 MODES = (FULL, QUICK, REFERENCE, *OF_MANDREL)
 WITNESS_NS = 600 * 10**9  # so long a mandrel's answer holds for measurements of the tool after it
 REMEMBERED = 200  # answers, and calibrations back to which a cycle's id is known
@@ -188,7 +212,8 @@ class ToolResults:
             return None
         if (mode, cycle_id) in self._answers:
             return self._answers[mode, cycle_id]
-        kind = {FULL: TOOL, REFERENCE: HEALTHY_TOOL, WITNESS_REFERENCE: MANDREL}.get(mode)
+        kinds = {FULL: TOOL, REFERENCE: HEALTHY_TOOL, WITNESS_REFERENCE: MANDREL}
+        kind = (kinds | {LASER: LASER_FRAME}).get(mode)
         for entry in self._history.list(REMEMBERED):
             if entry.kind == kind and entry.cycle_id == cycle_id:
                 document = self._history.document(entry.id)
@@ -206,6 +231,7 @@ class ToolResults:
             REFERENCE: self._reference,
             WITNESS: self._witness,
             WITNESS_REFERENCE: self._reference,
+            LASER: self._laser,
         }
         return self._remembered(run, ends[run.mode](run, command, wall_ns))
 
@@ -237,7 +263,8 @@ class ToolResults:
         known: Document = {"cause": witness.cause}
         if witness.cause == "tool" and witness.tip_m <= SMALL_M:  # many of them do not add up
             known["anchor"] = anchor.tolist()
-        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, found, **known)
+        model = found.document() | known
+        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, model)
         return Outcome(command, verdict.code, verdict.reason, document, kept)
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
@@ -254,12 +281,53 @@ class ToolResults:
         own: Document = {"traits": run.traits(estimate).document()}
         if mandrel:
             own = {"mandrel": taught.tolist()}
-        kept = self._keep(kind, run, command, wall_ns, verdict, document, found, **own)
+        kept = self._keep(kind, run, command, wall_ns, verdict, document, found.document() | own)
         if verdict.accept:
-            by = str(command.arguments.get("by", ""))
-            self._history.accept(
-                kept, by=by, reason=verdict.reason, expected_head=None, wall_ns=wall_ns
+            self._accept(kept, command, verdict, wall_ns)
+        return Outcome(command, verdict.code, verdict.reason, document, kept)
+
+    def _accept(self, kept: int, command: Command, verdict: Verdict, wall_ns: int) -> None:
+        """Bring into force what moves nothing."""
+        by, reason = str(command.arguments.get("by", "")), verdict.reason
+        self._history.accept(kept, by=by, reason=reason, expected_head=None, wall_ns=wall_ns)
+
+    def _laser(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
+        """Where the mandrel finds the beams, against the first time."""
+        config, mandrel = self._config, run.plan.T_flange_tool
+        found = measure_station(
+            run.plan.laser, run.path, run.steps, mandrel, config.mandrel_radius_m, config.noise
+        )
+        first = self._current.commissioned_station
+        shift = station_shift(first or found, found)
+        size_mm, sigma_mm = 1e3 * shift.size_m, 1e3 * found.sigma_m
+        words = f"the beams are known to {sigma_mm:.3f} mm at each point"
+        code, answer = Code.ACCEPT, "pass"
+        if first is not None:
+            sigma_mm = 1e3 * shift.sigma_m
+            words = (
+                f"the crossing is {size_mm:.3f} mm from where it was first (sigma {sigma_mm:.3f})"
             )
+            if shift.moved and shift.size_m > config.check.limit_m:
+                code, answer = Code.STATION_MOVED, "recalibrate"
+                words += ": write its new laser file (robocal tool station), and use it"
+            elif shift.moved:
+                words += ", more than chance, less than matters"
+        verdict = Verdict(code, words)
+        document: Document = {
+            "answer": answer,
+            "change": {"tip_mm": size_mm, "axis_deg": shift.turned_deg},
+            "sigma_mm": [sigma_mm],
+            "misfit_mm": 1e3 * found.misfit_m,
+            "station": shift.document(),
+            "cycle_id": run.cycle_id,
+            "verdict": verdict_document(verdict),
+        }
+        measured = measurement_document(found)
+        before = measured if first is None else measurement_document(first)
+        model = measured | {"mandrel": mandrel.tolist(), "first": before}
+        kept = self._keep(LASER_FRAME, run, command, wall_ns, verdict, document, model)
+        if verdict.accept:
+            self._accept(kept, command, verdict, wall_ns)
         return Outcome(command, verdict.code, verdict.reason, document, kept)
 
     def _witness(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
@@ -353,8 +421,7 @@ class ToolResults:
         wall_ns: int,
         verdict: Verdict,
         document: Document,
-        found: KnownTool,
-        **beside: Any,
+        model: Document,
     ) -> int:
         return self._history.propose(
             Proposal(
@@ -369,9 +436,8 @@ class ToolResults:
                 code=verdict.code,
                 reason=verdict.reason,
                 document=document,
-                model=found.document()
-                | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)}
-                | beside,
+                model=model
+                | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)},
                 inputs=run.arrays(),
             )
         )
@@ -503,7 +569,7 @@ class ToolSession(SessionBase):
         config, current = self.config, self.current
         quick = mode == QUICK
         tool = self._results.expected().T_flange_tool if quick else self._results.taught(mode)
-        steps: Mode = "quick" if quick else "full"
+        steps: Mode = "quick" if quick else "laser" if mode == LASER else "full"
         plan = MeasuringPlan(steps, self._laser, tool, config.motion, config.spin_rad)
         self._runs += 1
         begun_ns = command.stamp_ns or 0
@@ -573,6 +639,7 @@ def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
         "tool": current.head.model,
         OWN["tool"]: current.healthy.model,
         "mandrel": current.mandrel.model,
+        "station": current.station.model,
     }
     return configured_with(session, topics, session.config.document(), in_force)
 
@@ -588,7 +655,8 @@ def tool_session_as_recorded(
     arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
     config = ToolConfig.of_document(arguments["config"])
     in_force = {kind: arguments[name] for name, kind in IN_FORCE.items()}
-    in_force[MANDREL] = configured.arguments.get("mandrel")  # older recordings have none
+    for kind, name in ((MANDREL, "mandrel"), (LASER_FRAME, "station")):
+        in_force[kind] = configured.arguments.get(name)  # older recordings have none
     seeded(history, nominal, in_force, software)
     return ToolSession(nominal, history, config, software)
 

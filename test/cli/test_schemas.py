@@ -282,6 +282,21 @@ CASES = {
         [*CORRECT, "weld.urp"],
         (2, "BAD_INPUT"),
     ),
+    "tool station": (
+        "tool.station.json",
+        [
+            "tool",
+            "station",
+            "--robot",
+            "ur10",
+            "--robot-serial",
+            "laser_frame",
+            "--state",
+            "stations",
+        ],
+        ["tool", "station", "--robot", "ur10", "--robot-serial", "K2", "--state", "stations"],
+        (2, "BAD_INPUT"),
+    ),
     "correct-points": (
         "correct-points.json",
         [*POINTS, "--mount", "mount.yaml", "--output", "in_base.csv"],
@@ -364,6 +379,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
+    bag = str(ROOT / "bags" / "laser_frame.mcap")
+    robocal_json("replay.tool.json", "replay", bag, "--state", folder / "stations")
     for kind in ("sphere", "step", "line"):
         hand_eye_tables(folder / kind, kind)
     shots = (folder / "sphere" / "poses.csv").read_text().splitlines()

@@ -1,0 +1,256 @@
+"""The laser frame measured in a run: a known cylinder, the mandrel, through both beams.
+
+Upright circles tell where each beam lies across and which way it runs, plunges beside the crossing
+how high it is at two places. The problem is that of a tool's run (`crossed_model`) the other way
+round: the tool is known and the points A ... D of the beams are free, so that the covariance holds
+the robot's repeatability and the edges. What the mandrel itself is off by is in every measurement
+alike: it is not in the sigma, and cancels in a change.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
+from robocal_ros.estimation.estimation import solve
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, ResidualError
+from robocal_ros.ground.frames import Array, Document
+from robocal_ros.tool.crossed_model import (
+    EXACT_M,
+    LARGEST_MISFIT_M,
+    BeamStep,
+    Held,
+    RobotNoise,
+    run_problem,
+)
+from robocal_ros.tool.laser_frame import POINTS, FlangePath, LaserFrame
+from robocal_ros.tool.run import WrongToolError
+
+ROUGH_M = 5e-3  # how well the beams' points are known before: a drawing, or before a knock
+KNOWN = Held(tilt_rad=EXACT_M, along_m=EXACT_M, across_m=EXACT_M)
+REACHES = 3  # turns of reach and place: one moves the other by its square
+NEVER = 0.001  # chance that a station that stands still looks moved
+LARGEST_REACH_M = 2e-3  # half of the thickest beam
+DAY_NS = 86_400 * 10**9
+H_M = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class StationMeasurement:
+    """Beams as a run found them.
+
+    ``laser``: with the reach of each beam.
+    ``covariance`` (8, 8): of A ... D, each across its beam and upwards, m^2.
+    ``misfit_m``: rms of the edges, m.
+    """
+
+    laser: LaserFrame
+    covariance: Array
+    misfit_m: float
+
+    @property
+    def frame_covariance(self) -> Array:
+        """(6, 6) of the frame's origin and of its turn about that, base, m^2 and rad^2."""
+        R = np.kron(np.eye(2), self.laser.T_base_laser[:3, :3])
+        rows = R @ _frame_rows(self.laser)
+        return np.asarray(rows @ self.covariance @ rows.T)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of a coordinate of a point across its beam."""
+        return float(np.sqrt(np.mean(np.diag(self.covariance))))
+
+
+@dataclass(frozen=True, eq=False)
+class StationShift:
+    """How a station has moved, in its own axes then.
+
+    ``shift`` (3,) of the crossing, m, and ``turn`` (3,) of the frame, rad; ``covariance`` (6, 6).
+    ``moved``: whether one of them is more than both measurements explain.
+    """
+
+    shift: Array
+    turn: Array
+    covariance: Array
+    moved: bool
+
+    @property
+    def size_m(self) -> float:
+        """Length of the shift."""
+        return float(np.linalg.norm(self.shift))
+
+    @property
+    def sigma_m(self) -> float:
+        """Its standard deviation, in the worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def turned_deg(self) -> float:
+        """Angle of the turn."""
+        return float(np.degrees(np.linalg.norm(self.turn)))
+
+    def document(self) -> Document:
+        """For people: mm and degrees."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        return {
+            "shift_mm": (1e3 * self.shift).tolist(),
+            "shift_sigma_mm": (1e3 * sigma[:3]).tolist(),
+            "turn_deg": np.degrees(self.turn).tolist(),
+            "turn_sigma_deg": np.degrees(sigma[3:]).tolist(),
+            "moved": self.moved,
+        }
+
+
+def moved_points(laser: LaserFrame, bend: Array) -> LaserFrame:
+    """The frame with A ... D moved (4, 2), across each beam and upwards, m."""
+    across = bend[:, :1] * np.repeat(laser.normals, 2, axis=0)
+    up = bend[:, 1:] * laser.T_base_laser[:3, 2]
+    return replace(laser, points=laser.points + across + up)
+
+
+def measure_station(
+    laser: LaserFrame,
+    path: FlangePath,
+    steps: Sequence[BeamStep],
+    T_flange_cylinder: Array,
+    radius_m: float,
+    noise: RobotNoise,
+) -> StationMeasurement:
+    """Find the beams from the edges of a cylinder of known place, axis and radius.
+
+    ``laser``: the beams roughly, to some millimetres; A ... D stay beside its points.
+    ``T_flange_cylinder`` (4, 4): its end, z along its axis; ``radius_m`` as certified: how far a
+    beam reaches is what its shadows are wider than that.
+
+    Raises `BeamError` when edges are missing or out of order; `InputError` or `ResidualError` when
+    no two beams explain them; `WrongToolError` when the shadows are another cylinder's.
+    """
+    rough, bend = replace(laser, sigma_m=ROUGH_M), np.zeros((4, 2))
+    for _ in range(REACHES):
+        problem, start = run_problem(rough, path, steps, T_flange_cylinder, noise, held=KNOWN)
+        start = replace(start, bend=bend, radius=np.full_like(start.radius, radius_m))
+        found = solve(problem, start, prior_information=problem.prior, robust=False)
+        if not found.converged:
+            raise ResidualError(
+                "no two beams are found: the search still moves; check the mandrel's place on the "
+                "flange, the robot's model and the laser file"
+            )
+        bend = found.state.bend
+        wider = found.state.radius.mean(axis=0) - radius_m
+        if float(np.abs(wider).max()) > LARGEST_REACH_M:
+            raise WrongToolError(
+                f"its shadows are those of a radius of {1e3 * (radius_m + wider.max()):.2f} mm, "
+                f"the mandrel's is {1e3 * radius_m:.2f} mm: another one is mounted, or "
+                "mandrel_radius_mm is wrong"
+            )
+        rough = replace(rough, reach=wider)
+    misfit_m = float(np.sqrt(np.mean((found.residual[:, 0] * problem.sigma_m) ** 2)))
+    if misfit_m > LARGEST_MISFIT_M:
+        raise ResidualError(
+            f"the edges miss any two beams by {1e3 * misfit_m:.3f} mm rms (allowed "
+            f"{1e3 * LARGEST_MISFIT_M:.1f} mm): is the mandrel bent or loose?"
+        )
+    names = found.names
+    beams = [i for i, name in enumerate(names) if name.startswith("laser_")]
+    C = found.covariance[np.ix_(beams, beams)].copy()
+    for b, beam in enumerate("xy"):  # what is not known of a reach lifts both points of its beam
+        own = [i for i, name in enumerate(names) if name.startswith(f"radius_{beam}_")]
+        variance = float(found.covariance[np.ix_(own, own)].mean())
+        up = [4 * b + 1, 4 * b + 3]
+        C[np.ix_(up, up)] += variance
+    away = problem.deviation(found.state)
+    squares = float(np.sum((found.residual / found.scale) ** 2) + away @ problem.prior @ away)
+    free = len(found.residual) - problem.undetermined - bend.size
+    if free > 0 and squares > chi2_quantile(SOUND_FIT, free):
+        C *= squares / free
+    placed = moved_points(rough, bend)
+    sigma_m = float(np.sqrt(np.mean(np.diag(C))))
+    return StationMeasurement(replace(placed, sigma_m=sigma_m), C, misfit_m)
+
+
+def station_shift(before: StationMeasurement, now: StationMeasurement) -> StationShift:
+    """How the station has moved between two measurements with one mandrel.
+
+    Raises `InputError` when they are not of the same beams.
+    """
+    bend = _bend(before.laser, now.laser)
+    C = before.covariance + now.covariance
+    if float(np.abs(bend).max()) > 2.0 * ROUGH_M:
+        raise InputError(
+            f"the beams lie {1e3 * np.abs(bend).max():.1f} mm apart: these are two stations"
+        )
+
+    found, rows = _frame_moved(before.laser, bend), _frame_rows(before.laser)
+    spread, limit = rows @ C @ rows.T, chi2_quantile(1.0 - NEVER / 2.0, 3)
+    parts = [(found[i], spread[i, i]) for i in (slice(3), slice(3, 6))]
+    moved = any(away @ np.linalg.solve(own, away) > limit for away, own in parts)
+    return StationShift(found[:3], found[3:], spread, moved)
+
+
+def _frame_moved(laser: LaserFrame, bend: Array) -> Array:
+    """Shift and turn (6,) of the frame in its own axes, by moved points (4, 2)."""
+    away = frames.invert(laser.T_base_laser) @ moved_points(laser, bend).T_base_laser
+    return np.concatenate([away[:3, 3], frames.log_rotation(away[:3, :3])])
+
+
+def _frame_rows(laser: LaserFrame) -> Array:
+    """Of `_frame_moved` by the points' moves (6, 8)."""
+    steps = H_M * np.eye(8).reshape(8, 4, 2)
+    moved = [_frame_moved(laser, h) - _frame_moved(laser, -h) for h in steps]
+    return np.array(moved).T / (2.0 * H_M)
+
+
+def _bend(before: LaserFrame, now: LaserFrame) -> Array:
+    """How far (4, 2) the new beams pass the old points, across each beam and upwards, m."""
+    along = np.repeat(now.direction, 2, axis=0)
+    apart = np.repeat(now.points[[0, 2]], 2, axis=0) - before.points
+    u = np.repeat(before.direction, 2, axis=0)
+    # to where the new beam crosses the plane through the old point, across the old beam
+    reach = np.sum(apart * u, axis=1) / np.sum(along * u, axis=1)
+    away = apart - reach[:, None] * along
+    normals = np.repeat(before.normals, 2, axis=0)
+    return np.column_stack([np.sum(away * normals, axis=1), away @ before.T_base_laser[:3, 2]])
+
+
+def measurement_document(found: StationMeasurement) -> Document:
+    """A measurement in SI, for keeping; `measurement_of` reads it back."""
+    return {
+        "points_m": dict(zip(POINTS, found.laser.points.tolist(), strict=True)),
+        "reach_m": found.laser.reach.tolist(),
+        "covariance": found.covariance.tolist(),
+        "misfit_m": found.misfit_m,
+    }
+
+
+def measurement_of(document: Document) -> StationMeasurement:
+    """Read a measurement back."""
+    C = np.array(document["covariance"])
+    points = np.array([document["points_m"][name] for name in POINTS])
+    laser = LaserFrame(points, float(np.sqrt(np.mean(np.diag(C)))), np.array(document["reach_m"]))
+    return StationMeasurement(laser, C, document["misfit_m"])
+
+
+def station_trend(stamp_ns: Sequence[int], shifts: Sequence[StationShift]) -> Document:
+    """Straight line through the crossing's shifts: mm a day (3), and its sigma; none of one.
+
+    Weighted by each shift's covariance; the first measurement is in all of them alike and moves
+    the line, not its slope.
+    """
+    days = np.array([(stamp - stamp_ns[0]) / DAY_NS for stamp in stamp_ns])
+    if len(days) < 2 or float(np.ptp(days)) <= 0.0:
+        return {"per_day_mm": None, "sigma_mm": None, "days": 0.0}
+    information, right = np.zeros((6, 6)), np.zeros(6)
+    for day, one in zip(days, shifts, strict=True):
+        rows = np.concatenate([np.eye(3), day * np.eye(3)], axis=1)
+        weight = np.linalg.inv(one.covariance[:3, :3])
+        information += rows.T @ weight @ rows
+        right += rows.T @ weight @ one.shift
+    C = np.linalg.inv(information)
+    slope = (C @ right)[3:]
+    return {
+        "per_day_mm": (1e3 * slope).tolist(),
+        "sigma_mm": (1e3 * np.sqrt(np.diag(C)[3:])).tolist(),
+        "days": float(days[-1]),
+    }
