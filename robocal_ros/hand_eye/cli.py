@@ -19,6 +19,7 @@ from robocal_ros.cli.main import (
     Document,
     input_topic,
     positive,
+    print_table,
     print_verdict,
     spaced,
     text,
@@ -39,9 +40,22 @@ from robocal_ros.hand_eye.data import (
     first_of_each,
     flange_poses,
 )
-from robocal_ros.hand_eye.files import PoseTable, read_flange_mount, read_pose_table, read_profiles
+from robocal_ros.hand_eye.files import (
+    PoseTable,
+    read_flange_mount,
+    read_pose_table,
+    read_profiles,
+    read_scanned_points,
+    read_touched_points,
+)
 from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, Profile, SensorDescription, sensor_of
-from robocal_ros.hand_eye.result import METHODS, HandEyeSettings, by_shot, hand_eye_document
+from robocal_ros.hand_eye.result import (
+    METHODS,
+    HandEyeSettings,
+    by_shot,
+    hand_eye_document,
+    shots_of,
+)
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
 from robocal_ros.hand_eye.stairs import task_of
@@ -53,8 +67,9 @@ from robocal_ros.hand_eye.targets import (
     read_target,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData
+from robocal_ros.hand_eye.touch_test import touch_test
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.robots import load_robot, read_fields
 from robocal_ros.session.events import session_kind
 
 if TYPE_CHECKING:
@@ -64,6 +79,7 @@ if TYPE_CHECKING:
 BagShots = tuple[HandEyeData, dict[str, str]]
 
 KINDS = ("sphere", "step", "line")
+POINT = "point"
 LIMIT_MM = 1e3 * HandEyeSettings.limit_m
 MOST_NAMED = 5  # samples left out for one reason
 
@@ -544,10 +560,19 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
         "--result",
         required=True,
         type=Path,
+        action="append",
         metavar="FILE",
-        help="JSON that sphere, step, line, joint or tracker printed",
+        help="JSON that sphere, step, line, joint or tracker printed; of point several, to compare",
     )
-    add_target_kind(parser)
+    parser.add_argument(
+        "--target-kind",
+        required=True,
+        choices=(*KINDS, POINT),
+        help="what the shots show; point: marked points, where --poses holds what was seen of them",
+    )
+    parser.add_argument(
+        "--touched", type=Path, metavar="CSV", help="of point: where they are, touched by the robot"
+    )
     add_shots(parser)
     add_target(parser)
     add_feature(parser)
@@ -556,8 +581,12 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
 
 def run_verify(args: argparse.Namespace) -> CliResult:
     """Do ``verify``. Raises `RobocalError` for what a user can mend."""
+    if args.target_kind == POINT:
+        return _run_touch_test(args)
+    if len(args.result) > 1 or args.touched is not None:
+        raise InputError("--touched, and a second --result, are for --target-kind point")
     settings = settings_of(args)
-    mount = read_flange_mount(args.result)
+    mount = read_flange_mount(args.result[0])
     T_flange_sensor = mount.T_parent_sensor
     target = given_target(args.target_kind, args.target, args.radius_mm)
     task = task_of(target, args.line_kind, towards=described(args).towards)
@@ -574,6 +603,35 @@ def run_verify(args: argparse.Namespace) -> CliResult:
         "verdict": verdict_document(found.verdict),
     }
     return CliResult(document, _show_verify)
+
+
+def _run_touch_test(args: argparse.Namespace) -> CliResult:
+    if args.poses is None or args.bag is not None:
+        raise InputError("--target-kind point needs --poses, a table of what was seen of them")
+    scanned = read_scanned_points(args.poses, arm_of(args))
+    touched = {} if args.touched is None else read_touched_points(args.touched)
+    rows: list[Document] = []
+    for path in args.result:
+        mount = read_flange_mount(path)
+        found = touch_test(mount, scanned, touched, args.limit_mm * 1e-3)
+        fields = read_fields(path, "mount file").values
+        used = shots_of((fields.get("residual_mm") or {}).get("per_sample") or {})
+        row = {"result": str(path), "shots": len(used) or None} | found.document()
+        rows.append(row | {"verdict": verdict_document(found.verdict)})
+    document: Document = {"kind": POINT, "results": rows, "verdict": rows[-1]["verdict"]}
+    return CliResult(document, _show_touch_test)
+
+
+def _show_touch_test(console: "Console", document: Document) -> None:
+    rows = []
+    for row in document["results"]:
+        accuracy, three = row["accuracy_mm"], row["three_sigma_mm"]
+        figures = [accuracy[name] for name in ("mean_mm", "max_mm")] if accuracy else [None, None]
+        shown = ["" if x is None else f"{x:.3f}" for x in (*figures, three)]
+        rows.append([row["result"], str(row["shots"] or ""), *shown, row["verdict"]["code"]])
+    head = ("result", "shots", "off, mean mm", "largest", "3 sigma, mm", "verdict")
+    print_table(console, "Marked points, scanned and touched", head, rows, words=(0, 5))
+    print_verdict(console, document)
 
 
 def _show_verify(console: "Console", document: Document) -> None:

@@ -180,6 +180,54 @@ def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | 
     return frames.transform(read_rotations(table, layout.orientation), position)
 
 
+@dataclass(frozen=True, eq=False)
+class ScannedPoints:
+    """Marked points that the sensor saw: ``point`` (m,) names, ``points`` (m, 2) x and z, m.
+
+    ``T_base_flange`` (m, 4, 4): where the flange was.
+    """
+
+    point: tuple[str, ...]
+    points: Array
+    T_base_flange: Array
+
+
+SCANNED = ("point", "sensor_x_mm", "sensor_z_mm")
+
+
+def read_scanned_points(path: Path, arm: SerialArm | None = None) -> ScannedPoints:
+    """Read a table of marked points, each row a pose and where the sensor saw the point then.
+
+    Raises `InputError` as `read_pose_table`.
+    """
+    found: list[TableLayout] = []
+
+    def check(header: list[str], file: str) -> None:
+        found.append(read_pose_columns(header, arm, file, ("sample", "stamp_s", *SCANNED)))
+        if missing := [name for name in SCANNED if name not in found[0].place]:
+            raise InputError(f"column {', '.join(missing)} is missing", file=file, row=1)
+
+    table = read_cells(path, check)
+    layout, q = found[0], None
+    if layout.joints:
+        q = np.column_stack([table.numbers(name) for name in layout.joints])
+        q = q * layout.joint_factors
+    points = 1e-3 * np.column_stack([table.numbers(name) for name in SCANNED[1:]])
+    return ScannedPoints(table.words("point"), points, _poses(table, layout, arm, q))
+
+
+def read_touched_points(path: Path) -> dict[str, Array]:
+    """Places (3,) in base, m, of touched points by name.
+
+    Raises `InputError` for a table that is not so, and for a point that is there twice.
+    """
+    columns = ("point", *POSITION["mm"])
+    table = read_cells(path, lambda header, file: check_plain(header, file, columns))
+    require_different(table, "point")
+    places = 1e-3 * np.column_stack([table.numbers(name) for name in columns[1:]])
+    return dict(zip(table.words("point"), places, strict=True))
+
+
 def read_profile(path: Path, name: str, sensor: SensorDescription = DEFAULT) -> Profile:
     """Read a profile; rows without a return (an empty cell, or nan) are left out.
 

@@ -470,6 +470,13 @@ def add_screen(parser: argparse.ArgumentParser) -> None:
         help="best (default): what leaves the highest share; classic: the first that does no harm",
     )
     parser.add_argument(
+        "--stationarity",
+        choices=("autocorrelation", "ljung-box"),
+        default="autocorrelation",
+        help="when a series is stationary: by how many of its autocorrelations lie outside of what "
+        "white noise has (default), or by the Ljung-Box test, both at 5 %%",
+    )
+    parser.add_argument(
         "--threshold-mm",
         type=positive,
         default=THRESHOLD_MM,
@@ -490,12 +497,17 @@ def run_screen(args: argparse.Namespace) -> CliResult:
         raise InputError(f"--wanted {args.wanted}: this robot has {len(arm.parameters)} parameters")
     history = _history(args, arm)
     found = screen(
-        history, wanted=args.wanted, removal=args.removal, threshold_m=args.threshold_mm * 1e-3
+        history,
+        wanted=args.wanted,
+        removal=args.removal,
+        test=args.stationarity,
+        threshold_m=args.threshold_mm * 1e-3,
     )
     document: Document = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "removal": args.removal,
+        "stationarity": args.stationarity,
         "threshold_mm": args.threshold_mm,
         "cycles": len(history.displacement),
         "uncompensated": found.uncompensated,

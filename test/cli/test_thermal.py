@@ -178,6 +178,19 @@ def test_screening_reports_every_round_and_draws_them(folder):
     assert (folder / "rounds.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_screening_by_ljung_box(folder):
+    """The tests differ in which series they call stationary on this shift, and it is told."""
+    words = ["--robot", ROBOT, "--sensor", folder / "s.yaml", "--cold", folder / "cold.csv"]
+    words += ["--warm", folder / "shift.csv", "--check", folder / "judges.csv", "--wanted", 20]
+    found = {}
+    for test in ("autocorrelation", "ljung-box"):
+        more = [*words, "--stationarity", test]
+        document = robocal_json("thermal.screen.json", "thermal", "screen", *more)
+        assert document["stationarity"] == test
+        found[test] = [row["stationary"] for row in document["rounds"]]
+    assert found["autocorrelation"] != found["ljung-box"]
+
+
 def test_planned_poses_beat_random_and_own_ones(folder):
     words = ["--robot", ROBOT, "--sensor", folder / "s.yaml", "--own", folder / "warm.csv"]
     words += ["--working", folder / "check.csv", "--output", folder / "planned.csv"]
