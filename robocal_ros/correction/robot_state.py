@@ -295,11 +295,7 @@ class RobotState:
         read = self.measured.clip(-FARTHEST, FARTHEST)
         # some drivers say 0 in motion
         place, speed = read, self.velocity if self.velocity.any() else np.nan * self.velocity
-        track = [row for row in self._track if row[0] >= self._whole_s]
-        since_s = track[-1][0] - VELOCITY_S
-        recent = track[-max(sum(at_s >= since_s for at_s, _ in track), LEAST) :]
-        times, q = np.array([at_s for at_s, _ in recent]), np.array([place for _, place in recent])
-        q = q.clip(-FARTHEST, FARTHEST)
+        times, q = self._recent()
         i, j = np.triu_indices(len(times), 1)
         apart = times[j] - times[i] >= LEAST_TRACK_S
         if apart.any():
@@ -312,40 +308,62 @@ class RobotState:
         here = place + speed * (now_s - float(np.min(self._heard_s)))
         return (here, speed) if np.isfinite(here).all() else None
 
+    def _recent(self) -> tuple[Array, Array]:
+        """Times (m,) and joints (m, n) of the readings that tell a speed."""
+        track = [row for row in self._track if row[0] >= self._whole_s]
+        since_s = track[-1][0] - VELOCITY_S
+        recent = track[-max(sum(at_s >= since_s for at_s, _ in track), LEAST) :]
+        times, q = np.array([at_s for at_s, _ in recent]), np.array([place for _, place in recent])
+        return times, q.clip(-FARTHEST, FARTHEST)
+
     def to_stop(self, now_s: float) -> tuple[Array, Array] | None:
         """Joints and speeds (n,) to stop from: the controller's, where the robot follows it.
 
         None where nobody knows where the robot is. One that pauses is held.
         """
-        here, told = self.here(now_s), self.told(now_s)
+        here = self.here(now_s)
         if here is None:
             return None
-        if told is not None:  # but for its lag
-            reach = LAG_S * (np.abs(told[1]) + np.abs(here[1])) + self._near
-            here = told if np.all(np.abs(told[0] - here[0]) < reach) else here
-        q, qd = here
+        q, qd = self._followed(here, now_s) or here
         return q, np.clip(qd, -self._fastest, self._fastest) * (self.scaling > 0.0)
 
+    def _followed(self, here: tuple[Array, Array], now_s: float) -> tuple[Array, Array] | None:
+        """Where the controller is, if the robot is ``here`` but for its lag."""
+        told = self.told(now_s)
+        if told is None:
+            return None
+        reach = LAG_S * (np.abs(told[1]) + np.abs(here[1])) + self._near
+        return told if np.all(np.abs(told[0] - here[0]) < reach) else None
+
     def speed(self, now_s: float) -> float:
-        """Of the fastest joint, as read; NaN where that is not known."""
+        """Of the fastest joint, unscaled; of one that pauses as read; NaN where it is not known."""
         here = self.here(now_s)
-        return float("nan") if here is None else float(np.max(np.abs(here[1])))
+        if here is None:
+            return float("nan")
+        told = self._followed(here, now_s) if self.scaling > 0.0 else None
+        if told is not None:
+            return float(np.max(np.abs(told[1])))
+        return float(np.max(np.abs(here[1]))) / (max(self.scaling, 0.1) if self.scaling else 1.0)
 
     def seen_s(self, now_s: float) -> float:
-        """What the robot is sent shows so late."""
-        return LAG_S
+        """What the robot is sent shows so late: readings that come seldom tell an older speed."""
+        if self.blind(now_s):
+            return np.inf
+        times, _ = self._recent()
+        span_s = float(times[-1] - times[0])
+        return LAG_S + now_s - float(times[-1]) + max(0.5 * (span_s - VELOCITY_S), 0.0)
 
     def at_rest(self, now_s: float) -> bool:
-        """Whether all joints were read lately, and have not moved for `STANDS_S`."""
+        """Whether all joints were read lately, and by these have not moved for `STANDS_S`."""
         return self.stood_s(now_s) >= STANDS_S
 
     def stood_s(self, now_s: float) -> float:
-        """How long the joints have stood in one place; 0 where they were not all read lately."""
-        return 0.0 if self.blind(now_s) else now_s - self._place_s
+        """How long the joints were read in one place; 0 where they were not all read lately."""
+        return 0.0 if self.blind(now_s) else max(float(self._heard_s.min()) - self._place_s, 0.0)
 
     def follows(self, path: SentPath, now_s: float) -> bool:
         """Whether the robot is where a path has it, or was lately; True where it is not known."""
-        if self.blind(now_s):
+        if self.here(now_s) is None:
             return True
         heard_s = float(np.min(self._heard_s))
         times = np.linspace(heard_s - RESPONSE_S, now_s + LAG_S, FOLLOWED)

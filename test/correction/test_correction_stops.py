@@ -172,10 +172,18 @@ class SimulatedController:
     ----------
     losses : so many trajectories are lost.
     reports : velocities in readings: "measured", "nan" or "zero".
+    period_s : of the readings; infinite: they are silent.
     """
 
-    def __init__(self, losses: int = 0, reports: str = "measured", scaling: float = 1.0) -> None:
+    def __init__(
+        self,
+        losses: int = 0,
+        reports: str = "measured",
+        scaling: float = 1.0,
+        period_s: float = CYCLE_S,
+    ) -> None:
         self.now_s, self.losses, self.reports, self.scaling = 100.0, losses, reports, scaling
+        self.period_s, self._read_s = period_s, -np.inf
         self.q, self.qd = HOME.copy(), SPEED.copy()
         self.state = RobotState(ARM, 0.2, np.full(6, 3.5e-4), ROBOT.max_velocity)
         limits = MotionLimits(stop_deceleration=ROBOT.max_acceleration)
@@ -227,7 +235,9 @@ class SimulatedController:
             "nan": np.full(6, np.nan),
             "zero": np.zeros(6),
         }[self.reports]
-        self.state.read(np.arange(6), self.q.copy(), self.now_s, velocity=told)
+        if self.now_s - self._read_s >= self.period_s - 1e-6:
+            self.state.read(np.arange(6), self.q.copy(), self.now_s, velocity=told)
+            self._read_s = self.now_s
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / CYCLE_S)):
@@ -237,7 +247,7 @@ class SimulatedController:
         """Time from the stop's begin until the robot stands."""
         began_s = moved_s = self.now_s
         self.begins()
-        while self.looks():
+        while self.looks() and self.now_s < began_s + 20.0:
             before = self.q
             self.cycle()
             moved_s = self.now_s if np.any(np.abs(self.q - before) > 1e-9) else moved_s
@@ -277,6 +287,44 @@ def test_a_controller_that_runs_slowly_is_waited_for(scaling):
     robot.stops()
     assert robot.stop.sent == 1
     assert not robot.stop.failed
+
+
+@pytest.mark.parametrize("scaling", [0.1, 0.5])
+def test_a_lost_stop_is_sent_again_to_a_controller_that_tells_its_unscaled_speed(scaling):
+    """Finding: slower readings than the plan's speeds looked like a robot that obeys."""
+    robot = SimulatedController(losses=1, scaling=scaling)
+    robot.state.told = lambda now: (robot.q.copy(), robot.qd.copy())
+    robot.run(0.3)
+    robot.looks()
+    took_s = robot.stops()
+    assert robot.stop.sent == 2
+    assert not robot.stop.failed
+    assert took_s <= 1.5 * robot.plans[0].duration_s / scaling
+
+
+@pytest.mark.parametrize("losses", [0, 1])
+@pytest.mark.parametrize("reports", ["measured", "nan"])
+@pytest.mark.parametrize("period_s", [0.02, 0.04, 0.1, 0.12])
+def test_readings_that_come_seldom_show_a_stop_late(period_s, reports, losses):
+    """Finding: a robot that obeyed was stopped anew from old speeds, or held to stand in motion."""
+    robot = SimulatedController(losses, reports, period_s=period_s)
+    robot.run(1.0)
+    robot.stops()
+    assert not robot.qd.any()
+    assert robot.stop.sent == losses + 1
+    assert not robot.stop.failed
+
+
+def test_a_robot_that_is_heard_no_more_while_it_stops_does_not_stand():
+    """Finding: 0.1 s after the last reading of a robot in motion it stood."""
+    robot = SimulatedController()
+    robot.stop = WatchedStop(ARM, MotionLimits(stop_deceleration=1.0))
+    robot.run(0.3)
+    robot.begins()
+    while robot.looks() and not robot.stop.failed:
+        robot.cycle()
+        robot.period_s = np.inf if robot.now_s > 100.5 else CYCLE_S
+    assert "joint states are missing" in robot.stop.failed
 
 
 def test_a_robot_that_does_not_stop_is_told():
@@ -365,6 +413,10 @@ def test_whether_a_robot_follows_its_path(late_s):
     path.scale(0.0, robot.now_s)
     robot.run(1.0)
     assert not robot.state.follows(path, robot.now_s)
+    robot.now_s, robot.reports = robot.now_s + 1.0, "nan"
+    robot.cycle()  # nobody knows how fast it is: it can be stopped on its path alone
+    assert robot.state.to_stop(robot.now_s) is None
+    assert robot.state.follows(path, robot.now_s)
 
 
 # ---- pauses -------------------------------------------------------------------------------------
