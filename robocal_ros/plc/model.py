@@ -421,6 +421,14 @@ class InformationModel:
         for path, value in values:
             await self.set(path, value, at)
 
+    def good_values(self) -> dict[str, Any]:
+        """What is shown and stood by, by its path below the cell."""
+        return {
+            path.removeprefix(f"{CELL}."): shown.Value.Value
+            for path, shown in self._values.items()
+            if shown.StatusCode == ua.StatusCode() and shown.Value is not None
+        }
+
     async def look(self, now_s: float) -> None:
         """What has fallen silent is marked: nobody stands by its last value."""
         for shown in SHOWN:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import partial
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,18 @@ def enumerations() -> dict[str, dict[str, int]]:
     }
 
 
+def _addresses(given: list[str]) -> str | None:
+    wrong = next((a for a in given if a and not _is_address(a)), None)
+    return None if wrong is None else f"'{wrong}' is no IP address"
+
+
+def _is_address(text: str) -> bool:
+    try:
+        return bool(ip_address(text))
+    except ValueError:
+        return False
+
+
 def _beam_names(names: list[str]) -> str | None:
     wrong = [name for name in names if name and not name.replace("_", "").isalnum()]
     if wrong or len(set(names)) < len(names):
@@ -77,6 +90,14 @@ SETTINGS = (
     ),
     Setting("host", "0.0.0.0", "Address of this machine to listen at; 0.0.0.0: all of them"),
     number("port", 4840, "TCP port; OPC UA's own is 4840", 1, 65535),
+    Setting(
+        "modbus_clients",
+        [""],
+        "Addresses of gateways that are served the register map by Modbus TCP, which has neither "
+        "users nor encryption; none: it is off",
+        check=_addresses,
+    ),
+    number("modbus_port", 502, "TCP port of that; below 1024 only root may listen", 1, 65535),
     Setting(
         "beams", [""], "Beams whose levels the PLC writes; none: it writes none", check=_beam_names
     ),
@@ -148,7 +169,14 @@ class PlcBridgeNode(HouseNode):
         timing = InputTiming(settings["beam_latency_ms"] * 1e-3, settings["beam_jitter_ms"] * 1e-3)
         self._server = ServerThread(
             ServerSettings(
-                settings["host"], settings["port"], folder, beams, timing, enumerations()
+                settings["host"],
+                settings["port"],
+                folder,
+                beams,
+                timing,
+                enumerations(),
+                tuple(settings["modbus_clients"]),
+                settings["modbus_port"],
             ),
             self._hand,
         )

@@ -7,6 +7,7 @@ in asyncua's source. Its loop has a thread of its own; what a PLC wants goes to 
 
 import asyncio
 import contextlib
+import gc
 import logging
 import threading
 import time
@@ -27,8 +28,9 @@ from asyncua.server.internal_session import InternalSession
 from cryptography.hazmat.primitives import serialization
 
 from robocal_ros.adapter.inputs import InputTiming, LevelChange
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
+from robocal_ros.plc import modbus
 from robocal_ros.plc.access import (
     KEY,
     SERVER,
@@ -39,11 +41,13 @@ from robocal_ros.plc.access import (
     read_certificate,
 )
 from robocal_ros.plc.inputs import GOOD, BeamInput, Heartbeat, HeartbeatInput
+from robocal_ros.plc.modbus import CYCLE, VALID, ModbusServer
 from robocal_ros.plc.model import (
     ACTIVE,
     BEAMS,
     BLOCKED,
     HEARTBEAT,
+    METHODS,
     METHODS_NODE,
     TIME,
     InformationModel,
@@ -109,6 +113,8 @@ class ServerSettings:
     beams: tuple[str, ...]
     timing: InputTiming
     enumerations: Mapping[str, Mapping[str, int]]
+    modbus_clients: tuple[str, ...] = ()  # none: Modbus is off
+    modbus_port: int = 502
 
 
 @dataclass
@@ -187,9 +193,9 @@ class Cell:
         for beam in self.beams.values():
             beam.restart()
 
-    def end(self, session: "CellSession") -> None:
+    def end(self, writer: str) -> None:
         """A session is gone."""
-        self._heartbeat.end(session.label)
+        self._heartbeat.end(writer)
 
     async def write(
         self, session: "CellSession", items: Sequence[ua.WriteValue]
@@ -234,12 +240,7 @@ class Cell:
         path, value = self._path(item), item.Value.Value.Value
         source_ns = _ns(item.Value.SourceTimestamp)
         if path == HEARTBEAT:
-            came = self._heartbeat.write(session.label, value, source_ns, time.monotonic())
-            if came.passed is not None:
-                self._hand(came.passed)
-            if came.words:
-                self._hand(Notice(f"heartbeat of {session.label}: {came.words}"))
-            return came.status
+            return self.heartbeat(session.label, value, source_ns)
         name, _, part = path.removeprefix(f"{BEAMS}.").rpartition(".")
         if part == BLOCKED:
             at_ns = source_ns or _ns(times.get(f"{BEAMS}.{name}.{TIME}"))
@@ -250,6 +251,15 @@ class Cell:
                 self._hand(Notice(f"beam {name} of {session.label}: {found.words}"))
             return found.status
         return GOOD
+
+    def heartbeat(self, writer: str, echo: int, source_ns: int | None) -> str:
+        """Judge a heartbeat, pass it on where it is new; its status."""
+        came = self._heartbeat.write(writer, echo, source_ns, time.monotonic())
+        if came.passed is not None:
+            self._hand(came.passed)
+        if came.words:
+            self._hand(Notice(f"heartbeat of {writer}: {came.words}"))
+        return came.status
 
     async def call(self, session: "CellSession", request: ua.CallMethodRequest) -> Any:
         """Carry out one call; answered within `ANSWER_S`."""
@@ -264,8 +274,17 @@ class Cell:
         fields, status, each = arguments_of(method, sent)
         if status:
             return _call_result(status, each)
+        outputs = await self.carry_out(method, session.user_name, fields)
+        if isinstance(outputs, str):
+            return _call_result(outputs)
+        return ua.CallMethodResult(OutputArguments=outputs)
+
+    async def carry_out(
+        self, method: Method, user: str, fields: Mapping[str, Any]
+    ) -> list[ua.Variant] | str:
+        """Let the node call; the outputs, or the name of a status."""
         if not self.active:
-            return _call_result("BadInvalidState")
+            return "BadInvalidState"
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[list[ua.Variant] | str] = loop.create_future()
 
@@ -277,14 +296,46 @@ class Cell:
             with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
                 loop.call_soon_threadsafe(settle, outputs)
 
-        self._hand(MethodCalled(method, session.user_name, fields, answer))
+        self._hand(MethodCalled(method, user, fields, answer))
         try:
-            outputs = await asyncio.wait_for(answered, ANSWER_S)
+            return await asyncio.wait_for(answered, ANSWER_S)
         except TimeoutError:
-            return _call_result("BadTimeout")
-        if isinstance(outputs, str):
-            return _call_result(outputs)
-        return ua.CallMethodResult(OutputArguments=outputs)
+            return "BadTimeout"
+
+
+class RegisterImage:
+    """The cell for `ModbusServer`: the same values, heartbeat and calls as by OPC UA."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+
+    def values(self) -> Mapping[str, Any]:
+        """Good values by path; a number of the last cycle, where its id is one."""
+        found = self._cell.model.good_values()
+        found[VALID] = {"Accuracy.State", "Maintenance.State"} <= found.keys()
+        cycle = str(found.get("LastCycle.CycleId", ""))
+        found[CYCLE] = int(cycle) if cycle.isdecimal() and int(cycle) < 2**32 else 0
+        return found
+
+    def heartbeat(self, writer: str, echo: int) -> int:
+        """As by OPC UA, without a source time."""
+        if not self._cell.active:
+            return modbus.FAILED
+        return 0 if self._cell.heartbeat(writer, echo, None) == GOOD else modbus.BUSY
+
+    def end(self, writer: str) -> None:
+        """What it wrote counts no more."""
+        self._cell.end(writer)
+
+    async def request(self, writer: str, command: int, cycle: int, gap_s: int) -> int:
+        """Run or cancel."""
+        name = {modbus.RUN: "Run", modbus.CANCEL: "Cancel"}.get(command)
+        method = next((m for m in METHODS if m.name == name), None)
+        if method is None:
+            return int(Code.BAD_INPUT)
+        fields = {"cycle_id": str(cycle), "gap_s": float(gap_s)} if method.inputs else {}
+        outputs = await self._cell.carry_out(method, writer, fields)
+        return modbus.NO_ANSWER if isinstance(outputs, str) else int(outputs[1].Value)
 
 
 def _call_result(status: str, each: Sequence[str] = ()) -> ua.CallMethodResult:
@@ -337,7 +388,7 @@ class CellSession(InternalSession):
 
     async def close_session(self, delete_subs: bool = True) -> None:
         """End, with what it wrote; asyncua keeps one with subscriptions when its socket goes."""
-        self.iserver.cell.end(self)
+        self.iserver.cell.end(self.label)
         await super().close_session(True)
 
     async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
@@ -482,6 +533,15 @@ class CellServer(Server):
         model = InformationModel(self, self._settings.enumerations, self._settings.beams)
         await model.build()
         self.iserver.cell.model = model
+        # A look for garbage through the standard's address space would take hundreds of
+        # milliseconds, in which no heartbeat is passed on.
+        gc.collect()
+        gc.freeze()
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether it does."""
+        return self.bserver is not None and self.bserver._server is not None
 
     async def start(self) -> None:
         """Listen. Raises `OSError` where the port is taken; it may then be tried again."""
@@ -582,8 +642,13 @@ class ServerThread:
         door = Door(self._settings.folder, self._hand)
         server = CellServer(self._settings, self.cell, door, self._hand)
         await server.prepare()
+        registers = ModbusServer(
+            RegisterImage(self.cell),
+            self._settings.modbus_clients,
+            lambda words: self._hand(Notice(words)),
+        )
         try:
-            await self._listen(server)
+            await self._listen(server, registers)
             while not self._stopped:
                 await self._look(server)
                 with contextlib.suppress(TimeoutError):
@@ -591,15 +656,19 @@ class ServerThread:
         finally:
             self.state.listening = False
             self.state.sessions = ()
+            await registers.stop()
             if server.bserver is not None:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(server.stop(), STOP_S)
 
-    async def _listen(self, server: CellServer) -> None:
+    async def _listen(self, server: CellServer, registers: ModbusServer) -> None:
         assert self._ending is not None
         while not self._stopped:
             try:
-                await server.start()
+                if not server.is_listening:
+                    await server.start()
+                if self._settings.modbus_clients:
+                    await registers.start(self._settings.host, self._settings.modbus_port)
             except OSError as error:
                 self.state.trouble = f"cannot listen: {error.strerror or error}"
                 with contextlib.suppress(TimeoutError):

@@ -6,6 +6,7 @@ processes, and the robot stands.
 
 import contextlib
 import json
+import struct
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from datetime import UTC, datetime, timedelta
@@ -16,14 +17,17 @@ import pytest
 from asyncua import ua
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from plc_client import PlcClient, free_port, security_folder
+from pymodbus.client import ModbusTcpClient
 from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus
 from test_maintenance_calls import Plc, candidates, process
 
+from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.plc import access
+from robocal_ros.plc.inputs import CONTEST_S
+from robocal_ros.plc.modbus import CANCEL, CYCLE, INPUT_WORDS, INPUTS, RUN
 
 BRIDGE = "/plc_bridge_node"
 DISAPPEARS_S = 25.0  # DDS misses a process that was killed after up to 20 s
@@ -34,6 +38,7 @@ class Line:
 
     def __init__(self, graph: Any, folder: Path) -> None:
         self.graph, self.folder, self.port = graph, security_folder(folder), free_port()
+        self.modbus_port = free_port()
         self.clients: list[PlcClient] = []
         self.gaps: list[GapOpen] = graph.collect(GapOpen, "gap_open")
         self.edges: list[BeamEvent] = graph.collect(BeamEvent, "beam_events")
@@ -48,6 +53,8 @@ class Line:
             "host": "127.0.0.1",
             "port": self.port,
             "beams": "['x', 'y']",
+            "modbus_clients": "['127.0.0.1']",
+            "modbus_port": self.modbus_port,
         }
         return self.graph.start("plc_bridge_node", settings)
 
@@ -275,6 +282,42 @@ def test_beams_that_the_plc_writes_become_events_at_their_own_time(line):
         assert one[:2] == other[:2]
         assert one[2:] == pytest.approx(other[2:], abs=1e-6)
     assert {e.header.frame_id for e in line.edges} == {"station"}
+
+
+def test_a_gap_by_the_register_map_of_modbus(line):
+    """A gateway reads and writes its whole image in each of its cycles."""
+    line.quiet()
+    gateway = ModbusTcpClient("127.0.0.1", port=line.modbus_port)
+    line.graph.spin_until(gateway.connect, "Modbus")
+    line.graph.spin_for(CONTEST_S)  # the other PLC is silent
+    request = [0] * 6
+
+    def cycle() -> dict[str, float]:
+        line.graph.spin_for(0.05)
+        words = gateway.read_input_registers(0, count=INPUT_WORDS).registers
+        data = struct.pack(f">{INPUT_WORDS}H", *words)
+        found = {r.path: struct.unpack_from(f">{r.kind}", data, 2 * r.address)[0] for r in INPUTS}
+        echo = found["Gap.Beat"]
+        written = gateway.write_registers(0, [echo >> 16, echo & 0xFFFF, *request])
+        assert not written.isError()
+        return found
+
+    def until(holds: Callable[[dict[str, float]], bool]) -> dict[str, float]:
+        until_s = time.monotonic() + DISAPPEARS_S
+        while not holds(found := cycle()):
+            assert time.monotonic() < until_s, (found, line.doing)
+        return found
+
+    until(lambda found: not line.doing)
+    request[:] = struct.unpack(">6H", struct.pack(">IHHI", 1, RUN, 30, 815))
+    assert until(lambda found: found["Answer.Number"] == 1)["Answer.Status"] == Code.ACCEPT
+    ended = until(lambda found: found[CYCLE] == 815 and found["LastCycle.Code"])
+    assert (ended["LastCycle.Code"], ended["Valid"], ended["Active"]) == (Code.ACCEPT, 1, 1)
+    assert line.call("Status", "815")[4] == Code.ACCEPT
+    request[:] = struct.unpack(">6H", struct.pack(">IHHI", 2, CANCEL, 0, 0))
+    assert until(lambda found: found["Answer.Number"] == 2)["Answer.Status"] == Code.CONFLICT
+    gateway.close()
+    line.graph.spin_until(lambda: line.doing, "the gap closes by its own rule", 5.0)
 
 
 # ---- who gets in --------------------------------------------------------------------------------

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 from maintenance_live import HOME_DEG, LiveCell
-from plc_client import PlcClient, free_port, security_folder
 from robocal_msgs.msg import MaintenanceStatus
 from test_plc_bridge import DISAPPEARS_S, refused
 
+from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 
 pytestmark = pytest.mark.cell

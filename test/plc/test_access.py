@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
-from plc_client import OPERATOR, security_folder
 
+from bench.live.opc_ua import OPERATOR, security_folder
 from robocal_ros.ground.errors import InputError
 from robocal_ros.plc import access
 from robocal_ros.plc.access import Role, Trust, Users

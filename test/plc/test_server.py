@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 from asyncua import ua
-from plc_client import NAMESPACE, PlcClient, free_port, security_folder
 
+from bench.live.opc_ua import NAMESPACE, PlcClient, free_port, security_folder
 from robocal_ros.adapter.inputs import InputTiming
 from robocal_ros.ground.errors import Code
 from robocal_ros.plc import access

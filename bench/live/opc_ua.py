@@ -5,7 +5,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from concurrent.futures import Future
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,6 +36,7 @@ def security_folder(folder: Path) -> Path:
 
 
 def free_port() -> int:
+    """A TCP port that nobody listens at."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         return int(taken.getsockname()[1])
@@ -49,6 +50,8 @@ class PlcClient:
         self.beating, self.is_open, self.stamped = False, True, False
         self.written: list[int] = []
         self.refused: list[str] = []
+        self._beat = 0
+        self._watched: Client | None = None
         self.index = 2
         self.client: Client
         self._loop = asyncio.new_event_loop()
@@ -56,6 +59,7 @@ class PlcClient:
         self._thread.start()
 
     def start(self, work: Coroutine[Any, Any, Any]) -> "Future[Any]":
+        """Begin it; nothing waits."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def do(self, work: Coroutine[Any, Any, Any], within_s: float = 15.0) -> Any:
@@ -72,6 +76,7 @@ class PlcClient:
         return client
 
     async def secured(self, client: Client) -> Client:
+        """The same, signed and encrypted."""
         own = self.folder / access.CLIENTS / f"{self.name}.der"
         await client.set_security(
             SecurityPolicyBasic256Sha256,
@@ -82,9 +87,11 @@ class PlcClient:
         return client
 
     async def connect(self) -> None:
-        self.client = await self.secured(self.made())
-        await self.client.connect()
-        self.index = await self.client.get_namespace_index(NAMESPACE)
+        """Begin a session."""
+        client = await self.secured(self.made())
+        await client.connect()
+        self.index = await client.get_namespace_index(NAMESPACE)
+        self.client = client
 
     async def connect_once_there(self, within_s: float = 60.0) -> None:
         """Again and again, as a PLC does."""
@@ -99,12 +106,19 @@ class PlcClient:
                 await asyncio.sleep(0.2)
 
     def node(self, path: str) -> Any:
+        """Of the cell, by its name."""
         return self.client.get_node(ua.NodeId(f"Cell.{path}", self.index))
 
     async def read(self, path: str) -> Any:
+        """A value."""
         return await self.node(path).read_value()
 
+    async def read_all(self, paths: Sequence[str]) -> list[Any]:
+        """In one request."""
+        return await self.client.read_values([self.node(path) for path in paths])
+
     async def write(self, path: str, value: ua.Variant, at: datetime | None = None) -> None:
+        """Write a value, with its time or without."""
         await self.node(path).write_value(ua.DataValue(value, SourceTimestamp=at))
 
     async def call(self, method: str, *arguments: Any) -> list[Any]:
@@ -118,21 +132,39 @@ class PlcClient:
                     raise
         raise AssertionError("never reached")
 
+    def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
+        """A beat has come, as asyncua tells a subscription."""
+        self._beat = value or 0
+
+    async def _watch(self) -> None:
+        """Subscribe the beat, of each session anew."""
+        if self._watched is not self.client:
+            self._beat, client = 0, self.client
+            beats = await client.create_subscription(1e3 * PROGRAM_S, self)
+            await beats.subscribe_data_change(self.node("Gap.Beat"))
+            self._watched = client
+
     async def program(self) -> None:
-        """The PLC's program: it copies the beat while the robot may be moved."""
+        """The PLC's program: it copies the newest beat in each cycle while it gives the gap.
+
+        Beats come by a subscription, so that writing waits for no reading.
+        """
         while True:
             await asyncio.sleep(PROGRAM_S)
             if not self.beating:
                 continue
             try:
-                echo = await self.read("Gap.Beat") if self.is_open else 0
+                await self._watch()
+                echo = self._beat if self.is_open else 0
                 at = datetime.now(UTC) if self.stamped else None
-                await self.write("Gap.Heartbeat", ua.Variant(echo or 0, ua.VariantType.UInt32), at)
+                await self.write("Gap.Heartbeat", ua.Variant(echo, ua.VariantType.UInt32), at)
                 self.written.append(echo)
             except Exception as error:
                 self.refused.append(type(error).__name__)
 
     def close(self) -> None:
+        """Leave."""
+
         async def leave() -> None:
             self.beating = False
             for task in asyncio.all_tasks() - {asyncio.current_task()}:
