@@ -93,7 +93,7 @@ class Recorder:
 
     def run(self, mode: str, cycle_id: str) -> Outcome:
         """A run with all its steps; the outcome of the last."""
-        self._give(self.program.rest(0.5))
+        self.rest(0.5)
         outcome = self.command(events.MEASURE_TOOL, mode=mode, cycle_id=cycle_id, by=BY)
         while outcome.done and (step := self.session.awaited) is not None:
             taken = self._give(self.program.drive(step))
@@ -106,6 +106,10 @@ class Recorder:
     def command(self, name: str, **arguments: Any) -> Outcome:
         """Give a command to the session, and record what came of it."""
         return self._carry_out(Command(name, arguments))
+
+    def rest(self, seconds: float) -> None:
+        """Stand still."""
+        self._give(self.program.rest(seconds))
 
     def truth(self, tool: np.ndarray) -> None:
         """Mount another tool."""

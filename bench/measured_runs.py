@@ -26,6 +26,7 @@ from robocal_ros.cell_sim.beams import (
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import inverse
 from robocal_ros.tool.circle import CircleMethod, CircleMotion, CommandedCircle, fit_circle
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
 from robocal_ros.tool.edges import BeamEdge, EdgeSample, StepKind
@@ -228,6 +229,38 @@ class MeasuredRun:
         self.moves.append(move)
         kind: StepKind = "circle" if isinstance(move, Circle) else "plunge"
         self.steps.append(BeamStep(name, kind, edges))
+
+
+TOUCHED = np.array([0.80, -0.13, 0.19])  # a point before the robot, base, m
+WAY = 24  # poses on a way, so that no joint jumps
+
+
+def touching(
+    arm: SerialArm,
+    tool: Array,
+    q_near: Array,
+    count: int,
+    *,
+    tilt_rad: float = 0.45,
+    scatter_m: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> Array:
+    """Joints (count, n) with the tip of a tool (4, 4) on `TOUCHED`, tilted all around it.
+
+    ``scatter_m``: of the tip about the point along each axis, drawn from ``rng``.
+    """
+    found, here = [], arm.fk(q_near)
+    for i in range(count):
+        turn = 2.0 * np.pi * i / count
+        tilt = tilt_rad * np.array([np.cos(turn), np.sin(turn), 0.0])
+        off = np.zeros(3) if rng is None else scatter_m * rng.standard_normal(3)
+        share = np.linspace(0.0, 1.0, WAY)[:, None]
+        R = frames.exp_rotation(share * tilt) @ here[:3, :3]
+        start = here[:3, 3] + here[:3, :3] @ tool[:3, 3]
+        tip = start + share * (TOUCHED + off - start)
+        T = frames.transform(R, tip - R @ tool[:3, 3])
+        found.append(inverse(arm, T, q_near)[-1])
+    return np.array(found)
 
 
 def point_sigma(station: BeamStation) -> float:

@@ -38,6 +38,7 @@ MEASURE_TOOL = "measure_tool"
 STEP_BEGINS = "step_begins"
 TOOL_STEP = "tool_step"
 BREAK_OFF = "break_off"
+TOUCH, SOLVE_TOUCHES, CLEAR_TOUCHES = "touch", "solve_touches", "clear_touches"
 LEFT_PLAN = "left_plan"  # argument of it: the robot was stopped because it left its plan
 START = "start"
 CAPTURE = "capture"

@@ -32,8 +32,23 @@ from robocal_ros.ros.parameters import (
     number,
     pose_settings,
 )
-from robocal_ros.ros.session_node import STATE_DIR, DecisionServices, SessionNode, trigger_answer
-from robocal_ros.session.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
+from robocal_ros.ros.session_node import (
+    STATE_DIR,
+    DecisionServices,
+    SessionNode,
+    trigger_answer,
+    twin,
+)
+from robocal_ros.session.events import (
+    BREAK_OFF,
+    CLEAR_TOUCHES,
+    MEASURE_TOOL,
+    SOLVE_TOUCHES,
+    TOOL_STEP,
+    TOUCH,
+    Command,
+    Outcome,
+)
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.driving import load_measuring
 from robocal_ros.tool.edges import EDGES, InputRule
@@ -215,6 +230,8 @@ class TcfServices:
         add(Trigger, "~/quick_check_trigger", self._starter(QUICK))
         add(Trigger, "~/measure_reference_trigger", self._starter(REFERENCE))
         add(Trigger, "~/laser_frame_trigger", self._starter(LASER))
+        for name in (TOUCH, SOLVE_TOUCHES, CLEAR_TOUCHES):
+            add(Trigger, f"~/{name}_trigger", twin(ask, name, {}))
         add(Trigger, "~/cancel_trigger", self._cancel_twin)
         add(Trigger, "~/result_trigger", self._result)
         DecisionServices(add, ask, history, TOOL)
@@ -459,17 +476,23 @@ class TcfNode(SessionNode[ToolSession]):
             self.last = outcome
             if self._motion is not None:
                 self._motion.run_ended(outcome)
-            try:
-                if outcome.calibration_id and self._history is not None:
-                    model = self._history.model(outcome.calibration_id)
-                    of_laser = "points_m" in model
-                    show = self._outputs.laser if of_laser else self._outputs.candidate
-                    show(model, outcome.command.stamp_ns or 0)
-                self._outputs.quality(outcome)
-            except RobocalError as error:  # the caller is answered all the same
-                self.get_logger().error(f"the run has ended but was not published: {error}")
+            self._show_result(outcome)
             if not self.run_end.done():
                 self.run_end.set_result(outcome)
+        elif name == SOLVE_TOUCHES:
+            self._show_result(outcome)
+
+    def _show_result(self, outcome: Outcome) -> None:
+        """Publish what was measured, and its verdict."""
+        try:
+            if outcome.calibration_id and self._history is not None:
+                model = self._history.model(outcome.calibration_id)
+                of_laser = "points_m" in model
+                show = self._outputs.laser if of_laser else self._outputs.candidate
+                show(model, outcome.command.stamp_ns or 0)
+            self._outputs.quality(outcome)
+        except RobocalError as error:  # the caller is answered all the same
+            self.get_logger().error(f"it is measured but was not published: {error}")
 
     def _show_step(self, words: str = "") -> None:
         session = self._session

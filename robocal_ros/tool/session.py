@@ -81,6 +81,7 @@ from robocal_ros.tool.station import (
     measurement_of,
     station_shift,
 )
+from robocal_ros.tool.touches import TouchLog
 
 
 class ToolInForce(HistoryFollower):
@@ -467,6 +468,7 @@ class ToolSession(SessionBase):
         self._results = ToolResults(nominal, history, config, software, self.current)
         self._laser = config.laser
         self._edges = EdgeLog()
+        self._touches = TouchLog(nominal, config, software)
         self._runs = 0
         self._strays = 0  # edges of the run that came with a stamp far from the joints'
         self._over: Command | None = None
@@ -552,7 +554,19 @@ class ToolSession(SessionBase):
             events.STEP_BEGINS: self._step_begins,
             events.TOOL_STEP: self._take_step,
             events.BREAK_OFF: self._break_off,
+            events.TOUCH: self._touch,
+            events.SOLVE_TOUCHES: self._solve_touches,
+            events.CLEAR_TOUCHES: lambda command, wall_ns: self._touches.clear(command),
         }
+
+    def _touch(self, command: Command, wall_ns: int) -> Outcome:
+        stamp_ns = (command.marks or {}).get(JOINTS, 0)
+        return self._touches.add(command, self.stream, stamp_ns)
+
+    def _solve_touches(self, command: Command, wall_ns: int) -> Outcome:
+        now, history = self.current, self._history
+        revision = now.thermal.revision
+        return self._touches.solve(command, history, now.arm, now.tool, revision, wall_ns)
 
     def _measure(self, command: Command, wall_ns: int) -> Outcome:
         mode, cycle_id = str(command.arguments["mode"]), str(command.arguments.get("cycle_id", ""))
