@@ -17,7 +17,6 @@ import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -26,6 +25,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.ros import endpoints
+from robocal_ros.ros.executor import NodeExecutor
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another
@@ -96,6 +96,17 @@ class Executable:
         self._log.seek(0)
         return self._log.read()
 
+    @property
+    def starved_s(self) -> float:
+        """For how long its main thread was to run and had no core, since its start.
+
+        What it did itself meanwhile, a stall of its own, does not count.
+        """
+        told = Path(
+            f"/proc/{self.process.pid}/schedstat"
+        ).read_text()  # sched-stats.rst of the kernel
+        return int(told.split()[1]) * 1e-9
+
     def kill(self) -> None:
         """End it as a power cut would."""
         self.process.kill()
@@ -131,7 +142,7 @@ class Graph:
         self.context = Context()
         rclpy.init(args=[], context=self.context, domain_id=domain)
         self.probe = Node("probe", context=self.context, start_parameter_services=False)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = NodeExecutor(context=self.context)
         self.executor.add_node(self.probe)
         self._environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),
@@ -188,6 +199,11 @@ class Graph:
         process = Executable(name, command, self._environment, forked=forked)
         self._executables.append(process)
         return process
+
+    @property
+    def starved_s(self) -> float:
+        """Of all executables together."""
+        return sum(one.starved_s for one in self._executables if one.process.poll() is None)
 
     def spin_until(
         self, condition: Callable[[], object], what: str = "", within_s: float = DEADLINE_S

@@ -1,6 +1,7 @@
 """Garbage is collected when it is told to be, and never in between."""
 
 import gc
+import sys
 import weakref
 
 import pytest
@@ -49,3 +50,30 @@ def test_in_the_end_python_collects_again(memory):
     memory.end()
     assert gc.isenabled()
     assert gc.get_freeze_count() == 0
+
+
+NODE = """
+import gc
+from robocal_ros.ros.base import HouseNode, run
+
+class Counting(HouseNode):
+    NAME = "counting"
+
+    def activate(self):
+        self.made = [[] for _ in range(100_000)]
+        self.add_timer(0.01, self.tick, steady=True)
+
+    def tick(self):
+        print("frozen", gc.get_freeze_count(), gc.isenabled(), flush=True)
+
+run(Counting)
+"""
+
+
+def test_no_node_looks_at_what_its_start_made(graph):
+    """Nor one that collects as Python does."""
+    node = graph.run("counting", [sys.executable, "-c", NODE])
+    graph.spin_until(lambda: "frozen" in node.output, "it works")
+    _, frozen, enabled = node.output[node.output.index("frozen") :].split("\n")[0].split()
+    assert int(frozen) > 100_000
+    assert enabled == "True"
