@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import robocal
 from history_content import content
 
 from robocal_ros.ground.errors import Code
@@ -34,11 +35,8 @@ def played(graph, tmp_path) -> Path:
 
 
 def test_live_equals_replay_bit_for_bit(played, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "robocal_ros.cli.main", "replay", str(played / "recorded.mcap"),
-         "--state", str(tmp_path / "again"), "--json"],
-        env=os.environ, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    state = tmp_path / "again"
+    done = robocal("replay", played / "recorded.mcap", "--state", state, "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert (document["recorded"], document["differs"]) == (True, [])

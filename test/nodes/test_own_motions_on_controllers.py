@@ -27,6 +27,7 @@ from trajectory_controllers import (
 )
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.cell_sim.sensors import TICK_S
 from robocal_ros.motion.driver import COPIES
 
 pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
@@ -134,22 +135,34 @@ UNTOLD = pytest.param(
 )
 
 
+SLOW = 3.3  # rad/s^2
+LATE_S = 0.012  # of a stop beyond `REACTION_S`, which it comes with less of where cores are free
+TRIES = 5
+
+
 @pytest.mark.parametrize("own", [*KINDS, LAGGING], indirect=True)
 def test_a_stop_slows_down_evenly_and_never_goes_back(own):
-    way = own.at_speed(slow=3.3)
-    begin_s = own.controller.now_s - 0.05
-    own.order(stop=True)
-    stood = own.stopped()
+    """Done anew where a busy computer had it wait on its way for as long as it may be late."""
+    for _ in range(TRIES):
+        way = own.at_speed(slow=SLOW)
+        begin_s, starved_s = own.controller.now_s - 0.05, own.graph.starved_s
+        own.order(stop=True)
+        own.wait("stops")
+        own.graph.spin_for(0.03)  # until it is there
+        starved_s = own.graph.starved_s - starved_s
+        stood = own.stopped()
+        if starved_s < LATE_S:
+            break
     assert stood["sent"] == 1
     assert stood["took_s"] < 1.5 * stood["planned_s"]
     at_s, speed = own.controller.speeds(begin_s)
     speed = speed * np.sign(way)
     assert np.min(speed) > -1e-3
     assert np.max(speed) < 1.05
-    # Planned: 3.3 rad/s^2. At once it would be 250, and 40 to 220 where the controller begins at
-    # the measured position.
+    # At once it would be 250, and 40 to 220 where the controller begins at the measured position;
+    # one that is late makes up for it in one of its steps.
     harder = np.diff(speed, axis=0) / np.diff(at_s)[:, None]
-    assert np.max(np.abs(harder)) < 2.5 * 3.3
+    assert np.max(np.abs(harder)) < SLOW * (1.0 + LATE_S / TICK_S)
 
 
 @pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, UNTOLD], indirect=True)
@@ -158,18 +171,19 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         (10.0, {"lost": 1}),  # planned: 0.12 s
         (10.0, {"lost": 2}),
         (1.0, {"lost": 2}),
-        (3.3, {"lost": COPIES}),  # all of one: seen by the robot
-        (3.3, {"rejected": 2}),
+        (SLOW, {"lost": COPIES}),  # all of one: seen by the robot
+        (SLOW, {"rejected": 2}),
     ):
         own.at_speed(0.3, slow=slow)
+        starved_s = own.graph.starved_s
         own.order(stop=True, **how)
         stood = own.stopped()
+        starved_s = own.graph.starved_s - starved_s
         assert stood["failed"] == ""
         # Once more where a busy computer hides for 20 ms that it slows down: that does no harm.
         anew = how.get("rejected", how.get("lost") == COPIES)
         assert stood["sent"] - 1 - anew in (0, 1)
-        paused_s = stood["sent"] * max(stood["longest_tick_s"] - 0.02, 0.0)  # a busy computer
-        assert stood["took_s"] < 1.5 * stood["planned_s"] + paused_s, (how, stood)
+        assert stood["took_s"] < 1.5 * stood["planned_s"] + starved_s, (how, stood)
         own.arrive()
 
 

@@ -2,12 +2,11 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from command import robocal
 from diagnostic_msgs.msg import DiagnosticArray
 from history_content import content
 from robocal_msgs.msg import SessionEvent
@@ -58,11 +57,7 @@ def played(graph: Any, bag: Path, serial: str, poses: int) -> list[SessionEvent]
 
 
 def replayed(bag: Path, state: Path, *options: str) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, "-m", "robocal_ros.cli.main", "replay", str(bag), "--robot", "ur10",
-         "--state", str(state), "--json", *options],
-        env=os.environ, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    done = robocal("replay", bag, "--robot", "ur10", "--state", state, "--json", *options)
     assert done.returncode == 0, done.stderr
     return dict(json.loads(done.stdout))
 

@@ -4,8 +4,6 @@ import json
 import math
 import os
 import re
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cell import DEEP, Cell, message_of
+from command import robocal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped
 from joint_errors import with_joint_errors
@@ -203,7 +202,7 @@ def test_what_the_command_line_decides_is_in_force_within_a_second(graph, visits
     cell = Cell(graph)
     found = candidate(cell, visits)
     command = ["history", "accept", str(found), "--robot-serial", "s1", "--by", "shift lead"]
-    done = robocal(graph, *command)
+    done = robocal(*command, ROBOCAL_STATE=str(graph.state))
     begin = time.monotonic()
     assert done.returncode == 0, done.stdout + done.stderr
     graph.spin_until(lambda: cell.models[-1].revision == 1, "the node follows")
@@ -213,20 +212,10 @@ def test_what_the_command_line_decides_is_in_force_within_a_second(graph, visits
     assert json.loads(cell.events[-2].arguments)["arguments"]["by"] == "shift lead"
     assert cell.call("accept", id=found).status == Code.CONFLICT
     (entry,) = [c for c in cell.call("list").calibrations if c.id == found]
-    listed = json.loads(robocal(graph, "history", "list", "--robot-serial", "s1", "--json").stdout)
+    command = ["history", "list", "--robot-serial", "s1", "--json"]
+    listed = json.loads(robocal(*command, ROBOCAL_STATE=str(graph.state)).stdout)
     (line,) = [c for c in listed["calibrations"] if c["id"] == found]
     assert (line["state"], line["revision"]) == (entry.state, entry.revision) == ("in_force", 1)
-
-
-def robocal(graph: Any, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "robocal_ros.cli.main", *arguments],
-        env=os.environ | {"ROBOCAL_STATE": str(graph.state)},
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
 
 
 def test_an_accuracy_that_is_no_number_is_a_fault_and_ends_nothing(graph, visits, nominal):

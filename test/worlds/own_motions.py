@@ -75,7 +75,6 @@ class OwnMotions(HouseNode):
         self._stops: dict[str, Any] | None = None
         self._going = False
         self._names = list(ARM.joint_names)
-        self._ticked_s = self._longest_tick_s = 0.0
         self.motion = LossyDriver(
             self,
             self._names,
@@ -155,7 +154,6 @@ class OwnMotions(HouseNode):
             return
         self._stops = {"why": why, "planned_s": plan.duration_s}
         self._say("stops", **self._stops)
-        self._longest_tick_s = 0.0
         self._send(plan, stop=True)
 
     def _reported(self, report: MotionReport) -> None:
@@ -164,15 +162,13 @@ class OwnMotions(HouseNode):
 
     def _tick(self) -> None:
         mover, now_s = self.mover, self._steady.now_s()
-        self._longest_tick_s = max(self._longest_tick_s, now_s - self._ticked_s)
-        self._ticked_s = now_s
         mover.watch.silence.look(now_s)
         stopping = mover.stopping
         if (plan := stopping.look(mover.watch, now_s)) is not None:
             self._send(plan, stop=True)
         if self._stops is not None and not stopping.under_way:
             how = {"sent": stopping.sent, "failed": stopping.failed}
-            self._say("stood", longest_tick_s=self._longest_tick_s, **how, **self._stops)
+            self._say("stood", **how, **self._stops)
             self._stops = None
         try:
             mover.require_sane(now_s)
