@@ -312,7 +312,7 @@ def identify_full(
         if foretold is None:
             return rival.start
         squared = foretold
-    return full.reported(_stretch(squared))
+    return full.reported(_stretch(squared, full.keep))
 
 
 def _foretold(
@@ -343,16 +343,19 @@ def _foretold(
     return squared if with_functions < CLEAR_GAIN * without else None
 
 
-def _stretch(squared: Array) -> float:
+def _stretch(squared: Array, keep: Mask) -> float:
     """By how much sigmas grow, for left-out errors whose squares (m,) over covariances are given.
+
 
     Errors that no model explains have longer tails than the normal distribution: sigmas that fit
     their squares are too small for bounds of 95 %, those that fit bounds too large for the squares.
-    Between the two, nearer to the bounds; the farthest in a hundred is left out of the squares.
+    Between the two, nearer to the bounds; the farthest in a hundred is left out of the squares. One
+    in a hundred that was not kept (m,) is such a tail; more are of the tracker, off by any length.
     """
-    inner = np.sort(squared)[: int(np.ceil(INNER * len(squared)))]
+    inner = np.sort(squared[keep])[: int(np.ceil(INNER * len(squared)))]
+    tail = np.sort(squared[~keep])[: int((1.0 - INNER) * len(squared))]
     by_squares = float(np.mean(inner)) / INNER_SQUARES
-    by_bounds = float(np.quantile(squared, 0.95)) / chi2_quantile(0.95, 3)
+    by_bounds = float(np.quantile(np.append(squared[keep], tail), 0.95)) / chi2_quantile(0.95, 3)
     return float(max(1.0, (by_squares * by_bounds**2) ** (1.0 / 6.0)))
 
 
@@ -373,10 +376,20 @@ def _solved(
         )
     if 3.0 * len(data) < FEWEST_NUMBERS * before or start.estimate.creeping:
         return None, rival
+    try:
+        return _by_rounds(problem, torque), rival
+    except np.linalg.LinAlgError:  # data without noise, of which rounding alone is left
+        return None, rival
+
+
+def _by_rounds(problem: _FullProblem, torque: Array | None) -> "_Solved | None":
+    """The full model, of poses with these gravity torques (m, n), where the evidence wants one."""
+    start, q = problem.start, problem.data.q
+    before = len(start.layout.names)
     at = _Solution(
         start.cell,
         JointTerms.cover(q, torque, before, coarse=True),
-        FunctionPrior.typical(arm.n, start.estimate.scale),
+        FunctionPrior.typical(start.nominal.n, start.estimate.scale),
     )
     for _ in range(_ROBUST_ROUNDS):
         residual, rows = problem.linearise(at.cell, at.terms)
@@ -387,7 +400,7 @@ def _solved(
     functions, bends = _unwanted(at)
     terms = JointTerms.cover(q, torque, before).without(functions, bends)
     if terms.size == before:
-        return None, rival
+        return None
     amplitude = np.where(functions, 0.0, at.prior.amplitude)
     rigid = replace(at.cell, arm=bare(at.cell.arm))
     at = _Solution(rigid, terms, replace(at.prior, amplitude=amplitude))
@@ -400,10 +413,10 @@ def _solved(
         if attempt >= _FREE_ROUNDS:  # a sample at the limit must not come and go for ever
             keep &= last
         if 2 * np.sum(keep) < len(keep):
-            return None, rival
+            return None
         if np.array_equal(last, keep) and at.settled(residual):
             break
-    return _Solved(problem, at, last, weight, residual), rival
+    return _Solved(problem, at, last, weight, residual)
 
 
 def _round(

@@ -288,7 +288,9 @@ class JointEvidence:
         B /= prior.noise**2
         B[np.diag_indices_from(B)] += 1.0
         whitened = np.concatenate([L.T @ pull[block] for block, L in factors])
-        R, _ = lapack.dpotrf(B.T, lower=1, overwrite_a=1)  # B is symmetric
+        R, lost = lapack.dpotrf(B.T, lower=1, overwrite_a=1)  # B is symmetric
+        if lost:
+            raise np.linalg.LinAlgError("what the data tell is lost in rounding")
         z, _ = lapack.dpotrs(R, whitened / prior.noise**2, lower=1)
         determinant = 2.0 * float(np.sum(np.log(np.diag(R))))
         inverse, _ = lapack.dpotri(R, lower=1, overwrite_c=1)
@@ -321,6 +323,8 @@ class JointEvidence:
 
         def summed(product: Array) -> Array:
             """Its sums over pairs of blocks."""
+            if not first:  # compliances alone
+                return np.zeros((0, 0))
             part = product[first[0] :, first[0] :]
             places = np.array(first) - first[0]
             return np.asarray(np.add.reduceat(np.add.reduceat(part, places, 0), places, 1))
@@ -366,6 +370,8 @@ class JointEvidence:
         prior, at, cost, slope, fisher = evaluated(x)
         for _ in range(_STEPS):
             free = ~(((x <= lower) & (slope > 0.0)) | ((x >= upper) & (slope < 0.0)))
+            if not free.any():
+                break
             step = np.zeros(h)
             step[free] = np.linalg.solve(fisher[np.ix_(free, free)], -slope[free])
             step *= min(1.0, LONGEST_STEP / float(np.max(np.abs(step))))

@@ -140,6 +140,38 @@ def test_outliers_are_named_and_not_learned(bent):
     assert rms_mm(spoiled, check) < 1.1 * rms_mm(found, check)
 
 
+@pytest.mark.parametrize("size_m", [3e-3, 2e-2])
+def test_outliers_do_not_widen_what_is_stated_of_the_others(size_m):
+    """Three rows of a hundred, as trackers have them: errors at other poses as large as stated."""
+    ratios = []
+    for seed in range(3):
+        robot = BentRobot(seed)
+        data, check = robot.measured(robot.poses(300)), robot.measured(robot.poses(300))
+        position = data.position.copy()
+        position[:9] += size_m * robot.rng.standard_normal((9, 3))
+        found = identify_full(robot.nominal, replace(data, position=position))
+        variance = found.predicted_variance(check.q, np.zeros(300, dtype=np.int64))
+        expected = np.trace(variance, axis1=1, axis2=2) + 3.0 * found.noise_m**2
+        ratios.append(np.mean(np.sum(found.cell.residual(check) ** 2, axis=1) / expected))
+    assert 0.8 < np.mean(ratios) < 1.25
+
+
+def test_a_robot_that_only_sags_has_compliances_alone():
+    robot = BentRobot(1, size_rad=0.0, compliance=10.0 * COMPLIANCE)
+    data, check = robot.measured(robot.poses(300)), robot.measured(robot.poses(300), 0.0)
+    found, plain = (solved(robot.nominal, data) for solved in (identify_full, identify))
+    assert np.all(found.known.terms.count == 0)
+    assert found.cell.arm.functions.compliance == pytest.approx(10.0 * COMPLIANCE, abs=1e-6)
+    assert rms_mm(found, check) < 0.5 * rms_mm(plain, check)
+
+
+def test_of_data_without_noise_rounding_is_not_learned():
+    robot = BentRobot(3, size_rad=0.0, compliance=np.zeros(6), noise_m=0.0)
+    found = identify_full(robot.nominal, robot.measured(robot.poses(200)))
+    assert not isinstance(found, FullIdentification)
+    assert rms_mm(found, robot.measured(robot.poses(100))) < 1e-5
+
+
 @pytest.mark.parametrize("count", [16, 40, 200])
 def test_a_robot_without_joint_errors_loses_nothing(count):
     ratios = []
