@@ -36,8 +36,8 @@ EXAMPLES = {
         "--output poses.csv"
     ),
     "correct-points": (
-        "robocal correct-points --robot kr150_r3100 --model full.yaml --data measured.csv "
-        "--output part.csv"
+        "robocal correct-points --robot kr150_r3100 --model full.yaml --mount mount.json "
+        "--data measured.csv --output part.csv"
     ),
     "tool beams": (
         "robocal tool beams --data beams.csv --radius-mm 2.5 --robot ur10 --station cell_1 "

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 GAP_NS = 250_000_000
+JOINT_STATE = "sensor_msgs/msg/JointState"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 POINT = "geometry_msgs/msg/PointStamped"
 
@@ -132,32 +133,37 @@ def _of_bag(
             raise InputError(
                 f"no topic {missing[0]}; it has {', '.join(reader.info.topics)}", file=str(args.bag)
             )
+        for topic, kinds in ((args.joints, (JOINT_STATE,)), (args.points, (POINT, CLOUD))):
+            kind = reader.info.topics[known[topic.strip("/")]].msgtype
+            if kind not in kinds:
+                raise InputError(
+                    f"{topic} is of type {kind}, not {' or '.join(kinds)}", file=str(args.bag)
+                )
         count = 0
         for recorded in reader.messages([known[topic] for topic in wanted]):
-            message = recorded.message
-            name = f"{args.points.strip('/')}/{count + 1}"
+            message, name = recorded.message, recorded.topic
             try:
                 if recorded.topic == known[args.joints.strip("/")]:
                     queue.stream.add(joint_sample(message), GAP_NS)
                 else:
                     count += 1
+                    name = f"{args.points.strip('/')}/{count}"
                     queue.add(_shot(recorded.msgtype, message, name))
             except RobocalError as error:
                 lost.append(f"{name}: {error}")
             yield from ready()
+        lost.extend(f"{shot.name}: {error}" for shot, error in queue.end())
 
 
 def _shot(kind: str, message: object, name: str) -> SensorShot:
-    """Raises `InputError` for a message that holds no points."""
+    """The points of a message, a cloud or a single one."""
     told = message.header  # type: ignore[attr-defined]
     if kind == CLOUD:
         points = cloud_points(message)
         points = points[np.all(np.isfinite(points), axis=1)]
-    elif kind == POINT:
+    else:
         p = message.point  # type: ignore[attr-defined]
         points = np.array([[p.x, p.y, p.z]])
-    else:
-        raise InputError(f"of type {kind}: points are {POINT} or {CLOUD}")
     return SensorShot(stamp_ns(told.stamp), told.frame_id, points, name)
 
 

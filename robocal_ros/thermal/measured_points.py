@@ -59,10 +59,7 @@ class PointQueue:
             raise InputError("points must be finite, one at least")
         newest = self.stream.newest_ns
         if newest is not None and shot.stamp_ns > newest + AHEAD_NS:
-            ahead_s = 1e-9 * (shot.stamp_ns - newest)
-            raise InputError(
-                f"stamped {ahead_s:.1f} s ahead of the joint states: stamp both on one clock"
-            )
+            raise _ahead(shot.stamp_ns - newest)
         if len(self._waiting) >= MOST_WAITING:
             raise InputError(f"{MOST_WAITING} wait for joint states: does the driver publish them?")
         self._waiting.append(shot)
@@ -70,10 +67,20 @@ class PointQueue:
     def ready(
         self, arm: SerialArm, T_flange_sensor: Array
     ) -> Iterator[tuple[SensorShot, PlacedShot | RobocalError]]:
-        """Shots whose joints are complete, with their places or why there are none."""
+        """Shots whose joints are complete, with their places or why there are none.
+
+        One that came before any joints may be stamped far ahead of them: the others do not wait
+        for it.
+        """
         newest = self.stream.newest_ns
-        while newest is not None and self._waiting and self._waiting[0].stamp_ns <= newest:
+        while newest is not None and self._waiting:
+            ahead_ns = self._waiting[0].stamp_ns - newest
+            if 0 < ahead_ns <= AHEAD_NS:
+                return
             shot = self._waiting.popleft()
+            if ahead_ns > 0:
+                yield shot, _ahead(ahead_ns)
+                continue
             try:
                 q = self.stream.at(shot.stamp_ns, LONGEST_GAP_S)
             except RobocalError as error:
@@ -81,3 +88,14 @@ class PointQueue:
                 continue
             T = arm.fk(q)
             yield shot, PlacedShot(shot, T, frames.apply(T @ T_flange_sensor, shot.points))
+
+    def end(self) -> Iterator[tuple[SensorShot, RobocalError]]:
+        """Shots that still wait, when no more joints will come."""
+        while self._waiting:
+            yield self._waiting.popleft(), InputError("no joint readings after the measurement")
+
+
+def _ahead(ahead_ns: int) -> InputError:
+    return InputError(
+        f"stamped {1e-9 * ahead_ns:.1f} s ahead of the joint states: stamp both on one clock"
+    )
