@@ -239,6 +239,8 @@ class Settled:
         while not self.session.status().settled:
             self.read()
             self.at = self.session.target(JointCommand(self.names, home), self.now).position
+        self.now += 1000.0
+        self.rest()
 
     def read(self, later_s: float = 0.002) -> None:
         """Hear where the robot is, a little later."""
@@ -252,9 +254,7 @@ class Settled:
         self.session.look(self.now, 0)
 
     def run(self, trajectory: TrajectoryCommand) -> TrajectoryCommand:
-        """Correct a trajectory that begins at home, after the one before has ended."""
-        self.now += 1000.0
-        self.rest()
+        """Correct a trajectory that begins at home, where the robot stands."""
         return self.session.trajectory(trajectory, self.now)
 
 

@@ -1,9 +1,8 @@
 """Compiled correction of six turning joints without a branch, for many points at once.
 
-Newton's method as in `solution`, with three matrices and two steps each, written with single
-numbers: the compiler works on several points at a time in vector registers. Each gets the bits that
-it gets alone. What that does not solve, as a shift is so large that it needs more steps, is left to
-`solution`.
+Newton's method as in `solution`, with three matrices (of a `large` change of the tool four) and two
+steps each, written with single numbers: the compiler works on several points at a time in vector
+registers. Each gets the bits that it gets alone. What that does not solve is left to `solution`.
 
 Frames are twelve numbers: axes x, y, z and origin. Twists and joints are six. A model's
 constants stand in one array, at places that are known when this is compiled.
@@ -19,6 +18,7 @@ from robocal_ros.correction.damping import (
     TCP_ROTATION,
     TCP_SHIFT,
     WEAK,
+    WEIGHT,
     Nine,
     Six,
     damping,
@@ -47,12 +47,16 @@ N = 6
 # of a model's constants: nine for each joint, twelve of the root's frame, three of the tool's place
 ROOT, TOOL, MODEL = 54, 66, 69
 # of all: the taught model, the actual one, the turn from the taught tool to it, the largest
-# shifts, and the damping's steepness and its rise
-ACTUAL, SWAP, LARGEST, DAMPING, CONSTANTS = (2 * MODEL + k for k in (-MODEL, 0, 9, 15, 17))
-# The angle by its sine's series: largest square of the sine.
-SERIES = 1e-3
+# shifts, the damping's steepness and its rise, and whether the change of the tool is large
+ACTUAL, SWAP, LARGEST, DAMPING, LARGE, CONSTANTS = (
+    2 * MODEL + k for k in (-MODEL, 0, 9, 15, 17, 18)
+)
+# The angle by its sine's series, to 1e-17: largest square of the sine, 5.7 deg.
+SERIES = 1e-2
+# Square of a tool's change (1.1 deg, 6 mm) from which on three matrices leave more than rounding.
+LARGE_CHANGE = 4e-4
 LANES = 16
-ITERATIONS = 3.0
+ITERATIONS = 3.0  # one more of a large change
 
 # A residual (m, rad) that is left alone.
 AT_GOAL = 1e-12
@@ -80,6 +84,19 @@ def constants(model: Array, root: Array, tool: Array, old_tool: Array, at: int, 
                 + old_tool[r, 1] * tool[c, 1]
                 + old_tool[r, 2] * tool[c, 2]
             )
+
+
+@lean
+def serves(c: Array) -> bool:
+    """Whether the tool turns within the reach of the series; notes whether its change is large."""
+    s, shift = SWAP, 0.0
+    for r in range(3):
+        x = (c[ACTUAL + TOOL + r] - c[TOOL + r]) * WEIGHT
+        shift += x * x
+    w0, w1, w2 = c[s + 7] - c[s + 5], c[s + 2] - c[s + 6], c[s + 3] - c[s + 1]
+    sine = 0.25 * (w0 * w0 + w1 * w1 + w2 * w2)
+    c[LARGE] = 1.0 if sine + shift > LARGE_CHANGE else 0.0
+    return bool((sine <= SERIES) & (c[s] + c[s + 4] + c[s + 8] >= 1.0))
 
 
 @lean
@@ -155,7 +172,8 @@ def residual(goal: Frame, here: Frame) -> tuple[Six, bool]:
     w2 = 0.5 * ((x0 * g1 - x1 * g0) + (y0 * h1 - y1 * h0) + (z0 * k1 - z1 * k0))
     trace = x0 * g0 + x1 * g1 + x2 * g2 + y0 * h0 + y1 * h1 + y2 * h2 + z0 * k0 + z1 * k1 + z2 * k2
     square = w0 * w0 + w1 * w1 + w2 * w2
-    tail = square * (105.0 / 3456.0 + square * (945.0 / 42240.0))
+    tail = square * (231.0 / 13312.0 + square * (143.0 / 10240.0))
+    tail = square * (105.0 / 3456.0 + square * (945.0 / 42240.0 + tail))
     tail = 3.0 / 40.0 + square * (15.0 / 336.0 + tail)
     factor = 1.0 + square * (1.0 / 6.0 + square * tail)
     near = (square <= SERIES) & (trace >= 1.0)
@@ -278,7 +296,7 @@ def _two_steps(
 
 
 @lean
-def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool, bool]:
+def _solve(c: Array, q: Six, large: bool) -> tuple[Six, Six, Six, bool, bool]:
     """Shift, first and last residual, whether it is the solution, and whether something is weak."""
     aim = goal(c, q)
     frames = walk(c, ACTUAL, q)
@@ -295,6 +313,9 @@ def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool, bool]:
     fine &= good & (second <= BESIDE * BESIDE * first)
     y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
     fine &= good
+    if large:
+        y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
+        fine &= good
     y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
     fine &= good & (first <= NEAR * NEAR) & (second <= SHORT * SHORT) & within(c, x, FAR)
     last, _ = residual(aim, frames[6])
@@ -307,13 +328,13 @@ def _length(x: float, y: float, z: float) -> float:
 
 
 @lean
-def _correct(c: Array, q: Array, k: int, lanes: int, out: Array) -> None:
+def _correct(c: Array, q: Array, k: int, lanes: int, large: bool, out: Array) -> None:
     """Point ``k`` of ``lanes``: corrected joints, and their report."""
     at = (
         q[k], q[lanes + k], q[2 * lanes + k],
         q[3 * lanes + k], q[4 * lanes + k], q[5 * lanes + k],
     )  # fmt: skip
-    x, first, last, fine, weak = _solve(c, at)
+    x, first, last, fine, weak = _solve(c, at, large)
     x = more(at, 1.0, x)
     out[k], out[lanes + k], out[2 * lanes + k] = x[0], x[1], x[2]
     out[3 * lanes + k], out[4 * lanes + k], out[5 * lanes + k] = x[3], x[4], x[5]
@@ -328,11 +349,15 @@ def _correct(c: Array, q: Array, k: int, lanes: int, out: Array) -> None:
 @kernel
 def correct_one(c: Array, q: Array, out: Array) -> None:
     """Corrected joints of one point (6,) and its report (but for the iterations): ``out`` (13,)."""
-    _correct(c, q, 0, 1, out)
+    _correct(c, q, 0, 1, c[LARGE] > 0.5, out)
 
 
 @kernel
 def correct_lanes(c: Array, q: Array, out: Array) -> None:
     """`correct_one` for sixteen points: ``q`` (96,) and ``out`` (208,), row by row."""
+    if c[LARGE] > 0.5:
+        for k in range(LANES):
+            _correct(c, q, k, LANES, True, out)
+        return
     for k in range(LANES):
-        _correct(c, q, k, LANES, out)
+        _correct(c, q, k, LANES, False, out)

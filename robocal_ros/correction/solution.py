@@ -148,7 +148,7 @@ def prepare(
     turning = not free and n == N
     for i in range(n):
         turning = turning and room.links[i, 8] < 0.5
-    room.settings[IS_STRAIGHT] = 1.0 if turning else 0.0
+    room.settings[IS_STRAIGHT] = 0.0
     if not turning:
         return
     for i in range(N):
@@ -157,6 +157,7 @@ def prepare(
     taught, tool = room.taught_tool, room.tool
     six_axis.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
     six_axis.constants(room.links, room.root, tool, taught, six_axis.ACTUAL, room.constants)
+    room.settings[IS_STRAIGHT] = 1.0 if six_axis.serves(room.constants) else 0.0
 
 
 @lean
@@ -282,7 +283,7 @@ def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
     """A point of `six_axis`, with its report; False where it must be solved here."""
     for r in range(N + REPORT):
         out[r] = room.goes[r * lanes + lane]
-    out[N + ITERATIONS] = six_axis.ITERATIONS
+    out[N + ITERATIONS] = six_axis.ITERATIONS + room.constants[six_axis.LARGE]
     return bool(out[N + CONVERGED] > 0.5)
 
 

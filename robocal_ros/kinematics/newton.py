@@ -47,10 +47,12 @@ def at_tool(T: Array, tool: Array) -> None:
 
 @lean
 def largest_of(values: Array) -> float:
-    """Largest magnitude of some numbers."""
+    """Largest magnitude of some numbers; NaN where one is."""
     largest = 0.0
     for i in range(values.shape[0]):
-        largest = max(largest, abs(values[i]))
+        size = abs(values[i])
+        if size > largest or size != size:
+            largest = size
     return largest
 
 

@@ -108,7 +108,8 @@ def at_most_iterations(arm: SerialArm, q: np.ndarray, error: np.ndarray) -> np.n
 
 @pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
 @pytest.mark.parametrize(
-    ("drift_m", "shift_m", "turn_deg"), [(1e-3, 0.0, 0.0), (1e-3, 2e-3, 0.5), (1e-3, 20e-3, 7.0)]
+    ("drift_m", "shift_m", "turn_deg"),
+    [(1e-3, 0.0, 0.0), (1e-3, 2e-3, 0.5), (1e-3, 9e-3, 3.5), (1e-3, 20e-3, 7.0)],
 )
 def test_reaches_the_taught_pose(
     name: str, drift_m: float, shift_m: float, turn_deg: float
@@ -130,11 +131,29 @@ def test_reaches_the_taught_pose(
     error = np.hypot(result.tcp_shift_m / LENGTH, result.tcp_rotation_rad)
     most = at_most_iterations(actual, q, error)
     assert np.all(whole[most > 0])
-    assert np.all(result.iterations[most > 0] <= np.maximum(most, six_axis.ITERATIONS)[most > 0])
+    sixteen_at_a_time = six_axis.ITERATIONS + (shift_m > 5e-3)
+    assert np.all(result.iterations[most > 0] <= np.maximum(most, sixteen_at_a_time)[most > 0])
     assert np.mean(most > 0) > 0.3 or turn_deg > 1.0
     assert np.allclose(result.joint_shift, result.q - q)
     apart = (actual.fk(q) @ actual.T_flange_tool - goal)[:, :3, 3]
     assert np.allclose(result.tcp_shift_m, np.linalg.norm(apart, axis=1), rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
+@pytest.mark.parametrize("turn_deg", [0.5, 1.2, 2.0, 3.5, 5.0])
+def test_a_bent_tool_is_solved_sixteen_points_at_a_time(name: str, turn_deg: float) -> None:
+    """Finding: from 1.8 deg on each point was tried so, and then solved once more by itself."""
+    rng = np.random.default_rng(2)
+    arm = robot(name)
+    actual = bent(arm, rng, 2e-3 * turn_deg, turn_deg)
+    q = rng.uniform(-2.0, 2.0, (480, 6))
+    stage = staged(arm, actual)
+    result = stage.correct(q).tool
+    assert result is not None
+    assert result.converged.all()
+    assert np.mean(np.isin(result.iterations, [3, 4])) > 0.95
+    back = stage.uncorrect(stage.correct(q).q)
+    assert np.allclose(back, q, rtol=0.0, atol=1e-9)
 
 
 def test_nothing_to_correct_gives_the_same_joints() -> None:

@@ -10,6 +10,7 @@ from motion_cell import POSTURES
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.arm import SMALLEST_SINGULAR_VALUE, follow, inverse
 from robocal_ros.kinematics.robots import load_robot
 
@@ -123,3 +124,13 @@ def test_what_is_not_finite_is_refused():
         inverse(arm, T * np.nan, POSTURES["ur10"])
     with pytest.raises(LimitError, match="not finite"):
         inverse(arm, T, np.full(6, np.nan))
+
+
+@pytest.mark.parametrize("at", range(6))
+def test_a_number_that_is_none_is_no_small_residual(at):
+    """Comparisons with NaN are false: a maximum that is taken so would lose it."""
+    values = np.full(6, 1e-13)
+    values[at] = np.nan
+    assert np.isnan(newton.largest_of(values))
+    values[at] = -np.inf
+    assert newton.largest_of(values) == np.inf
