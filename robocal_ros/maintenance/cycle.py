@@ -10,7 +10,7 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
-from robocal_ros.maintenance.mover import HOME, FaultError
+from robocal_ros.maintenance.mover import HOME, STATION, FaultError
 from robocal_ros.maintenance.robot_interface import (
     BeginCycle,
     CellInterface,
@@ -37,6 +37,7 @@ FAILED = (  # without a result they say that something is wrong with the tool, o
     Code.RESIDUAL_TOO_LARGE,
     Code.LIMIT_EXCEEDED,
 )
+MEASURED_ANEW = ("recalibrate", "cannot tell")  # answers of a check
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 LATE = "its check does not fit this gap any more, and it is accepted in a gap where that fits"
 UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
@@ -254,7 +255,7 @@ class ToolPart:
                     outcome.note = f"tool candidate {waiting.id} waits for a decision"
             return
         if wanted == QUICK:
-            if not (yield from self._check(f"{cycle_id}/check")):
+            if not (yield from self._check(f"{cycle_id}/check", goes_on=True)):
                 return
             record, every_s = self._memory.tool, self._cell.config.full_every_s
             if record.answer == "pass":
@@ -281,7 +282,7 @@ class ToolPart:
         known = 0 < record.wall_ns <= self.wall_ns
         known = known and record.revision == self._decider.revision(TOOL)
         known = known and record.thermal_id == self._decider.thermal_id()
-        if known and record.answer in ("recalibrate", "cannot tell"):
+        if known and record.answer in MEASURED_ANEW:
             return FULL
         if not known or record.answer == "failed":
             return QUICK
@@ -290,16 +291,20 @@ class ToolPart:
     def _age_s(self, wall_ns: int) -> float:
         return (self.wall_ns - wall_ns) / NS
 
-    def _check(self, name: str) -> Script[bool]:
+    def _check(self, name: str, *, goes_on: bool = False) -> Script[bool]:
         """A quick check; whether it gave an answer."""
-        answer = yield from self._measured(QUICK, name)
+        answer = yield from self._measured(QUICK, name, goes_on=goes_on)
         if answer is None:
             return False
         self.outcome.checked = answer.answer
         return True
 
-    def _measured(self, mode: str, cycle_id: str) -> Script[DriverAnswer | None]:
-        """Measure from home and back; None where it did not fit, or no result counts.
+    def _measured(
+        self, mode: str, cycle_id: str, *, goes_on: bool = False
+    ) -> Script[DriverAnswer | None]:
+        """Measure from where the robot stands, and go home; None where no result counts.
+
+        With ``goes_on`` a check after which a full measurement is due and fits leaves it there.
 
         Raises `FaultError` when the robot was stopped because it left its plan, or as
         `CellInterface` does.
@@ -329,7 +334,9 @@ class ToolPart:
         yield from cell.stand(STANDS_S)
         if answer.left_plan:  # held, or it hit something: nobody drives it on unseen
             raise FaultError(answer.code, answer.message)
-        yield from cell.go_home()
+        full = answer.has_result and answer.answer in MEASURED_ANEW
+        if not (goes_on and full and cell.fits(cell.tool_worst_s(FULL))):
+            yield from cell.go_home()
         return self._credited(mode, answer, before)
 
     def _learn(self, mode: str, answer: DriverAnswer) -> None:
@@ -365,7 +372,7 @@ class ToolPart:
             outcome.fault = f"{failed}: take it back"
 
     def _credited(self, mode: str, answer: DriverAnswer, before: ToolRecord) -> DriverAnswer | None:
-        """The answer, where it is of the tool in force; kept at home, where nothing moves."""
+        """The answer, where it is of the tool in force; kept while nothing moves."""
         outcome = self.outcome
         current = self._revision == self._decider.revision(TOOL)
         if answer.has_result and not current:
@@ -553,6 +560,9 @@ class CycleRun:
 
     def _measure_tool(self) -> Script[None]:
         yield from self._tool.script(self.result.cycle_id)
+        if self._cell.robot.place == STATION:  # a measurement did not fit any more after a check
+            yield
+            yield from self._cell.go_home()
         found = self._tool.outcome
         if found.left:
             self._leave(found.left)

@@ -297,7 +297,7 @@ class CellInterface(Asking):
         return lasts_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
 
     def tool_worst_s(self, mode: str) -> float:
-        """A tool measurement from home and back, with everything that may go wrong."""
+        """A tool measurement, from home or the station, and home: all that may go wrong in it."""
         times = self.config.times
         limit_s = times.check_s if mode == QUICK else times.full_s
         # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.

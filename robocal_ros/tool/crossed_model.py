@@ -114,7 +114,8 @@ class RunProblem:
     """Residuals of all edges; built by `run_problem`.
 
     ``taper``: growth of the tool's radius per length above the tip; ``height`` (circles,): of each
-    circle above the tip, where its radius counts.
+    circle above the tip, where its radius counts. ``may_turn``: both beams together about the z of
+    the laser, which then counts no more in the prior of its points.
     """
 
     laser: LaserFrame
@@ -133,6 +134,7 @@ class RunProblem:
     taught: ToolState
     noise: RobotNoise
     held: Held
+    may_turn: bool = False
     scale_components: int = field(default=1, init=False)
 
     @property
@@ -148,7 +150,7 @@ class RunProblem:
         """How many unknowns have no prior."""
         held = 2 * (self.held.tilt_rad is not None) + (self.held.along_m is not None)
         held += 2 * (self.held.across_m is not None)
-        return 6 + 2 * self.circles - held
+        return 6 + 2 * self.circles - held + self.may_turn
 
     @property
     def _starts(self) -> tuple[int, int, int]:
@@ -173,7 +175,19 @@ class RunProblem:
         if self.held.across_m is not None:
             sides = across(self.taught.axis)
             information[:3, :3] += sides @ sides.T / self.held.across_m**2
+        if self.may_turn:
+            told = information @ self.turn
+            information -= np.outer(told, told) / (self.turn @ told)
         return information
+
+    @property
+    def turn(self) -> Array:
+        """(k,) how the unknowns change with a turn of the beams, per rad."""
+        T, normals = self.laser.T_base_laser, np.repeat(self.laser.normals, 2, axis=0)
+        across_m = np.sum(np.cross(T[:3, 2], self.laser.points - T[:3, 3]) * normals, axis=1)
+        way = np.zeros(len(self.names))
+        way[self._starts[2] :: 2] = across_m
+        return way
 
     def deviation(self, state: ToolState) -> Array:
         """Distance from the prior's mean."""
@@ -296,6 +310,8 @@ def touch_of(
 
 
 MOST_SIGMAS = 6.0  # of a step's shift
+TURNED_SIGMAS = 3.29  # of beams that have not turned one in a thousand seems to have
+MOST_TURNED_RAD = 0.05  # by a knock; what is further off is another station's frame
 LARGEST_MISFIT_M = 2e-4  # rms of the edges: more is no robot's repeatability
 
 
@@ -311,6 +327,8 @@ class ToolEstimate:
     ``radius`` (circles, 2): of the tool as each circle and beam sees it, m.
     ``misfit_m``: rms of the edges' residuals, m.
     ``shift_m``: largest shift of a step against the others, m.
+    ``turn_rad``, ``turn_sigma_rad``: of both beams about the laser's z since they were placed; None
+    of a run with something held. Taken out where the edges are not explained without.
     ``estimate``: with the covariance that all sigmas here are of: wider where the given noise does
     not explain edges, shifts or what was held.
     """
@@ -323,6 +341,8 @@ class ToolEstimate:
     radius: Array
     misfit_m: float
     shift_m: float
+    turn_rad: float | None
+    turn_sigma_rad: float
     estimate: Estimate[ToolState]
 
     @property
@@ -378,6 +398,9 @@ def estimate_tool(
     if held.tilt_rad is None:
         require_height(float(np.ptp(problem.height)))
     solved = solve(problem, start, prior_information=problem.prior, robust=False)
+    turn_rad, turn_sigma_rad = None, 0.0
+    if held == Held():  # one circle alone does not tell a turn from a latency
+        problem, solved, turn_rad, turn_sigma_rad = _turned(problem, start, solved)
     misfit = float(np.sqrt(np.mean((solved.residual[:, 0] * problem.sigma_m) ** 2)))
     _require_fit(solved, misfit, steps, noise)
     found, state = _widened(problem, solved), solved.state
@@ -398,6 +421,8 @@ def estimate_tool(
         radius=state.radius,
         misfit_m=misfit,
         shift_m=float(np.linalg.norm(state.shift, axis=1).max()),
+        turn_rad=turn_rad,
+        turn_sigma_rad=turn_sigma_rad,
         estimate=found,
     )
 
@@ -526,14 +551,43 @@ def _require_fit(
         )
 
 
+def _turned(
+    problem: RunProblem, start: ToolState, solved: Estimate[ToolState]
+) -> tuple[RunProblem, Estimate[ToolState], float | None, float]:
+    """The beams' turn, its sigma, and the solution with it where that explains most of the rest."""
+    turned = replace(problem, may_turn=True)
+    again = solve(turned, start, prior_information=turned.prior, robust=False)
+    if not again.converged:
+        return problem, solved, None, 0.0
+    way = turned.turn / (turned.turn @ turned.turn)
+    turn_rad = float(way @ turned.deviation(again.state))
+    sigma_rad = float(np.sqrt(way @ again.covariance @ way))
+    misfit = _misfit(problem, solved, 1.0)
+    explains = _misfit(turned, again, 1.0) < 0.5 * misfit
+    told = TURNED_SIGMAS * sigma_rad < abs(turn_rad) < MOST_TURNED_RAD
+    if told and explains and misfit > _most_misfit(problem, solved):
+        problem, solved = turned, again
+    return problem, solved, turn_rad, sigma_rad
+
+
 def _widened(problem: RunProblem, found: Estimate[ToolState]) -> Estimate[ToolState]:
     """With a covariance for shifts, or what was held, that are larger than their sigmas explain.
 
     For edges that are, `solve` has widened it: here they count with the scatter that it found.
     """
-    away = problem.deviation(found.state)
-    misfit = float(np.sum((found.residual / found.scale) ** 2) + away @ problem.prior @ away)
-    free = len(found.residual) - problem.undetermined
-    if free <= 0 or misfit <= chi2_quantile(SOUND_FIT, free):
+    misfit, free = _misfit(problem, found, found.scale), len(found.residual) - problem.undetermined
+    if misfit <= _most_misfit(problem, found):
         return found
     return replace(found, covariance=misfit / free * found.covariance)
+
+
+def _misfit(problem: RunProblem, found: Estimate[ToolState], scale: float) -> float:
+    """Square of what edges (in units of their sigmas times ``scale``) and prior do not agree in."""
+    away = problem.deviation(found.state)
+    return float(np.sum((found.residual / scale) ** 2) + away @ problem.prior @ away)
+
+
+def _most_misfit(problem: RunProblem, found: Estimate[ToolState]) -> float:
+    """Beyond which it says that given sigmas are too small."""
+    free = len(found.residual) - problem.undetermined
+    return chi2_quantile(SOUND_FIT, free) if free > 0 else np.inf

@@ -13,6 +13,7 @@ from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamp
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.crossed_model import (
+    TURNED_SIGMAS,
     BeamStep,
     Held,
     RobotNoise,
@@ -44,6 +45,7 @@ STEPS: Mapping[Mode, tuple[str, ...]] = {
 }
 # Of a plunge beside the crossing: along which beam, and which way.
 BESIDE: Mapping[str, tuple[int, int]] = {"a": (0, -1), "b": (0, 1), "c": (1, -1), "d": (1, 1)}
+LITTLE_TURN_RAD = 2e-3  # of the beams; ten times what a robot turns that warms up by 0.5 mm in 3 m
 START_RAD = float(np.pi / 4.0)  # in mid-quadrant: no circle begins on a beam
 
 
@@ -208,6 +210,7 @@ class RunTraits:
     each.
     ``latency_s``, ``latency_sigma_s``: of the edges behind the joint readings.
     ``rate_hz``: of the joint readings.
+    ``turn_rad``, ``turn_sigma_rad``: of the beams, as of a `ToolEstimate`; older runs have none.
     """
 
     radius_m: Mapping[str, tuple[float, float]]
@@ -215,6 +218,8 @@ class RunTraits:
     latency_s: float
     latency_sigma_s: float
     rate_hz: float
+    turn_rad: float | None = None
+    turn_sigma_rad: float = 0.0
 
     @classmethod
     def of(cls, estimate: ToolEstimate, circles: Sequence[str], rate_hz: float) -> "RunTraits":
@@ -229,6 +234,8 @@ class RunTraits:
             estimate.latency_s,
             estimate.latency_sigma_s,
             rate_hz,
+            estimate.turn_rad,
+            estimate.turn_sigma_rad,
         )
 
     def document(self) -> dict[str, Any]:
@@ -549,6 +556,21 @@ class ToolRun:
         """Refuse what is no bend, see `RunTraits.require_like`."""
         if self.healthy is not None:
             self.traits(estimate).require_like(self.healthy, self.config.traits)
+
+    def turned(self, estimate: ToolEstimate) -> str:
+        """That the beams have turned since the healthy tool's run, in words; else empty."""
+        before_rad = None if self.healthy is None else self.healthy.turn_rad
+        if self.healthy is None or before_rad is None or estimate.turn_rad is None:
+            return ""
+        off_rad = estimate.turn_rad - before_rad
+        sigma_rad = float(np.hypot(estimate.turn_sigma_rad, self.healthy.turn_sigma_rad))
+        if abs(off_rad) <= max(TURNED_SIGMAS * sigma_rad, LITTLE_TURN_RAD):
+            return ""
+        return (
+            f"the beams have turned by {np.degrees(off_rad):.2f} deg (sigma "
+            f"{np.degrees(sigma_rad):.2f}) since the healthy tool was measured, which no bend "
+            "makes of them: the beam station was knocked"
+        )
 
     def require_even_readings(self) -> None:
         """Refuse unlike rates of the joint readings, see `require_even`."""

@@ -254,6 +254,8 @@ class ToolResults:
         anchor = self._current.anchor
         shift = run.path.at(run.last_edge_s)[0][0, :3, :3] @ difference(found, in_force)[:3]
         witness = witness_of(found, in_force, self._config.bend, anchor)
+        if turned := run.turned(estimate):
+            witness = replace(witness, cause="station", reason=turned)
         witness = self._with_mandrel(witness, found, shift, command)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         document = run_document(found, estimate, run.circles, verdict) | {

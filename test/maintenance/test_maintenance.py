@@ -68,6 +68,32 @@ def test_a_bent_tool_is_measured_in_full(cell):
     over(cell)
 
 
+def test_a_tool_that_a_check_finds_bent_is_measured_from_where_the_robot_stands(cell):
+    """Finding: on the way home and back the time went that the measurement needed."""
+    cell.check = bent()
+    assert cell.ran("c1", 33.0).complete
+    first = kinds(cell).index("Arm")
+    tool = ["Arm", "Measure", "Disarm"]
+    assert kinds(cell)[first:] == [*tool, *tool, "Move"]
+    over(cell)
+
+
+def test_a_full_measurement_that_does_not_fit_any_more_lets_the_robot_go_home(cell):
+    """What was found is kept before it, and the disk takes its time."""
+
+    def takes() -> None:
+        if "Measure" in kinds(cell):
+            cell.shelf.takes = lambda: None
+            cell.pause(1.0)
+
+    cell.check, cell.shelf.takes = bent(), takes
+    result = cell.ran("c1", 33.0)
+    assert result.left == ("tool measurement (full)",)
+    assert result.code is Code.ACCEPT
+    assert kinds(cell)[-1] == "Move"
+    over(cell)
+
+
 @pytest.mark.parametrize("gap_s", np.arange(2.0, 62.0, 6.0))
 def test_no_gap_is_overrun(cell, gap_s):
     """What does not fit is left, whatever the length."""
@@ -107,7 +133,7 @@ def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
 
 def test_a_full_measurement_that_did_not_fit_comes_next(cell):
     cell.check = bent()
-    assert cell.ran("c1", 33.0).left == ("tool measurement (full)",)
+    assert cell.ran("c1", 30.0).left == ("tool measurement (full)",)
     (left,) = (outcome for name, outcome in cell.events if name == LEAVE)
     assert left.command.arguments["what"] == "tool measurement (full)"
     worst_s = cell.session.worst_cases()["tool measurement (full)"]
@@ -303,7 +329,7 @@ def test_an_error_that_is_no_number_is_not_within_tolerance(cell):
 
 def test_a_bent_tool_degrades(cell):
     cell.check = bent()
-    cell.ran("c1", 33.0)
+    cell.ran("c1", 30.0)
     assert accuracy(cell).level is AccuracyLevel.DEGRADED
 
 

@@ -29,7 +29,7 @@ from robocal_ros.maintenance.robot_interface import DriverAnswer
 from robocal_ros.session.events import ACCEPT, ROLLBACK
 from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 
-TOO_SHORT_FOR_FULL_S = 33.0
+TOO_SHORT_FOR_FULL_S = 30.0
 DAY_NS = 86_400 * 10**9
 WITHOUT_WAY = DriverAnswer(Code.LIMIT_EXCEEDED, "the housing would be hit")
 OTHER_MODEL = "another thermal model is in force than it was checked with: check it"

@@ -179,6 +179,20 @@ def test_two_errors_along_one_line_are_one_such_error():
     assert both.bound_m == pytest.approx(1.959964 * 5e-4, rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("drift_m", "p95_m"),  # of closed_loop_drift_bound: stated for the tip, and true
+    [(1.607e-4, 7.98e-5), (8.10e-5, 5.46e-5)],
+)
+@pytest.mark.parametrize("over_rms", [1.614, 1.96])  # every way alike, and on one line
+def test_what_a_check_of_a_healthy_tool_adds_to_the_bound(drift_m, p95_m, over_rms):
+    """Why the closed loop states 2.8 to 3.0 times its errors, and could not state 2.5."""
+    drift, sigma_m = ToolError(drift_m / over_rms, drift_m), 3.7e-5
+    in_place = both_errors(drift, offset_error(0.0, sigma_m)).bound_m / p95_m
+    assert 2.5 < in_place < 2.7 + 0.05
+    by_noise = both_errors(drift, offset_error(np.sqrt(3.0) * sigma_m, sigma_m)).bound_m / p95_m
+    assert 2.85 < by_noise < 3.35
+
+
 def test_one_error_alone_is_itself():
     drift = ToolError(1e-4, 2e-4)
     for both in (both_errors(drift, ToolError(0.0, 0.0)), both_errors(ToolError(0.0, 0.0), drift)):

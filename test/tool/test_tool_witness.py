@@ -1,5 +1,6 @@
 """Bent tool or knocked station? Wrong as often as is said, and never by more than is said."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
 from robocal_ros.cell_sim.faults import Fault, Faults, size_of
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import TOOL, CalibrationState
@@ -156,6 +158,44 @@ def test_a_bent_tool_is_proven_by_its_tilt(driver, size_m):
     found = driver.measure("full")
     assert found.done, found.message
     assert found.document["witness"]["cause"] == "tool", found.message
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_station_that_was_knocked_hard_has_turned_and_says_so(driver, seed):
+    """Finding: what the turn left unexplained made the axis look unknown, and the doubt stayed.
+
+    A knock turns the station about any axis; about the laser's z the beams show it.
+    """
+    laser, faults = driver.cell.laser, Faults({"station_knocked": 2e-3}, seed)
+    R = faults.T_station_knock(laser.T_base_laser[:3, 3])[:3, :3]
+    turned_deg = np.degrees(frames.log_rotation(R) @ laser.T_base_laser[:3, 2])
+    driver.cell.station = faults.station(driver.cell.station)
+    found = driver.measure("full")
+    told = re.search(r"turned by (\S+) deg \(sigma (\S+)\)", found.message)
+    if abs(turned_deg) > 0.2:
+        assert found.status is Code.STATION_MOVED
+        assert told is not None
+        # by its sigma, to the digits that are told
+        assert abs(float(told[1]) - turned_deg) < 4.0 * float(told[2]) + 0.02
+    assert taken(driver) <= HARM_M, found.message
+
+
+@pytest.mark.parametrize("turn_deg", [0.1, 0.3, 1.0])
+def test_a_station_that_has_always_stood_turned_is_not_knocked(tmp_path, turn_deg):
+    """Beams that were placed wrongly: for the healthy tool they lie as they do for the bent one."""
+    cell = noisy_cell()
+    config = config_of(cell)
+    faults = Faults({"station_knocked_turn": np.radians(turn_deg)}, 2)
+    cell.station = faults.station(cell.station)
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        session = ToolSession(cell.arm, history, config, "test")
+        driver = Driver(session, cell, RoundTool.cylinder(TAUGHT, RADIUS_M))
+        assert driver.measure("reference").done
+        hit = bent(TAUGHT, [1e-3, 0.0, 0.0], [0.0, 1e-2, 0.0])
+        driver.program.tool = RoundTool.cylinder(hit, RADIUS_M)
+        found = driver.measure("full")
+        assert "turned" not in found.message
+        assert found.document["witness"]["cause"] == "tool", found.message
 
 
 MANDREL = bent(TAUGHT, [-0.02, 0.01, -0.03], [0.0, 0.0, 0.0])  # shorter, beside the tool
