@@ -274,7 +274,9 @@ class PlcBridgeNode(HouseNode):
 
     def _call(self, called: Any) -> None:
         client = self._calls[called.method.service]
-        if not self.is_active:
+        if time.monotonic() > called.until_s:  # this process paused, and the PLC was told so
+            self._tell(f"{called.method.name} of {called.user} came too late and is not passed on")
+        elif not self.is_active:
             called.answer("BadInvalidState")
         elif not client.service_is_ready():
             called.answer("BadNoCommunication")

@@ -84,6 +84,7 @@ class MethodCalled:
     user: str
     fields: Mapping[str, Any]
     answer: "Callable[[list[ua.Variant] | str], None]"
+    until_s: float  # by the steady clock; the PLC has been told then that nobody answers
 
 
 @dataclass(frozen=True)
@@ -296,7 +297,8 @@ class Cell:
             with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
                 loop.call_soon_threadsafe(settle, outputs)
 
-        self._hand(MethodCalled(method, user, fields, answer))
+        until_s = time.monotonic() + ANSWER_S
+        self._hand(MethodCalled(method, user, fields, answer, until_s))
         try:
             return await asyncio.wait_for(answered, ANSWER_S)
         except TimeoutError:

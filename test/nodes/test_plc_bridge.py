@@ -19,6 +19,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from pymodbus.client import ModbusTcpClient
 from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus
+from std_srvs.srv import Trigger
 from test_maintenance_calls import Plc, candidates, process
 
 from bench.live.opc_ua import PlcClient, free_port, security_folder
@@ -28,6 +29,8 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.plc import access
 from robocal_ros.plc.inputs import CONTEST_S
 from robocal_ros.plc.modbus import CANCEL, CYCLE, INPUT_WORDS, INPUTS, RUN
+from robocal_ros.plc.node import LATE_S, PlcBridgeNode
+from robocal_ros.ros.endpoints import trigger_text
 
 BRIDGE = "/plc_bridge_node"
 DISAPPEARS_S = 25.0  # DDS misses a process that was killed after up to 20 s
@@ -497,3 +500,47 @@ def test_what_falls_silent_is_uncertain(line):
 def test_both_threads_end_at_the_first_signal(line):
     assert line.bridge.stop() == 0, line.bridge.output
     assert "Traceback" not in line.bridge.output, line.bridge.output
+
+
+def test_what_waited_for_a_stalled_executor_is_not_passed_on(graph, tmp_path):
+    """Finding: a call whose PLC had long been told that nobody answers was carried out then."""
+    called: list[Any] = []
+
+    def cancel(request: Any, response: Any) -> Any:
+        called.append(request)
+        response.success, response.message = True, trigger_text(0, Code.ACCEPT, "")
+        return response
+
+    graph.probe.create_service(Trigger, "maintenance_node/cancel_trigger", cancel)
+    port = free_port()
+    node = graph.add(
+        PlcBridgeNode,
+        {"security_dir": str(security_folder(tmp_path)), "host": "127.0.0.1", "port": port},
+    )
+    gaps = graph.collect(GapOpen, "gap_open")
+    client = PlcClient(tmp_path, port)
+
+    def do(work: Coroutine[Any, Any, Any]) -> Any:
+        done = client.start(work)
+        graph.spin_until(done.done, "the PLC's request", 70.0)
+        return done.result()
+
+    try:
+        do(client.connect_once_there())
+        graph.spin_until(lambda: node.is_active, "it acts")
+        assert do(client.call("Cancel"))[0]
+        do(client.write("Gap.Heartbeat", u32(1)))
+        graph.spin_until(lambda: gaps, "it is passed on")
+        gaps.clear()
+        called.clear()
+        client.do(client.write("Gap.Heartbeat", u32(2)))  # nothing of the node runs meanwhile
+        client.do(client.write("Gap.Heartbeat", u32(0)))
+        assert refused(lambda: client.do(client.call("Cancel"))) == "BadTimeout"
+        time.sleep(LATE_S)
+        graph.spin_until(lambda: gaps, "the gap is closed all the same")
+        graph.spin_for(0.5)
+        assert [gap.open for gap in gaps] == [False]
+        assert not called
+        assert do(client.call("Cancel"))[0]
+    finally:
+        client.close()
