@@ -11,6 +11,7 @@ import gc
 import logging
 import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -170,9 +171,8 @@ class Door:
             self._hand(Notice(f"nobody can log in: {error}"))
             return None
         if rights is None:
-            if len(self._wrong) > 100:  # names that somebody makes up
-                self._wrong.clear()
-            self._wrong[name] = [*wrong, now_s]
+            lately = {of: at for of, at in self._wrong.items() if now_s - at[-1] < LOCKED_S}
+            self._wrong = lately | {name: [*wrong, now_s]}  # of a guess each 50 ms at the most
             self._hand(Notice(f"login of {quoted(name)} is refused: no such user, or password"))
             return None
         self._wrong.pop(name, None)
@@ -456,7 +456,8 @@ class CellInternalServer(InternalServer):
         self.max_monitored_item_queue_size = 100
         self.max_unacked_messages_per_subscription = 100
         self.max_lifetime_count = self.max_keep_alive_count = 3_000
-        self.sessions: set[CellSession] = set()
+        # A connection that begins another session drops the one before without ending it.
+        self.sessions: weakref.WeakSet[CellSession] = weakref.WeakSet()
 
     def create_session(
         self, name: str, user: User | None = None, external: bool = False

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import os
 import random
 import socket
@@ -23,6 +24,7 @@ from robocal_ros.plc.inputs import Heartbeat
 from robocal_ros.plc.model import METHODS
 from robocal_ros.plc.server import (
     LOCKED_AFTER,
+    Door,
     EdgeWritten,
     MethodCalled,
     ServerSettings,
@@ -252,6 +254,42 @@ def test_sessions_with_wrong_certificates_and_passwords_open_nothing(
     assert any("is locked" in notice.words for notice in served.handed if hasattr(notice, "words"))
     guesser.close()
     served.works()
+
+
+def test_sessions_that_are_begun_and_refused_are_not_kept(served: Served) -> None:
+    """Finding: the server kept each of them for ever, of clients that it does not know, too."""
+
+    async def begin(count: int) -> None:
+        client = served.plc.made()
+        await client.connect_socket()
+        try:
+            await client.send_hello()
+            await client.open_secure_channel()
+            for _ in range(count):
+                with pytest.raises(ua.UaStatusCodeError):
+                    await client.uaclient.create_session(ua.CreateSessionParameters())
+            await client.close_secure_channel()
+        finally:
+            client.disconnect_socket()
+
+    served.plc.do(begin(200))
+    gc.collect()
+    assert len(served.thread.cell.model._server.iserver.sessions) < 20
+    served.works()
+
+
+def test_names_that_nobody_has_unlock_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finding: a hundred made up names made the wrong passwords of all others forgotten."""
+    told: list[Any] = []
+    door = Door(tmp_path, told.append)
+    monkeypatch.setattr(door, "untrusted", lambda certificate: "")
+    monkeypatch.setattr(access.Users, "login", lambda *_: None)  # which takes its time
+    for number in range(LOCKED_AFTER):
+        assert door.get_user(None, "plc", f"guess {number}") is None
+    for number in range(120):
+        assert door.get_user(None, f"nobody {number}", "guess") is None
+    assert door.get_user(None, "plc", "guess") is None
+    assert "'plc' is locked" in told[-1].words
 
 
 def test_a_call_that_nobody_answers_ends_in_time(served: Served) -> None:
