@@ -408,7 +408,8 @@ class InformationModel:
             return
         now = datetime.now(UTC)
         shown = ua.DataValue(value, SourceTimestamp=at or now, ServerTimestamp=now)
-        if isinstance(value.Value, float) and not math.isfinite(value.Value):
+        numbers = value.Value if value.is_array else [value.Value]
+        if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
             shown = ua.DataValue(Value=value, StatusCode=ua.StatusCode(ua.StatusCodes.BadNoData))
         self._values[path] = shown
         await self._server.write_attribute_value(self.node_id(path), shown)
