@@ -19,6 +19,7 @@ from typing import Any
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.event_handler import EventHandler
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import (
     ConditionReachedException,
     ShutdownException,
@@ -51,11 +52,15 @@ class MiddlewareEvents(Waitable):
 
     def __enter__(self) -> None:
         """Nothing of them is destroyed until `__exit__`."""
-        self._handlers = self._now()
+        self._handlers = []
         self._held.append(self._handlers)
         self.waits += 1
-        for handler in self._handlers:
-            handler.__enter__()
+        for handler in self._now():
+            try:
+                handler.__enter__()
+            except InvalidHandle:  # another thread takes its owner down
+                continue
+            self._handlers.append(handler)
 
     def __exit__(self, *error: Any) -> None:
         """The wait that began first is over."""
