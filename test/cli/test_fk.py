@@ -173,10 +173,10 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
         target_sigma=1.0, length=np.full(6, LENGTH), amplitude=np.full(6, SIZE),
     )  # fmt: skip
     save_robot(replace(arm, functions=replace(arm.functions, identified_from=known)), path)
-    command = ["joint-functions", "--robot", str(path), "--output", str(tmp_path / "t.csv")]
+    plain = ["joint-functions", "--robot", str(path), "--output", str(tmp_path / "t.csv")]
     poses = {f"q{i}_deg": [f"{x:.6f}" for x in np.degrees(measured[:, i - 1])] for i in range(1, 7)}
     write_cells(tmp_path / "poses.csv", poses)
-    command += ["--data", str(tmp_path / "poses.csv"), "--figures", str(tmp_path)]
+    command = [*plain, "--data", str(tmp_path / "poses.csv"), "--figures", str(tmp_path)]
     status, document = answer(command, capsys)
     assert status == 0
     rows = [line.split(",") for line in (tmp_path / "t.csv").read_text().splitlines()[1:]]
@@ -196,5 +196,5 @@ def test_joint_functions_as_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert sigma.min() < 0.8e6 * SIZE < sigma.max() <= 1.001e6 * SIZE
     assert (tmp_path / "joints.svg").is_file()
     assert told["compliance_micro"] == pytest.approx(1e6 * arm.functions.compliance[2])
-    assert main(command) == 0
+    assert main(plain) == 0
     assert "what joints turn besides what is read" in capsys.readouterr().out

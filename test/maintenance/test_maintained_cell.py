@@ -139,9 +139,9 @@ PAUSE_S = 10.0
 
 
 @pytest.mark.parametrize("tells", [True, False])
-@pytest.mark.parametrize("speed", [0.1, 0.5])
-def test_a_cycle_at_any_speed_ends_as_at_full_speed(warm, speed, tells):
+def test_a_cycle_at_a_tenth_of_the_speed_ends_as_at_full_speed(warm, tells):
     """Ways between taught poses, to the beams, through them and home; model and tool are right."""
+    speed = 0.1  # at which people watch; of motions by 0.5 and 0.95: test_watched_motion
     slow = Times() if tells else Times(check_s=15.0 / speed, full_s=30.0 / speed)
     cell = warm(automatic=True, tool_m=0.01, tool_rad=0.1, times=slow)
     cell.speed, cell.tells = speed, tells
@@ -161,7 +161,8 @@ def test_a_cycle_at_any_speed_ends_as_at_full_speed(warm, speed, tells):
 
 
 @pytest.mark.parametrize("tells", [True, False])
-def test_a_pause_of_ten_seconds_in_each_motion_of_a_cycle_is_waited_for(warm, tells):
+def test_a_pause_of_ten_seconds_in_every_second_motion_of_a_cycle_is_waited_for(warm, tells):
+    """In the odd ones where the robot tells its speed, in the even ones where it does not."""
     slow = Times() if tells else Times(check_s=60.0, full_s=200.0)
     cell = warm(automatic=True, tool_m=0.01, tool_rad=0.1, times=slow)
     cell.tells = tells
@@ -170,7 +171,8 @@ def test_a_pause_of_ten_seconds_in_each_motion_of_a_cycle_is_waited_for(warm, te
     def pausing() -> None:
         step()
         since_s = cell.now_s - cell.sent[-1][0] if cell.sent else 0.0
-        if 0.3 < since_s < PAUSE_S and len(cell.sent) not in paused:
+        turn = len(cell.sent) % 2 == int(tells) and len(cell.sent) not in paused
+        if 0.3 < since_s < PAUSE_S and turn:
             paused.add(len(cell.sent))
             cell.speed, until_s = 0.0, cell.now_s + PAUSE_S
             while cell.now_s < until_s:
@@ -185,7 +187,7 @@ def test_a_pause_of_ten_seconds_in_each_motion_of_a_cycle_is_waited_for(warm, te
     assert result.complete, result.message
     assert result.tool_answer == "pass"
     long = [number for number, (_, plan) in enumerate(cell.sent, 1) if plan.duration_s > 0.4]
-    assert paused >= set(long)
+    assert paused >= {number for number in long if number % 2 == int(tells)}
     assert len(long) > 7 + 10 + 4  # poses and home, full measurement, checks
     assert np.all(true_error_m(cell) < cell.accuracy().error.bound_m)
 
