@@ -1,6 +1,7 @@
 """``robocal info FILE``: what a bag, table or file holds, and what can be done with it."""
 
 import argparse
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -58,6 +59,11 @@ def _show(console: "Console", document: Document) -> None:
 # ---- bags ---------------------------------------------------------------------------------------
 
 
+def _typed(name: Path | str) -> str:
+    """As a shell takes it, spaces and all."""
+    return shlex.quote(str(name))
+
+
 def _bag(path: Path) -> tuple[str, Facts, list[str], list[Document]]:
     from robocal_ros.bags.foreign import open_bag
     from robocal_ros.bags.replay import EVENTS, first_configuration
@@ -84,16 +90,16 @@ def _bag(path: Path) -> tuple[str, Facts, list[str], list[Document]]:
                 facts.append(("session", f"{kind} of {robot}, told on {topic}"))
     named = {topic.rpartition("/")[2]: topic for topic in info.topics}
     if sessions:
-        commands = [f"robocal validate {path} --report out/validation"]
+        commands = [f"robocal validate {_typed(path)} --report out/validation"]
         one = len(sessions) == 1
         commands += [
-            f"robocal replay {path}" + ("" if one else f" --topic {EVENTS}:={topic}")
+            f"robocal replay {_typed(path)}" + ("" if one else f" --topic {EVENTS}:={topic}")
             for topic in sessions
         ]
     elif "joint_states" in named:
         facts.append(("session", "none: commands of a node were not recorded"))
-        commands = [f"robocal replay {path} --robot ROBOT --auto"]
-        commands += [f"robocal replay {path} --robot ROBOT --auto --topic INPUT:=TOPIC"]
+        commands = [f"robocal replay {_typed(path)} --robot ROBOT --auto"]
+        commands += [f"robocal replay {_typed(path)} --robot ROBOT --auto --topic INPUT:=TOPIC"]
     else:
         facts.append(("session", "none, and no joint_states: there is nothing to replay"))
         commands = []
@@ -122,12 +128,14 @@ def _file(path: Path) -> Told:
     if suffix in (".urdf", ".xacro", ".xml") or "<robot" in text[:2000]:
         return _description(path, text)
     if suffix == ".conf" or "delta_theta" in text:
-        command = f"robocal import-ur --calibration {path} --nominal urcontrol.conf"
+        command = f"robocal import-ur --calibration {_typed(path)} --nominal urcontrol.conf"
         command += " --output robot.yaml"
         return "calibration of a Universal Robots controller", [], [command]
     for dialect in DIALECTS:
         if suffix in dialect.suffixes:
-            command = f"robocal correct-program {path} --robot ROBOT --model MODEL --output FILE"
+            command = (
+                f"robocal correct-program {_typed(path)} --robot ROBOT --model MODEL --output FILE"
+            )
             lines = ("lines", str(text.count("\n")))
             return f"program of {dialect.maker}", [lines], [f"{command}{path.suffix}"]
     known = "a bag, a table (.csv), a robot or result file (.yaml, .json), a URDF, a program"
@@ -142,7 +150,7 @@ def _history(path: Path) -> Told:
         heads = history.heads()
         facts = [("calibrations", str(len(history.list(1_000_000))))]
         facts += [(f"{head.kind} in force", f"revision {head.revision}") for head in heads]
-    command = f"robocal history list --state {path.parent} --robot-serial {serial}"
+    command = f"robocal history list --state {_typed(path.parent)} --robot-serial {_typed(serial)}"
     return f"history of the robot with serial {serial}", facts, [command]
 
 
@@ -157,21 +165,23 @@ def _table(path: Path) -> Told:
     turned = bool({"rx_deg", "rvx_rad", "qx", "w_deg"} & columns)
     if {"stamp_s", "beam", "blocked"} <= columns:
         return "table of beam edges", facts, [
-            f"robocal tool crossed --events {path} --joints JOINTS.csv --robot ROBOT --laser L.yaml"
+            f"robocal tool crossed --events {_typed(path)} --joints JOINTS.csv --robot ROBOT "
+            "--laser L.yaml"
         ]  # fmt: skip
     if {"sweep", "beam"} <= columns:
         return "table of sweeps through parallel beams", facts, [
-            f"robocal tool parallel --data {path} --up-mm UP --down-mm DOWN"
+            f"robocal tool parallel --data {_typed(path)} --up-mm UP --down-mm DOWN"
         ]  # fmt: skip
     if "point" in columns and place:
-        return "table of the edges that place beams", facts, [f"robocal tool beams --data {path}"]
+        beams = [f"robocal tool beams --data {_typed(path)}"]
+        return "table of the edges that place beams", facts, beams
     if joints and place:
         facts.append(("joints", str(len(joints))))
-        commands = [f"robocal identify --robot ROBOT --data {path} --hold-out 0.5"]
+        commands = [f"robocal identify --robot ROBOT --data {_typed(path)} --hold-out 0.5"]
         if {"pose", "cycle"} <= columns:
             commands.append(
                 "robocal thermal identify --robot ROBOT --sensor S.yaml --cold COLD.csv "
-                f"--warm {path}"
+                f"--warm {_typed(path)}"
             )
         return "measurements: joints, and where a target was", facts, commands
     if joints:
@@ -179,7 +189,7 @@ def _table(path: Path) -> Told:
         kind = "joint readings over time" if "stamp_s" in columns else "poses, as joints"
         return f"table of {kind}", facts, []
     if place and turned:
-        return "table of flange poses", facts, [f"robocal tool points --data {path}"]
+        return "table of flange poses", facts, [f"robocal tool points --data {_typed(path)}"]
     return "table of no kind that is known (docs/files.md has the columns)", facts, []
 
 
@@ -194,7 +204,7 @@ def _mapping(path: Path, text: str) -> Told:
     if any(isinstance(part, Mapping) and "ros__parameters" in part for part in _values(found)):
         nodes = [("nodes", ", ".join(map(str, found)))]
         return "parameter file of nodes", nodes, [
-            f"ros2 launch robocal_ros cell.launch.py params:={path}"
+            f"ros2 launch robocal_ros cell.launch.py params:={_typed(path)}"
         ]  # fmt: skip
     words = ", ".join(map(str, found)) if keys else type(found).__name__
     return "document of no kind that is known", [("holds", words)], []
@@ -218,9 +228,9 @@ def _robot(path: Path, _: Any) -> Told:
     ]
     zeros = ",".join(["0"] * arm.n)
     return "robot file", facts, [
-        f"robocal fk --robot {path} --joints-deg {zeros}",
-        f"robocal identify --robot {path} --data MEASURED.csv",
-        f"robocal export-urdf --robot {path} --output robot.urdf",
+        f"robocal fk --robot {_typed(path)} --joints-deg {zeros}",
+        f"robocal identify --robot {_typed(path)} --data MEASURED.csv",
+        f"robocal export-urdf --robot {_typed(path)} --output robot.urdf",
     ]  # fmt: skip
 
 
@@ -228,20 +238,24 @@ def _laser(path: Path, found: Any) -> Told:
     names = ("station", "robot", "model_hash", "serial")
     facts = [(name, str(found[name])) for name in names if name in found]
     return "laser file: beams of a station", facts, [
-        f"robocal tool crossed --laser {path} --events EDGES.csv --joints JOINTS.csv --robot ROBOT",
-        f"ros2 run robocal_ros tcf_node --ros-args -p laser:={path} -p robot:=ROBOT",
+        f"robocal tool crossed --laser {_typed(path)} --events EDGES.csv --joints JOINTS.csv "
+        "--robot ROBOT",
+        f"ros2 run robocal_ros tcf_node --ros-args -p laser:={_typed(path)} -p robot:=ROBOT",
     ]  # fmt: skip
 
 
 def _kinematics(path: Path, found: Any) -> Told:
-    facts = [("hash", str(found["kinematics"].get("hash", "none")))]
+    held = found["kinematics"]
+    facts = [("hash", str(held.get("hash", "none")))] if isinstance(held, Mapping) else []
     words = "kinematics of a Universal Robots arm, as ur_calibration writes them"
-    return words, facts, [f"robocal import-urdf {path} --output robot.yaml"]
+    return words, facts, [f"robocal import-urdf {_typed(path)} --output robot.yaml"]
 
 
 def _result(path: Path, found: Any) -> Told:
     verdict = found["verdict"]
-    facts = [("verdict", f"{verdict.get('code')}: {verdict.get('reason')}")]
+    if isinstance(verdict, Mapping):
+        verdict = f"{verdict.get('code')}: {verdict.get('reason')}"
+    facts = [("verdict", str(verdict))]
     return "result of a robocal command", facts, []
 
 
@@ -266,6 +280,6 @@ def _description(path: Path, text: str) -> Told:
         ("joints", ", ".join(joint.name for joint in links.moving)),
     ]
     return "description of a robot (URDF)", facts, [
-        f"robocal import-urdf {path} --output robot.yaml",
-        f"robocal export-urdf --robot MODEL.yaml --into {path} --output calibrated.urdf",
+        f"robocal import-urdf {_typed(path)} --output robot.yaml",
+        f"robocal export-urdf --robot MODEL.yaml --into {_typed(path)} --output calibrated.urdf",
     ]  # fmt: skip

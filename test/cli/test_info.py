@@ -65,6 +65,9 @@ def made(tmp_path_factory):
     (folder / "prog.src").write_bytes(b"DEF w()\n; N\xe4he\nEND\n")  # not UTF-8
     (folder / "bad.yaml").write_text("convention: dh\njoints: []\n")
     (folder / "result.json").write_text('{"verdict": {"code": "ACCEPT", "reason": "good"}}')
+    (folder / "verdict.json").write_text('{"verdict": "good"}')
+    (folder / "empty.yaml").write_text("kinematics:\n")
+    (folder / "cell 4.csv").write_bytes((TABLES / "measured.csv").read_bytes())
     nominal = load_robot("ur10")
     with CalibrationHistory.open("R7", model_hash=nominal.model_hash, state_dir=folder):
         pass
@@ -83,6 +86,9 @@ def made(tmp_path_factory):
         ("prog.src", "program of kuka", "lines: "),
         ("bad.yaml", "robot file that is not valid", "fault: "),
         ("result.json", "result of a robocal command", "ACCEPT: good"),
+        ("verdict.json", "result of a robocal command", "verdict: good"),
+        ("empty.yaml", "kinematics of a Universal Robots arm", ""),
+        ("cell 4.csv", "measurements: joints, and where", "joints: 6"),
         ("R7.sqlite", "history of the robot with serial R7", "calibrations: 0"),
     ],
 )
