@@ -51,14 +51,13 @@ from robocal_ros.tool.session import (
 )
 from robocal_ros.tool.station import measurement_of
 
-LASER_GOAL = 6  # MeasureTool.Goal.LASER_FRAME
 MODES = {
     MeasureTool.Goal.FULL: FULL,
     MeasureTool.Goal.QUICK: QUICK,
     MeasureTool.Goal.REFERENCE: REFERENCE,
     MeasureTool.Goal.WITNESS: WITNESS,
     MeasureTool.Goal.WITNESS_REFERENCE: WITNESS_REFERENCE,
-    LASER_GOAL: LASER,
+    MeasureTool.Goal.LASER_FRAME: LASER,
 }
 ANSWERS = {
     "pass": MeasureTool.Result.PASS,
