@@ -67,13 +67,15 @@ class StationMeasurement:
 class StationShift:
     """How a station has moved, in its own axes then.
 
-    ``shift`` (3,) of the crossing, m, and ``turn`` (3,) of the frame, rad; ``covariance`` (6, 6).
+    ``shift`` (3,) of the crossing, m, and ``turn`` (3,) of the frame, rad; ``covariance`` (6, 6),
+    of both measurements, and ``own`` (6, 6) of the later one.
     ``moved``: whether one of them is more than both measurements explain.
     """
 
     shift: Array
     turn: Array
     covariance: Array
+    own: Array
     moved: bool
 
     @property
@@ -186,7 +188,7 @@ def station_shift(before: StationMeasurement, now: StationMeasurement) -> Statio
     spread, limit = rows @ C @ rows.T, chi2_quantile(1.0 - NEVER / 2.0, 3)
     parts = [(found[i], spread[i, i]) for i in (slice(3), slice(3, 6))]
     moved = any(away @ np.linalg.solve(own, away) > limit for away, own in parts)
-    return StationShift(found[:3], found[3:], spread, moved)
+    return StationShift(found[:3], found[3:], spread, rows @ now.covariance @ rows.T, moved)
 
 
 def _frame_moved(laser: LaserFrame, bend: Array) -> Array:
@@ -235,8 +237,8 @@ def measurement_of(document: Document) -> StationMeasurement:
 def station_trend(stamp_ns: Sequence[int], shifts: Sequence[StationShift]) -> Document:
     """Straight line through the crossing's shifts: mm a day (3), and its sigma; none of one.
 
-    Weighted by each shift's covariance; the first measurement is in all of them alike and moves
-    the line, not its slope.
+    Weighted by the covariance of each later measurement; what the first one is off by is in all
+    shifts alike: it moves the line, and is neither in its slope nor in the slope's sigma.
     """
     days = np.array([(stamp - stamp_ns[0]) / DAY_NS for stamp in stamp_ns])
     if len(days) < 2 or float(np.ptp(days)) <= 0.0:
@@ -244,7 +246,7 @@ def station_trend(stamp_ns: Sequence[int], shifts: Sequence[StationShift]) -> Do
     information, right = np.zeros((6, 6)), np.zeros(6)
     for day, one in zip(days, shifts, strict=True):
         rows = np.concatenate([np.eye(3), day * np.eye(3)], axis=1)
-        weight = np.linalg.inv(one.covariance[:3, :3])
+        weight = np.linalg.inv(one.own[:3, :3])
         information += rows.T @ weight @ rows
         right += rows.T @ weight @ one.shift
     C = np.linalg.inv(information)
