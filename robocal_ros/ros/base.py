@@ -23,14 +23,13 @@ from typing import Any, ClassVar
 
 import rclpy
 from lifecycle_msgs.msg import State
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ros.endpoints import ERROR, WARN, Diagnostics, EndpointNode, Health
-from robocal_ros.ros.executor import NodeExecutor
 from robocal_ros.ros.parameters import ParameterTable, Setting
 
 NO_SERIAL = "unset"  # the history's name where none is set
@@ -271,7 +270,7 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
 
 def _executor(events: bool) -> Executor:
     if not events:
-        return NodeExecutor()
+        return SingleThreadedExecutor()
     from rclpy.experimental.events_executor import EventsExecutor
 
     return EventsExecutor()
