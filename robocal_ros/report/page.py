@@ -386,15 +386,19 @@ def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
     answers = []
     for bag in bags:
         for cell in bag.get("cells", []):
-            first, now = cell["states"][0], cell["states"][-1]
+            first, known = cell["states"][0], [one for one in cell["states"] if _is_told(one)]
+            now = (known or cell["states"])[-1]
+            end = "at the end" if now is cell["states"][-1] else f"after “{now['state']}”"
+            before = ""
+            if first is not now:
+                before = f" Before the first event it was off by {_mm(first['rms_without_mm'])} mm."
             bound = ""
             if now["bound_mm"] is not None:
                 bound = f"; 95 % of the errors were told to be below {_mm(now['bound_mm'])} mm"
             answers.append(
-                f"{escape(_name_of(bag, cell))}: at the end the tool is off by "
+                f"{escape(_name_of(bag, cell))}: {escape(end)} the tool is off by "
                 f"<b>{_mm(now['rms_with_mm'])} mm</b> (true, rms), without correction by "
-                f"{_mm(now['rms_without_mm'])} mm{bound}. At the beginning it was off by "
-                f"{_mm(first['rms_without_mm'])} mm."
+                f"{_mm(now['rms_without_mm'])} mm{bound}.{before}"
             )
     for row in rows:
         if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
@@ -410,6 +414,11 @@ def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
         count = len({row["bag"] for row in rows})
         answers.append(f"{failed} of {count} bags could not be validated.")
     return "<br>".join(answers) or "No thermal cycle in these bags."
+
+
+def _is_told(state: Document) -> bool:
+    """Whether the truth was told in it."""
+    return state["rms_without_mm"] is not None
 
 
 def _name_of(bag: Document, cell: Document) -> str:

@@ -315,7 +315,7 @@ def test_the_page_tells_of_the_cell():
     assert "The cell, by the truth of /left/truth/state</h3>" in html
     (lead,) = re.findall(r'<p class="lead">.*</p>', html)
     assert "one.mcap: at the end the tool is off by <b>0.055 mm</b> (true, rms)" in lead
-    assert "told to be below 0.200 mm. At the beginning it was off by 0.400 mm." in lead
+    assert "told to be below 0.200 mm. Before the first event it was off by 0.400 mm." in lead
     for said in ("collision 2 mm", "95.0%", "1.00 h"):
         assert said in html
     # before every other table
@@ -325,6 +325,20 @@ def test_the_page_tells_of_the_cell():
     without = hours_table([bag("two.mcap")])
     assert hours_table([told]).startswith(without)
     assert without.split(",")[:3] == ["bag", "topic", "hour"]
+
+
+def test_the_page_opens_with_what_was_told_last():
+    """Of an event after the last truth nothing is known, and where nothing happened nothing was."""
+    for changes, said in (
+        ([(0.9, "collision 2 mm"), (1.6, "rolled back")], "after “collision 2 mm” the tool"),
+        ([], "at the end the tool"),
+    ):
+        told = bag("one.mcap", simulated=True) | {"cells": [COURSE.document(changes)]}
+        html = page(REPORT | {"bags": [told]}, {"one.mcap": [[cell_drawn(COURSE)]]})
+        (lead,) = re.findall(r'<p class="lead">.*</p>', html)
+        assert f"{said} is off by" in lead
+        assert "without correction by 2.000 mm" in lead
+        assert ("Before the first event" in lead) == bool(changes)
 
 
 def test_the_page_names_each_of_two_cells():
