@@ -110,8 +110,9 @@ class PlcClient:
         return self.client.get_node(ua.NodeId(f"Cell.{path}", self.index))
 
     async def read(self, path: str) -> Any:
-        """A value."""
-        return await self.node(path).read_value()
+        """A value; None where nobody has said one yet."""
+        found = await self.node(path).read_data_value(raise_on_bad_status=False)
+        return None if found.Value is None else found.Value.Value
 
     async def read_all(self, paths: Sequence[str]) -> list[Any]:
         """In one request."""

@@ -106,7 +106,7 @@ class Shown:
     silent_s: float = 0.0
 
 
-STATUS, ACCURACY, TOOL = "maintenance_node/status", "accuracy_state", "tcf_node/tool_frame"
+STATUS, ACCURACY, TOOL = "maintenance_node/status", "accuracy_state", "tcf_node/tool"
 SILENT_S = 3.0  # maintenance_node says its status at 5 Hz, the accuracy at 1 Hz
 
 SHOWN = (
@@ -184,11 +184,11 @@ SHOWN = (
     Shown(
         "Tool",
         TOOL,
-        "The tool's frame in force, or a candidate's",
+        "The tool's frame in force",
         (
             Item("Name", "String", "child_frame_id", "Its frame"),
             Item("State", "ToolState", "state", "CANDIDATE or ACCEPTED"),
-            Item("Revision", "UInt32", "revision", "In the history; 0: taught, or a candidate"),
+            Item("Revision", "UInt32", "revision", "In the history; 0: taught"),
             Item("XMm", "Double", lambda m: MM * m.tool.translation.x, "In the flange, mm"),
             Item("YMm", "Double", lambda m: MM * m.tool.translation.y, "In the flange, mm"),
             Item("ZMm", "Double", lambda m: MM * m.tool.translation.z, "In the flange, mm"),
@@ -417,7 +417,9 @@ class InformationModel:
     async def show(
         self, source: str, values: Iterable[tuple[str, ua.Variant]], at: datetime, now_s: float
     ) -> None:
-        """Show what a source has said."""
+        """Show what a source has said; older news than it had is none."""
+        if now_s < self._heard_s.get(source, now_s):
+            return
         self._heard_s[source] = now_s
         for path, value in values:
             await self.set(path, value, at)

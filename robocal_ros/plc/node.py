@@ -42,7 +42,7 @@ SERVICES: Mapping[str, Any] = {
 MESSAGES: Mapping[str, Any] = {
     "accuracy_state": AccuracyState,
     "maintenance_node/status": MaintenanceStatus,
-    "tcf_node/tool_frame": ToolFrame,
+    "tcf_node/tool": ToolFrame,
 }
 
 
@@ -218,7 +218,7 @@ class PlcBridgeNode(HouseNode):
             stamp = message.header.stamp
             at = datetime.fromtimestamp(stamp.sec + 1e-9 * stamp.nanosec, UTC)
             values, now_s = values_of(topic, message), time.monotonic()
-            self._server.post(lambda model: model.show(topic, values, at, now_s))
+            self._server.show(topic, values, at, now_s)
         except Exception as error:  # whatever a stranger publishes, the node lives on
             self._log(topic, error)
 

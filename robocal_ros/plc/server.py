@@ -591,9 +591,17 @@ class ServerThread:
         self._ending: asyncio.Event | None = None
         self._stopped = False
         self._tasks: set[asyncio.Future[Any]] = set()
+        self._latest: dict[str, tuple[Sequence[tuple[str, ua.Variant]], datetime, float]] = {}
         self._log = _Notices(hand)
         self._thread = threading.Thread(target=self._run, name="opc_ua", daemon=True)
         self._thread.start()
+
+    def show(
+        self, source: str, values: Sequence[tuple[str, ua.Variant]], at: datetime, now_s: float
+    ) -> None:
+        """Show what a source said; what comes before the server is up, then. Thread-safe."""
+        self._latest[source] = values, at, now_s
+        self.post(lambda model: model.show(source, values, at, now_s))
 
     def post(self, act: Callable[[InformationModel], Any]) -> None:
         """Let the loop await ``act`` of the model; nothing while there is none. Thread-safe."""
@@ -652,6 +660,8 @@ class ServerThread:
         )
         try:
             await self._listen(server, registers)
+            for source, latest in list(self._latest.items()):
+                await self.cell.model.show(source, *latest)
             while not self._stopped:
                 await self._look(server)
                 with contextlib.suppress(TimeoutError):

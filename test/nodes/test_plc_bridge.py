@@ -18,7 +18,7 @@ from asyncua import ua
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from pymodbus.client import ModbusTcpClient
-from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus
+from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus, ToolFrame
 from std_srvs.srv import Trigger
 from test_maintenance_calls import Plc, candidates, process
 
@@ -30,6 +30,7 @@ from robocal_ros.plc import access
 from robocal_ros.plc.inputs import CONTEST_S
 from robocal_ros.plc.modbus import CANCEL, CYCLE, INPUT_WORDS, INPUTS, RUN
 from robocal_ros.plc.node import LATE_S, PlcBridgeNode
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import trigger_text
 
 BRIDGE = "/plc_bridge_node"
@@ -46,6 +47,11 @@ class Line:
         self.gaps: list[GapOpen] = graph.collect(GapOpen, "gap_open")
         self.edges: list[BeamEvent] = graph.collect(BeamEvent, "beam_events")
         self.maintenance = Plc(graph, lambda: process(graph), bridge=False)
+        # tcf_node says it once, at its start: before this server is up
+        self.tool = graph.probe.create_publisher(ToolFrame, "tcf_node/tool", endpoints.LATCHED)
+        frame = ToolFrame(child_frame_id="tcp", revision=3, state=ToolFrame.ACCEPTED)
+        frame.tool.translation.z = 0.1505
+        self.tool.publish(frame)
         self.bridge = self.start()
         self.plc = self.connected()
         self.plc.start(self.plc.program())
@@ -140,9 +146,8 @@ def test_what_is_shown_is_what_the_nodes_say(line):
     shown = line.do(line.plc, line.plc.node("Accuracy.State").read_data_value())
     stamp = line.maintenance.states[-1].header.stamp.sec
     assert abs(shown.SourceTimestamp.timestamp() - stamp) < 5.0
-    # of what nobody has said there is no value
-    tool = line.do(line.plc, line.plc.node("Tool.Revision").read_data_value(False))
-    assert tool.StatusCode.name == "BadWaitingForInitialData"
+    tool = [line.read(f"Tool.{name}") for name in ("Name", "Revision", "State", "ZMm")]
+    assert tool == ["tcp", 3, ToolFrame.ACCEPTED, pytest.approx(150.5)]
 
 
 def test_codes_are_an_enumeration_of_the_same_table(line):

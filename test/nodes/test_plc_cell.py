@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from maintenance_live import HOME_DEG, LiveCell
-from robocal_msgs.msg import MaintenanceStatus
+from robocal_msgs.msg import MaintenanceStatus, ToolFrame
 from test_plc_bridge import DISAPPEARS_S, refused
 
 from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
+from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 GAP_S = 150.0
@@ -90,7 +91,15 @@ def test_a_whole_gap_by_opc_ua_and_a_bridge_that_dies_while_the_robot_moves(
     assert (success, code, result) == (True, Code.ACCEPT, Code.ACCEPT), words
     assert state == MaintenanceStatus.IDLE
     assert cell.at_home()
+    graph.spin_until(lambda: ended(cycle), "the status that tells so")
+    graph.spin_until(
+        lambda: do(plc, plc.read_all(["LastCycle.CycleId", "LastCycle.Code"])) == [cycle, result],
+        "it is shown",
+    )
     last = cell.statuses[-1].last
     shown = [do(plc, plc.read(f"LastCycle.{n}")) for n in ("CycleId", "ToolCode", "ToolId", "Left")]
     assert shown == [cycle, last.tool_code, last.tool_id, list(last.left)]
+    tools = graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
+    graph.spin_until(lambda: tools, "the tool in force")
+    assert do(plc, plc.read("Tool.Name")) == tools[-1].child_frame_id != ""
     assert bridge.stop() == 0
