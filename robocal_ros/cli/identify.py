@@ -82,9 +82,11 @@ def show_identification(console: "Console", document: Document) -> None:
     console.print()
     _show_errors(console, document)
     predicted = document["calibrated"]["predicted"]
+    functions = any(row["function"] for row in document.get("joints", ()))
+    of = " of its geometry alone" if functions else ""
     console.print(
         f"Uncertainty of the model itself: {predicted['model_rms_mm']:.3f} mm rms at these poses, "
-        f"{predicted['workspace_rms_mm']:.3f} mm throughout the joint limits. "
+        f"{predicted['workspace_rms_mm']:.3f} mm{of} throughout the joint limits. "
         f"Noise: {document['noise_mm']:.3f} mm per coordinate.",
         soft_wrap=True,
     )

@@ -49,7 +49,8 @@ class Judgement:
     cold one), of the model in force and of the identified one.
     ``predicted_rms_m``: the candidate's error expected from its covariance alone.
     ``predicted_total_rms_m``: the same with the noise of the measurements added.
-    ``workspace_rms_m``: the same as ``predicted_rms_m`` over postures throughout the joint limits.
+    ``workspace_rms_m``: the same as ``predicted_rms_m`` over postures throughout the joint limits,
+        of geometry alone: where a joint was not measured its function is not known at all.
     ``held_out_rejected``: samples left out of the judgement because no model can fit them.
     """
 
