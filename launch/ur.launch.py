@@ -11,7 +11,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterFile
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
@@ -40,12 +40,15 @@ def generate_launch_description():
         package=PACKAGE,
         executable="adapter_node",
         name="adapter_node",
+        namespace=LaunchConfiguration("namespace"),
         parameters=[
             in_share("config", "adapter_node.yaml"),
             BEAMS,
             ParameterFile(LaunchConfiguration("params"), allow_substs=True),
+            {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
         ],
         remappings=[("io_states", "/io_and_status_controller/io_states")],
+        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
         output="screen",
         condition=IfCondition(LaunchConfiguration("beams")),
     )
