@@ -234,6 +234,7 @@ class JointCorrectionNode(RobotNode):
                 self._proxy.end(why)
             if self._stopping.under_way:
                 self.get_logger().warning(f"{why} while the robot is still being stopped")
+            self._stopping.forget()  # what moves the robot when it is active again is another one
         finally:
             self._session.release(Reason.STOPPED)
             self._ending = False
@@ -441,10 +442,10 @@ class JointCorrectionNode(RobotNode):
         self._stop_path = self._session.output.path
         state = self._session.robot.to_stop(now_s)
         if state is None:
-            self._stopping.forget()
-            self._stop_fault = (
-                f"{why}: no stop can be planned, the joint states are missing or too old"
-            )
+            if not self._stopping.under_way:  # one that is goes on being watched
+                self._stop_fault = (
+                    f"{why}: no stop can be planned, the joint states are missing or too old"
+                )
             return False
         self._astray, self._stop_why, self._stop_fault = self._stop_path, why, ""
         self._send_plan(self._stopping.begin(state, now_s))

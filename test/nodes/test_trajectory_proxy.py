@@ -518,6 +518,32 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
     robot.destroy_node()
 
 
+def test_a_stop_of_before_a_deactivation_ends_with_it(graph: Any) -> None:
+    """Finding: activated again, at whatever time, the node called the hard stop at once."""
+    cell = Cell(graph)
+    robot = InParts(deaf=True, context=graph.context)
+    graph.executor.add_node(robot)
+    called: list[Any] = []
+    robot.create_service(
+        Trigger, "/hard_stop", lambda request, response: called.append(request) or response
+    )
+    node = graph.add(JointCorrectionNode, SETTINGS | {"hard_stop_service": "/hard_stop"})
+    cell.begin(settled=False)
+    cell.send(HOME, MOVED, lasts_s=20.0)
+    graph.spin_until(lambda: robot.q[0] > HOME[0] + 0.01, "the robot moves")
+    cell.change(Transition.TRANSITION_DEACTIVATE)
+    graph.spin_until(lambda: len(robot.goals) > 1, "the stop")
+    graph.spin_for(1.5)  # somebody else drives it
+    cell.change(Transition.TRANSITION_ACTIVATE)
+    graph.spin_for(0.5)
+    assert node.is_active
+    assert not called
+    assert not node._stop_fault
+    cell.client.destroy()
+    robot.without_answers.destroy_node()
+    robot.destroy_node()
+
+
 # ---- node and controller as processes: the node in its own executor -----------------------------
 
 SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
