@@ -17,6 +17,7 @@ READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_MANY = 3, 4, 6, 16
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, FAILED, BUSY = 1, 2, 3, 4, 6
 MOST_CONNECTIONS = 4
 IDLE_S = 60.0
+LARGEST = 3.4e38  # of a float of four bytes
 NO_ANSWER = 255  # in `ANSWER`: not carried out, as the bridge or maintenance_node did not
 RUN, CANCEL = 1, 2
 HEARTBEAT_AT, REQUEST_AT, HOLDING_WORDS = 0, 2, 8
@@ -94,9 +95,10 @@ def words_of(registers: Sequence[Register], values: Mapping[str, Any], count: in
     """Registers as sent, big-endian; without a value 0."""
     data = bytearray(2 * count)
     for register in registers:
-        struct.pack_into(
-            f">{register.kind}", data, 2 * register.address, values.get(register.path, 0)
-        )
+        value = values.get(register.path, 0)
+        if register.kind == "f":
+            value = min(max(value, -LARGEST), LARGEST)
+        struct.pack_into(f">{register.kind}", data, 2 * register.address, value)
     return bytes(data)
 
 
@@ -109,6 +111,7 @@ class ModbusServer:
         self._writers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._holding = bytearray(2 * HOLDING_WORDS)
+        self._numbers: dict[str, int] = {}  # of each connection, the request that it wrote last
         self._number = self._answered = self._answer = 0
 
     async def start(self, host: str, port: int) -> None:
@@ -139,6 +142,7 @@ class ModbusServer:
             return  # it is gone, or says nothing
         finally:
             self._writers.discard(writer)
+            self._numbers.pop(name, None)
             self._image.end(name)
             writer.close()
 
@@ -202,10 +206,18 @@ class ModbusServer:
         return 0
 
     def _begin(self, name: str, number: int, command: int, gap_s: int, cycle: int) -> None:
-        """Carry a request out once: a gateway writes its image again and again."""
-        if number in (0, self._number):
+        """Carry a request out once: a gateway writes its image again and again.
+
+        What a connection finds in it at first may be of before a restart: it is not carried out.
+        """
+        before = self._numbers.get(name)
+        if number in (0, before):
+            self._numbers.setdefault(name, 0)
             return
-        self._number = number
+        self._numbers[name] = self._number = number
+        if before is None:
+            self._answer, self._answered = NO_ANSWER, number
+            return
 
         async def carry_out() -> None:
             answer = NO_ANSWER

@@ -142,6 +142,7 @@ def test_a_request_is_carried_out_once_however_often_the_image_is_written(served
             if found["Answer.Number"] == number:
                 return int(found["Answer.Status"])
 
+    client.write_registers(2, written(0))
     for _ in range(5):
         assert not client.write_registers(0, [0, 7, *written(1)]).isError()
     assert answered(1) == 1
@@ -153,6 +154,31 @@ def test_a_request_is_carried_out_once_however_often_the_image_is_written(served
     assert answered(3) == 1
     assert image.requests[1:] == [(9, 4711, 60), (2, 4711, 60)]
     assert image.echoes == [7] * 5
+
+
+def test_what_a_connection_finds_latched_is_not_carried_out(served: Served) -> None:
+    """It may be of before a restart of the bridge; so of another gateway, each by itself."""
+    client, image = served.client, served.image
+    client.write_registers(2, written(8, command=2))
+    found = served.inputs()
+    assert (found["Answer.Number"], found["Answer.Status"]) == (8, NO_ANSWER)
+    other = ModbusTcpClient("127.0.0.1", port=served.port)
+    assert other.connect()
+    other.write_registers(2, written(0))
+    for _ in range(3):
+        other.write_registers(2, written(3))
+        client.write_registers(2, written(8, command=2))
+    other.close()
+    client.write_registers(2, written(9, command=2))
+    while served.inputs()["Answer.Number"] != 9:
+        pass
+    assert image.requests == [(1, 4711, 60), (2, 4711, 60)]
+
+
+def test_a_value_beyond_four_bytes_is_the_largest() -> None:
+    data = words_of(INPUTS, {"Accuracy.BoundMm": 1e300}, INPUT_WORDS)
+    at = next(one.address for one in INPUTS if one.path == "Accuracy.BoundMm")
+    assert struct.unpack_from(">f", data, 2 * at)[0] == pytest.approx(3.4e38)
 
 
 def test_hostile_bytes_end_their_connection_alone(served: Served) -> None:
