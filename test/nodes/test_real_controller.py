@@ -4,6 +4,7 @@ Each test runs against both, judged by the commands that they say they send. The
 ros2_control, is looked for in the environment; without it those tests are skipped.
 """
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,15 @@ import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.msg import JointTolerance
 from jumps import no_jump
-from trajectory_controllers import CONTROLLERS, HOME, NAMES, Controlled, seconds, trajectory
+from trajectory_controllers import (
+    CONTROLLERS,
+    HOME,
+    NAMES,
+    PERIOD_S,
+    Controlled,
+    seconds,
+    trajectory,
+)
 
 from robocal_ros.cell_sim.trajectory_controller import SampledPath, Trajectory
 
@@ -280,8 +289,12 @@ def test_a_goal_ends_when_its_robot_is_there(controller):
     begin_s = controller.now_s
     handle = controller.goal(trajectory([(1.0, HOME + STEP, REST)]))
     assert controller.end(handle) == (SUCCEEDED, 0)
-    assert 1.0 < controller.now_s - begin_s < 1.5
+    ended_s = time.time()
     assert controller.stands() == pytest.approx(HOME + STEP, abs=1e-9)
+    at_s, sent = controller.sent(begin_s)
+    arrived_s = at_s[np.max(np.abs(sent - HOME - STEP), axis=1) < 1e-9][0]
+    assert 1.0 < arrived_s - begin_s < 1.5
+    assert arrived_s - PERIOD_S < ended_s < arrived_s + 0.5
 
 
 def test_another_goal_aborts_the_one_before_it(controller):

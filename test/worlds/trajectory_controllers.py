@@ -22,7 +22,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.robots import load_description, load_robot
+from robocal_ros.kinematics.urdf import urdf_of
 from robocal_ros.ros import endpoints
 
 ARM = load_robot("ur10")
@@ -263,27 +264,21 @@ def _ask(graph: Any, service: str, kind: Any, request: Any) -> None:
 
 
 def _urdf(velocities: bool) -> str:
-    """Six joints in a row on mock hardware, at home."""
-    links, hardware = ['<link name="base"/>'], []
-    for i, (name, start) in enumerate(zip(NAMES, HOME.tolist(), strict=True)):
-        parent = f"link_{i}" if i else "base"
-        links.append(
-            f'<link name="link_{i + 1}"/><joint name="{name}" type="revolute">'
-            f'<parent link="{parent}"/><child link="link_{i + 1}"/><axis xyz="0 0 1"/>'
-            '<limit lower="-6.28" upper="6.28" velocity="3.14" effort="100"/></joint>'
-        )
-        speed = '<state_interface name="velocity"/>' * velocities
-        hardware.append(
-            f'<joint name="{name}"><command_interface name="position"/>'
-            '<state_interface name="position"><param name="initial_value">'
-            f"{start}</param></state_interface>{speed}</joint>"
-        )
+    """The arm on mock hardware, at home; nodes refuse a description of another robot."""
+    speed = '<state_interface name="velocity"/>' * velocities
+    joints = [
+        f'<joint name="{name}"><command_interface name="position"/>'
+        f'<state_interface name="position"><param name="initial_value">{start}</param>'
+        f"</state_interface>{speed}</joint>"
+        for name, start in zip(NAMES, HOME.tolist(), strict=True)
+    ]
     dynamics = '<param name="calculate_dynamics">true</param>' * velocities
-    return (
-        f'<robot name="arm">{"".join(links)}<ros2_control name="hardware" type="system">'
-        f"<hardware><plugin>mock_components/GenericSystem</plugin>{dynamics}</hardware>"
-        f"{''.join(hardware)}</ros2_control></robot>"
+    hardware = (
+        '<ros2_control name="hardware" type="system"><hardware>'
+        f"<plugin>mock_components/GenericSystem</plugin>{dynamics}</hardware>"
+        f"{''.join(joints)}</ros2_control></robot>"
     )
+    return urdf_of(ARM, load_description("ur10").max_velocity).replace("</robot>", hardware)
 
 
 CONTROLLERS = {"simulated": simulated, "real": real}
