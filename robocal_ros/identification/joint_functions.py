@@ -308,7 +308,7 @@ class JointEvidence:
         cost = 0.5 * (told * np.log(variance) + at.determinant + loss / variance)
         C = np.tril(at.inverse) + np.tril(at.inverse, -1).T
         gained = np.eye(p) - C  # what the data tell, of one
-        by_length = np.empty_like(C)
+        by_length = np.zeros_like(C)
         slope, with_noise = [], []
         for (_, block), change in zip(self._blocks, at.slopes, strict=True):
             by_length[block] = change @ gained[block]
