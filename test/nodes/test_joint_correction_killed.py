@@ -41,13 +41,15 @@ SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
 class Stream:
     """A planner, a correction node as a process, and a controller."""
 
+    OUTPUT = f"{NODE}/joint_trajectory"
+
     def __init__(self, graph: Any, controller: Controlled, profiles: Path) -> None:
         self.graph, self.controller, self._profiles = graph, controller, profiles
         probe = graph.probe
         probe.destroy_publisher(controller.topic)  # the node alone commands the controller
         controller.action.destroy()
         self.sent: list[JointTrajectory] = graph.collect(
-            JointTrajectory, f"{NODE}/joint_trajectory", endpoints.RELIABLE
+            JointTrajectory, self.OUTPUT, endpoints.RELIABLE
         )
         self.status: list[CorrectionStatus] = graph.collect(
             CorrectionStatus, f"{CORRECTION}/status", endpoints.LATCHED
@@ -91,7 +93,7 @@ class Stream:
                 "joint_correction_node",
                 {"robot": "ur10", "serial": "s1", "joint_state_age_s": 0.5},
                 {
-                    "~/joint_trajectory": f"{NODE}/joint_trajectory",
+                    "~/joint_trajectory": self.OUTPUT,
                     "controller_state": f"{NODE}/controller_state",
                 },
             )
