@@ -14,7 +14,6 @@ from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import endpoints
-from robocal_ros.tool.services import LASER_GOAL
 
 MANDREL = bent(TAUGHT, [-0.02, 0.01, -0.01], [0.0, 0.0, 0.0])
 RADIUS_MM = 2.5
@@ -37,7 +36,7 @@ def cell(graph: Any, tmp_path: Any) -> LiveCell:
 
 def test_the_laser_frame_is_measured_and_told(graph: Any, cell: LiveCell) -> None:
     told = graph.collect(PoseWithCovarianceStamped, "/tcf_node/laser_frame", endpoints.LATCHED)
-    result = cell.measure(LASER_GOAL, "commissioning")
+    result = cell.measure(MeasureTool.Goal.LASER_FRAME, "commissioning")
     assert result.success, result.message
     assert (result.status, result.answer) == (Code.ACCEPT, MeasureTool.Result.PASS)
     graph.spin_until(lambda: told, "the frame")
@@ -52,7 +51,7 @@ def test_the_laser_frame_is_measured_and_told(graph: Any, cell: LiveCell) -> Non
     names = [f.feedback.step.name for f in cell.feedback]
     assert names[:4] == [f"circle_{i}" for i in range(1, 5)]
     assert len(names) == 13  # twelve steps, and the end
-    again = cell.measure(LASER_GOAL, "commissioning")  # nothing is driven twice
+    again = cell.measure(MeasureTool.Goal.LASER_FRAME, "commissioning")  # nothing is driven twice
     assert again.candidate_id == result.candidate_id
     with_trigger = graph.call(Trigger, "/tcf_node/laser_frame_trigger")
     assert with_trigger.success, with_trigger.message
