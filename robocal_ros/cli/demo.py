@@ -9,7 +9,6 @@ import runpy
 import sys
 from pathlib import Path
 
-from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import share_folders
 
 # A graph of its own on this machine: its cell must neither find nor be found by a real one.
@@ -22,7 +21,7 @@ def main() -> None:
     folders = share_folders("robocal_ros", "demo/bags", "bags")
     script = next((f / "demo.py" for f in folders if (f / "demo.py").is_file()), None)
     if script is None:
-        raise InputError(f"no demo.py in {', '.join(map(str, folders))}: build the workspace anew")
+        sys.exit(f"no demo.py in {', '.join(map(str, folders))}: build the workspace anew")
     for name, value in DOMAIN.items():
         os.environ.setdefault(name, value)
     sys.argv = [str(script), "--out", str(Path.cwd() / OUT), *sys.argv[1:]]

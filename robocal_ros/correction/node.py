@@ -415,6 +415,8 @@ class JointCorrectionNode(RobotNode):
             return
         self._rescale(now)
         path, robot, sent = self._session.output.path, self._session.robot, True
+        if path is not self._stop_path:  # the last stop was of another motion
+            self._stopping.forget()
         if path is not None and path.live(now) and not robot.follows(path, now):
             self._session.stream.end(RefusedError(Reason.STOPPED, why), now)
             sent = self._stop_by_readings(why, now)

@@ -592,11 +592,7 @@ class JointStream:
                 f"{self._names[worst]} moved by {np.degrees(spread[worst]):.3f} deg "
                 f"(allowed {np.degrees(rule.tolerance_rad):.3f} deg)"
             )
-        at = int(np.searchsorted(stamps, stamp_ns, side="right"))
-        before, after = int(stamps[at - 1]), int(stamps[min(at, high)])
-        share = 0.0 if after == before else (stamp_ns - before) / (after - before)
-        q = (1.0 - share) * self._q[at - 1] + share * self._q[min(at, high)]
-        return Reading(q, int(stamps[high]))
+        return Reading(self.at(stamp_ns, rule.gap_s), int(stamps[high]))
 
     def resting(self, stamp_ns: int, rule: StandstillRule) -> Array | None:
         """Mean joints (n,) of the standstill about an instant. Else as `standstill`."""

@@ -210,15 +210,13 @@ class PlcBridgeNode(HouseNode):
     # ---- from the cell to the PLC ---------------------------------------------------------------
 
     def _show(self, topic: str, message: Any) -> None:
-        from robocal_ros.plc.model import values_of
+        from robocal_ros.plc.model import time_of, values_of
 
         if self._server is None:
             return
         try:
-            stamp = message.header.stamp
-            at = datetime.fromtimestamp(stamp.sec + 1e-9 * stamp.nanosec, UTC)
-            values, now_s = values_of(topic, message), time.monotonic()
-            self._server.show(topic, values, at, now_s)
+            values, at = values_of(topic, message), time_of(message.header.stamp)
+            self._server.show(topic, values, at, time.monotonic())
         except Exception as error:  # whatever a stranger publishes, the node lives on
             self._log(topic, error)
 
@@ -231,8 +229,8 @@ class PlcBridgeNode(HouseNode):
             self._wake.trigger()
 
     def _take(self) -> None:
+        from robocal_ros.plc.cell import EdgeWritten, MethodCalled, Notice
         from robocal_ros.plc.inputs import Heartbeat
-        from robocal_ros.plc.server import EdgeWritten, MethodCalled, Notice
 
         while True:
             try:
@@ -257,9 +255,8 @@ class PlcBridgeNode(HouseNode):
         if not self.is_active or (heartbeat.echo and late_s > LATE_S):
             return
         self._heartbeat_s = heartbeat.at_s
-        message = GapOpen(open=heartbeat.echo > 0, echo=heartbeat.echo)
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._gap.publish(message)
+        stamped = header(self.now_ns(), "")
+        self._gap.publish(GapOpen(header=stamped, open=heartbeat.echo > 0, echo=heartbeat.echo))
 
     def _pass_edge(self, beam: str, edge: Any) -> None:
         if self._edges is not None and self.is_active:

@@ -13,23 +13,17 @@ from robocal_ros.cli.programs import add_given_model, given_model, model_history
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.frames import Array, transform_document
-from robocal_ros.ground.samples import (
-    JOINTS,
-    JointStream,
-    cloud_points,
-    joint_sample,
-    stamp_ns,
-)
+from robocal_ros.ground.samples import JOINTS, JointStream, joint_sample
 from robocal_ros.history.history_records import REFERENCE
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import read_measurements, stamp_texts, texts, write_cells
-from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, SensorShot
+from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, shot_of
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-GAP_NS = 250_000_000
+GAP_NS = 250_000_000  # a longer pause of the joints is counted as one
 JOINT_STATE = "sensor_msgs/msg/JointState"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 POINT = "geometry_msgs/msg/PointStamped"
@@ -148,23 +142,11 @@ def _of_bag(
                 else:
                     count += 1
                     name = f"{args.points.strip('/')}/{count}"
-                    queue.add(_shot(recorded.msgtype, message, name))
+                    queue.add(shot_of(message, name))
             except RobocalError as error:
                 lost.append(f"{name}: {error}")
             yield from ready()
         lost.extend(f"{shot.name}: {error}" for shot, error in queue.end())
-
-
-def _shot(kind: str, message: object, name: str) -> SensorShot:
-    """The points of a message, a cloud or a single one."""
-    told = message.header  # type: ignore[attr-defined]
-    if kind == CLOUD:
-        points = cloud_points(message)
-        points = points[np.all(np.isfinite(points), axis=1)]
-    else:
-        p = message.point  # type: ignore[attr-defined]
-        points = np.array([[p.x, p.y, p.z]])
-    return SensorShot(stamp_ns(told.stamp), told.frame_id, points, name)
 
 
 def _show_correct_points(console: "Console", document: Document) -> None:

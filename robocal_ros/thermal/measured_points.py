@@ -7,18 +7,19 @@ for the joint reading after its stamp, so that the place does not depend on whic
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.frames import Array
-from robocal_ros.ground.samples import JointStream
+from robocal_ros.ground.samples import JointStream, cloud_points, stamp_ns
 from robocal_ros.kinematics import SerialArm
 
 LONGEST_GAP_S = 0.05  # between two joint readings; at 10 rad/s^2 the line misses by 3 mrad
 MOST_WAITING = 200  # shots that wait for joints: more means that none come
-AHEAD_NS = 1_000_000_000
+AHEAD_NS = 1_000_000_000  # of a shot before the newest joints: more is another clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,21 @@ class SensorShot:
     frame: str
     points: Array
     name: str = ""
+
+
+def shot_of(message: Any, name: str) -> SensorShot:
+    """The shot of a ``PointStamped`` or a ``PointCloud2``, without points that are missing.
+
+    Raises as `cloud_points`.
+    """
+    if hasattr(message, "point"):
+        p = message.point
+        points = np.array([[p.x, p.y, p.z]])
+    else:
+        points = cloud_points(message)
+        points = points[np.all(np.isfinite(points), axis=1)]
+    frame = message.header.frame_id.lstrip("/")
+    return SensorShot(stamp_ns(message.header.stamp), frame, points, name)
 
 
 @dataclass(frozen=True, eq=False)

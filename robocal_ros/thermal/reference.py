@@ -303,34 +303,28 @@ def reference_document(reference: ColdReference) -> Document:
     """A cold reference in full precision, SI; ``reference_of`` reads it back to the last bit."""
     cell, data = reference.cell, reference.data
     model = model_document(cell.arm)
-    return (
-        {key: model[key] for key in ("mdh", "functions", "load") if key in model}
-        | {
-            "T_frame_base": cell.T_frame_base.tolist(),
-            "targets": list(cell.targets),
-            "T_flange_target": cell.T_flange_target.tolist(),
-            "q": data.q.tolist(),
-            "position": data.position.tolist(),
-            "target": list(data.target),
-            "sample": list(data.sample),
-            "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
-            "fixed": reference.fixed.tolist(),
-            "temperature": None
-            if reference.temperature is None
-            else reference.temperature.tolist(),
+    temperature = reference.temperature
+    document = {key: model[key] for key in ("mdh", "functions", "load") if key in model} | {
+        "T_frame_base": cell.T_frame_base.tolist(),
+        "targets": list(cell.targets),
+        "T_flange_target": cell.T_flange_target.tolist(),
+        "q": data.q.tolist(),
+        "position": data.position.tolist(),
+        "target": list(data.target),
+        "sample": list(data.sample),
+        "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
+        "fixed": reference.fixed.tolist(),
+        "temperature": None if temperature is None else temperature.tolist(),
+    }
+    if (spheres := reference.spheres) is not None:
+        document |= {
+            "T_flange_sensor": spheres.T_flange_sensor.tolist(),
+            "sphere": list(spheres.sphere),
+            "centre": spheres.centre.tolist(),
+            "spot_q": spheres.q.tolist(),
+            "sensor_frame": spheres.frame,
         }
-        | (
-            {}
-            if (spheres := reference.spheres) is None
-            else {
-                "T_flange_sensor": spheres.T_flange_sensor.tolist(),
-                "sphere": list(spheres.sphere),
-                "centre": spheres.centre.tolist(),
-                "spot_q": spheres.q.tolist(),
-                "sensor_frame": spheres.frame,
-            }
-        )
-    )
+    return document
 
 
 def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
@@ -351,10 +345,13 @@ def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
     )
     warmth, spheres = document["temperature"], None
     if "T_flange_sensor" in document:
-        parts = np.array(document["centre"]), np.array(document["spot_q"])
-        sensor = np.array(document["T_flange_sensor"])
-        names = tuple(document["sphere"])
-        spheres = SpheresInCell(sensor, names, *parts, frame=document["sensor_frame"])
+        spheres = SpheresInCell(
+            np.array(document["T_flange_sensor"]),
+            tuple(document["sphere"]),
+            np.array(document["centre"]),
+            np.array(document["spot_q"]),
+            document["sensor_frame"],
+        )
     return ColdReference(
         cell,
         data,

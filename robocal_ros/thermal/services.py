@@ -1,19 +1,18 @@
 """Topics of a measuring robot: where the flange truly is, and what its sensor sees in base."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import Point, PointStamped, PoseStamped
 from sensor_msgs.msg import PointCloud2
 
 from robocal_ros.ground.errors import InputError, RobocalError
-from robocal_ros.ground.samples import cloud_points, stamp_ns
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import cloud, header, pose_message
 from robocal_ros.ros.endpoints import EndpointNode
-from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, SensorShot
+from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, shot_of
 from robocal_ros.thermal.session import ThermalSession
 
 POINT, CLOUD = "point", "cloud"
@@ -35,8 +34,8 @@ class MeasuringRobotTopics:
         self._base, self._session = base_frame, session
         self._queue: PointQueue | None = None
         self._arm: tuple[int, SerialArm] | None = None
-        node.add_input(PointStamped, POINT, self._take_point, endpoints.STREAM)
-        node.add_input(PointCloud2, CLOUD, self._take_cloud, endpoints.STREAM)
+        for kind, topic in ((PointStamped, POINT), (PointCloud2, CLOUD)):
+            node.add_input(kind, topic, partial(self._take, topic), endpoints.STREAM)
         self._pose = node.add_output(PoseStamped, "~/flange_pose", endpoints.STREAM)
         self._point = node.add_output(PointStamped, "~/corrected_point", endpoints.RELIABLE)
         self._cloud = node.add_output(PointCloud2, "~/corrected_cloud", endpoints.RELIABLE)
@@ -57,15 +56,7 @@ class MeasuringRobotTopics:
             self._arm = revision, session.current.arm
         return self._arm[1]
 
-    def _take_point(self, message: Any) -> None:
-        p = message.point
-        self._take(message, np.array([[p.x, p.y, p.z]]), POINT)
-
-    def _take_cloud(self, message: Any) -> None:
-        points = cloud_points(message)
-        self._take(message, points[np.all(np.isfinite(points), axis=1)], CLOUD)
-
-    def _take(self, message: Any, points: np.ndarray, name: str) -> None:
+    def _take(self, name: str, message: Any) -> None:
         session = self._session()
         if session is None:
             return
@@ -73,12 +64,12 @@ class MeasuringRobotTopics:
             reference = session.reference
             if reference is None or reference.spheres is None:
                 raise InputError(UNPLACED)
-            frame, known = message.header.frame_id.lstrip("/"), reference.spheres.frame
-            if frame != known:
-                raise InputError(f"frame '{frame}' is not the placed sensor's, '{known}'")
+            shot, known = shot_of(message, name), reference.spheres.frame
+            if shot.frame != known:
+                raise InputError(f"frame '{shot.frame}' is not the placed sensor's, '{known}'")
             if self._queue is None or self._queue.stream is not session.desk.stream:
                 self._queue = PointQueue(session.desk.stream)
-            self._queue.add(SensorShot(stamp_ns(message.header.stamp), frame, points, name))
+            self._queue.add(shot)
         except RobocalError as error:
             session.refuse(name, error)
             return

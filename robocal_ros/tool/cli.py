@@ -27,11 +27,10 @@ from robocal_ros.cli.main import (
     three_numbers,
     warn,
 )
+from robocal_ros.cli.programs import model_history
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_file import state_folder
 from robocal_ros.history.history_records import LASER_FRAME
 from robocal_ros.programs.conventions import Load
 from robocal_ros.tool.circle import CircleMotion, classic_from_path, fit_circle
@@ -436,7 +435,7 @@ def run_export(args: argparse.Namespace) -> CliResult:
     return CliResult(document, print_text)
 
 
-MOST_LISTED = 1_000_000
+MOST_LISTED = 1_000_000  # all that a history holds
 
 
 def add_station(parser: argparse.ArgumentParser) -> None:
@@ -459,24 +458,14 @@ def add_station(parser: argparse.ArgumentParser) -> None:
 def run_station(args: argparse.Namespace) -> CliResult:
     """Do ``station``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
-    folder = state_folder() if args.state is None else args.state.absolute()
-    with CalibrationHistory.open(
-        args.robot_serial,
-        model_hash=robot.arm.model_hash,
-        state_dir=folder,
-        create=False,
-        owner=False,
-    ) as history:
+    with model_history(args, robot.arm) as history:
         entries = [e for e in reversed(history.list(MOST_LISTED)) if e.kind == LASER_FRAME]
         models = [history.model(entry.id) for entry in entries]
         path = str(history.path)
     if not entries:
         raise InputError("no laser frame was measured: mode LASER_FRAME of tcf_node", file=path)
-    same = [m["made_with"] == models[-1]["made_with"] for m in models]
-    same = [
-        own and m["mandrel"] == models[-1]["mandrel"] for own, m in zip(same, models, strict=True)
-    ]
-    kept = [(e, m) for e, m, own in zip(entries, models, same, strict=True) if own]
+    of = [(model["made_with"], model["mandrel"]) for model in models]
+    kept = [(e, m) for e, m, own in zip(entries, models, of, strict=True) if own == of[-1]]
     first = measurement_of(kept[0][1])
     later = [(entry, measurement_of(model)) for entry, model in kept[1:]]
     shifts = [station_shift(first, found) for _, found in later]

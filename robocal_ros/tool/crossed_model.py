@@ -189,6 +189,15 @@ class RunProblem:
         way[self._starts[2] :: 2] = across_m
         return way
 
+    def misfit(self, found: Estimate[ToolState], scale: float = 1.0) -> float:
+        """Square of what edges (in units of their sigmas times ``scale``) and prior disagree in."""
+        away = self.deviation(found.state)
+        return float(np.sum((found.residual / scale) ** 2) + away @ self.prior @ away)
+
+    def edges_rms_m(self, found: Estimate[ToolState]) -> float:
+        """Of the edges' residuals, m."""
+        return float(np.sqrt(np.mean((found.residual[:, 0] * self.sigma_m) ** 2)))
+
     def deviation(self, state: ToolState) -> Array:
         """Distance from the prior's mean."""
         _, shifts, bends = self._starts
@@ -401,7 +410,7 @@ def estimate_tool(
     turn_rad, turn_sigma_rad = None, 0.0
     if held == Held():  # one circle alone does not tell a turn from a latency
         problem, solved, turn_rad, turn_sigma_rad = _turned(problem, start, solved)
-    misfit = float(np.sqrt(np.mean((solved.residual[:, 0] * problem.sigma_m) ** 2)))
+    misfit = problem.edges_rms_m(solved)
     _require_fit(solved, misfit, steps, noise)
     found, state = _widened(problem, solved), solved.state
     R = retaught(T_flange_tool[:3, :3], state.axis)
@@ -562,8 +571,8 @@ def _turned(
     way = turned.turn / (turned.turn @ turned.turn)
     turn_rad = float(way @ turned.deviation(again.state))
     sigma_rad = float(np.sqrt(way @ again.covariance @ way))
-    misfit = _misfit(problem, solved, 1.0)
-    explains = _misfit(turned, again, 1.0) < 0.5 * misfit
+    misfit = problem.misfit(solved)
+    explains = turned.misfit(again) < 0.5 * misfit
     told = TURNED_SIGMAS * sigma_rad < abs(turn_rad) < MOST_TURNED_RAD
     if told and explains and misfit > _most_misfit(problem, solved):
         problem, solved = turned, again
@@ -575,16 +584,10 @@ def _widened(problem: RunProblem, found: Estimate[ToolState]) -> Estimate[ToolSt
 
     For edges that are, `solve` has widened it: here they count with the scatter that it found.
     """
-    misfit, free = _misfit(problem, found, found.scale), len(found.residual) - problem.undetermined
+    misfit, free = problem.misfit(found, found.scale), len(found.residual) - problem.undetermined
     if misfit <= _most_misfit(problem, found):
         return found
     return replace(found, covariance=misfit / free * found.covariance)
-
-
-def _misfit(problem: RunProblem, found: Estimate[ToolState], scale: float) -> float:
-    """Square of what edges (in units of their sigmas times ``scale``) and prior do not agree in."""
-    away = problem.deviation(found.state)
-    return float(np.sum((found.residual / scale) ** 2) + away @ problem.prior @ away)
 
 
 def _most_misfit(problem: RunProblem, found: Estimate[ToolState]) -> float:

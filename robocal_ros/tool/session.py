@@ -80,8 +80,9 @@ from robocal_ros.tool.station import (
     measurement_document,
     measurement_of,
     station_shift,
+    station_verdict,
 )
-from robocal_ros.tool.touches import TouchLog
+from robocal_ros.tool.touches import TouchedTip, TouchLog
 
 
 class ToolInForce(HistoryFollower):
@@ -294,6 +295,13 @@ class ToolResults:
         by, reason = str(command.arguments.get("by", "")), verdict.reason
         self._history.accept(kept, by=by, reason=reason, expected_head=None, wall_ns=wall_ns)
 
+    def touched(self, tip: TouchedTip, command: Command, wall_ns: int) -> Outcome:
+        """Propose a tip that was found by touches."""
+        verdict, document, model = tip.verdict, tip.document, tip.found.document()
+        kept = self._keep(TOOL, tip, command, wall_ns, verdict, document, model, method="touches")
+        outcome = Outcome(command, verdict.code, verdict.reason, document, kept)
+        return replace(outcome, samples=len(tip.q))
+
     def _laser(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         """Where the mandrel finds the beams, against the first time."""
         config, mandrel = self._config, run.plan.T_flange_tool
@@ -302,24 +310,12 @@ class ToolResults:
         )
         first = self._current.commissioned_station
         shift = station_shift(first or found, found)
-        size_mm, sigma_mm = 1e3 * shift.size_m, 1e3 * found.sigma_m
-        words = f"the beams are known to {sigma_mm:.3f} mm at each point"
-        code, answer = Code.ACCEPT, "pass"
-        if first is not None:
-            sigma_mm = 1e3 * shift.sigma_m
-            words = (
-                f"the crossing is {size_mm:.3f} mm from where it was first (sigma {sigma_mm:.3f})"
-            )
-            if shift.moved and shift.size_m > config.check.limit_m:
-                code, answer = Code.STATION_MOVED, "recalibrate"
-                words += ": write its new laser file (robocal tool station), and use it"
-            elif shift.moved:
-                words += ", more than chance, less than matters"
-        verdict = Verdict(code, words)
+        verdict = station_verdict(found, None if first is None else shift, config.check.limit_m)
+        sigma_m = found.sigma_m if first is None else shift.sigma_m
         document: Document = {
-            "answer": answer,
-            "change": {"tip_mm": size_mm, "axis_deg": shift.turned_deg},
-            "sigma_mm": [sigma_mm],
+            "answer": "pass" if verdict.accept else "recalibrate",
+            "change": {"tip_mm": 1e3 * shift.size_m, "axis_deg": np.degrees(shift.turned_rad)},
+            "sigma_mm": [1e3 * sigma_m],
             "misfit_mm": 1e3 * found.misfit_m,
             "station": shift.document(),
             "cycle_id": run.cycle_id,
@@ -419,12 +415,13 @@ class ToolResults:
     def _keep(
         self,
         kind: str,
-        run: ToolRun,
+        run: ToolRun | TouchedTip,
         command: Command,
         wall_ns: int,
         verdict: Verdict,
         document: Document,
         model: Document,
+        method: str = "crossed beams",
     ) -> int:
         return self._history.propose(
             Proposal(
@@ -435,7 +432,7 @@ class ToolResults:
                 stamp_ns=command.stamp_ns or 0,
                 created_ns=wall_ns,
                 software=self._software,
-                method="crossed beams",
+                method=method,
                 code=verdict.code,
                 reason=verdict.reason,
                 document=document,
@@ -470,7 +467,7 @@ class ToolSession(SessionBase):
         self._results = ToolResults(nominal, history, config, software, self.current)
         self._laser = config.laser
         self._edges = EdgeLog()
-        self._touches = TouchLog(nominal, config, software)
+        self._touches = TouchLog(config)
         self._runs = 0
         self._strays = 0  # edges of the run that came with a stamp far from the joints'
         self._over: Command | None = None
@@ -566,9 +563,11 @@ class ToolSession(SessionBase):
         return self._touches.add(command, self.stream, stamp_ns)
 
     def _solve_touches(self, command: Command, wall_ns: int) -> Outcome:
-        now, history = self.current, self._history
-        revision = now.thermal.revision
-        return self._touches.solve(command, history, now.arm, now.tool, revision, wall_ns)
+        now = self.current
+        tip = self._touches.solve(now.arm, now.tool, now.thermal.revision)
+        outcome = self._results.touched(tip, command, wall_ns)
+        self._touches.clear(command)
+        return outcome
 
     def _measure(self, command: Command, wall_ns: int) -> Outcome:
         mode, cycle_id = str(command.arguments["mode"]), str(command.arguments.get("cycle_id", ""))

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.estimation.estimation import solve
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import InputError, ResidualError
+from robocal_ros.ground.errors import Code, InputError, ResidualError
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.tool.crossed_model import (
     EXACT_M,
@@ -26,7 +27,7 @@ from robocal_ros.tool.crossed_model import (
     run_problem,
 )
 from robocal_ros.tool.laser_frame import POINTS, FlangePath, LaserFrame
-from robocal_ros.tool.run import WrongToolError
+from robocal_ros.tool.run import LITTLE_TURN_RAD, WrongToolError
 
 ROUGH_M = 5e-3  # how well the beams' points are known before: a drawing, or before a knock
 KNOWN = Held(tilt_rad=EXACT_M, along_m=EXACT_M, across_m=EXACT_M)
@@ -89,9 +90,9 @@ class StationShift:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     @property
-    def turned_deg(self) -> float:
+    def turned_rad(self) -> float:
         """Angle of the turn."""
-        return float(np.degrees(np.linalg.norm(self.turn)))
+        return float(np.linalg.norm(self.turn))
 
     def document(self) -> Document:
         """For people: mm and degrees."""
@@ -148,7 +149,7 @@ def measure_station(
                 "mandrel_radius_mm is wrong"
             )
         rough = replace(rough, reach=wider)
-    misfit_m = float(np.sqrt(np.mean((found.residual[:, 0] * problem.sigma_m) ** 2)))
+    misfit_m = problem.edges_rms_m(found)
     if misfit_m > LARGEST_MISFIT_M:
         raise ResidualError(
             f"the edges miss any two beams by {1e3 * misfit_m:.3f} mm rms (allowed "
@@ -162,8 +163,7 @@ def measure_station(
         variance = float(found.covariance[np.ix_(own, own)].mean())
         up = [4 * b + 1, 4 * b + 3]
         C[np.ix_(up, up)] += variance
-    away = problem.deviation(found.state)
-    squares = float(np.sum((found.residual / found.scale) ** 2) + away @ problem.prior @ away)
+    squares = problem.misfit(found, found.scale)
     free = len(found.residual) - problem.undetermined - bend.size
     if free > 0 and squares > chi2_quantile(SOUND_FIT, free):
         C *= squares / free
@@ -189,6 +189,31 @@ def station_shift(before: StationMeasurement, now: StationMeasurement) -> Statio
     parts = [(found[i], spread[i, i]) for i in (slice(3), slice(3, 6))]
     moved = any(away @ np.linalg.solve(own, away) > limit for away, own in parts)
     return StationShift(found[:3], found[3:], spread, rows @ now.covariance @ rows.T, moved)
+
+
+def station_verdict(
+    found: StationMeasurement, shift: StationShift | None, limit_m: float
+) -> Verdict:
+    """Whether the laser file still holds; ``shift``: against the first time, None of that.
+
+    ``limit_m``: so far the crossing may move. A turn that a tool's full run tells is one here.
+    """
+    if shift is None:
+        words = f"the beams are known to {1e3 * found.sigma_m:.3f} mm at each point"
+        return Verdict(Code.ACCEPT, words)
+    words = (
+        f"the crossing is {1e3 * shift.size_m:.3f} mm from where it was first "
+        f"(sigma {1e3 * shift.sigma_m:.3f})"
+    )
+    turned = shift.turned_rad > LITTLE_TURN_RAD
+    if shift.moved and (turned or shift.size_m > limit_m):
+        if turned:
+            words += f", and the station has turned by {np.degrees(shift.turned_rad):.2f} deg"
+        words += ": write its new laser file (robocal tool station), and use it"
+        return Verdict(Code.STATION_MOVED, words)
+    if shift.moved:
+        words += ", more than chance, less than matters"
+    return Verdict(Code.ACCEPT, words)
 
 
 def _frame_moved(laser: LaserFrame, bend: Array) -> Array:

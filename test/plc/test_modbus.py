@@ -5,6 +5,7 @@ import random
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,13 @@ class Served:
         self.do(self.server.start("0.0.0.0", self.port))
         self.client = ModbusTcpClient("127.0.0.1", port=self.port)
         assert self.client.connect()
+
+    def answered(self, number: int) -> int:
+        """What answers a request."""
+        until_s = time.monotonic() + 10.0
+        while (found := self.inputs())["Answer.Number"] != number:
+            assert time.monotonic() < until_s, found
+        return int(found["Answer.Status"])
 
     def do(self, work: Any) -> Any:
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(10.0)
@@ -136,22 +144,16 @@ def test_each_write_of_the_heartbeat_is_passed_on_and_half_of_one_is_not(served:
 def test_a_request_is_carried_out_once_however_often_the_image_is_written(served: Served) -> None:
     client, image = served.client, served.image
 
-    def answered(number: int) -> int:
-        while True:
-            found = served.inputs()
-            if found["Answer.Number"] == number:
-                return int(found["Answer.Status"])
-
     client.write_registers(2, written(0))
     for _ in range(5):
         assert not client.write_registers(0, [0, 7, *written(1)]).isError()
-    assert answered(1) == 1
+    assert served.answered(1) == 1
     assert image.requests == [(1, 4711, 60)]
     client.write_registers(2, written(0))
     client.write_registers(2, written(2, command=9))
-    assert answered(2) == NO_ANSWER  # a defect
+    assert served.answered(2) == NO_ANSWER  # a defect
     client.write_registers(2, written(3, command=2))
-    assert answered(3) == 1
+    assert served.answered(3) == 1
     assert image.requests[1:] == [(9, 4711, 60), (2, 4711, 60)]
     assert image.echoes == [7] * 5
 
@@ -170,8 +172,7 @@ def test_what_a_connection_finds_latched_is_not_carried_out(served: Served) -> N
         client.write_registers(2, written(8, command=2))
     other.close()
     client.write_registers(2, written(9, command=2))
-    while served.inputs()["Answer.Number"] != 9:
-        pass
+    assert served.answered(9) == 1
     assert image.requests == [(1, 4711, 60), (2, 4711, 60)]
 
 

@@ -20,16 +20,10 @@ from bench.live.opc_ua import NAMESPACE, PlcClient, free_port, security_folder
 from robocal_ros.adapter.inputs import InputTiming
 from robocal_ros.ground.errors import Code
 from robocal_ros.plc import access
+from robocal_ros.plc.cell import EdgeWritten, MethodCalled
 from robocal_ros.plc.inputs import Heartbeat
 from robocal_ros.plc.model import METHODS
-from robocal_ros.plc.server import (
-    LOCKED_AFTER,
-    Door,
-    EdgeWritten,
-    MethodCalled,
-    ServerSettings,
-    ServerThread,
-)
+from robocal_ros.plc.server import LOCKED_AFTER, Door, ServerSettings, ServerThread
 
 REQUESTS = int(os.environ.get("ROBOCAL_PLC_REQUESTS", "300"))
 UP_S, QUICK_S = 30.0, 5.0

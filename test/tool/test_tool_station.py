@@ -237,6 +237,17 @@ def test_a_station_is_commissioned_and_followed(driver, tmp_path):
     assert np.linalg.norm(off) < 4.0 * placed.laser.sigma_m
 
 
+@pytest.mark.parametrize(("turn_deg", "code"), [(0.05, Code.ACCEPT), (0.5, Code.STATION_MOVED)])
+def test_a_station_that_only_turned_has_moved_too(driver, turn_deg, code):
+    """As a full run of the tool says; a turn as small as a warm robot's does not matter."""
+    assert driver.measure("laser", cycle_id="c1").status is Code.ACCEPT
+    turned = knocked(driver.cell, [0.0, 0.0, 0.0], [0.0, 0.0, np.radians(turn_deg)])
+    driver.program.cell.station = turned.station
+    found = driver.measure("laser", cycle_id="c2")
+    assert found.status is code, found.message
+    assert ("turned by 0.5" in found.message) == (code is Code.STATION_MOVED)
+
+
 def test_without_a_mandrel_it_says_so(tmp_path):
     cell = noisy_cell()
     with CalibrationHistory.open("K2", state_dir=tmp_path) as history:
