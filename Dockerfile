@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # The suite on the stock image of ROS 2 Jazzy: docker build -t robocal_ros .
 #   docker run --rm --net=host --ipc=host -v robocal_state:/state robocal_ros \
 #       ros2 launch robocal_ros cell.launch.py simulated:=true

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # make demo | test | bench | docs | soak | lint | test-floor: each does all the set-up that it needs.
 # A step's stamp is written only after the step succeeded; an interrupted one is simply done again.
 

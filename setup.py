@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Package robocal_ros for ament and pip."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo: a cell keeps itself accurate, in closed loop and in real time; everything is simulated.
 
 ``make demo`` runs it. A simulated KR 150 has worked for three hours since its cold cell was

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the demo leaves behind: the validated bag's page, and a summary on the terminal."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the robot's program does in a golden hand-eye bag: standstills, shots, captures."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A hand-eye session that is driven as by its node, with a bag in which all of it is written."""
 
 import tempfile

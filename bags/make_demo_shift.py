@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated shift of three hours: ``python bags/make_demo_shift.py`` writes ``demo_shift.mcap``.
 
 A KR 150 works for three hours with a break. Cold, it shows its sphere to the sensor in twelve

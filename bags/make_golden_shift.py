@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden shift: ``python bags/make_golden_shift.py``, ``out/golden_shift.mcap``.
 
 Simulated: eight hours of a KR 150 that warms up at its work and keeps itself accurate in 96 gaps,

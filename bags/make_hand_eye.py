@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden hand-eye bags: ``python bags/make_hand_eye.py`` writes ``hand_eye_*.mcap``.
 
 Simulated: a UR10 whose lengths err by 0.1 mm shows a line laser a sphere,

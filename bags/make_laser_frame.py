@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden bag of a laser frame: ``python bags/make_laser_frame.py``, ``laser_frame.mcap``.
 
 Simulated: the UR10 of ``make_tool_runs`` carries a mandrel, whose place and radius are certified,

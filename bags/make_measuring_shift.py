@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden bag of a measuring robot: ``python bags/make_measuring_shift.py``.
 
 Simulated: the KR 150 of ``make_thermal_shift``, with its sensor on the flange. It works for two

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden thermal bag: ``python bags/make_thermal_shift.py``, ``thermal_shift.mcap``.
 
 Simulated: a KR 150 works for four hours with a break; every twenty minutes it shows its sphere in

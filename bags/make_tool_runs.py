@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden tool bag: ``python bags/make_tool_runs.py``, ``tool_runs.mcap``.
 
 Simulated: a UR10 with a pin, two crossed beams, an input that is read every 2 ms and lags by 4 ms.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the golden bag of a touched tool: ``python bags/make_touches.py``, ``touches.mcap``.
 
 Simulated: a UR10 that repeats to 0.03 mm touches one point with a bent tool's tip from eight

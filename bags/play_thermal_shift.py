@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Play the golden thermal bag live: ``tools/with_ros python bags/play_thermal_shift.py``.
 
 This script is the cell controller: at the mark after each cycle it pauses the replay, ends the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a session was told and what came of it, written into a bag as its node does."""
 
 from collections.abc import Mapping

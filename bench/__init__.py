@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmarks: accuracy on real measurements, speed beside other libraries."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make every table, print it, and write it to out/bench, a file for each part: ``python -m bench``.
 
 With ``--keep`` also to bench/results, and to docs/figures as the documents refer to it.

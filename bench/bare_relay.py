@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The least that a relay of joint messages costs in rclpy: each goes out as it came.
 
 ``python bench/bare_relay.py events`` or ``single``: the executor; ``bytes``: events, and what is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated cell without a graph: its samples, and a way of its robot through poses."""
 
 import numpy as np

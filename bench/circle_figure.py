@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figure of the docs: one circle through two crossed beams, with its eight edges; simulated."""
 
 import matplotlib as mpl

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joint correction: how fast, beside Newton loops of Pinocchio and KDL, and how exact.
 
 All of it is simulated: an arm whose parameters have drifted and a tool that is bent, with the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What joint_correction_node adds to a stream of joint messages, beside a bare relay of rclpy.
 
 Needs rclpy, which the other benchmarks' venv has not: ``tables`` runs this file in the venv of the

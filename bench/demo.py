@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How long `make demo` takes once it is set up, beside its goal; all in it is simulated.
 
 It needs ROS, and runs in the venv of the nodes. The demo itself only says so where it took longer:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of the README: ``tools/with_ros python bench/figures.py``.
 
 - ``ur10_campaigns.png``: real measurements (see ``ur10_campaigns``), mean error at poses that were

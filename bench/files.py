@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading tables, bags and histories beside the plain library call that does the same."""
 
 import csv

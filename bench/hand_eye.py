@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Line laser on a flange: against the bound, whether covariances are true, plans; all simulated.
 
 Of sensors and robots that err as real ones do; `bench.hand_eye_profiles` takes other conditions.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a line laser sees of a target, and the least error that any estimator can reach with it.
 
 A path of its own: planes, lines and circles are cut in base, and every derivative is a central

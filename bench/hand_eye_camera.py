@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera's hand-eye: against the bound and OpenCV's closed forms, and on real measurements."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated hand-eye cells: a robot that holds a line laser before a target, or a camera and board.
 
 The operator jogs until the laser line lies where it is wanted: the true poses are those that are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of a hand-eye calibration, written: shots and profiles, targets, a laser tracker's points.
 
 What the commands read, made for bench, bags and tests; what cannot be written raises `InputError`.

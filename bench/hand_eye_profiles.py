@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Line laser on a flange, whole profiles: unseen poses, what is not modelled, time; simulated."""
 
 import time

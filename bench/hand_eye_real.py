@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real profiles of line lasers on FANUC robots: spread, shots left out, halves, wrong radii.
 
 Sets of others below $ROBOCAL_DATA/line_laser_fanuc, where they are there; the command reads the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real measurements for the hand-eye of a camera, as pairs, streams, and tables of the command.
 
 A UR10 with a T-Mac (Landgraf et al. 2021, MIT), a UR with a camera (wangrp1997, MIT), an arm with

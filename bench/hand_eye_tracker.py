@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A profile sensor placed by a laser tracker: repeatability, error over its bound; all simulated.
 
 The truth is a P-R-P arm of plain elementary motions, and a sensor that casts rays.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated shots of a sphere, of stairs and of an edge; what the operator knows, what is true.
 
 Whole profiles of a sensor and poses of a robot that err as real ones do (`ProfileSensor`,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated laser tracker, and a cell in which it measures a robot, a cube and a sphere.
 
 The robot's truth is a product of elementary motions, and the sensor's a cast of rays, so that a

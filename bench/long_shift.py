@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A long simulated shift as a bag, to time its replay: as many messages as a real one has.
 
 The robot and its sensor are those of the other simulated shifts; nothing goes wrong. Joint states

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot that carries a tool through a beam station, for tests, figures and bags.
 
 What it is told follows from what the estimators say after each step, as in a real cell. Also the

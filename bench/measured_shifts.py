@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measured production shifts: a cold reference, then warm cycles of a few poses while it works.
 
 Each cycle visits all sphere poses at one state of warmth. The drift of an individual robot is

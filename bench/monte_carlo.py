@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated truth, many runs: is the error the least possible one, and are the sigmas true?"""
 
 from collections.abc import Callable, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real measurements: what a calibrated model is worth, at poses that it was not made from."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How fast a bag is replayed, beside the library that decodes it. The shift is simulated."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The long form of what the tests show briefly: ``make soak``, or ``python -m bench.soak --short``.
 
 Kills at random moments, other random examples in each round, hours of a live graph, more simulated

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """joint_correction_node for hours: a stream at 250 Hz, and another model every ten seconds.
 
 ``tools/with_ros python -m bench.soak_correction --seconds 60`` for a look; an hour is the default.

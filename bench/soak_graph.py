@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """thermal_node and joint_correction_node as processes, and a robot that streams through them."""
 
 import os

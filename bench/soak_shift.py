@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A live shift at real time: six nodes of a cell as processes over DDS, driven by a PLC's calls.
 
 ``tools/with_ros python -m bench.soak_shift --seconds 900`` for a look; an hour is the default.

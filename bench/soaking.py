@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the parts of the soak that also run alone have in common."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Speed beside Pinocchio, pybotics and scipy: the same task, the same start, in one run.
 
 Times are processor time of one thread (what else runs on the machine does not count), medians of

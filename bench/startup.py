@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the start of each executable to the first answer of its services.
 
 Needs rclpy, which the other benchmarks' venv has not: ``start_times`` runs this file in the venv

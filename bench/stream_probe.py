@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot that streams joint targets and states through a process, and times what comes back."""
 
 import contextlib

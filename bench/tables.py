@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of results: on the terminal, as Markdown, as JSON; where they are kept, and of what."""
 
 import platform

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated shifts: how much of the workspace stays accurate, by method; see docs/simulation.md.
 
 Nothing is tuned on the shift that is judged: prior and parameters come from another shift of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real drift: a UR10 measured for 100 hours, tracked block by block against a static model."""
 
 from collections.abc import Iterator, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Setting up: how well the sensor is placed, and what planned poses are worth. Simulated."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated shifts as the estimators see them."""
 
 from collections.abc import Sequence

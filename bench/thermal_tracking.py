@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tracker on simulated shifts: between cycles, and whether its bounds and innovations are true.
 
 Each robot has worked four earlier shifts, measured in twenty poses; of them everything is learned.

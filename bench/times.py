@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Times of all estimators beside others of their kind."""
 
 from collections.abc import Sequence

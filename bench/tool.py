@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tool frames from crossed beams: bias, spread against the bound, re-mountings; all simulated.
 
 The truth is a round tool moved through beams of finite width, its edges found on the geometry.

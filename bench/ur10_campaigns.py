@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real measurements as tables and bags: a UR10 with a Leica tracker and T-Mac, four campaigns.
 
 Data: Landgraf, Ernst, Schleth, Fabritius, Huber, IEEE CASE 2021 (MIT licence), in the folder

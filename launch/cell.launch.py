@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts all nodes of one robot's cell; needs ros2 launch.
 
 ros2 launch robocal_ros cell.launch.py params:=my_cell.yaml namespace:=robot_1

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo: a simulated cell keeps itself accurate, in closed loop, in three minutes.
 
 ros2 launch robocal_ros demo.launch.py

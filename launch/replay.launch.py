@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plays a recording through live estimators on the clock of the recording.
 
 ros2 launch robocal_ros replay.launch.py bag:=/data/recordings/robocal_X params:=cell.yaml

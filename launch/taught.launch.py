@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts another launch file whose nodes are to see the taught robot: MoveIt, displays.
 
 ros2 launch robocal_ros taught.launch.py package:=ur_moveit_config file:=ur_moveit.launch.py \

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts thermal_node and joint_correction_node for one robot; needs ros2 launch.
 
 ros2 launch robocal_ros thermal.launch.py thermal_params:=A.yaml correction_params:=B.yaml

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts the nodes of two robots, each in a namespace and with a parameter file of its own.
 
 ros2 launch robocal_ros two_robots.launch.py left_params:=left.yaml right_params:=right.yaml

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All nodes of a cell behind ur_robot_driver, which must run already; needs ros2 launch.
 
 ros2 launch robocal_ros ur.launch.py params:=my_cell.yaml beams:=true

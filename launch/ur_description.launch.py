@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ur_robot_driver's description with a robot_state_publisher that shows the taught robot.
 
 ros2 launch ur_robot_driver ur_control.launch.py ur_type:=ur5e robot_ip:=192.168.56.101 \

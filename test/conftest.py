@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What all tests share: the place of the real measurements, and which tests can run here."""
 
 import gc

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The house rules that a reader relies on: who may import whom, and how large a file may be."""
 
 import ast

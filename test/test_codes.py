@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of codes, states and refusals must say what enumerations and messages say."""
 
 import re

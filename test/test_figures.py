@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the pages quote of bench/results is what stands there, rounded as the page has it."""
 
 import json

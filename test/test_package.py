@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The package says the same of itself in every place."""
 
 import os
@@ -21,6 +22,22 @@ def test_one_version_everywhere() -> None:
     manifests = [ROOT / "package.xml", ROOT / "msg_defs" / "package.xml"]
     versions = [ElementTree.parse(path).findtext("version") for path in manifests]
     assert versions == [robocal_ros.__version__] * 2
+
+
+def test_every_source_file_names_its_licence() -> None:
+    assert ElementTree.parse(ROOT / "package.xml").findtext("license") == "Apache-2.0"
+    code = [ROOT / "setup.py", ROOT / "Makefile", ROOT / "Dockerfile", ROOT / ".ci" / "run"]
+    for folder in ("robocal_ros", "launch", "bags", "bench", "tools", "test", "resource"):
+        code += [path for path in (ROOT / folder).rglob("*") if path.is_file()]
+    scripts = [path for path in code if path.read_bytes().startswith(b"#!")]
+    named = [path for path in code if path.suffix == ".py" or path in code[:4] or path in scripts]
+    assert len(named) > 600
+    line = "# SPDX-License-Identifier: Apache-2.0"
+    # A kernel's file is compiled anew at each change: they follow with the next one.
+    kernels = "\nfrom robocal_ros.ground.compiled import "
+    texts = {path: path.read_text() for path in named if path.name != "compiled.py"}
+    bare = [path for path, text in texts.items() if line not in text.splitlines()[:2]]
+    assert not [path for path in bare if kernels not in texts[path]]
 
 
 def test_the_codes_of_the_message_are_the_codes_of_the_core() -> None:

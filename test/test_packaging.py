@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What pip makes of the source tree: a wheel that needs no ROS, and says what it needs."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The site: every page has its place, and its reference is what the programs declare."""
 
 import importlib.util

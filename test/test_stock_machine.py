@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a stock machine with ROS 2 Jazzy, a container and the public CI are told.
 
 None of the three can be had here: what they name must exist, and be what the pages say.

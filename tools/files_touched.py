@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which files of ours one piece of work passes through.
 
     tools/with_ros python tools/files_touched.py [-v]

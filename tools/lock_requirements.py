@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write requirements/constraints.txt: every version that pip put into this venv.
 
 Run with the venv's Python after a change of a requirement (CONTRIBUTING.md).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Point the ROS wheels' CMake files at this machine's Python and NumPy headers.
 
 The wheels were built elsewhere and name that machine's paths. Run once with the venv's Python;

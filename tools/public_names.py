@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What of ours others rely on by name, as one JSON document, to be compared with diff.
 
     tools/with_ros python tools/public_names.py >names.json

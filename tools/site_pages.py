@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lay out in a folder what `make docs` makes a site of: pages where they lie, and the reference.
 
 The reference is written from what the programs themselves declare: parameters of the nodes, help of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A cell that keeps itself accurate for a shift: simulated cell and sessions in one process.
 
 setting      settings of the sessions, as a configured cell has them

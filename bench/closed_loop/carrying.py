@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the maintenance asks, carried out by the sessions themselves; their answers to it."""
 
 from collections.abc import Callable

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From which size on a fault is reported with the right code. Simulated.
 
 Each seed is another cell, commissioned once, then checked with one fault after the other: by a

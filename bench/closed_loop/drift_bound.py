@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the stated bound of the drift is made of: many robots, at the pace of their cycles."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shifts of a robot at the pace of its measuring cycles, and what earlier ones have taught."""
 
 from dataclasses import replace

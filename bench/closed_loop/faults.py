@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What each fault costs, who reports it, and from which size on. Simulated."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

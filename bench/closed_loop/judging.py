@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How accurate the cell was, by the truth, against the same shift without its suite."""
 
 from collections.abc import Collection, Mapping, Sequence

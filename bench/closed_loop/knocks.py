@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a knock of station, sensor or sphere costs, in many cells. Simulated.
 
 In each cell one of the station's faults and one of the others is tried, of a size of its sweep:

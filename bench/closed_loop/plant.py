@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot, PLC and suite on one clock: commissioning, gaps, production."""
 
 import tempfile

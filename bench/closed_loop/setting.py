@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the sessions, as a configured KR 150 cell has them."""
 
 import numpy as np

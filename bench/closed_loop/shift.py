@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shifts of the cell, with and without its suite, and what came of them."""
 
 from collections.abc import Callable

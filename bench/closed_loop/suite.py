@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sessions that keep a cell accurate, joined as their nodes join them."""
 
 from collections.abc import Callable, Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the sessions tell each other, as their nodes put it."""
 
 import numpy as np

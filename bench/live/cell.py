@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cell before its shift: commissioned while it was cold, in one process. Simulated.
 
 What a person does once in a real cell is done by the sessions of the nodes on the simulated robot

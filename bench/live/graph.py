@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A graph of installed executables as processes, and the cell controller that calls them.
 
 Everything passes through DDS, as between real machines.

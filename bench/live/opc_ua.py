@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A PLC as asyncua's own client: its certificate, its user, its program's heartbeat, its calls."""
 
 import asyncio

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The PLC's bridge: heartbeat, programme, maintenance's services, and the correction's node
 (/joint_correction_node/status and enable). Nothing else.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cell from its commissioning to the complete recording, and what that recording gives."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the sample tables beside this file: ``.venv/bin/python docs/examples/make_measurements.py``.
 
 Simulated, nothing was measured: a UR10 that is off its nominal model by tenths of a millimetre,

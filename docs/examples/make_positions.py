@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make ``positions.csv`` beside this file: ``.venv/bin/python docs/examples/make_positions.py``.
 
 Simulated, nothing was measured: a robot attains two poses thirty times, some tenths of a millimetre

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make tables of a simulated drift: ``.venv/bin/python docs/examples/make_thermal.py out/thermal``.
 
 Simulated, nothing was measured: a KR 150 in two shifts of 90 cycles, the true robot of

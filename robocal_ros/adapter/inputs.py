@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Levels of digital inputs as drivers tell them, and the edges in them; scans as profiles.
 
 Works on any object with the attributes of the ROS message. Nothing is debounced here: a contact

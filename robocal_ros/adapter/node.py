@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The adapter node: inputs and scanners as drivers publish them in, beam events and profiles out.
 
 docs/adapter_node.md.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags (MCAP) that ``ros2 bag play`` accepts, written without ROS: files, and recordings that grow.
 
 Each file of a recording has an index once it is full; of one that a crash left behind, `BagReader`

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags of ROS 2 messages (MCAP), read without ROS, and the data files of hand-eye calibrations.
 
 A message read from a bag has the attributes of the ROS message of its type.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags as others record them: ROS 1, SQLite, and what streams through them with clocks of its own.
 
 A tracker streams: it measures while the robot moves too, its stamps are often those of its

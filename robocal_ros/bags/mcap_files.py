@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """MCAP files without ROS: the types of their messages, and a file as blocks of messages.
 
 Blocks are found by the index or, without one, by a scan. A file without an index is what a recorder

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records what a dispute needs, for as long as there is room (docs/bags.md)."""
 
 import socket

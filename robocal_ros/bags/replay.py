@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded stream through the thermal session: the live node's results, off line."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plays a bag into the graph with /clock; tells what was not received (docs/bags.md)."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """True edges: a round tool moved through beams of finite width, each edge found on the geometry.
 
 Seen along a beam the tool is a chain of discs and their common tangents; its distance from the

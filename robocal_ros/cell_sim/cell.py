@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated cell: what it is made of, its course over time, and the samples that come of it.
 
 It is driven by time, and all of it follows from one seed. The joints go where they are told; their

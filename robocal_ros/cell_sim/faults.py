@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What may go wrong in the simulated cell: in its beams' input, on the way to its controller, in
 its joint readings.
 """

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the joints of a true robot turn besides what their encoders show: gears, and backlash.
 
 Sums of sines, where the estimators have splines: another code path, so that neither hides the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A KUKA KR 150 R3100 as it might stand in a cell: plausible figures, none measured.
 
 Lengths grow by steel's expansion; what an engineer cannot look up (bending per kelvin, static

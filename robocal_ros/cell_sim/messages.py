@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated cell on the graph: messages that it reads and publishes, its controller's action.
 
 The action, topic, state and speed scaling are as joint_trajectory_controller 4.42.1 offers them;

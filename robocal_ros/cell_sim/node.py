@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated cell."""
 
 from collections.abc import Callable, Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The true robot: what really happens to the flange when the encoders show some joint values.
 
 Forward kinematics here are plain products of 4 x 4 matrices, one per elementary motion, so that a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What measures in the simulated cell: line laser, sphere sensor and floor sphere; when it stands.
 
 The light leaves its frame's origin within the plane y = 0, around z. The camera sits on the y

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A joint trajectory controller without a clock, as ros2_controllers' is.
 
 Follows joint_trajectory_controller 4.42.1 (joint_trajectory_controller.cpp, tolerances.hpp) with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``ros2 run robocal_ros demo``: the demo of `make demo`, from an installed workspace.
 
 What it simulates and judges with is the benches' code, which lies in the share folder and on nobody

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An example for the help of each command; those with longer ones have them beside their options.
 
 Apart from the table of commands, which every start reads: only help needs these.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal history``: calibrations listed and shown, decisions taken, damage acknowledged."""
 
 import argparse

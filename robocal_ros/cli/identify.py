@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal identify`` and ``iso9283``: what measurements say of a robot."""
 
 import argparse

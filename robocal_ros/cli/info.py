@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal info FILE``: what a bag, table or file holds, and what can be done with it."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Entry point of ``robocal``, and what every command shares: arguments, the result, how it leaves.
 
 Exit status: 0 = computed, also when the verdict refuses; 2 = wrong usage, or input that cannot be

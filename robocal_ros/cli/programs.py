@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robots that ROS does not command: ``robocal correct-program`` and ``frame-shift``."""
 
 import argparse

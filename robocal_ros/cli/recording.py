@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag as the recording of a session: its inputs, commands and robot, and the truth it tells."""
 
 import contextlib

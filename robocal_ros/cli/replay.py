@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal replay``: a bag through the sessions of the live nodes, with the same results."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands about one robot: ``robocal fk``, ``joint-functions`` and ``import-ur``."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot descriptions of ROS: ``robocal import-urdf`` and ``export-urdf``."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal validate``: any number of bags replayed and judged, with one report of them all.
 
 Jobs go out and results come back. A bag whose process dies is told, the others go on.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One bag through the code of ``robocal replay``, and judged, for ``robocal validate``.
 
 What judges it is the truth of a simulated one, else its own measurements. Runs in a process of its

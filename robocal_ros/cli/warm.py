@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal warm``: compile the kernels before a node or a command has to.
 
 Numba keeps the machine code (``ground.compiled`` says where), for the array types that a kernel was

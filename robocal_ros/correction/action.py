@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The action FollowJointTrajectory before a controller: taught goals in, corrected ones out.
 
 Each goal is corrected and forwarded; it ends as the controller ends it. Nothing here waits: goals

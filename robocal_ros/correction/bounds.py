@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Models and tools that are corrected with, the correction's bounds, and the offset it asks for.
 
 What becomes of a correction beyond its bounds says the policy; the limiter comes after it.

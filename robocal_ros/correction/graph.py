@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who else commands the robot, or publishes its joints: by who serves and publishes on the graph.
 
 A publisher numbers its messages, those of one publisher increase (rmw_fastrtps); what else is used

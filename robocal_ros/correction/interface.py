@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What goes in and out of the correction session: commands, refusals, and its status.
 
 The builders accept any object with the attributes of the ROS message.

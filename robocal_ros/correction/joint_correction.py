@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint correction between a reference model and the actual one, each with its tool.
 
 Given taught joints q, the corrected joints q' satisfy

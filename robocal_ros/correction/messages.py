@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What goes in and out of the joint correction node as messages.
 
 Joint states and trajectories are read and written as they come over the wire, without a message's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joint correction node: taught joints in, corrected ones out (docs/joint_correction.md)."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the joint correction tells: offsets, status, diagnostics, and its part of the history."""
 
 import queue

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the robot was read, where its controller is, and what was put out last."""
 
 from collections import deque

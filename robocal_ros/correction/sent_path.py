@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A trajectory that was put out, as its controller drives it."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Session of the joint correction: taught joints in, corrected ones out, and back. No clock.
 
 It is off until enabled. Whatever changes (enabling, a model, a tool, a posture, a refusal), the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the joint correction node."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A stream of joint targets: as new as its newest message, within the speeds, ended in order."""
 
 from bisect import bisect_right

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whole trajectories, corrected along their time, and stops of what moves.
 
 A controller has no order for "stop": one that is sent nothing, or a trajectory without points, goes

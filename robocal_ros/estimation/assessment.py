@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is it good, in mm? Errors on data not used to solve, and the decision with its reason."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Damped Gauss-Newton on a manifold, robust or plain, and the test of each sample."""
 
 from dataclasses import dataclass, replace

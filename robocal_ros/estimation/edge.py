@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The corners of a staircase, and the edge or groove of a straight-line target, from one profile.
 
 *Classic*, as published: the corners are the points at which the profile is split, and one that is

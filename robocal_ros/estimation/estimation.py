@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robust maximum likelihood and maximum a posteriori estimation on manifolds.
 
 Gauss-Newton with Levenberg damping over a problem that linearises itself. A first pass with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A reference sphere of known radius: the arc of its cut by a laser plane, or a cloud of its cap.
 
 An arc's profile may hold the table, the stem, gaps, spikes and double reflections. The start is the

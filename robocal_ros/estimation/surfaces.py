@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The straight surfaces in a profile, and the corners where neighbours meet.
 
 The profile is split at the point farthest from the chord until no point is farther than its noise

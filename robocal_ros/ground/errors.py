@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors that a user can act on; every message names the thing, the value and what to do."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rigid transforms as 4 x 4 arrays, batched in the leading dimensions.
 
 ``T_a_b`` maps coordinates in frame b to frame a: ``p_a = T_a_b @ p_b``.

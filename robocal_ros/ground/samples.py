@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Typed samples, what sensors and the robot deliver, whatever brought them; joints by time stamp.
 
 The builders accept any object with the attributes of the ROS message, so that live nodes and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a camera sits: from pairs of robot poses and board poses to a result that is judged."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What places a camera: boards in images, or streams on two clocks, paired with the robot's poses.
 
 OpenCV's closed forms solve such pairs; `camera_fit` is better.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Maximum likelihood of a hand-eye calibration, with the noise of both sides."""
 
 from dataclasses import astuple, dataclass

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands of ``robocal hand-eye`` for a line laser, and the options and files of all."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands of ``robocal hand-eye`` for a camera and a laser tracker, export and check-plan."""
 
 import argparse

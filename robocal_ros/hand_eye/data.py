@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a sensor sent, and the data set of a hand-eye calibration that captures make of it.
 
 Shots are kept as they came, and read only when a capture waits: a sensor that runs freely costs

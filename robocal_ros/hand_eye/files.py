@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of a hand-eye calibration: tables of shots and profiles, of a laser tracker, and mounts.
 
 The contracts are written in docs/hand_eye.md and docs/hand_eye_tracker.md. A mount is what

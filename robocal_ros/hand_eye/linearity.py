@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sensor's own linearity: a smooth error of z over its field that all profiles share.
 
 A circle's residuals show it but for what looks like another circle, those of a straight surface

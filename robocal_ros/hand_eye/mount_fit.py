@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Maximum likelihood of a mount: robust, with the robot's own error found where none is given."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pose of a sensor on the flange as an estimation problem, with the robot's error as nuisance.
 
 Each profile is reduced to features that hold all it says (Fisher information) about where the

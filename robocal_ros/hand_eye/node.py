@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The hand-eye node: joints and what a sensor sees in, the sensor's place out.
 
 docs/hand_eye_node.md.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Will planned poses do? Rank, expected error and better poses, before the robot moves.
 
 The Fisher information of a pose is that of its predicted sighting: the Jacobian of the estimator at

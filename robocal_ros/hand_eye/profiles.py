@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A profile, and how a maker's line laser tells it: the sensor description, files and clouds.
 
 Files: tables of text, PLY (Turk 1994, "The PLY polygon file format") and PCD 0.7

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The outcome of a hand-eye calibration, whatever the target, and whether it is good, in mm."""
 
 import re

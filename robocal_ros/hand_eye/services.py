@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The services of the hand-eye node: each call becomes a command to the session."""
 
 import time

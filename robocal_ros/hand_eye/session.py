@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The hand-eye session: samples and commands in, the sensor's place out. No clock, no ROS."""
 
 from collections.abc import Mapping, Sequence

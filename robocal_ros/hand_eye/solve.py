@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a line-laser sensor sits: profiles of a target and flange poses in, its pose out."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The task of a staircase: which corner of a profile is which; and the task of any target."""
 
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Targets that a sensor is shown, as they are known before the calibration, and their files.
 
 Files are YAML, in millimetres and degrees; the contract is written in docs/hand_eye.md,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A task per target: read its features from profiles, start, solve in the classic way."""
 
 from abc import ABC, abstractmethod

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The touch test: marked points scanned with a mount and touched with the robot.
 
 The sources' evaluation (sphere and step targets, section on experiments): accuracy is the distance

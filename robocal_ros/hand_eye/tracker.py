@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a profile sensor sits on a robot, by laser tracker (multiple coordinate transformations).
 
 Source: Jing, Hu and Guo 2020. ``classic`` is its closed form; ``best`` is the maximum likelihood of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a laser tracker measures: the paths of a reflector on the flange, and the target.
 
 The target is a cube with a sphere beside it. Source: Jing, Hu and Guo 2020, section 3.

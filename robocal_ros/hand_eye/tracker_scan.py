@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scan of a cube and a sphere, its parts, and the sensor's place from them in closed form.
 
 Source: Jing, Hu and Guo 2020, with the slide along the sensor axis that the solution itself gives

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The calibration history of one robot: proposed, accepted, rejected, rolled back; never lost.
 
 A change is one SQLite transaction: a process killed at any moment leaves the state before it or

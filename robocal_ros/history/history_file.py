@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The SQLite file behind a calibration history: place, schema, locks, damage.
 
 A damaged file is never repaired and never deleted: it is set aside under another name. That is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a calibration is on its way from proposal to force, and its rows in the history file.
 
 Sessions make proposals, the history keeps them, nodes and commands show them: records that never

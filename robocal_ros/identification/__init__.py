@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of a robot's kinematic model from measured points or poses."""
 
 from robocal_ros.identification.cell_model import CellModel, Part

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot, where it stands in the measuring frame, and the targets on its flange: its model.
 
 Its unknowns, how predictions depend on them, and a closed-form start.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The full model of an arm: geometry, joint functions and compliances, base and targets together.
 
 Begins with the geometric model (`solve.identify`); then all of it in one robust weighted least

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint functions and compliances from measurements: what is unknown, and what the evidence wants.
 
 Of each joint a smooth function of its own angle is a Gaussian process, with a Matérn 5/2 kernel

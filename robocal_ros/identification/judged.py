@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identify on one part of the data, judge on another; accuracy and repeatability of a pose."""
 
 from collections.abc import Callable, Collection, Iterator

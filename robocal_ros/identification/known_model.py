@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well a full model is known: its covariance, where it was measured, what it predicts.
 
 The covariance is found when a model is identified. Of a model that was read back it follows from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which poses to measure, so that the full model errs least where the robot works.
 
 Before anything is measured, geometry lies about the nominal one as robots are built, and each

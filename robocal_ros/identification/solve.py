@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Base, targets and model parameters from measurements: least squares or maximum a posteriori."""
 
 from collections.abc import Collection

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Serial arms in Hayati's five-parameter modified Denavit-Hartenberg form, and their inverse.
 
 The compiled kernels are loaded when they are first used: a quarter of a second that reading a

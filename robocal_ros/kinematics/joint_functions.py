@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a joint turns besides what is read: a function of its own angle, and its winding under load.
 
     theta_i = sign_i (q_i + delta_i(q_i) + c_i tau_i(q)) + theta0_i

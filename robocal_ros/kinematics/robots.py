@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot files (YAML), described in docs/files.md, and where the shipped ones are."""
 
 import hashlib

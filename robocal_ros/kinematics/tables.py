@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurements as CSV tables, each complaint with its file, row and column: see docs/files.md."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Factory calibration of Universal Robots as a serial arm in Hayati's form.
 
 The factory file describes nearly parallel axes by plain DH parameters, whose common normal then

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robots as URDF describes them: an arm in Hayati's form from one, and an arm put into one.
 
 A URDF gives each joint's axis where its link stands at zero; the lines of these axes and the pose

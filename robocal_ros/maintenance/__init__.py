@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance of a cell in its production gaps.
 
 session          what is driven: heartbeats, readings, calls and answers in, requests out

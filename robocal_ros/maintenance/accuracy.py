@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the maintenance, what it remembers over a restart, and how accurate the cell is.
 
 The state that the line reads is judged by all that is known: `accuracy_of`.

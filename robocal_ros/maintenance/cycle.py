@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A maintenance cycle: the thermal measurement, the tool, and what became of both."""
 
 from collections.abc import Callable

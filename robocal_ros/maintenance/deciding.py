@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decisions about thermal models and tools, and what may be accepted without a person."""
 
 from collections.abc import Callable, Iterator, Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One motion of the robot at a time, supervised; whatever is odd is a reason to stop."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance node: one call from the PLC keeps a cell accurate (docs/maintenance_node.md)."""
 
 import math

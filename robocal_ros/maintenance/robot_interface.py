@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a cycle does with robot and nodes: requests to the driver, and waits for the answers.
 
 A script is a generator: it yields whenever it has to wait, and is resumed at the next tick.

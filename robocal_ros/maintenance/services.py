@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance node as a PLC sees it: parameters, services, the action, topics."""
 
 from collections.abc import Callable, Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance of a cell, without clock and ROS: what the PLC asks in, requests to others out.
 
 Whoever drives it gives what happens (`gap`, `reading`, `measured`, `answered`, `drift`,

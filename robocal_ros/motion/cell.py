@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot with its tool at a station, and the check of a motion along its whole way."""
 
 import inspect

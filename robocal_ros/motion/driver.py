@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sends the motions of a node to the robot's controller, and reports what it makes of them.
 
 Motions go as goals of FollowJointTrajectory: a rejection, a violated tolerance and an end are then

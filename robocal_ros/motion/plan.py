@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A motion of the joints over time, as a trajectory controller will interpolate it."""
 
 from collections.abc import Sequence

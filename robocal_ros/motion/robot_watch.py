@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is watched while the robot moves: its plan, and the production gap."""
 
 import math

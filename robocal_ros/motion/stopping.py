@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A stop that was sent, watched until the robot stands.
 
 A controller has no order to stop: it drives on where it is sent nothing or a trajectory without

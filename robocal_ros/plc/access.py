@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who may talk to the cell: users with hashed passwords and roles, clients with certificates.
 
 All of it lies in one folder: ``server.der`` and ``server_key.pem``, the PLCs' certificates in

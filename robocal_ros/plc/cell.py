@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the PLC's sessions act on: their writes and calls, judged and handed to the node."""
 
 import asyncio

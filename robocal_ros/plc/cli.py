@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Certificates and users of the bridge to a PLC: ``robocal plc certificates`` and ``user``."""
 
 import argparse

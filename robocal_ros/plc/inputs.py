@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a PLC writes: its heartbeat and its beams, judged before anything is passed on.
 
 Names of refusals are those of OPC UA's status codes (OPC 10000-6, annex A.2). Works without OPC UA,

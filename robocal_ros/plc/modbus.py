@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cell's register map by Modbus TCP, for gateways of fieldbuses (Profinet, EtherNet/IP).
 
 Modbus has neither users nor encryption: whoever connects from an address that is allowed is the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cell in OPC UA: what is shown, what may be called, what may be written, and its types.
 
 All nodes have names as identifiers (``ns=2;s=Cell.Accuracy.State``), which stay. Of a message that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge to a PLC: an OPC UA server with the cell's state, its calls, the gap and the beams.
 
 docs/plc.md.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The OPC UA server: who gets in, what may be asked, and the thread that it runs in.
 
 asyncua (2.1) leaves some doors open, which are closed here; docs/plc.md names each with its place

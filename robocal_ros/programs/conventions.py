@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How makers write a pose in numbers: order, units, what their angles turn about, and back.
 
 Each from the frame that is referred to, with its source in docs/programs.md: KUKA A, B, C about z,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Programs corrected point by point for the robot as it is.
 
 The controller reckons with its own nominal model. For taught joints q, which a pose of the program

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """FANUC teach pendant programs as text (.ls): positions behind /POS, numbers of three decimals.
 
     P[1:"pick"]{

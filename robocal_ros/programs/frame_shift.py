@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The shift of base and tool frame that serves a robot's working poses best.
 
 Where no program is to be touched, two frames of the controller still move every point: its base,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """KUKA programs (.src, .dat): points in braces, frames by number, status and turn.
 
     DECL E6POS XP1={X 1250.5,Y -20.0,Z 980.25,A 90.0,B 0.0,C 180.0,S 2,T 35,E1 0.0,…}

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot program as text with the points in it: where each number stands, what it means.
 
 A file is bytes to us: read as Latin-1, in which every byte is one character, and written back so;

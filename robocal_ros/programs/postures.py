@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joints that reach a pose: all postures of an arm, and the one that a program's point means.
 
 An inverse for any serial arm: Newton steps, damped where they would be long (Levenberg and

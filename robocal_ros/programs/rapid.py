@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""ABB RAPID modules (.mod, .sys, .prg): robtargets and jointtargets, tooldata and wobjdata.
 
     CONST robtarget p10:=[[600,0,812.5],[0.0,0.0,1.0,0.0],[0,-1,0,1],[9E9,9E9,9E9,9E9,9E9,9E9]];

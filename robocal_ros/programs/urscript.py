@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Universal Robots scripts (.script): poses p[x, y, z, rx, ry, rz], joints [q1, …, q6], m and rad.
 
     global Waypoint_1_p=p[.433025361705, -.467959205379, .522310714714, 1.5003, .5214, .5309]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many validated bags together: rows and tables, and one HTML page that needs nothing else."""
 
 import csv

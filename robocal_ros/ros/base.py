@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The house node: a lifecycle node that starts by itself, reports its faults and ends cleanly.
 
 A node names its parameters in ``SETTINGS`` and fills in four hooks:

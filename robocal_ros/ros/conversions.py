@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Documents and history entries as messages: pure mapping. A number that is not finite stays."""
 
 import math

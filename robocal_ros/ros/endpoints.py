@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs, outputs, services and timers of a lifecycle node; their QoS; its diagnostics."""
 
 import inspect

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What other nodes do on the graph: who commands the robot, opens the gap, shows a frame on tf.
 
 Who publishes and serves is the fact, never a name: names only make the messages readable. Facts

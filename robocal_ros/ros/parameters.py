@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node parameters as a table: what each means, its unit, its bounds, when it may change."""
 
 import math

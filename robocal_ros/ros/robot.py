@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot of a node: a robot file's, or that of the description on the graph.
 
 ``robot_description`` (std_msgs/String, reliable, transient local, depth 1) is a URDF, as

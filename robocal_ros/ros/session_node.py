@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node that drives a session with live messages and calls: its history, clocks and services."""
 
 import json

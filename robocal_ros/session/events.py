@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands to a session, what came of them, and who carries them out: the record that replay obeys.
 
 Decisions about calibrations are commands to the history. A session carries its commands out in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What drift to expect of a robot, learned from its cycles; how far the tool may be off by now."""
 
 import math

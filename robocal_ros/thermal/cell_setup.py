@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a fixed sensor stands and where the sphere sits on the flange, from one cold visit.
 
 ``p_sensor = T_sensor_base T_base_flange(q) p_flange`` over n >= 5 poses that turn the flange about

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands of ``robocal thermal``: calibrate-sensor, identify, learn-prior, plan-poses, screen."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command ``robocal correct-points``: what a sensor on the flange measured, in base."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings, what is in force, and the tracker of the cold reference in force.
 
 The tracker is a function of the reference and of the cycles kept since, so it survives a restart:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A measuring robot: the sensor rides on the flange and sees spheres that are fixed in the cell.
 
 ``c = T_base_flange(q) T_flange_sensor p_sensor`` is the same at every pose of one sphere. Geometry,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a robot's parameters drift in time: the prior of the tracker."""
 
 from collections.abc import Sequence

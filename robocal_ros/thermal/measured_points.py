@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the sensor of a measuring robot sees, in base: by the model in force, where the robot was.
 
 A point is measured at one instant and has the joints of that instant, in motion too; live it waits

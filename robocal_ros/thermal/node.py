@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The thermal node: measurements in, judged models out, decisions kept (docs/thermal_node.md)."""
 
 from collections.abc import Callable, Mapping

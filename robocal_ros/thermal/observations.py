@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurements paired with the joints of the same instant, whatever order they arrive in.
 
 On its way to the model a measurement is a `PointSample` as it was read, an `Observation` with the

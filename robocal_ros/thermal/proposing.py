@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the measurements of a command to a proposal in the history."""
 
 from collections.abc import Callable

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cold reference: base, targets and static errors, from one visit of the measuring poses."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What drift to expect of one robot, learned from cycles that it has measured."""
 
 from collections.abc import Iterator, Sequence

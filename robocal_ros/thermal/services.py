@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Topics of a measuring robot: where the flange truly is, and what its sensor sees in base."""
 
 from collections.abc import Callable

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
 
 from collections.abc import Iterable, Mapping, Sequence

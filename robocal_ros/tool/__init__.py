@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a tool's tip and axis are, from light barriers or from touches."""

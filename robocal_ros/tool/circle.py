@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the tool's axis is from one circle through two crossed beams, by time alone.
 
 The flange runs on a circle of radius R at constant speed in the beam plane, its orientation held.

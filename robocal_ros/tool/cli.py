@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands of ``robocal tool``: beams, crossed, points, parallel, export.
 
 ``crossed`` gives of one circle the place of its axis, of a whole run tip and axis.

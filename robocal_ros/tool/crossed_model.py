@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The edges of a whole run as a maximum likelihood problem over the tool in the flange frame.
 
 A circle's edge: the line of the tool's axis passes the line of the beam at a signed distance

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drives a robot through the steps of a tool session; whatever is odd ends in a stop. No ROS.
 Nothing is sent unless it was armed. Each motion is planned from where the robot stands, and sent
 only when the one before has ended there.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Edges of light barriers: debounced, alternating, each with the uncertainty of its stamp.
 
 Order is judged beam by beam: two beams' shadows may overlap, so nothing follows from the order of

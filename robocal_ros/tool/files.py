@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is it the tool that changed, or the beam station that measures it?
 
 A tool bends: what lies below the bend turns as one piece about it, so its tip moves by the tilt of

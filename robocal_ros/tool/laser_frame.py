@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frame of two crossed beams, calibrated with a cylinder on the flange.
 
 methods: the cylinder finds two points on each beam, A and B on the x-beam, C and D on the y-beam;

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tool node: parameters, services and the action, each call a command to the session."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which circles and plunges measure a tool: each follows from what is known by then."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the tool node publishes, and the motions that it drives itself."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a complete run to its answer: a tool in the history, or the answer of a quick check."""
 
 from collections import OrderedDict

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The laser frame measured in a run: a known cylinder, the mandrel, through both beams.
 
 Upright circles tell where each beam lies across and which way it runs, plunges beside the crossing

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A tool frame from touches of one point (four or more) and two straight moves (seven).
 
 methods: flange z down and y_e along y_b; the tool sweeps along x_b through both beams: mid-places

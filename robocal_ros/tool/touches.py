@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A tip from touches of one point, recorded by the node while the robot stands at each."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Edges in levels as drivers tell them, and scans as profiles, against what was true."""
 
 from types import SimpleNamespace

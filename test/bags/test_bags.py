@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags: written, read back, broken off, damaged, in folders, and as ROS itself reads them."""
 
 import os

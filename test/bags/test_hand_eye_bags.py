@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data files of a hand-eye calibration: the same bits come back, and anyone can read them."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint states read in blocks are those that decoding one by one gives, in the same order."""
 
 from pathlib import Path

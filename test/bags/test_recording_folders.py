@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Room for recordings on real disks: only what this recorder made goes, and nothing holds it up."""
 
 import errno

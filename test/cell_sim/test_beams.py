@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """True edges against distances that can be written down."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cell over time: what it shows against what is commanded, and what can be found from it."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each fault does to what the cell tells what it says, and to nothing else."""
 
 from dataclasses import replace

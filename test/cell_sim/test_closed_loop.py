@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The closed loop: gaps and incidents count from when they are due, and its judging can fail."""
 
 import json

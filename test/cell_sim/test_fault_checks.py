@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table of the fault checks can miss its goals; it says what was told of smaller faults."""
 
 from dataclasses import replace

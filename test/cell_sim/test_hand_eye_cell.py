@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated hand-eye sets: they show the target where it truly is, and report poses that err."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole cell: what its robot does to it, and what it shows of that."""
 
 from dataclasses import replace

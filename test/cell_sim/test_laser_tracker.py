@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated tracker cell: what it measures is what stands there, with the noise it is given."""
 
 import numpy as np

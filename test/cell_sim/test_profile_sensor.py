@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated line laser: its points lie on what it looks at; what it cannot see is missing."""
 
 from dataclasses import replace

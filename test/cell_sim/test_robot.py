@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated truth: equal to the nominal model when nothing is wrong, else wrong as stated."""
 
 from dataclasses import replace

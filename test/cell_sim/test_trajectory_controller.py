@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated controller and its drives, against interpolation written out here; its faults."""
 
 import numpy as np

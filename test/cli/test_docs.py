@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The commands of the documentation run as they are typed, after ``make demo``."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal fk`` and ``robocal import-ur``: answers, refusals, exit status and JSON."""
 
 import json

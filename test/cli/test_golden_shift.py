@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A commissioning as the golden shift's script records it, and the shift's excerpt, replayed."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal hand-eye``: sphere, stairs, edge and groove from tables; what is refused, by name."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal hand-eye --bag``: recordings, data files, what is refused."""
 
 import json

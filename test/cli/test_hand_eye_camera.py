@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal hand-eye camera`` from tables and images, and the real measurements' figures."""
 
 import json

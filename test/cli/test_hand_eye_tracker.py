@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal hand-eye tracker``: both methods from files, and what it says of wrong files."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal identify`` on tables: figures that hold, refusals that say why, exit status, JSON."""
 
 import json

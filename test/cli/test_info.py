@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal info``: each kind of file is known, and the commands that it names take it."""
 
 import argparse

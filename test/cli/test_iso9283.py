@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal iso9283``: the figures of a table, and what it refuses."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal correct-program`` and ``frame-shift`` on files: what is written, whose model it is."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real measurements through ``robocal identify`` and ``robocal replay``: the figures in mm.
 
 A UR10 and a tracked T-Mac; the limits are the goals of the full model of half of the poses at the

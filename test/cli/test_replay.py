@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal replay`` on bags: the live session's results, windows, --auto, and bad recordings."""
 
 import dataclasses

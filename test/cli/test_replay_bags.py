@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal replay`` of bags of tools and sensors, by blocks, and of bags that lack something."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags that others recorded: ROS 1, SQLite, any names, a tracker that streams by its own clock."""
 
 import json

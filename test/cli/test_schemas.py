@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every command, as a process of its own: its document follows its schema, well or ill."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal thermal``: from tables to a placed sensor, a drift and a prior."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal tool``: beams, one circle, touches; each from a table."""
 
 from pathlib import Path

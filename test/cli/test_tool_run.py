@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal tool`` on whole simulated runs: from the beams' edges to a controller's text."""
 
 import json

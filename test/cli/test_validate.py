@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal validate``: what the page says is what the replay and the truth say."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a bag tells of its cell's truth, as ``robocal validate`` reads it."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop closed through the correction: the same model as without it, and no ratcheting."""
 
 from dataclasses import replace

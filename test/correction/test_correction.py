@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The correction session: off until asked, never a jump, never beyond its bounds, never NaN."""
 
 from dataclasses import replace

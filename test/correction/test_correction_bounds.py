@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A clamped correction: within its bounds everywhere, continuous, and to be undone."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is compiled before the first command is all that a correction ever calls."""
 
 import gc

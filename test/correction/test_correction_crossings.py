@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Near singular postures: a drift's correction is slow, a bent tool never much further off."""
 
 from collections.abc import Iterator

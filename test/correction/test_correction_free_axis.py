@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A tool that may turn about its z: five equations, and the joints move least.
 
 An arm reaches position and axis; what the freedom is used for is shown against the same correction

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Correction of an arm whose joints have functions and wind under load: exact, smooth, undone."""
 
 import re

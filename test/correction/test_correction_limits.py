@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Beyond its bounds and limits nothing is corrected, nor with a model of others."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever happens in whatever order: offset and commands move within their limits in time."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Honest programs are corrected from the first target to the last: none is refused or ended."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether commands are corrected with what is in force, by what the correction says of itself."""
 
 from dataclasses import replace

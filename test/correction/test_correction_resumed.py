@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What comes after a pause, another's motion, a wrong clock or a rejected goal: never a jump."""
 
 from dataclasses import replace

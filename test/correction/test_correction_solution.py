@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The correction reaches the taught pose, can be undone, and never leaves its bounds."""
 
 from collections.abc import Iterator

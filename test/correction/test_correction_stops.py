@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A stop of a trajectory slows down on its way: no joint leaves it, or goes on beyond its end."""
 
 import numpy as np

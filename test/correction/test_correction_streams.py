@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Streams of the joint correction: their period, their pauses; models that grow old."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measured tools of the joint correction: which are taken over, and when."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories are corrected as a whole, with a blend along their time."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A jump that comes now and then is seen: what found it is not run again until it passes."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stops of what was put out, on controllers as they are: judged by each cycle of their command."""
 
 from types import SimpleNamespace

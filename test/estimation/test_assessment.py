@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The decision: groups, splits, codes, and a significance level that is what it says."""
 
 import numpy as np

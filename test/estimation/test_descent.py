@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a descent counts as converged."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The estimator on a small manifold problem whose answer is known in closed form."""
 
 from dataclasses import dataclass, replace

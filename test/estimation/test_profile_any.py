@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever a profile holds, its fit is finite or refused with a message."""
 
 import contextlib

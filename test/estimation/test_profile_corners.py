@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The corners of a staircase in a profile: accuracy, its own estimate of it, what is left out."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An edge or a groove in a profile: accuracy, its own estimate of it, and what is refused."""
 
 import numpy as np

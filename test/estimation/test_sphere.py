@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The centre of a sphere of known radius, from clouds with stem, background and spikes."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kept machine code never outlives an edit, also of a function in another file."""
 
 import ast

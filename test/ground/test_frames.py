@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rigid transforms: round trips, conventions, and the corners of SO(3)."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages among records, against the library that wrote them."""
 
 import struct

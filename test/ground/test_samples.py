@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Samples from messages: joints, images and clouds in the layouts that cameras and sensors send."""
 
 from array import array

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The state of a robot beside its history: whole, on the disk, and missed when it is gone."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint readings by stamp: interpolation, standstill, gaps, order and memory."""
 
 import numpy as np

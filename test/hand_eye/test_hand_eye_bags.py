@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The golden hand-eye bags: what they hold, that their script makes them again, their truth."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hand-eye of a camera: truth by the simulated cell, recovered; its noise and its covariance."""
 
 from dataclasses import replace

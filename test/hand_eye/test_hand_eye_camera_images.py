@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera from corners and from images of its board."""
 
 from itertools import product

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes in the poses of a camera are named; poses that do not suffice are refused."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Captures that fail say why, and poses that tell too little are refused."""
 
 import numpy as np

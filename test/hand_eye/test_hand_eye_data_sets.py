@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data sets in files and recordings give the identical result, or are refused."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of shots, target files and documents, exports of mounts: read as written, or refused."""
 
 import json

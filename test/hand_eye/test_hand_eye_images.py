@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hand-eye sessions of a camera on a simulated robot that looks at a chessboard."""
 
 import json

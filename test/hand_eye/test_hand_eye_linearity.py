@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sensor's own linearity is found from profiles, taken out, and told in um."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mount as an estimation problem: its Jacobian, its covariance, what it rejects."""
 
 from dataclasses import replace

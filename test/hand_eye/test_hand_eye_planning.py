@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planned poses: judged before the robot moves, and mended; where they look for a sphere."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planned poses as the node is given them: refused, or judged with what the session knows."""
 
 from dataclasses import replace

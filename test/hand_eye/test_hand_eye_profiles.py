@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Profiles as makers' sensors tell them: read as a description says, or refused in its words."""
 
 import json

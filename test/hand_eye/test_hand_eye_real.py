@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real profiles of line lasers on FANUC robots, as others recorded them."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hand-eye sessions, driven by a simulated robot that brings a laser sensor before a sphere."""
 
 import json

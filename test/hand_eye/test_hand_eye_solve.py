@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sphere, stairs, edge and groove from profiles: recovered, or refused with what is wrong."""
 
 import re

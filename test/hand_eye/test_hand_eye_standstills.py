@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which profiles of a recording are shots, and of which its session made samples."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Streams of poses on two clocks: the offset and the camera, from simulated motions."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A profile sensor placed by a laser tracker: exact, as good as the bound, refusals in words."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Marked points scanned and touched: accuracy, stability, and against how many shots."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Proposals and decisions: what is in force, and since when."""
 
 import contextlib

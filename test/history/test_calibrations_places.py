@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A history belongs to one robot and lies in one place; many processes share it."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A full disk, a file taken away, damage: nothing is lost, nothing half-written."""
 
 import contextlib

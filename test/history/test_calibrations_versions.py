@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files beside a history, its versions, and how fast it opens after years."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What commands were corrected with, in the robot's history."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Random decisions against a reference of the rules that keeps the whole story in a list."""
 
 import tempfile

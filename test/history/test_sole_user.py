@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One process at a time plays a part for a robot, and a killed one holds nothing."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint functions and compliances: simulated by other code, found, and never for the worse."""
 
 import json

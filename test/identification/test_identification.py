@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification against a simulated truth: recovery, honesty of its figures, and its refusals."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """AP and RP against values counted by hand and against what statistics expects."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes in the data that are named instead of fitted."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planned poses: their error is what the design says, and less than that of random ones."""
 
 import numpy as np

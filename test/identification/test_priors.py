@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The prior's width comes from the data: neither too narrow nor a licence for noise."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real measurements of a UR10 over eight months: what the model is worth at unseen poses."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real campaigns become tables and bags that say the same."""
 
 from pathlib import Path

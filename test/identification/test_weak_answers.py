@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses that leave something open: what predictions need is found, the rest is held and named."""
 
 from dataclasses import replace

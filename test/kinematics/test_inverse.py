@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bounded inverse kinematics along a path: recovers joints and rates, and refuses in words."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint functions and winding under load: against the definition, numeric derivatives, and back."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kinematics against the definition, against numeric derivatives and against known poses."""
 
 from dataclasses import replace

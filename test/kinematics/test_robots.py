@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot files: the shipped ones, reading, writing, looking up, and every way to get one wrong."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurement tables: the contract of docs/files.md, and every way to break it."""
 
 from pathlib import Path

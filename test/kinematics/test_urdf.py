@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """URDF to an arm and an arm into a URDF: the same flange, to a nanometre and a nanoradian."""
 
 import json

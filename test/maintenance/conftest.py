@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cell that most tests of the maintenance begin with."""
 
 import pytest

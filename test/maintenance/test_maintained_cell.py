@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance of a cell in closed loop, in one process: real sessions, simulated cell."""
 
 import shutil

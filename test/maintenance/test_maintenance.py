@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A maintenance run in gaps of all lengths, with everything that may go wrong."""
 
 import re

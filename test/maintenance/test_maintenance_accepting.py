@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What may come into force without a person."""
 
 import sqlite3

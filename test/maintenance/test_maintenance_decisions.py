@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decisions that meet a held history, fail half way, or come after a person's."""
 
 import sqlite3

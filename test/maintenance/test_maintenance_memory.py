@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a cycle finds, what it leaves for the next gap, and what outlives a restart."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A process that stands still now and then: a write that takes its time, a busy machine."""
 
 import numpy as np

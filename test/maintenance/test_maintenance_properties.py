@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever comes, in whatever order: what must never be is not.
 
 No motion in a closed gap, none that does not fit, home or FAULT at the end, always disarmed, never

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot that is silent, off its plan, pushed, or not at home; faults and their ends."""
 
 from collections.abc import Callable

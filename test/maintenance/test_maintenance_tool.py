@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is known of the tool: when it was checked, which one, and what may be concluded."""
 
 from dataclasses import replace

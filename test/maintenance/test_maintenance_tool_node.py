@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A tool node that is deaf, dead, absent, or left armed by whoever ran before."""
 
 from dataclasses import replace

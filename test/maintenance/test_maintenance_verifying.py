@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a measurement said outlives a run that breaks off; no tool stays in force unchecked."""
 
 from collections.abc import Callable

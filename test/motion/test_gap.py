@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The heartbeat of the gap and its echo, heard by a process that pauses now and then."""
 
 from collections.abc import Callable

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Circles, plunges, approaches: where they begin, how they run, what they are refused for."""
 
 from dataclasses import replace

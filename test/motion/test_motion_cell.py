@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ways clear of the housing, between taught poses, and stops."""
 
 from dataclasses import replace

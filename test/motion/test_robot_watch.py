@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the robot is against its plan, and how fast its controller drives."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Own motions on a controller as it is: scaled, paused, deaf to a stop, or unwilling."""
 
 import numpy as np

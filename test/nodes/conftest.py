@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Harness of the node tests: a graph of its own for each test, spun in the test's own thread."""
 
 import contextlib

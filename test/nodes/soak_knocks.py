@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What was knocked or moved, in a whole cell over DDS: a thermal cycle tells it. All is simulated.
 
 Not of ``make test``, as it takes minutes: a part of ``make soak``, or

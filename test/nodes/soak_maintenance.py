@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance of a whole cell over DDS, at the limits as they are set, and how long calls take.
 
 Not of ``make test``, which shares its machine: a part of ``make soak``, or

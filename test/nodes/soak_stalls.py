@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node that is stopped for a while (SIGSTOP) in a fast stream: what the robot then does.
 
 Planner, node and robot are a process each, the robot a simulated forward_command_controller.

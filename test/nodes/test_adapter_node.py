@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """adapter_node over DDS: inputs and scanners as drivers publish them, and the nodes behind it."""
 
 from pathlib import Path

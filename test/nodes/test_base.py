@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The house node, by a small node of its own kind."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The files of whole cells give each node values that it takes."""
 
 import re

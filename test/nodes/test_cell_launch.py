@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch files, without ros2 launch: what they name is there, and nodes take it.
 
 They are read, not run: launch and launch_ros come with a ROS installation only, and

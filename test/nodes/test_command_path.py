@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who else commands the robot that a node of the cell moves: told by the graph, over DDS."""
 
 from collections.abc import Iterator

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The parameter files show every parameter with its default, and a node starts with them."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who else commands the robot: told by the graph, over DDS."""
 
 import signal

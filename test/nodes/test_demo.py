@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole demo: a PLC bridge drives a cell of six processes by service calls alone."""
 
 import csv

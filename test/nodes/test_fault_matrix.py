@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults of the cell over DDS: switched on by parameter, one call of the PLC, the right code within
 one cycle, and the robot at home or a fault that says why not. All is simulated.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recording of a cell, played by another player beside live nodes: it moves nothing."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What goals of our own motions allow the controller's robot, and what is told where it is not."""
 
 import time

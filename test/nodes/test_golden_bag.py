@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The golden thermal bag through the live node: the replay's result, bit for bit."""
 
 import json

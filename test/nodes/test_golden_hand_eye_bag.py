@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The golden hand-eye bags: replayed, and played through the live node, with the same results."""
 
 import json

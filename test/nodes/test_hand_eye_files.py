@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """hand_eye_node keeps what was captured."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """hand_eye_node beside somebody else who puts the sensor's frame onto tf."""
 
 from copy import deepcopy

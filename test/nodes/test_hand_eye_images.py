@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """hand_eye_node over DDS: a simulated robot brings a camera before a chessboard."""
 
 from pathlib import Path

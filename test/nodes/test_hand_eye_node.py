@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """hand_eye_node over DDS: a simulated robot brings a laser sensor before a sphere."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """hand_eye_node over DDS: its other targets, plans that the session's own knowledge mends."""
 
 from collections.abc import Iterator

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the controller tells the joint correction node, and what that tells of time. Over DDS."""
 
 import time

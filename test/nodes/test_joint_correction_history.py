@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the joint correction keeps in the robot's history: what it corrected with, since when."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ends a motion of the program: others on the graph, a lease, a stop, deactivation. Over DDS.
 
 The controllers are played by the test: a stream is followed at once, a trajectory as

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hostile messages to the joint correction node, over DDS: nothing wrong ever goes out.
 
 What goes out is finite, within the joints' limits and bounds, and changes over the time that passed

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A correction node that is killed in a stream of trajectories of one point each, and started anew.
 
 Judged by what the controller commands, simulated or real; the real one is looked for in the

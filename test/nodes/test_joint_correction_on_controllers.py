@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """joint_correction_node before a trajectory controller, judged by what that commands.
 
 Simulated or real; the real one is looked for in the environment, without it those tests are

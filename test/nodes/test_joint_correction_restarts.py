@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whoever is killed and started anew, in whatever order: the robot's commands go on without a step.
 
 All three nodes are processes; planner and robot are played by the test. The robot does exactly

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shadow mode of the joint correction node: it tells what it would do, and changes nothing."""
 
 import copy

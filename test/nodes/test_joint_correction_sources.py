@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who commands: several publishers at once, and publishers that vanish, over DDS."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint commands, offsets, status and tools of the joint correction node, over DDS."""
 
 import time

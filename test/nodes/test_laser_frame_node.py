@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """tcf_node finds its own beams with a mandrel, over DDS: by the action, and by its Trigger."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch file, without ros2 launch: what it names is there, and the nodes take what it gives.
 
 It is read, not run: launch and launch_ros come with a ROS installation only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch files, loaded and visited by launch itself: what starts, its names, its parameters.
 
 launch and launch_ros come with a ROS installation only; without them test_cell_launch.py reads the

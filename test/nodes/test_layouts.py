@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The layouts of config/ show topics and fields that exist."""
 
 import json

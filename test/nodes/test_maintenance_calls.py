@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The line is told over DDS whether commands are corrected with what is in force."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the maintenance session asks is carried out in the right order."""
 
 import time

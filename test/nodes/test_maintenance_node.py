@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The maintenance of a whole cell over DDS; the test is the PLC."""
 
 from pathlib import Path

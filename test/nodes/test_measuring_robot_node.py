@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """thermal_node of a measuring robot, over DDS: cycles, and what the sensor sees, in base."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A model with joint functions as a message, over the wire and back; what cannot be is refused."""
 
 from collections.abc import Callable

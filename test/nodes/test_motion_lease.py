@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who may move the robot, over DDS: one maintenance node, and no program while it measures."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readings and feedback with velocities of another number, and a robot's clock that begins anew."""
 
 from pathlib import Path

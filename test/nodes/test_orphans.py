@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What starts nodes may be killed at any time: none of them goes on without it."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions of our own nodes, judged by what a trajectory controller, real or simulated, commands.
 
 The real one is looked for in the environment; without it those tests are skipped.

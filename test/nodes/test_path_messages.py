@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Serialized trajectories are read and changed as ROS reads and writes the messages."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A cell by OPC UA, as a PLC sees it: its state, a gap, decisions; who gets in, what is not.
 
 The PLC is asyncua's own client with its own certificate; maintenance_node and the bridge are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A gap of a whole cell by OPC UA alone: the PLC runs it, its bridge is killed in a motion."""
 
 from pathlib import Path

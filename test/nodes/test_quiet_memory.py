@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Garbage is collected when it is told to be, and never in between."""
 
 import gc

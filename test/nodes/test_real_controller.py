@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a joint trajectory controller does: the real one, and the simulated one in its place.
 
 Each test runs against both, judged by the commands that they say they send. The real one, of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real measurements through the live nodes: the results of ``robocal replay``, bit for bit."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
 import os

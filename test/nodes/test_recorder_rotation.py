@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recording that follows another: replayed by itself, it gives what the live nodes said."""
 
 import json

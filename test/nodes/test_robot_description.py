@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The robot of the description on the graph, over DDS: waited for, taken, compared with a file."""
 
 import math

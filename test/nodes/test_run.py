@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node as a process of its own: how it starts and how it ends."""
 
 import signal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two robots do not share a serial: the second node of a kind refuses to work."""
 
 import os

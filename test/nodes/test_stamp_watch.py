@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readings against this host's clock, and robots that nothing but their file tells apart."""
 
 from pathlib import Path

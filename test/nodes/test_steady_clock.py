@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The clock of whoever moves the robot, over a host that is suspended."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint messages that came in, and what goes out for them: irregular ones by way of a message."""
 
 import math

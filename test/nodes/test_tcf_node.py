@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """tcf_node over DDS: a simulated robot drives what the node announces."""
 
 from typing import Any

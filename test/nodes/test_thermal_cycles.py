@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measuring cycles over DDS, and everything that may go wrong with them."""
 
 import resource

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The set-up by services: sensor placed, poses planned, then a reference from the same samples."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """tcf_node and cell_sim_node as processes: the simulated robot moves, in real time."""
 
 import signal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Touches of one point by the Triggers of tcf_node, over DDS."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The action of the joint correction before a controller's, over DDS."""
 
 import signal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint messages on the wire are read and written as ROS does."""
 
 import math

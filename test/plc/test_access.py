@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Users and certificates: what is kept, who is let in, what cannot be read."""
 
 import json

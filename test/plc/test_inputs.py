@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a PLC writes, judged: each heartbeat is passed on once, each edge at its own time."""
 
 from hypothesis import given

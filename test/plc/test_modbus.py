@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The register map, read and written by pymodbus's client as a gateway does."""
 
 import asyncio

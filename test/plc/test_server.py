@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hostile requests to the server: they change nothing, end nothing, and hand nothing over."""
 
 import asyncio

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Programs corrected for a robot that errs: where it stands when the controller runs them."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames shifted and programs corrected for a robot that warms up: how much of its work is right.
 
 The robot is the simulator's (`cell_sim.robot`): elastic, with gears that err, its drift of the

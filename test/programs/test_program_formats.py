@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is read of programs of each maker, and what of them comes out as it came in."""
 
 import re

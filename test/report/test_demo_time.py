@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bench judges how long the demo takes, which the demo only tells."""
 
 import pytest

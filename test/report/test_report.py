@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures, rows, tables and page of a report: numbers that can be counted by hand."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What replay does with a recording: its configuration, and joint readings that decide nothing."""
 
 import json

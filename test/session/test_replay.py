@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay obeys what was recorded, finds cycles where nothing was, and says where it differs."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the line reads of an accuracy: the forecast and the tool's error, against draws."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors that models leave: none by the true model, the whole drift by the cold one."""
 
 import numpy as np

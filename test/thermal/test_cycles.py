@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measuring cycles of the session: bracketed, timed out, broken off, repeated, and what follows."""
 
 from dataclasses import replace

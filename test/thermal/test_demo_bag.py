@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo's bag: what it holds, that its script makes it again, and what the suite makes of it."""
 
 import json

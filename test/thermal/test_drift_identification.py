@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The drift of one cycle in closed form: bound, forecasts of each pose from the others, verdict."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a robot's own history teaches, with and without motor temperatures."""
 
 from pathlib import Path

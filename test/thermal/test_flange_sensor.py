@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A measuring robot: geometry, hand-eye and sphere centres from constancy alone."""
 
 from dataclasses import replace

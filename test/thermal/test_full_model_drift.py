@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot whose joints have functions: calibrated in full by the session, then its drift on top."""
 
 from collections.abc import Sequence

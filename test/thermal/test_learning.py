@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A prior and a process learned from a robot's own shifts: what was put in is found again."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Points of a measuring robot's sensor that wait for joints, live and from a recording."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The golden bag of a measuring robot: replayed bit for bit, and what its corrected points miss."""
 
 import json

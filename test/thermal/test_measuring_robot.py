@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A measuring robot's session: the sensor on the flange sees spheres that are fixed in the cell."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairing of measurements and joints: by stamps alone."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planned poses: reachable, seen, and the best of their candidates."""
 
 from itertools import combinations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A new cold reference while a drift is in force: of a robot that has cooled, or one still warm."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which parameters a drift needs; stationarity: white noise alarms as often as stated."""
 
 import json

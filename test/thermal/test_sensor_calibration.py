@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensor and sphere placed from one cold visit: simulated truth, bound, refusals."""
 
 import numpy as np

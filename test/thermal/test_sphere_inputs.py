@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Spheres as clouds or centres: the same drift; what is no sphere is said."""
 
 from types import SimpleNamespace as Message

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drift identification against a simulated truth: recovery, honesty, and what it cannot see."""
 
 import json

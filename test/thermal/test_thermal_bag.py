@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The golden thermal bag: what it holds, that its script makes it again, the truth beside it."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The thermal session: what it proposes, and that only stamps and commands decide it."""
 
 import re

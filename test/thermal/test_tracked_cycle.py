@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cycles through the tracker: figures of poses left out, steps refused with their cause."""
 
 from dataclasses import replace

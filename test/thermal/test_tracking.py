@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tracker: exact where it must be, honest where it cannot be, on simulated drift."""
 
 import pickle

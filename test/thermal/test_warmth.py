@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cold again, or as warm as a drift: the share that a visit shows, and when it is told."""
 
 from dataclasses import replace

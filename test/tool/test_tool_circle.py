@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One circle by time alone: exact, unbiased for thick tools, as good as the bound; refusals."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A session's steps driven as joint motions: by a simulated robot that follows what it is sent."""
 
 import numpy as np

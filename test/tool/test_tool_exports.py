@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A tool's frame as controllers write it, read back along another way: scipy's own conventions."""
 
 import re

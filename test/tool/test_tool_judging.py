@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Has a measured tool moved? By chance alone it looks so as often as is said."""
 
 import json

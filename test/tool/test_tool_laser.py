@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The laser frame: the source's data, simulated calibrations, refusals; axes and tool rotations."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The other ways to a tool: four and seven touches, two parallel beams."""
 
 import numpy as np

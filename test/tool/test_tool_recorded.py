@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded run: the circle that was driven, the classic method on it, steps by their names."""
 
 import numpy as np

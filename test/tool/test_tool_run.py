@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tip and axis from a whole run, the quick check, refusals: on a simulated UR10."""
 
 from dataclasses import replace

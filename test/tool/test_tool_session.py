@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs through the beams, driven by a simulated robot as a session asks for them."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The laser frame from a mandrel's run: found with the scatter that is told; a knock is seen."""
 
 from dataclasses import replace

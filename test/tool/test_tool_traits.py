@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A run against the healthy tool's: what is no bend ends it, with its own code. Simulated."""
 
 import json

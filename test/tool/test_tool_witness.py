@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bent tool or knocked station? Wrong as often as is said, and never by more than is said."""
 
 import re

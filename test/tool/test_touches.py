@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A tip from touches that the session records: found, judged, kept; the golden bag again."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A UR10 at a beam station, for the tests of tool frames."""
 
 from functools import cache

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A UR10 that errs as real ones do, made by code of its own: joint errors and weight."""
 
 from contextlib import suppress

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated camera on a robot before a chessboard: rendered images as messages of ROS types."""
 
 from dataclasses import replace

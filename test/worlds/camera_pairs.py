@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses of a robot and of a board that a camera on it sees, simulated."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables and images of a simulated camera for ``robocal hand-eye camera``."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated measuring campaign: a KR 150 as built, a point on its flange, tables of it."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated shift as ROS messages, and a probe that drives the thermal node with it."""
 
 import json

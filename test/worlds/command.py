@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run the real ``robocal`` in a process of its own, and check what it prints."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot, its models and its tools, for the tests of the joint correction's session."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS domains of tests that run beside each other."""
 
 import contextlib

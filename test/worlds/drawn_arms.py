@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms of several kinds and joint vectors, as hypothesis draws them, and twists between poses."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drifting arm seen by a fixed sensor, by the estimators' own model: for tests of statistics."""
 
 from dataclasses import replace

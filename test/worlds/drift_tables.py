@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of a simulated thermal drift: cold and warm visits of named poses."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot that follows what it is sent, under a tool session's driver."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated controller with the action FollowJointTrajectory, as joint_trajectory_controller.
 
 It begins where it is and as fast as it is, follows with a lag, watches the path tolerance, aborts a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings as others make them: a tracker that streams over a network beside a robot's driver."""
 
 from collections.abc import Callable, Iterable, Iterator

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Processes forked from one that has read the code: each saves a second and more of a core."""
 
 import ctypes

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bag of a simulated hand-eye session: all that was said, and what came of it."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``robocal hand-eye`` in this process, and its answer beside the truth."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot with a sensor before a target; all that it says are messages of ROS types."""
 
 from collections.abc import Callable, Iterator

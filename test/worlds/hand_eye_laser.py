@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A laser sensor on a robot, before targets of every kind, for the tests of its sessions."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot with a laser sensor over DDS, and the PLC that calls hand_eye_node."""
 
 from array import array

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated shots of hand-eye targets as the estimators take them, and how far an answer is off."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of a simulated line laser before a sphere, stairs, an edge and a groove."""
 
 from collections.abc import Sequence

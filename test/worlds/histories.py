@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Histories of calibrations, for their tests."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What two histories must have in common when they were made of the same samples and commands."""
 
 import json

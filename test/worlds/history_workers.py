@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Processes of their own for the history tests: one that gets killed, two that race, a writer.
 
 Run as ``python history_workers.py NAME ARGUMENTS``. They fork from a process that has everything

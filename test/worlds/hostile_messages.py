@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages that may come to a joint correction node: good ones, and every kind of bad ones."""
 
 from array import array

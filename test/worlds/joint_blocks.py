@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Samples as a bag gives them that is read in blocks."""
 
 from collections.abc import Iterator, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A joint correction node between a planner and a controller, both played by the test."""
 
 import time

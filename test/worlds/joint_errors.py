@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms whose joints turn otherwise than they read, by as much as a real UR10's."""
 
 from dataclasses import replace

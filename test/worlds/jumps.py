@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What fails as an output jumped is never run again: a second try would hide what comes at times.
 
 `make test` reruns node tests, which others on the machine may have starved, except for these.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole cell with a KR 150, and what it does in a test."""
 
 from dataclasses import replace

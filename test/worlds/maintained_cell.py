@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A whole simulated cell in one process: thermal and tool session, robot, beams, sphere sensor.
 
 What the maintenance asks is carried out by calling the sessions themselves, as a bench does.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot with a thermal and a tool node that may fail in any way, under one session."""
 
 from collections.abc import Callable, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A whole cell over DDS: robot, beams, thermal_node, tcf_node, maintenance_node; the probe is PLC
 and sphere sensor. Everything is simulated."""
 

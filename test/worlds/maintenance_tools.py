@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What tests of tools and of their acceptance ask of a cell."""
 
 from typing import Any

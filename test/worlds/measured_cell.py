@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A measured cell with a known truth: the arm off its nominal model, noise and nothing else."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robots with a tool over a beam station, for the tests of motions."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node that moves the robot as maintenance_node does, by orders of the test; run as a process.
 
 `MotionDriver` sends, `Mover` supervises and stops; what goes out may be lost. Orders and reports

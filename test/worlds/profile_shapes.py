@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Profiles of known shapes, as a line-laser sensor would measure them: simulated."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What processes of tests need, read once by the one that they are forked from (`forked`)."""
 
 import gc

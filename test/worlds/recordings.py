@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags of a simulated shift: what a recorder keeps of a robot, a sensor and a thermal session."""
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Programs of four makers for one robot, written by code of its own, and the robot that runs them.
 
 What a maker writes of joints and frames is stated here once more, along scipy's conventions, so

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small simulated shift: a robot moves from pose to pose, a ball on it is measured at rest.
 
 And the thermal session of such a robot.

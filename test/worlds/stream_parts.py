@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A planner that streams joint targets, or a robot that goes to the newest of them: a process each.
 
 The robot is a simulated forward_command_controller at 250 Hz: in each cycle it goes to the newest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot over DDS: it drives each step that tcf_node announces, as fast as it can."""
 
 from pathlib import Path

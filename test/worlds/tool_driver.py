@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated robot that drives what a tool session asks for."""
 
 import numpy as np

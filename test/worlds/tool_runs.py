@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of a simulated UR10 that measures a bent tool, and of sweeps through parallel beams."""
 
 from dataclasses import dataclass

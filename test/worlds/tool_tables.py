@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of a simulated tool: the source's beam points, one circle, touches."""
 
 import csv

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of a simulated calibration by laser tracker, in the folder `SCAN` and beside it."""
 
 from pathlib import Path

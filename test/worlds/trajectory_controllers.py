@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A trajectory controller on the graph, real or simulated, for six joints that start at home.
 
 Real: ros2_control's node with mock hardware; simulated: `cell_sim_node`. Both under the same names.
