@@ -89,7 +89,13 @@ def cell_node(name, condition=None):
             ("kinematic_model", "thermal_node/model"),
             ("tool", "tcf_node/tool"),
         ],
-        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+        # for SROS 2 (docs/security.md): of no effect unless ROS_SECURITY_ENABLE is true
+        ros_arguments=[
+            "--enclave",
+            f"/robocal/{name}",
+            "--log-level",
+            LaunchConfiguration("log_level"),
+        ],
         respawn=LaunchConfiguration("use_respawn"),
         respawn_delay=2.0,
         output="screen",
