@@ -26,10 +26,15 @@ from robocal_ros.kinematics.joint_functions import (
     JointFunctions,
 )
 
+try:  # a seventh of the time
+    from yaml import CSafeLoader as SafeLoader
+except ImportError:  # PyYAML without libyaml
+    from yaml import SafeLoader  # type: ignore[assignment]
+
 # ---- values of a YAML file by key, checked; errors name file, place and key ---------------------
 
 
-class _StrictLoader(yaml.SafeLoader):
+class _StrictLoader(SafeLoader):
     """YAML in which a key that is given twice is an error, not the last one's victory."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -50,7 +55,6 @@ def load_yaml(text: str, file: str) -> Any:
     Raises `InputError` with file and row, when it is not YAML or gives a key twice.
     """
     try:
-        # _StrictLoader is a SafeLoader
         return yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as error:
         row = error.problem_mark.line + 1 if error.problem_mark else None
