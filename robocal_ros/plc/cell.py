@@ -149,9 +149,9 @@ class Cell:
         return came.status
 
     async def call(
-        self, user: str, rights: Role | int, request: ua.CallMethodRequest
+        self, user: str, rights: Role | int, request: ua.CallMethodRequest, until_s: float
     ) -> ua.CallMethodResult:
-        """Carry out one call of a user; answered within `ANSWER_S`."""
+        """Carry out one call of a user; answered by a time of the steady clock."""
         method = self.model.methods.get(request.MethodId)
         sent = request.InputArguments or []
         if method is None or request.ObjectId != self.model.node_id(METHODS_NODE):
@@ -163,17 +163,20 @@ class Cell:
         fields, status, each = arguments_of(method, sent)
         if status:
             return _call_result(status, each)
-        outputs = await self.carry_out(method, user, fields)
+        outputs = await self.carry_out(method, user, fields, until_s)
         if isinstance(outputs, str):
             return _call_result(outputs)
         return ua.CallMethodResult(OutputArguments=outputs)
 
     async def carry_out(
-        self, method: Method, user: str, fields: Mapping[str, Any]
+        self, method: Method, user: str, fields: Mapping[str, Any], until_s: float
     ) -> list[ua.Variant] | str:
         """Let the node call; the outputs, or the name of a status."""
         if not self.active:
             return "BadInvalidState"
+        left_s = until_s - time.monotonic()
+        if left_s <= 0.0:
+            return "BadTimeout"
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[list[ua.Variant] | str] = loop.create_future()
 
@@ -185,10 +188,9 @@ class Cell:
             with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
                 loop.call_soon_threadsafe(settle, outputs)
 
-        until_s = time.monotonic() + ANSWER_S
         self._hand(MethodCalled(method, user, fields, answer, until_s))
         try:
-            return await asyncio.wait_for(answered, ANSWER_S)
+            return await asyncio.wait_for(answered, left_s)
         except TimeoutError:
             return "BadTimeout"
 
@@ -224,7 +226,8 @@ class RegisterImage:
         if method is None:
             return int(Code.BAD_INPUT)
         fields = {"cycle_id": str(cycle), "gap_s": float(gap_s)} if method.inputs else {}
-        outputs = await self._cell.carry_out(method, writer, fields)
+        until_s = time.monotonic() + ANSWER_S
+        outputs = await self._cell.carry_out(method, writer, fields, until_s)
         return modbus.NO_ANSWER if isinstance(outputs, str) else int(outputs[1].Value)
 
 

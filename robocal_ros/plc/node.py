@@ -6,6 +6,7 @@ docs/plc.md.
 
 import contextlib
 import queue
+import threading
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -29,7 +30,6 @@ from robocal_ros.ros.parameters import Setting, number
 
 GAP_OPEN, EVENTS = "gap_open", "beam_events"
 SHOW_ANSWERS_S = 1.0  # how often calls that nobody waits for any more are let go
-LATE_S = 0.5  # an older heartbeat opens no gap: maintenance_node's own limit
 EXPIRES_DAYS = 30  # warned of so long before
 SERVICES: Mapping[str, Any] = {
     "run": RunMaintenanceCycle,
@@ -132,6 +132,8 @@ class PlcBridgeNode(HouseNode):
         self._wake: Any = None
         self._pending: dict[Any, tuple[float, Any]] = {}
         self._heartbeat_s = float("-inf")
+        self._gap_lock = threading.Lock()  # nothing opens the gap after a deactivation
+        self._gap_acts = False
         self._notice: tuple[float, str] | None = None
         super().__init__(**options)
 
@@ -194,12 +196,15 @@ class PlcBridgeNode(HouseNode):
 
     def activate(self) -> None:
         """Let the gap and the methods act."""
+        self._gap_acts = True
         self._server.set_active(True)
 
     def deactivate(self) -> None:
         """Close the gap, refuse methods; the state is shown on."""
         self._server.set_active(False)
-        self._gap.publish(GapOpen(open=False))
+        with self._gap_lock:
+            self._gap_acts = False
+            self._gap.publish(GapOpen(open=False))
 
     def cleanup(self) -> None:
         """End the server."""
@@ -224,14 +229,26 @@ class PlcBridgeNode(HouseNode):
     # ---- from the PLC to the cell ---------------------------------------------------------------
 
     def _hand(self, handed: Any) -> None:
-        """Take what the server's thread hands over; carried out in the executor's."""
+        """Take what the server's thread hands over.
+
+        A heartbeat goes out at once, as the executor may have other work; all else is carried out
+        there.
+        """
+        from robocal_ros.plc.cell import Notice
+        from robocal_ros.plc.inputs import Heartbeat
+
+        if isinstance(handed, Heartbeat):
+            try:
+                self._pass_heartbeat(handed)
+                return
+            except Exception as error:  # it is being destroyed
+                handed = Notice(f"a heartbeat is lost: {type(error).__name__}: {error}")
         self._handed.put(handed)
         with contextlib.suppress(Exception):  # the node is being destroyed
             self._wake.trigger()
 
     def _take(self) -> None:
         from robocal_ros.plc.cell import EdgeWritten, MethodCalled, Notice
-        from robocal_ros.plc.inputs import Heartbeat
 
         while True:
             try:
@@ -240,8 +257,6 @@ class PlcBridgeNode(HouseNode):
                 return
             try:
                 match handed:
-                    case Heartbeat():
-                        self._pass_heartbeat(handed)
                     case EdgeWritten(beam=beam, edge=edge):
                         self._pass_edge(beam, edge)
                     case MethodCalled():
@@ -252,12 +267,12 @@ class PlcBridgeNode(HouseNode):
                 self._log("a PLC's request", error)
 
     def _pass_heartbeat(self, heartbeat: Any) -> None:
-        late_s = time.monotonic() - heartbeat.at_s
-        if not self.is_active or (heartbeat.echo and late_s > LATE_S):
-            return
-        self._heartbeat_s = heartbeat.at_s
         stamped = header(self.now_ns(), "")
-        self._gap.publish(GapOpen(header=stamped, open=heartbeat.echo > 0, echo=heartbeat.echo))
+        message = GapOpen(header=stamped, open=heartbeat.echo > 0, echo=heartbeat.echo)
+        with self._gap_lock:
+            if self._gap_acts:
+                self._heartbeat_s = heartbeat.at_s
+                self._gap.publish(message)
 
     def _pass_edge(self, beam: str, edge: Any) -> None:
         if self._edges is not None and self.is_active:

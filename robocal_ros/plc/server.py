@@ -13,20 +13,23 @@ import logging
 import threading
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from asyncua import Server, ua
 from asyncua.common.connection import TransportLimits
-from asyncua.common.utils import ServiceError
+from asyncua.common.utils import Buffer, ServiceError
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.crypto.uacrypto import x509_from_der
 from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
 from asyncua.server.internal_server import InternalServer
 from asyncua.server.internal_session import InternalSession
+from asyncua.server.uaprocessor import UaProcessor
+from asyncua.ua.ua_binary import nodeid_from_binary, struct_from_binary, uatcp_to_binary
 from cryptography.hazmat.primitives import serialization
 
 from robocal_ros.adapter.inputs import InputTiming
@@ -41,7 +44,7 @@ from robocal_ros.plc.access import (
     application_uri,
     read_certificate,
 )
-from robocal_ros.plc.cell import Cell, Handover, Notice, RegisterImage
+from robocal_ros.plc.cell import ANSWER_S, Cell, Handover, Notice, RegisterImage
 from robocal_ros.plc.modbus import ModbusServer
 from robocal_ros.plc.model import (
     ACTIVE,
@@ -54,8 +57,12 @@ STOP_S = 3.0
 CHUNK_BYTES = 65535
 MESSAGE_BYTES = 2 * CHUNK_BYTES
 MOST_CONNECTIONS = 30
-MOST_ITEMS, MOST_BROWSED, MOST_CALLS = 500, 100, 10  # of one request
+MOST_STRANGERS = 20  # connections whose channel no trusted certificate has opened; beside those
+MOST_ITEMS, MOST_BROWSED = 500, 100  # of one request
+MOST_CALLS = 10  # of one request; and so many requests of a session may wait
 LOCKED_AFTER, LOCKED_S = 5, 10.0  # wrong passwords of a name, and how long nobody has it then
+CALL = ua.NodeId(ua.ObjectIds.CallRequest_Encoding_DefaultBinary)
+NO_SECURITY = "http://opcfoundation.org/UA/SecurityPolicy#None"
 T = TypeVar("T")
 
 
@@ -81,17 +88,36 @@ class PlcUser(User):
     rights: Role = Role.OPERATOR
 
 
+class Login(NamedTuple):
+    """Who wants in: a name and a password, over a channel of a certificate."""
+
+    name: str
+    password: str
+    certificate: bytes | None
+
+
+class LoginWaitsError(Exception):
+    """A login has not been looked at yet: it takes its time, beside asyncua's loop."""
+
+    def __init__(self, login: Login) -> None:
+        super().__init__()
+        self.login = login
+
+
 class Door:
     """Lets users in whose client is trusted and whose password is right (asyncua's UserManager).
 
     asyncua checks a certificate only where CreateSession carries one, and not that it is the secure
-    channel's; what is checked here is the one that the channel was opened with.
+    channel's; what is checked here is the one that the channel was opened with. Files and hashes
+    are looked at in a thread beside the loop, one login after the other.
     """
 
     def __init__(self, folder: Path, hand: Handover) -> None:
         self._folder, self._hand = folder, hand
         self._trust = Trust(folder)
         self._wrong: dict[str, list[float]] = {}
+        self.answers: dict[Login, PlcUser | None] = {}  # for the one pass that follows
+        self._one = asyncio.Lock()
 
     def untrusted(self, certificate: bytes | None) -> str:
         """Why a client with this certificate is turned away; empty: it is not."""
@@ -109,18 +135,31 @@ class Door:
         password: str | None = None,
         certificate: bytes | None = None,
     ) -> PlcUser | None:
-        """Log a user in; None: refused."""
-        if why := self.untrusted(certificate):
+        """Who has logged in; None: refused. Raises `LoginWaitsError` where `look` comes first."""
+        login = Login((username or "")[:100], password or "", certificate)
+        if login not in self.answers:
+            raise LoginWaitsError(login)
+        return self.answers[login]
+
+    async def look(self, login: Login) -> None:
+        """Look at it beside the loop; `get_user` has the answer then."""
+        async with self._one:
+            answer = await asyncio.to_thread(self.admit, login)
+        self.answers[login] = answer
+
+    def admit(self, login: Login) -> PlcUser | None:
+        """Log a user in; None: refused. It reads files, and hashes for some 50 ms."""
+        name = login.name
+        if why := self.untrusted(login.certificate):
             self._hand(Notice(f"a client is turned away: {why}"))
             return None
-        name = (username or "")[:100]
         now_s = time.monotonic()
         wrong = [at_s for at_s in self._wrong.get(name, ()) if now_s - at_s < LOCKED_S]
         if len(wrong) >= LOCKED_AFTER:
             self._hand(Notice(f"login of {quoted(name)} is locked: {len(wrong)} wrong passwords"))
             return None
         try:
-            rights = Users(self._folder).login(name, password or "")
+            rights = Users(self._folder).login(name, login.password)
         except InputError as error:
             self._hand(Notice(f"nobody can log in: {error}"))
             return None
@@ -137,6 +176,10 @@ class CellSession(InternalSession):
     """A client's session: bounded requests, writes and calls by `Cell`."""
 
     iserver: "CellInternalServer"
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._calls_waiting, self._in_order = 0, asyncio.Lock()
 
     @property
     def rights(self) -> Role | int:
@@ -162,7 +205,7 @@ class CellSession(InternalSession):
             sent = None if found is None else found.public_bytes(serialization.Encoding.DER)
         except ValueError as error:
             raise ServiceError(ua.StatusCodes.BadCertificateInvalid) from error
-        if why := self.iserver.door.untrusted(sent):
+        if why := await asyncio.to_thread(self.iserver.door.untrusted, sent):
             self.iserver.hand(Notice(f"{self.name}: {why}"))
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted)
         return await super().create_session(params, sockname)
@@ -201,10 +244,17 @@ class CellSession(InternalSession):
         return await self.iserver.cell.write(self.label, _bounded(params.NodesToWrite, MOST_ITEMS))
 
     async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:
-        """Call, one after the other."""
-        requests = _bounded(params, MOST_CALLS)
+        """Call, one after the other; all are answered within `ANSWER_S`."""
+        requests, until_s = _bounded(params, MOST_CALLS), time.monotonic() + ANSWER_S
         cell, user, rights = self.iserver.cell, self.user_name, self.rights
-        return [await cell.call(user, rights, request) for request in requests]
+        if self._calls_waiting >= MOST_CALLS:
+            raise ServiceError(ua.StatusCodes.BadTooManyOperations)
+        self._calls_waiting += 1
+        try:
+            async with self._in_order:
+                return [await cell.call(user, rights, request, until_s) for request in requests]
+        finally:
+            self._calls_waiting -= 1
 
     async def history_read(self, params: ua.HistoryReadParameters) -> list[ua.HistoryReadResult]:
         """There is none."""
@@ -228,7 +278,7 @@ class CellInternalServer(InternalServer):
         self.supported_tokens = (ua.UserNameIdentityToken,)
         self.allow_remote_admin = False
         self.match_discovery_source_ip = False
-        self.max_connections = MOST_CONNECTIONS
+        self.max_connections = MOST_CONNECTIONS + MOST_STRANGERS
         self.max_pending_activation_seconds = 5.0
         self.max_pending_messages_per_connection = 100
         self.max_session_timeout_ms = 60_000.0
@@ -269,10 +319,84 @@ class CellInternalServer(InternalServer):
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
 
+class CellProcessor(UaProcessor):
+    """Serves the messages of a connection: neither a call nor a login holds up what comes after.
+
+    asyncua serves them one after the other, and looks at passwords in its loop.
+    """
+
+    iserver: CellInternalServer
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.is_trusted = False  # a certificate that is has opened the channel
+        self._calls: set[asyncio.Task[Any]] = set()
+
+    async def process(self, header: Any, body: Buffer) -> bool:
+        """Serve a message; a certificate that is not trusted opens no channel."""
+        if header.MessageType == ua.MessageType.SecureOpen and not self._connection.is_open():
+            opens = struct_from_binary(ua.AsymmetricAlgorithmHeader, body.copy())
+            secured = opens.SecurityPolicyURI != NO_SECURITY
+            untrusted = self.iserver.door.untrusted
+            if secured and (why := await asyncio.to_thread(untrusted, opens.SenderCertificate)):
+                self.iserver.hand(Notice(f"{self.name}: {why}"))
+                status = ua.StatusCode(ua.StatusCodes.BadCertificateUntrusted)
+                error = ua.ErrorMessage(status, "not trusted")
+                self._transport.write(uatcp_to_binary(ua.MessageType.Error, error))
+                return False
+            goes_on = bool(await super().process(header, body))
+            self.is_trusted = secured and self._connection.is_open()
+            return goes_on
+        return bool(await super().process(header, body))
+
+    async def process_message(self, seqhdr: Any, body: Buffer) -> Any:
+        """Serve a service; a call beside what comes after it."""
+        if nodeid_from_binary(body.copy()) != CALL:
+            return await super().process_message(seqhdr, body)
+        task = asyncio.create_task(super().process_message(seqhdr, body))
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+        return True
+
+    async def _process_message(
+        self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer
+    ) -> Any:
+        again = body.copy()
+        try:
+            return await super()._process_message(typeid, requesthdr, seqhdr, body)
+        except LoginWaitsError as waits:
+            login = waits.login
+        await self.iserver.door.look(login)
+        try:
+            return await super()._process_message(typeid, requesthdr, seqhdr, again)
+        finally:
+            self.iserver.door.answers.pop(login, None)
+
+
 class CellProtocol(OPCUAProtocol):
     """A connection; asyncua gathers what comes for a message of any size that its header names."""
 
     _buffer: bytes
+    processor: UaProcessor | None
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether a trusted certificate has opened its channel."""
+        return isinstance(self.processor, CellProcessor) and self.processor.is_trusted
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take it; of too many strangers the oldest goes of the address that has the most."""
+        strangers = [c for c in self.clients if isinstance(c, CellProtocol) and not c.is_trusted]
+        if len(strangers) >= MOST_STRANGERS:
+            ((crowd, _),) = Counter(c.peer_name[0] for c in strangers).most_common(1)
+            oldest = next(c for c in strangers if c.peer_name[0] == crowd)
+            self.clients.remove(oldest)
+            if oldest.transport is not None:
+                oldest.transport.abort()
+        super().connection_made(transport)
+        if self.processor is not None:
+            self.processor = CellProcessor(self.iserver, self.transport, self.limits)
+            self.processor.set_policies(self.policies)
 
     def data_received(self, data: bytes) -> None:
         """Take bytes; who sends more than a chunk without an end is cut off."""

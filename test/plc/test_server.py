@@ -8,6 +8,7 @@ import os
 import random
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -20,11 +21,20 @@ from asyncua import ua
 from bench.live.opc_ua import NAMESPACE, PlcClient, free_port, security_folder
 from robocal_ros.adapter.inputs import InputTiming
 from robocal_ros.ground.errors import Code
-from robocal_ros.plc import access
+from robocal_ros.plc import access, cell
+from robocal_ros.plc import server as plc_server
 from robocal_ros.plc.cell import EdgeWritten, MethodCalled
 from robocal_ros.plc.inputs import Heartbeat
 from robocal_ros.plc.model import METHODS
-from robocal_ros.plc.server import LOCKED_AFTER, Door, ServerSettings, ServerThread
+from robocal_ros.plc.server import (
+    LOCKED_AFTER,
+    MOST_CALLS,
+    MOST_STRANGERS,
+    Door,
+    Login,
+    ServerSettings,
+    ServerThread,
+)
 
 REQUESTS = int(os.environ.get("ROBOCAL_PLC_REQUESTS", "300"))
 UP_S, QUICK_S = 30.0, 5.0
@@ -56,10 +66,10 @@ class Served:
         """What would have moved, decided or said something."""
         return [h for h in self.handed if isinstance(h, (Heartbeat, EdgeWritten, MethodCalled))]
 
-    def works(self) -> None:
+    def works(self, heartbeat: int = 0) -> None:
         """A good request is answered, quickly."""
         began_s = time.monotonic()
-        assert self.plc.do(self.plc.read("Gap.Heartbeat")) == 0
+        assert self.plc.do(self.plc.read("Gap.Heartbeat")) == heartbeat
         assert time.monotonic() - began_s < QUICK_S
         assert self.thread.state.listening
         assert self.thread.state.trouble == ""
@@ -213,16 +223,17 @@ def test_hostile_requests_change_nothing_and_end_nothing(served: Served) -> None
 
 
 def test_connections_that_say_nothing_are_few_and_are_cut_off(served: Served) -> None:
-    silent = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(40)]
+    """A PLC finds its place among them, from their address too."""
+    silent = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(60)]
     served.works()
+    other = PlcClient(served.folder, served.port)
+    other.do(other.connect())
+    other.close()
     until_s = time.monotonic() + 15.0
     for each in silent:
         each.settimeout(max(until_s - time.monotonic(), 0.1))
         assert each.recv(1) == b""  # the server has ended it
         each.close()
-    other = PlcClient(served.folder, served.port)
-    other.do(other.connect_once_there())
-    other.close()
 
 
 def test_sessions_with_wrong_certificates_and_passwords_open_nothing(
@@ -280,10 +291,10 @@ def test_names_that_nobody_has_unlock_none(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(door, "untrusted", lambda certificate: "")
     monkeypatch.setattr(access.Users, "login", lambda *_: None)  # which takes its time
     for number in range(LOCKED_AFTER):
-        assert door.get_user(None, "plc", f"guess {number}") is None
+        assert door.admit(Login("plc", f"guess {number}", b"")) is None
     for number in range(120):
-        assert door.get_user(None, f"nobody {number}", "guess") is None
-    assert door.get_user(None, "plc", "guess") is None
+        assert door.admit(Login(f"nobody {number}", "guess", b"")) is None
+    assert door.admit(Login("plc", "guess", b"")) is None
     assert "'plc' is locked" in told[-1].words
 
 
@@ -294,10 +305,128 @@ def test_a_call_that_nobody_answers_ends_in_time(served: Served) -> None:
     assert type(caught.value).__name__ == "BadTimeout"
     assert time.monotonic() - began_s < QUICK_S
     called, *again = [h for h in served.handed if isinstance(h, MethodCalled)]
-    assert len(again) == 2
+    assert len(again) == 2  # as `PlcClient` calls again
     assert (called.user, called.fields) == ("ada", {"cycle_id": "4711", "gap_s": 30.0})
     called.answer([])  # too late: nobody waits
     served.works()
+
+
+def calls(served: Served, count: int) -> Any:
+    """One request of so many calls, which nobody answers; each with its status."""
+    index = served.plc.index
+    cancel = ua.CallMethodRequest(
+        ua.NodeId("Cell.Methods", index), ua.NodeId("Cell.Methods.Cancel", index), []
+    )
+    return served.plc.client.uaclient.call([cancel] * count)
+
+
+def test_many_calls_that_nobody_answers_end_with_the_first(served: Served) -> None:
+    """Finding: each of them held its session for 0.45 s, one after the other."""
+    served.handed.clear()
+    found = served.plc.do(calls(served, MOST_CALLS))
+    assert {result.StatusCode.name for result in found} == {"BadTimeout"}
+    assert len(served.acted) == 1  # nothing that the PLC was told to be late is carried out later
+
+    async def at_once() -> list[Any]:
+        requests = [calls(served, 1) for _ in range(MOST_CALLS + 2)]
+        return await asyncio.gather(*requests, return_exceptions=True)
+
+    served.handed.clear()
+    answers = served.plc.do(at_once())
+    refused = [type(a).__name__ for a in answers if isinstance(a, Exception)]
+    assert refused == ["BadTooManyOperations"] * 2
+    assert len(served.acted) == 1
+    served.works()
+
+
+@pytest.fixture
+def beating(tmp_path: Path) -> Iterator[Served]:
+    """A server of its own, whose PLC has begun to write heartbeats."""
+    made = Served(tmp_path)
+    yield made
+    made.plc.close()
+    made.thread.stop()
+
+
+def beats_pass(served: Served, count: int) -> None:
+    """So many heartbeats are answered and handed over."""
+    before = len(served.acted)
+    for number in range(count):
+        beat = ua.Variant(number + 1, ua.VariantType.UInt32)
+        served.plc.do(served.plc.write("Gap.Heartbeat", beat))
+    beats = [h.echo for h in served.acted[before:] if isinstance(h, Heartbeat)]
+    assert beats == [*range(1, count + 1)]
+
+
+def test_no_heartbeat_waits_behind_a_call(beating: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finding: on one session they waited until the call was answered, 0.45 s at the most."""
+    for module in (cell, plc_server):
+        monkeypatch.setattr(module, "ANSWER_S", 30.0)  # longer than this test may take
+    waits = beating.plc.start(calls(beating, 1))
+    _until(lambda: beating.acted)
+    beats_pass(beating, 10)
+    assert not waits.done()
+    beating.acted[0].answer("BadNoCommunication")
+    assert [result.StatusCode.name for result in waits.result(UP_S)] == ["BadNoCommunication"]
+
+
+def test_no_heartbeat_waits_behind_a_login(
+    beating: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding: passwords were hashed in the thread that passes heartbeats on, 50 ms for each."""
+    begun, goes_on = threading.Event(), threading.Event()
+    look = access.Users.login
+
+    def slow(*arguments: Any) -> Any:
+        begun.set()
+        assert goes_on.wait(UP_S)
+        return look(*arguments)
+
+    monkeypatch.setattr(access.Users, "login", slow)
+    other = PlcClient(beating.folder, beating.port)
+    login = other.start(other.connect())
+    try:
+        assert begun.wait(UP_S)
+        beats_pass(beating, 10)
+        assert not login.done()
+    finally:
+        goes_on.set()
+    login.result(UP_S)
+    other.close()
+
+
+def test_strangers_do_not_take_the_places_of_plcs(beating: Served) -> None:
+    """Finding: thirty connections without a certificate kept the PLC out while they were renewed.
+
+    From an address of their own, as fast as they can, for as long as a PLC comes and goes.
+    """
+    ended, opened = threading.Event(), [0]
+
+    def flood() -> None:
+        kept: list[socket.socket] = []
+        while not ended.is_set():
+            with contextlib.suppress(OSError):
+                at = ("127.0.0.1", beating.port)
+                kept.append(socket.create_connection(at, 1.0, ("127.0.0.2", 0)))
+                opened[0] += 1
+            if len(kept) > 2 * MOST_STRANGERS:
+                kept.pop(0).close()
+        for each in kept:
+            each.close()
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    try:
+        _until(lambda: opened[0] > 3 * MOST_STRANGERS)
+        for _ in range(3):
+            other = PlcClient(beating.folder, beating.port)
+            other.do(other.connect())
+            other.close()
+        beats_pass(beating, 10)  # whoever is there stays
+    finally:
+        ended.set()
+        thread.join(UP_S)
+    beating.works(10)
 
 
 def test_a_defect_in_its_thread_is_told_and_the_server_goes_on(served: Served) -> None:
