@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 
 from robocal_ros.ground.files import write_text
 from robocal_ros.ground.frames import Document, transform_document
-from robocal_ros.hand_eye.files import PROFILE, SPHERE, write_pose_table
+from robocal_ros.hand_eye.files import PROFILE, write_pose_table
 from robocal_ros.hand_eye.targets import (
+    FACES,
     KIND_OF,
+    SPHERE,
     LaserTarget,
     LineTarget,
     SphereTarget,
     TrackerTarget,
 )
-from robocal_ros.hand_eye.tracker_data import FACES, TrackerData
+from robocal_ros.hand_eye.tracker_data import TrackerData
 from robocal_ros.kinematics.tables import POSITION, joint_texts, texts, write_cells
 
 Array = NDArray[np.float64]

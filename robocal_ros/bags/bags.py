@@ -294,11 +294,12 @@ def bag_info(path: str | Path) -> BagInfo:
 
 
 DATA_SET, JOINTS, PROFILE, POSE = "data_set", "joint_states", "profile", "target_pose"
-IMAGE = "image"
+IMAGE, TRACKER_POINT = "image", "tracker_point"
 _TYPE = {
     PROFILE: "sensor_msgs/msg/PointCloud2",
     POSE: "geometry_msgs/msg/PoseStamped",
     IMAGE: "std_msgs/msg/Float64MultiArray",
+    TRACKER_POINT: "geometry_msgs/msg/PointStamped",
 }
 _DOUBLE = 8  # of sensor_msgs/PointField
 _BYTES = 24  # of a point
@@ -310,7 +311,8 @@ def write_data_set(
     """Write a data set; the file appears whole or not at all.
 
     ``document``: of the data set, with its ``samples`` in SI.
-    ``topic``: ``profile``, ``target_pose`` or ``image``; ``frame``: the sensor's.
+    ``topic``: ``profile``, ``target_pose``, ``image`` or ``tracker_point``, of samples that name
+    none of their own; ``frame``: the sensor's.
 
     Raises `InputError` when the file is there already, or cannot be written.
     """
@@ -337,7 +339,8 @@ def write_data_set(
                     "position": row["q"],
                 }
                 writer.write(JOINTS, "sensor_msgs/msg/JointState", joints, at_ns)
-                writer.write(topic, _TYPE[topic], _shot(topic, header, row["values"]), at_ns)
+                own = row.get("topic", topic)
+                writer.write(own, _TYPE[own], _shot(own, header, row["values"]), at_ns)
         draft.replace(path)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", file=str(path)) from error
@@ -346,7 +349,7 @@ def write_data_set(
 
 
 def _shot(topic: str, header: Document, values: Sequence[Sequence[float]]) -> Document:
-    """Message of an image (rows: its width and height, then each corner), a profile or a pose."""
+    """Message of a profile, point, pose or image (rows: its width and height, each corner)."""
     if topic == IMAGE:
         layout = [("size and corners", len(values), 2 * len(values)), ("x, y", 2, 2)]
         dim = [{"label": label, "size": n, "stride": stride} for label, n, stride in layout]
@@ -362,6 +365,9 @@ def _shot(topic: str, header: Document, values: Sequence[Sequence[float]]) -> Do
             "point_step": _BYTES, "row_step": len(data) * _BYTES, "data": data.tobytes(),
             "is_dense": True,
         }  # fmt: skip
+    if topic == TRACKER_POINT:
+        place = dict(zip("xyz", values[0], strict=True))
+        return {"header": header | {"frame_id": "tracker"}, "point": place}
     x, y, z, *quat = values[0]
     turn = dict(zip("xyzw", quat, strict=True))
     return {"header": header, "pose": {"position": {"x": x, "y": y, "z": z}, "orientation": turn}}
@@ -402,10 +408,13 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
 
 
 def _values(recorded: BagMessage) -> Array:
-    """Points (n, 2) of a cloud; pose (1, 7); size and corners (1 + n, 2) of an image."""
+    """Points (n, 2) of a cloud; point (1, 3); pose (1, 7); size and corners (1 + n, 2), image."""
     if recorded.topic == IMAGE:
         return np.asarray(recorded.message.data, dtype=np.float64).reshape(-1, 2)
     if recorded.topic == PROFILE:
         return cloud_points(recorded.message)[:, [0, 2]]
+    if recorded.topic == TRACKER_POINT:
+        p = recorded.message.point
+        return np.array([[p.x, p.y, p.z]])
     p, o = recorded.message.pose.position, recorded.message.pose.orientation
     return np.array([[p.x, p.y, p.z, o.x, o.y, o.z, o.w]])

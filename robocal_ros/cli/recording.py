@@ -38,7 +38,7 @@ from robocal_ros.ground.samples import (
     TEMPERATURES,
     stamp_ns,
 )
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, SHOTS, TARGET_POSE
+from robocal_ros.hand_eye.data import IMAGE, PROFILE, SHOTS, TARGET_POSE, TRACKER_POINT
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_folders
 from robocal_ros.session.events import Command
@@ -64,6 +64,7 @@ TYPES = {  # of the messages that an input is read from, where others may look l
     PROFILE: ("sensor_msgs/msg/PointCloud2",),
     TARGET_POSE: ("geometry_msgs/msg/PoseStamped",),
     IMAGE: ("sensor_msgs/msg/Image",),
+    TRACKER_POINT: _POINTS,
     EVENTS: ("robocal_msgs/msg/SessionEvent",),
 }
 

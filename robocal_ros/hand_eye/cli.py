@@ -65,10 +65,11 @@ from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LaserTarget,
     SphereTarget,
+    TrackerTarget,
     read_target,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData
-from robocal_ros.hand_eye.touch_test import touch_test
+from robocal_ros.hand_eye.touch_test import TouchTest, compared, touch_test
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot, read_fields
 from robocal_ros.session.events import session_kind
@@ -289,7 +290,7 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> Las
         return SphereTarget(radius_mm * 1e-3)
     if target is not None:
         known = read_target(target)
-        if isinstance(known, BoardTarget) or KIND_OF[type(known)] != kind:
+        if isinstance(known, BoardTarget | TrackerTarget) or KIND_OF[type(known)] != kind:
             words = f"describes a {KIND_OF[type(known)]}, not a {kind}"
             raise InputError(words, file=str(target))
         return known
@@ -612,14 +613,17 @@ def _run_touch_test(args: argparse.Namespace) -> CliResult:
     scanned = read_scanned_points(args.poses, arm_of(args))
     touched = {} if args.touched is None else read_touched_points(args.touched)
     rows: list[Document] = []
+    tests: dict[str, TouchTest] = {}
     for path in args.result:
         mount = read_flange_mount(path)
         found = touch_test(mount, scanned, touched, args.limit_mm * 1e-3)
+        tests[str(path)] = found
         fields = read_fields(path, "mount file").values
         used = shots_of((fields.get("residual_mm") or {}).get("per_sample") or {})
         row = {"result": str(path), "shots": len(used) or None} | found.document()
         rows.append(row | {"verdict": verdict_document(found.verdict)})
-    document: Document = {"kind": POINT, "results": rows, "verdict": rows[-1]["verdict"]}
+    verdict = verdict_document(compared(tests))
+    document: Document = {"kind": POINT, "results": rows, "verdict": verdict}
     return CliResult(document, _show_touch_test)
 
 

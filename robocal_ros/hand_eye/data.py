@@ -23,12 +23,13 @@ from robocal_ros.ground.samples import (
     StandstillRule,
     image_array,
     joint_sample,
+    point_sample,
     pose_sample,
     stamp_ns,
 )
 from robocal_ros.hand_eye.camera_data import Mount, find_corners
 from robocal_ros.hand_eye.profiles import DEFAULT, SensorDescription, cloud_profile, profile_of
-from robocal_ros.hand_eye.targets import BoardTarget, target_of
+from robocal_ros.hand_eye.targets import ROLES, BoardTarget, target_of
 from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
@@ -36,14 +37,18 @@ from robocal_ros.session import events
 from robocal_ros.session.events import GAP_NS, Command, Ignored
 
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
-SHOTS = (PROFILE, TARGET_POSE, IMAGE)
+TRACKER_POINT = "tracker_point"
+SHOTS = (PROFILE, TARGET_POSE, IMAGE, TRACKER_POINT)
 MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
 AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
+FARTHEST_TRACKED_M = 100.0  # the longest trackers measure 80 m
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One profile (``PointCloud2``), target pose (``PoseStamped``) or image (``Image``).
+    """One profile (``PointCloud2``), target pose (``PoseStamped``), image (``Image``) or point.
+
+    A point (``PointStamped``) is the reflector of a laser tracker.
 
     ``sensor``: how a line laser tells its profiles.
     """
@@ -69,10 +74,11 @@ class Shot:
         """Of a profile its points (n, 2), x and z, m, sensor frame; of a target pose (1, 7).
 
         That is position, m, and quaternion x, y, z, w of the target in the sensor frame. Of an
-        image its grey pixels (h, w), 8 bits.
+        image its grey pixels (h, w), 8 bits. Of a point (1, 3), m, tracker frame.
 
         Raises as `cloud_profile`, and `InputError` when the message is no image that is read, a
-        value of a pose is not finite or its quaternion is not of unit length.
+        value of a pose or a point is not finite, a quaternion is not of unit length or a point is
+        farther away than trackers measure.
         """
         return self._values
 
@@ -88,9 +94,18 @@ def _pose(message: Any) -> Array:
     return np.array([[p.x, p.y, p.z, o.x, o.y, o.z, o.w]])
 
 
+def _tracked(message: Any) -> Array:
+    point = point_sample(message).position_m
+    distance = float(np.linalg.norm(point))
+    if distance > FARTHEST_TRACKED_M:
+        raise InputError(f"the reflector is {distance:.4g} m from the tracker: is it in mm?")
+    return point[None]
+
+
 _READERS: Mapping[str, Callable[[Any], NDArray[Any]]] = {
     TARGET_POSE: _pose,
     IMAGE: image_array,
+    TRACKER_POINT: _tracked,
 }
 
 
@@ -108,9 +123,10 @@ class ShotLog:
         joints, or there are no joints yet.
         """
         if shot.frame != frame:
+            whose = "tracker" if shot.topic == TRACKER_POINT else "sensor"
             raise InputError(
-                f"{shot.topic} in frame '{shot.frame}', the sensor's frame is '{frame}': set "
-                "sensor_frame, or connect the right sensor"
+                f"{shot.topic} in frame '{shot.frame}', the {whose}'s frame is '{frame}': set "
+                f"{whose}_frame, or connect the right {whose}"
             )
         if not joints_ns:
             raise InputError(f"{shot.topic} came before any joint states")
@@ -267,9 +283,14 @@ Feature = Literal["edge", "groove"]
 IN_HAND: Mount = "in-hand"
 TO_HAND: Mount = "to-hand"
 MOUNTS = (IN_HAND, TO_HAND)
-WITHOUT_FILE = ("line", "camera")  # solved with the sensor's place
+TRACKER, POINT = "tracker", "point"  # the target of a laser tracker's method; marked points
+SCAN = "scan"  # mark of what the sensor sees of a tracker's target
+WITHOUT_FILE = ("line", "camera", POINT)  # solved with the sensor's place, or touched
 FEATURES: tuple[Feature, ...] = ("edge", "groove")
-TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
+TOPIC_OF = {
+    "sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE,
+    TRACKER: TRACKER_POINT, POINT: PROFILE,
+}  # fmt: skip
 
 MOST_CAPTURES = 500
 MOST_HANDLE = 2**32 - 1
@@ -328,7 +349,8 @@ class HandEyeSample:
     """What was seen at one standstill.
 
     ``handle``: its name.
-    ``mark``: of a step target the mark that the laser plane lies through; else empty.
+    ``mark``: of a step target the mark that the laser plane lies through, of a tracker's one of
+    `ROLES` or `SCAN`, of marked points the name; else empty.
     ``stamp_ns``: of the shot.
     ``q`` (n,) mean of the joint readings at standstill, rad (prismatic: m).
     ``values``: see `Shot.read`; of an image `seen_corners`.
@@ -383,17 +405,27 @@ class DataSet:
         """The input that shows the target."""
         return IMAGE if "columns" in self.target else TOPIC_OF[self.kind]
 
+    def topic_of(self, mark: str) -> str:
+        """The input that shows what is captured with a mark."""
+        return PROFILE if self.kind == TRACKER and mark == SCAN else self.topic
+
     @property
     def waiting(self) -> Capture | None:
         """The capture that waits; None while there is none."""
         return next((c for c in self.captures.values() if c.code is Code.NONE), None)
 
     def require_mark(self, mark: str) -> None:
-        """Refuse a mark that the target does not have; only a step has any.
+        """Refuse a mark that the target does not have; marked points are named freely.
 
         Raises `InputError`, naming those that there are.
         """
+        if self.kind == POINT:
+            if not mark.strip():
+                raise InputError("mark is empty: name the point that the laser line passes")
+            return
         known = tuple(self.target.get("corners", ("",)))
+        if self.kind == TRACKER:
+            known = (*ROLES, SCAN)
         if mark not in known:
             words = ", ".join(known) if any(known) else "none"
             raise InputError(f"mark '{mark}' is none of the target's: {words}")
@@ -401,8 +433,11 @@ class DataSet:
     def put(self, sample: HandEyeSample) -> str:
         """Add a sample; says what it is. Raises `InputError` when it cannot be one of this set."""
         count = len(sample.values)
-        seen = f"{count} points" if self.topic == PROFILE else "the target's pose"
-        if self.topic == IMAGE:
+        topic = self.topic_of(sample.mark)
+        seen = f"{count} points" if topic == PROFILE else "the target's pose"
+        if topic == TRACKER_POINT:
+            seen = f"a point of {sample.mark}"
+        elif topic == IMAGE:
             self._require_image(sample.values)
             seen = f"{count - 1} corners"
         words = f"{seen}, sample {len(self.samples) + 1}"
@@ -443,7 +478,8 @@ class DataSet:
     def document(self) -> Document:
         """Plain values; `data_set_of` reads them back to the last bit.
 
-        ``thermal`` of a sample: index of its model among ``thermal_models``.
+        ``thermal`` of a sample: index of its model among ``thermal_models``; ``topic``: its input,
+        where that is not the set's.
         """
         models = list(dict.fromkeys(sample.thermal for sample in self.samples.values()))
         return {
@@ -461,6 +497,7 @@ class DataSet:
                     "q": sample.q.tolist(),
                     "values": sample.values.tolist(),
                 }
+                | ({} if (own := self.topic_of(sample.mark)) == self.topic else {"topic": own})
                 for _, sample in sorted(self.samples.items())
             ],
         }
@@ -500,7 +537,7 @@ def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
             if models[-1].model is not None:
                 arm_of(models[-1].model, arm)  # of this robot
         for row in rows:
-            sample = _sample_of(row, found.topic, arm, models)
+            sample = _sample_of(row, found.topic_of(str(row["mark"])), arm, models)
             if sample.handle in found.samples:
                 raise InputError(f"the data set has two samples of handle {sample.handle}")
             found.require_mark(sample.mark)
@@ -527,6 +564,8 @@ def _sample_of(
         profile_of(values, f"of sample {handle}")
     elif topic == IMAGE:
         values = values.reshape(-1, 2)
+    elif topic == TRACKER_POINT:
+        values = values.reshape(1, 3)
     elif values.shape != (1, 7) or abs(float(np.linalg.norm(values[0, 3:])) - 1.0) > UNIT:
         raise InputError(f"sample {handle} of the data set is no pose: {values.tolist()}")
     thermal = row["thermal"]

@@ -32,7 +32,8 @@ from robocal_ros.hand_eye.profiles import (
     columns_profile,
     file_profile,
 )
-from robocal_ros.hand_eye.tracker_data import FACES, Arc
+from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE
+from robocal_ros.hand_eye.tracker_data import Arc
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import (
@@ -60,9 +61,6 @@ Format = Literal["urdf", "xacro", "yaml", "static-transform"]
 
 PROFILE = ("x_mm", "z_mm")
 FILE_COLUMNS = ("profile", "image")
-ARCS = ("arc_a", "arc_b")
-SPHERE = "sphere"
-ROLES = (*ARCS, SPHERE, *FACES)
 BESIDE = ("sample", "stamp_s")  # for the user's own record
 FARTHEST_M = {"flange": 3.0, "base": 20.0}  # of a sensor from its parent
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 from sensor_msgs.msg import Image, JointState, PointCloud2
 
 from robocal_ros import __version__
@@ -23,6 +23,7 @@ from robocal_ros.hand_eye.data import (
     PROFILE,
     TARGET_POSE,
     TOPIC_OF,
+    TRACKER_POINT,
 )
 from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, sensor_of
 from robocal_ros.hand_eye.result import METHODS
@@ -57,6 +58,7 @@ INPUTS = {
     PROFILE: (PointCloud2, endpoints.SENSOR),
     TARGET_POSE: (PoseStamped, endpoints.SENSOR),
     IMAGE: (Image, endpoints.SENSOR),
+    TRACKER_POINT: (PointStamped, endpoints.SENSOR),
 }
 
 
@@ -104,6 +106,29 @@ SETTINGS = (
         "Largest expected error at the working distance",
         1e-3,
         100.0,
+    ),
+    Setting("tracker_frame", "tracker", "Name of a laser tracker's frame, in its messages"),
+    number(
+        "tracker_sigma_mm",
+        0.015,
+        "Noise of a coordinate of a tracker's point, at the distance of the robot",
+        1e-4,
+        10.0,
+    ),
+    number(
+        "joint_sigma_mm",
+        0.02,
+        "Error of a sliding joint that moves between the tracker's points",
+        0.0,
+        10.0,
+    ),
+    Setting(
+        "joint_sigma_deg",
+        0.0029,
+        "And of a turning one",
+        unit="deg",
+        low=0.0,
+        high=1.0,
     ),
     *pose_settings(
         "rough",
@@ -164,6 +189,10 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
         robot_sigma_rad=float(np.radians(settings["robot_sigma_deg"])) or None,
         limit_m=settings["limit_mm"] * 1e-3,
         sensor=sensor_of(settings["sensor"], settings["z_grows"]),
+        tracker_frame=settings["tracker_frame"],
+        tracker_sigma_m=settings["tracker_sigma_mm"] * 1e-3,
+        joint_sigma_m=settings["joint_sigma_mm"] * 1e-3,
+        joint_sigma_rad=float(np.radians(settings["joint_sigma_deg"])),
     )
 
 

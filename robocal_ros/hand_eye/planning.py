@@ -39,6 +39,7 @@ from robocal_ros.hand_eye.targets import (
     LaserTarget,
     SphereTarget,
     StepTarget,
+    TrackerTarget,
     target_of,
 )
 from robocal_ros.hand_eye.tasks import FEWEST_SPHERES, HandEyeData, SphereTask
@@ -682,7 +683,7 @@ def judged_plan(
     if centre is not None and data.kind != "sphere":
         raise InputError(f"center is a sphere's, not a {data.kind}'s: leave it out")
     target = target_of(data.target)
-    if data.kind == "camera" or isinstance(target, BoardTarget):
+    if data.kind == "camera" or isinstance(target, BoardTarget | TrackerTarget):
         raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
     given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
     noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)

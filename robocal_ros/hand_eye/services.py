@@ -5,7 +5,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -29,17 +29,20 @@ from robocal_ros.ground.samples import joint_sample
 from robocal_ros.hand_eye.data import (
     IN_HAND,
     MOST_POINTS,
+    POINT,
     TO_HAND,
+    TOPIC_OF,
     WITHOUT_FILE,
     DataSet,
     data_set_begun,
+    data_set_of,
 )
-from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.profiles import Profile
+from robocal_ros.hand_eye.session import HandEyeSession, sample_poses, solved
 from robocal_ros.hand_eye.targets import KIND_OF, read_target, target_document
-from robocal_ros.hand_eye.targets import KINDS as TARGET_FILE_KINDS
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
-from robocal_ros.history.history_records import Head
+from robocal_ros.history.history_records import Head, hand_eye_kind
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import StaticTf, pose_message, transform_message
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
@@ -47,18 +50,17 @@ from robocal_ros.ros.parameters import given_pose
 from robocal_ros.ros.session_node import SessionEvents, answer, twin
 from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.files import SensorMount
+
 AddOutput = Callable[[type, str, QoSProfile], Any]
 Ask = Callable[[Command], Awaitable[Outcome]]
 
 KEPT, SUFFIX = "hand_eye", ".mcap"
+RUNS, LONGEST_RUNS_S = 5, 3.0  # of a calibration whose time is taken
 ROUGH = "rough"  # the parameters that say about where the sensor sits
 
-TARGETS = {
-    HandEyeStatus.SPHERE: "sphere",
-    HandEyeStatus.STEP: "step",
-    HandEyeStatus.LINE: "line",
-    HandEyeStatus.CAMERA: "camera",
-}
+TARGETS = dict(enumerate(TOPIC_OF, 1))  # by the constants of HandEyeStatus
 MOUNTS = {HandEyeStatus.ON_FLANGE: IN_HAND, HandEyeStatus.FIXED: TO_HAND}
 NUMBER_OF = {name: number for number, name in TARGETS.items()}
 MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
@@ -212,6 +214,31 @@ class HandEyeFiles:
     def _folder(self) -> Path:
         return made_folder_beside(self._history.path, KEPT)
 
+    def solved_again_s(self, number: int) -> float:
+        """Processor time, s, of a calibration from its kept samples; -1 where they are not there.
+
+        The first run loads the estimator and does not count; the mean is of five at most.
+        """
+        from robocal_ros.bags.bags import read_data_set
+
+        session, inputs = self._session(), self._history.inputs(number)
+        kept = [path for path in self._folder().glob(f"{number}*{SUFFIX}") if path.is_file()]
+        method = self._history.get(number).method.rpartition(", ")[2]
+        try:
+            newest = max(kept, key=lambda path: path.stat().st_mtime)
+            data = data_set_of(read_data_set(newest, session.nominal), session.nominal)
+            samples = data.chosen(inputs["handle"].tolist())
+            if [one.stamp_ns for one in samples] != inputs["stamp_ns"].tolist():
+                return -1.0
+            runs = list[float]()
+            while len(runs) <= RUNS and sum(runs) < LONGEST_RUNS_S:
+                begun = time.thread_time()
+                solved(data, samples, session.nominal, method, session.config)
+                runs.append(time.thread_time() - begun)
+        except (RobocalError, OSError, ValueError):
+            return -1.0
+        return sum(runs[1:] or runs) / len(runs[1:] or runs)
+
     def _unsaved(self, data: DataSet | None) -> int:
         of, handles = self._saved
         samples = () if data is None else data.samples
@@ -296,7 +323,7 @@ def start_arguments(
         target = target_document(kind, read_target(Path(file)))
     else:
         target, found = {"kind": kind}, ""
-        if configured and kind in TARGET_FILE_KINDS:
+        if configured and kind in KIND_OF.values():
             described = read_target(Path(configured))
             found = KIND_OF[type(described)]
             if found == kind:
@@ -342,6 +369,9 @@ class HandEyeServices:
         add(CalibrateHandEye, "~/calibrate", self._calibrate)
         add(Trigger, "~/calibrate_trigger", twin(files.calibrate, CALIBRATE, {}))
         add(CheckHandEyePlan, "~/check_plan", self._check_plan)
+        from robocal_msgs.srv import VerifyHandEye
+
+        add(VerifyHandEye, "~/verify", self._verify)
 
     async def _start(self, request: Any, response: Any) -> Any:
         kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
@@ -447,6 +477,72 @@ class HandEyeServices:
         response.unseen = [f"pose {i + 1}: {why}" for i, why in sorted(found.unseen.items())]
         response.proposed = [pose_message(T) for T in found.proposed]
         return response
+
+    def _verify(self, request: Any, response: Any) -> Any:
+        """The touch test of what is in force, or of candidates side by side."""
+        from robocal_ros.estimation.edge import EdgeRule
+        from robocal_ros.hand_eye.touch_test import compared, scanned_points, touch_test
+
+        session, limit_m = self._session(), self._session().config.limit_m
+        data, numbers = session.data, list(request.candidates)
+        if data is None or data.kind != POINT:
+            raise ConflictError(
+                f"no marked points are open: call start with target {NUMBER_OF[POINT]}, and "
+                "capture each point from several poses"
+            )
+        if not numbers:
+            if (number := session.in_force.calibration_id) is None:
+                raise ConflictError("no calibration is in force: name candidates")
+            numbers = [number]
+        touched = _touched(request)
+        samples = data.chosen([])
+        scanned, rejected = scanned_points(
+            [one.mark for one in samples],
+            [Profile(one.values, str(one.handle)) for one in samples],
+            sample_poses(samples, session.nominal),
+            EdgeRule(session.config.sensor.towards, kind=data.feature),
+        )
+        found = {}
+        for number in dict.fromkeys(numbers):
+            test = touch_test(self._mount(number), scanned, touched, limit_m)
+            found[f"calibration {number}"] = test
+            accuracy, stability_m = test.accuracy, test.stability_m
+            response.judged.append(number)
+            response.samples.append(len(self._history.inputs(number)["handle"]))
+            response.solve_s.append(self._files.solved_again_s(number))
+            response.off_mean_mm.append(-1.0 if accuracy is None else accuracy.mean_m * 1e3)
+            response.off_max_mm.append(-1.0 if accuracy is None else accuracy.max_m * 1e3)
+            response.three_sigma_mm.append(-1.0 if stability_m is None else stability_m * 1e3)
+            response.statuses.append(int(test.verdict.code))
+        verdict = compared(found)
+        response.success, response.status = verdict.accept, int(verdict.code)
+        lost = "".join(f"; capture {name} shows no point: {why}" for name, why in rejected.items())
+        response.message = f"{verdict.reason}{lost}"
+        return response
+
+    def _mount(self, number: int) -> "SensorMount":
+        from robocal_ros.hand_eye.files import SensorMount
+        from robocal_ros.hand_eye.linearity import SensorLinearity
+
+        kind, config = self._history.get(number).kind, self._session().config
+        if kind != hand_eye_kind(config.sensor_frame):
+            raise InputError(f"calibration {number} is of {kind}, not of '{config.sensor_frame}'")
+        model = self._history.model(number)
+        if model["parent"] != config.flange_frame:
+            raise InputError(f"calibration {number} is of a sensor that stands beside the robot")
+        own = self._history.document(number).get("linearity")
+        linearity = None if own is None else SensorLinearity.of_document(own)
+        return SensorMount("flange", np.array(model["T_parent_sensor"]), linearity)
+
+
+def _touched(request: Any) -> dict[str, Array]:
+    """Places (3,) in base, m, by name."""
+    names, places = list(request.points), [np.array(_point(p)) for p in request.touched]
+    if len(names) != len(places) or len(set(names)) < len(names):
+        raise InputError(f"points {names} and {len(places)} touched places: give one for each name")
+    if not all(np.all(np.isfinite(place)) for place in places):
+        raise InputError("touched places must be finite, m")
+    return dict(zip(names, places, strict=True))
 
 
 def _parts(pose: Any) -> tuple[list[float], list[float]]:

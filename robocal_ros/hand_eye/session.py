@@ -33,9 +33,13 @@ from robocal_ros.hand_eye.data import (
     MOST_CAPTURES,
     MOST_HANDLE,
     MOUNTS,
+    POINT,
+    SCAN,
     SHOTS,
     TO_HAND,
     TOPIC_OF,
+    TRACKER,
+    TRACKER_POINT,
     WITHOUT_FILE,
     Capture,
     DataSet,
@@ -58,7 +62,7 @@ from robocal_ros.hand_eye.result import (
     Method,
     hand_eye_document,
 )
-from robocal_ros.hand_eye.targets import target_of
+from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE, target_of
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
@@ -91,6 +95,8 @@ class HandEyeConfig:
     `HandEyeSettings`.
     ``limit_m``: largest expected error at the working distance that is accepted.
     ``sensor``: how a line laser tells its profiles.
+    ``tracker_frame``: of the points of a laser tracker; ``tracker_sigma_m``: of a coordinate of
+    one; ``joint_sigma_rad``, ``joint_sigma_m``: of a joint that moves between its visits.
     """
 
     base_frame: str = "base"
@@ -102,6 +108,10 @@ class HandEyeConfig:
     robot_sigma_rad: float | None = None
     limit_m: float = 1e-3
     sensor: SensorDescription = DEFAULT
+    tracker_frame: str = "tracker"
+    tracker_sigma_m: float = 1.5e-5
+    joint_sigma_rad: float = float(np.radians(0.0029))
+    joint_sigma_m: float = 2e-5
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
@@ -164,9 +174,9 @@ def require_known(data: DataSet, method: str) -> None:
 
 
 def solved(
-    data: DataSet, samples: Samples, T_base_flange: Array, method: str, config: HandEyeConfig
+    data: DataSet, samples: Samples, nominal: SerialArm, method: str, config: HandEyeConfig
 ) -> HandEyeResult:
-    """Where the sensor sits; ``T_base_flange`` (k, 4, 4), m, of the samples.
+    """Where the sensor sits; the flange poses of the samples are by their thermal models.
 
     The estimators are loaded when they are first used: a node's start does not need them.
 
@@ -175,6 +185,11 @@ def solved(
     require_known(data, method)
     if not samples:
         raise TooFewSamplesError("nothing was captured yet: capture the target from several poses")
+    if data.kind == POINT:
+        raise InputError("marked points judge a sensor's place, they find none: call verify")
+    if data.kind == TRACKER:
+        return _solved_tracker(data, samples, nominal, cast(Method, method), config)
+    T_base_flange = sample_poses(samples, nominal)
     if data.kind == "camera":
         return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
     from robocal_ros.hand_eye.solve import solve_task
@@ -192,6 +207,52 @@ def solved(
     target: Any = target_of(data.target)
     task = task_of(target, data.feature, method == "classic", config.sensor.towards)
     return solve_task(task, shots, cast(Method, method), settings)
+
+
+def sample_poses(samples: Samples, nominal: SerialArm) -> Array:
+    """T_base_flange (k, 4, 4), m, each by the thermal model that was in force at its sample."""
+    q = np.array([sample.q for sample in samples]).reshape(-1, nominal.n)
+    return flange_poses(q, [sample.thermal for sample in samples], nominal)
+
+
+def _solved_tracker(
+    data: DataSet, samples: Samples, nominal: SerialArm, method: Method, config: HandEyeConfig
+) -> HandEyeResult:
+    """From the points of a laser tracker and a scan; rejected ones are named by their handles."""
+    from robocal_ros.hand_eye.tracker import solve_tracker
+    from robocal_ros.hand_eye.tracker_data import Arc, TrackerData, TrackerNoise
+
+    of = {mark: [one for one in samples if one.mark == mark] for mark in (*ROLES, SCAN)}
+    if missing := [mark for mark, own in of.items() if not own]:
+        raise TooFewSamplesError(f"nothing was captured with mark {', '.join(missing)}")
+    model = samples[0].thermal
+    if any(one.thermal.revision != model.revision for one in samples):
+        raise InputError(
+            "another thermal model came into force between the captures: what the tracker saw of "
+            "one robot does not fit the other's joints; start again"
+        )
+
+    def points(mark: str) -> Array:
+        return np.concatenate([one.values for one in of[mark]])
+
+    def readings(mark: str) -> Array:
+        return np.array([one.q for one in of[mark]])
+
+    first, second = (Arc(mark, readings(mark), points(mark)) for mark in ARCS)
+    measured = TrackerData(
+        arm=nominal if model.model is None else arm_of(model.model, nominal),
+        arcs=(first, second),
+        sphere=points(SPHERE),
+        faces=(points(FACES[0]), points(FACES[1])),
+        q=readings(SCAN),
+        profiles=[Profile(one.values, str(one.handle)) for one in of[SCAN]],
+    )
+    noise = TrackerNoise(config.tracker_sigma_m, config.joint_sigma_rad, config.joint_sigma_m)
+    target: Any = target_of(data.target)
+    result = solve_tracker(measured, target, noise, method, config.limit_m)
+    handles = {f"{m} {i}": str(one.handle) for m in ROLES for i, one in enumerate(of[m], 1)}
+    rejected = {handles.get(name, name): why for name, why in result.rejected.items()}
+    return replace(result, rejected=rejected)
 
 
 def _solved_camera(
@@ -258,8 +319,10 @@ class HandEyeSession(SessionBase):
         if isinstance(sample, Shot):
             if sample.stamp_ns <= 0:
                 raise InputError(f"{sample.topic} has no time stamp")
-            self._shots.add(sample, self.config.sensor_frame, self.newest_joints_ns)
-            waiting = self.data.waiting if self.data and self.data.topic == sample.topic else None
+            by_tracker = sample.topic == TRACKER_POINT
+            frame = self.config.tracker_frame if by_tracker else self.config.sensor_frame
+            self._shots.add(sample, frame, self.newest_joints_ns)
+            waiting = self._waits_for(sample.topic)
             if waiting is not None and sample.stamp_ns < waiting.from_ns:
                 early_s = (waiting.from_ns - sample.stamp_ns) * 1e-9
                 words = f"{sample.topic} is stamped {early_s:.3f} s before the call"
@@ -276,13 +339,20 @@ class HandEyeSession(SessionBase):
             self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
         self._look()
 
+    def _waits_for(self, topic: str) -> Capture | None:
+        """The capture that waits, if for this input."""
+        waiting = None if self.data is None else self.data.waiting
+        if self.data is None or waiting is None or self.data.topic_of(waiting.mark) != topic:
+            return None
+        return waiting
+
     def _watches_joints(self) -> bool:
         return self.data is not None and self.data.waiting is not None and self._found is None
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""
         super().refuse(kind, error)
-        if self.data is not None and kind == self.data.topic:
+        if self._waits_for(kind) is not None:
             self._why = error
 
     def _look(self) -> None:
@@ -290,7 +360,8 @@ class HandEyeSession(SessionBase):
         capture = None if self.data is None else self.data.waiting
         if self.data is None or capture is None or self._found is not None:
             return
-        for shot in self._shots.since(self.data.topic, max(capture.from_ns, self._seen_ns)):
+        topic = self.data.topic_of(capture.mark)
+        for shot in self._shots.since(topic, max(capture.from_ns, self._seen_ns)):
             try:
                 shot.read()
                 reading = self.stream.standstill(shot.stamp_ns, self.config.standstill)
@@ -306,7 +377,7 @@ class HandEyeSession(SessionBase):
             arguments = {"handle": capture.handle, "shot_ns": shot.stamp_ns}
             self._found = Command(events.SAMPLE, arguments, self.newest_joints_ns)
             return
-        self._found = self._timed_out(capture, self.data.topic)
+        self._found = self._timed_out(capture, topic)
 
     def _timed_out(self, capture: Capture, topic: str) -> Command | None:
         limit_s = self.config.capture_timeout_s
@@ -382,10 +453,11 @@ class HandEyeSession(SessionBase):
         # The earliest stamp of a shot that is newer than all that was received. No clock of ours is
         # asked: those of robot and sensor need not be set to it. Who gives a command for a call
         # gives the messages first that came before it.
-        after_ns = self.newest_ns.get(data.topic, -1) + 1
+        topic = data.topic_of(mark)
+        after_ns = self.newest_ns.get(topic, -1) + 1
         from_ns = int(command.arguments.get("from_ns", max(self.newest_joints_ns, after_ns)))
         self._handle, self._why, self._seen_ns, self._leap_ns = handle, None, 0, 0
-        words = f"waits for {data.topic} with the robot at standstill"
+        words = f"waits for {topic} with the robot at standstill"
         data.captures[handle] = Capture(handle, mark, from_ns, words)
         bound = {"handle": handle, "from_ns": from_ns}
         command = replace(command, arguments={**command.arguments, **bound})
@@ -394,7 +466,7 @@ class HandEyeSession(SessionBase):
     def _sample(self, command: Command, wall_ns: int) -> Outcome:
         data, at_ns = self._require_set(), int(command.arguments["shot_ns"])
         capture = self._require_waiting(data, command)
-        shot = self._shots.at(data.topic, at_ns)
+        shot = self._shots.at(data.topic_of(capture.mark), at_ns)
         mean = self.stream.resting(at_ns, self.config.standstill)
         if mean is None:
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
@@ -440,17 +512,15 @@ class HandEyeSession(SessionBase):
         data.candidate = 0
         samples = data.chosen([int(handle) for handle in arguments.get("handles", ())])
         method = str(arguments.get("method") or data.method)
-        q = np.array([sample.q for sample in samples]).reshape(-1, self.nominal.n)
-        T_base_flange = flange_poses(q, [sample.thermal for sample in samples], self.nominal)
         try:
-            result = solved(data, samples, T_base_flange, method, self.config)
+            result = solved(data, samples, self.nominal, method, self.config)
         except RankDeficientError as error:
             told = {"unobservable": list(error.directions)}
             return Outcome(command, error.code, str(error), told, samples=len(samples))
         except np.linalg.LinAlgError as error:
             raise ResidualError(f"no pose of the sensor explains the samples: {error}") from error
         document = hand_eye_document(result)
-        proposal = self._proposal(data, samples, T_base_flange, result, document, command, wall_ns)
+        proposal = self._proposal(data, samples, result, document, command, wall_ns)
         data.candidate = self._history.propose(proposal)
         verdict = result.verdict
         used = len({name.partition("/")[0] for name in result.samples})  # a step names corners
@@ -462,7 +532,6 @@ class HandEyeSession(SessionBase):
         self,
         data: DataSet,
         samples: Samples,
-        T_base_flange: Array,
         result: HandEyeResult,
         document: Document,
         command: Command,
@@ -482,10 +551,13 @@ class HandEyeSession(SessionBase):
             "mark": np.array([sample.mark for sample in samples]),
             "stamp_ns": np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
             "q": np.array([sample.q for sample in samples]),
-            "T_base_flange": T_base_flange,
+            "T_base_flange": sample_poses(samples, self.nominal),
             "count": np.array([len(sample.values) for sample in samples]),
-            data.topic: np.concatenate([sample.values for sample in samples]),
         }
+        topics = [data.topic_of(sample.mark) for sample in samples]
+        for topic in dict.fromkeys(topics):
+            own = [one.values for one, of in zip(samples, topics, strict=True) if of == topic]
+            inputs[topic] = np.concatenate(own)
         return Proposal(
             kind=self._kind,
             model_hash=self.nominal.model_hash,

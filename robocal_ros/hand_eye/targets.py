@@ -35,12 +35,15 @@ class TrackerTarget:
     height_sigma_m: float = 2e-5
 
 
+ARCS, SPHERE, FACES = ("arc_a", "arc_b"), "sphere", ("face_1", "face_2")
+ROLES = (*ARCS, SPHERE, *FACES)  # of what a tracker measures
+
 CornerKind = Literal["convex", "concave", "both"]
 FirstStep = Literal["lowest", "highest"]
 
 MACHINING_M = 1e-4 / 3.0  # one sigma of a target that is machined to 0.1 mm
 NEAR, FAR = "near", "far"
-KINDS = ("sphere", "step", "line", "board")
+KINDS = ("sphere", "step", "line", "board", "tracker")
 CORNERS: dict[str, CornerKind] = {"convex": "convex", "concave": "concave", "both": "both"}
 FIRST: dict[str, FirstStep] = {"lowest": "lowest", "highest": "highest"}
 SMALLEST_MM, LARGEST_MM = 1.0, 1000.0  # of a sphere's radius
@@ -167,13 +170,14 @@ class Staircase:
 
 
 LaserTarget = SphereTarget | StepTarget | LineTarget
-Target = LaserTarget | BoardTarget
+Target = LaserTarget | BoardTarget | TrackerTarget
 
 KIND_OF: dict[type[Target], str] = {
     SphereTarget: "sphere",
     StepTarget: "step",
     LineTarget: "line",
     BoardTarget: "camera",  # the target of a camera, of which more is known
+    TrackerTarget: "tracker",
 }
 SHAPE_OF = {
     "T_base_user": (4, 4), "edge_user": (3,), "point_base": (3,), "direction_base": (3,),
@@ -226,8 +230,8 @@ def _require_numbers(name: str, value: Any) -> None:
         shape = (max(len(value), 1),)
     if np.shape(value) != shape or not np.all(np.isfinite(np.asarray(value, dtype=np.float64))):
         raise ValueError(f"{name} must be finite numbers of shape {shape}")
-    if name == "radius_m" and not value > 0.0:
-        raise ValueError(f"radius_m is {value}")
+    if name.endswith("radius_m") and not value > 0.0:
+        raise ValueError(f"{name} is {value}")
 
 
 def _plain(value: Any) -> Any:
@@ -256,6 +260,8 @@ def read_target(path: Path) -> Target:
         return _board(top, path.parent)
     if kind == "step":
         return _step(top)
+    if kind == "tracker":
+        return _tracker(top)
     top.only("kind", "point_mm", "direction")
     point_mm = np.array(top.numbers("point_mm", 3))
     _check_near(top, "point_mm", point_mm)
@@ -391,8 +397,12 @@ def read_tracker_target(path: Path) -> TrackerTarget:
     Raises `InputError`, naming file and key, when it is not as docs/hand_eye_tracker.md says.
     """
     top = read_fields(path, "target file")
-    top.only("kind", "sphere_radius_mm", "reflector_radius_mm", "height_mm", "height_sigma_mm")
     top.choice("kind", ("tracker",))
+    return _tracker(top)
+
+
+def _tracker(top: Fields) -> TrackerTarget:
+    top.only("kind", "sphere_radius_mm", "reflector_radius_mm", "height_mm", "height_sigma_mm")
     target = TrackerTarget(_radius(top, "sphere_radius_mm"), _radius(top, "reflector_radius_mm"))
     if "height_mm" not in top.values:
         if "height_sigma_mm" in top.values:

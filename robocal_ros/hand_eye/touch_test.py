@@ -6,16 +6,18 @@ of scanned points from touched ones, stability three times the standard deviatio
 scanned from several poses, along the worst axis of the base.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from robocal_ros.estimation.assessment import ErrorSummary, Verdict, errors_document, summarise
+from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, InputError
+from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.hand_eye.files import ScannedPoints, SensorMount
+from robocal_ros.hand_eye.profiles import Profile
 
 FEWEST_SCANS = 3  # of a point, for a standard deviation
 
@@ -68,6 +70,32 @@ class TouchTest:
             "accuracy_mm": None if accuracy is None else errors_document(accuracy),
             "three_sigma_mm": None if stability_m is None else 1e3 * stability_m,
         }
+
+
+def scanned_points(
+    points: Sequence[str], profiles: Sequence[Profile], T_base_flange: Array, rule: EdgeRule
+) -> tuple[ScannedPoints, dict[str, str]]:
+    """Marked points of an edge or groove where the laser line crosses it, one in each profile.
+
+    ``points`` (m,): their names; ``T_base_flange`` (m, 4, 4). Beside them why a profile, by its
+    name, shows none.
+
+    Raises `TooFewSamplesError` when none shows one.
+    """
+    kept, seen = list[int](), list[Array]()
+    rejected: dict[str, str] = {}
+    for i, profile in enumerate(profiles):
+        try:
+            seen.append(fit_edge(profile.points, rule).point)
+            kept.append(i)
+        except RobocalError as error:
+            rejected[profile.name] = str(error)
+    if not kept:
+        why = "; ".join(f"{name}: {reason}" for name, reason in list(rejected.items())[:1])
+        raise TooFewSamplesError(f"no profile shows a marked point: {why or 'none was captured'}")
+    return ScannedPoints(
+        tuple(points[i] for i in kept), np.array(seen), T_base_flange[kept]
+    ), rejected
 
 
 def touch_test(
@@ -127,3 +155,30 @@ def _verdict(distance: Array, three_sigma: Array, limit_m: float) -> Verdict:
         words.append(f"allowed are {1e3 * limit_m:g} mm: the mount is not this one")
         return Verdict(Code.RESIDUAL_TOO_LARGE, "; ".join(words))
     return Verdict(Code.ACCEPT, "; ".join(words))
+
+
+def compared(found: Mapping[str, TouchTest]) -> Verdict:
+    """Of several places, by name, all judged by the same points: ACCEPT where each of them passed.
+
+    Else the code of the first that did not. The best is the one whose scans are nearest to what was
+    touched; where nothing was, the steadiest.
+    """
+    if len(found) == 1:
+        return next(iter(found.values())).verdict
+    passed = [name for name, test in found.items() if test.verdict.accept]
+    words = f"{len(passed)} of {len(found)} pass"
+    figures = {
+        name: test.accuracy.rms_m if test.accuracy else test.stability_m
+        for name, test in found.items()
+    }
+    known = {name: value for name, value in figures.items() if value is not None}
+    if known:
+        best = min(known, key=lambda name: known[name])
+        what = "off" if found[best].accuracy else "three sigma"
+        words += f"; best is {best}: {what} {1e3 * known[best]:.3f} mm"
+        words += " rms" if found[best].accuracy else ""
+    failed = next((test for name, test in found.items() if name not in passed), None)
+    if failed is None:
+        return Verdict(Code.ACCEPT, words)
+    others_named = ", ".join(name for name in found if name not in passed)
+    return Verdict(failed.verdict.code, f"{words}; not {others_named}: {failed.verdict.reason}")

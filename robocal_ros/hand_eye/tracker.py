@@ -29,9 +29,8 @@ from robocal_ros.hand_eye.result import (
     judge_classic,
     point_covariance,
 )
-from robocal_ros.hand_eye.targets import TrackerTarget
+from robocal_ros.hand_eye.targets import FACES, TrackerTarget
 from robocal_ros.hand_eye.tracker_data import (
-    FACES,
     MOVED,
     Axis,
     Cube,

@@ -21,10 +21,9 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.profiles import Profile
-from robocal_ros.hand_eye.targets import TrackerTarget
+from robocal_ros.hand_eye.targets import FACES, TrackerTarget
 from robocal_ros.kinematics import SerialArm
 
-FACES = ("face_1", "face_2")
 MOVED = 1e-3  # rad or m: a joint that changes by less stands still
 FEWEST_ARC_POINTS = 6
 FEWEST_FACE_POINTS = 4

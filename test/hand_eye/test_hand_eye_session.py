@@ -193,11 +193,11 @@ def test_classic_is_the_same_in_a_session_and_in_the_command(history):
         driver.robot.rest(0.7, lambda stamp_ns, points=points: profile(stamp_ns, points))
     samples = driver.session.data.chosen([])
     poses = ARM.fk(np.array([sample.q for sample in samples]))
-    found = solved(driver.session.data, samples, poses, "classic", driver.session.config)
+    found = solved(driver.session.data, samples, ARM, "classic", driver.session.config)
     names = tuple(str(sample.handle) for sample in samples)
     seen = [Profile(sample.values, name) for sample, name in zip(samples, names, strict=True)]
     task = task_of(None, "edge", classic=True, towards=True)
     by_command = solve_task(task, HandEyeData(names, poses, seen), "classic", HandEyeSettings())
     assert np.array_equal(found.T_flange_sensor, by_command.T_flange_sensor)
-    best = solved(driver.session.data, samples, poses, "best", driver.session.config)
+    best = solved(driver.session.data, samples, ARM, "best", driver.session.config)
     assert not np.array_equal(found.residual_m, best.residual_m)

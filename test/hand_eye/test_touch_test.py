@@ -118,7 +118,25 @@ def test_results_of_few_and_of_many_shots_side_by_side(tables):
     assert few["accuracy_mm"]["mean_mm"] > 3.0 * many["accuracy_mm"]["mean_mm"]
     assert many["accuracy_mm"]["n"] == 10
     assert many["three_sigma_mm"] < 3.0 * 1e3 * SIGMA_M * np.sqrt(chi2.ppf(0.9999, 4) / 4)
-    assert document["verdict"] == many["verdict"]
+    # Its own verdict: both pass or not, and which is the best.
+    passed = [row["verdict"]["accept"] for row in document["results"]]
+    assert document["verdict"]["accept"] == all(passed)
+    assert f"{sum(passed)} of 2 pass" in document["verdict"]["reason"]
+    assert f"best is {tables / 'of_15.json'}" in document["verdict"]["reason"]
+
+
+def test_one_that_fails_among_several_decides(tables):
+    """Turned by 2 mrad at 0.2 m: 0.4 mm, above a limit of 0.2; the other is within it."""
+    document = robocal_json(
+        "hand-eye.verify.json", "hand-eye", "verify", "--target-kind", "point",
+        "--result", tables / "of_5.json", "--result", tables / "of_15.json",
+        "--poses", tables / "scans.csv", "--touched", tables / "touched.csv",
+        "--limit-mm", "0.2",
+    )  # fmt: skip
+    few, many = document["results"]
+    assert many["verdict"]["accept"]
+    assert document["verdict"]["code"] == few["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
+    assert f"not {tables / 'of_5.json'}" in document["verdict"]["reason"]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
 from robocal_ros.hand_eye.profiles import SensorDescription
 from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.targets import SphereTarget, target_document
@@ -37,6 +37,7 @@ TYPE = {
     PROFILE: "sensor_msgs/msg/PointCloud2",
     TARGET_POSE: "geometry_msgs/msg/PoseStamped",
     IMAGE: "sensor_msgs/msg/Image",
+    TRACKER_POINT: "geometry_msgs/msg/PointStamped",
 }
 SPHERE = {
     "target": target_document("sphere", SphereTarget(RADIUS_M)),
@@ -116,6 +117,12 @@ def target_pose(stamp_ns: int, T: np.ndarray, frame: str = FRAME) -> Recorded:
     pose = {"position": {"x": x, "y": y, "z": z}, "orientation": turn}
     header = {"stamp": ros_time(stamp_ns), "frame_id": frame}
     return Recorded(TARGET_POSE, stamp_ns, {"header": header, "pose": pose})
+
+
+def tracker_point(stamp_ns: int, point: np.ndarray, frame: str = "tracker") -> Recorded:
+    header = {"stamp": ros_time(stamp_ns), "frame_id": frame}
+    fields = {"header": header, "point": dict(zip("xyz", point.tolist(), strict=True))}
+    return Recorded(TRACKER_POINT, stamp_ns, fields)
 
 
 class Robot:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 from hand_eye_driver import FRAME, LASER, RADIUS_M, Recorded, Robot, sphere_shots_of
 from rclpy.qos import HistoryPolicy, QoSProfile
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus
@@ -15,13 +15,16 @@ from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 
 from bench.hand_eye_files import write_target
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.ros import endpoints
 
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
-TYPES = {JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped, IMAGE: Image}
+TYPES = {
+    JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped, IMAGE: Image,
+    TRACKER_POINT: PointStamped,
+}  # fmt: skip
 NAME = "/hand_eye_node"
 SHOTS = list(sphere_shots_of(14))
 
