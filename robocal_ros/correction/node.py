@@ -38,6 +38,7 @@ from robocal_ros.correction.messages import (
     JointMessage,
     JointWire,
     PathMessage,
+    joint_names,
     read_message,
     tail_message,
 )
@@ -57,7 +58,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.driver import HardStopService, StatedController
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits
-from robocal_ros.motion.robot_watch import SpeedScaling
+from robocal_ros.motion.robot_watch import BEHIND_S, SpeedScaling
 from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, run
@@ -189,7 +190,7 @@ class JointCorrectionNode(RobotNode):
                     self._correct_goal,
                     self._goal_sent,
                     # the robot may still follow it, and is stopped by where it is
-                    lambda why: self._stop_by_readings(why, time.monotonic()),
+                    self._stop_lost,
                 )
             self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
@@ -348,6 +349,15 @@ class JointCorrectionNode(RobotNode):
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         taught = self._session.reading(command, now, age)
         self._put_out(STATES, message, command, taught)
+        if self._session.lateness(command.names).late_s > BEHIND_S:
+            self._catch_up()
+
+    def _catch_up(self) -> None:
+        """Take the newest of the robot that has arrived; of a busy node it waits."""
+        self.take_waiting(CONTROLLER)
+        self.take_waiting(
+            STATES, pick=lambda came: {joint_names(one): one for one in came}.values()
+        )
 
     def _on_path(self, message: PathMessage) -> None:
         if not message.points:  # what its sender means: a controller drops it and drives on
@@ -411,9 +421,10 @@ class JointCorrectionNode(RobotNode):
 
     def _stop(self, why: str) -> None:
         """Bring what this node moves to rest: by what was put out, else by where the robot is."""
-        now = time.monotonic()
         if self._shadow:
             return
+        self._catch_up()
+        now = time.monotonic()
         self._rescale(now)
         path, robot, sent = self._session.output.path, self._session.robot, True
         if path is not self._stop_path:  # the last stop was of another motion
@@ -439,6 +450,10 @@ class JointCorrectionNode(RobotNode):
         self._stop_path = self._session.output.path
         if self._stopping.under_way:
             self._stop_timer.reset()
+
+    def _stop_lost(self, why: str) -> bool:
+        self._catch_up()
+        return self._stop_by_readings(why, time.monotonic())
 
     def _stop_by_readings(self, why: str, now_s: float) -> bool:
         """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
@@ -480,6 +495,7 @@ class JointCorrectionNode(RobotNode):
 
     def _is_stopping(self) -> bool:
         """Let a stop go on; whether one is under way."""
+        self._catch_up()
         now = time.monotonic()
         if self._session.output.path is not self._stop_path:
             self._stopping.forget()
@@ -525,17 +541,18 @@ class JointCorrectionNode(RobotNode):
         now = time.monotonic()
         self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
         self._rescale(now)
-        self._controller.take(message, self._scaling, now)
+        stamp = stamp_ns(message.header.stamp)
+        age_s = (self.now_ns() - stamp) * 1e-9 if stamp else 0.0
+        self._controller.take(message, self._scaling, now, age_s)
         self._session.robot.held_s = self._controller.held_s
         position = np.array(message.reference.positions, dtype=np.float64)
-        stamp = stamp_ns(message.header.stamp)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
             self._scaling,
             now,
             np.array(message.reference.velocities, dtype=np.float64),
-            (self.now_ns() - stamp) * 1e-9 if stamp else 0.0,
+            max(age_s, self._controller.lateness.late_s),
         )
 
     def _on_scaling(self, message: Any) -> None:
@@ -610,7 +627,11 @@ class JointCorrectionNode(RobotNode):
 
     def _rivals(self) -> list[str]:
         now = time.monotonic()
-        return [words for s in (self._streams, self._paths) if (words := s.words(now))]
+        late = self._session.late(now), self._controller.lateness.words(now)
+        found = [self._streams.words(now), self._paths.words(now), *late]
+        for words in filter(None, late):
+            self.warn(STATES, words)
+        return [words for words in found if words]
 
     def _serial(self) -> str:
         """The robot's serial: as configured, else the model's, else the robot's name."""

@@ -180,21 +180,26 @@ class RobotState:
         now_s: float,
         age_s: float = 0.0,
         velocity: Array | None = None,
+        late_s: float = 0.0,
     ) -> None:
-        """Take readings (k,) that were ``age_s`` old by their stamp when they came."""
-        blind = self.blind(now_s)
+        """Take readings (k,) that were ``age_s`` old by their stamp when they came.
+
+        ``late_s``: they are so much older than when they came, whatever the clocks differ by.
+        """
+        at_s = now_s - late_s
+        blind = self.blind(at_s)
         if blind:
-            self._whole_s = now_s
-        self.measured[index], self._heard_s[index] = position, now_s
+            self._whole_s = at_s
+        self.measured[index], self._heard_s[index] = position, at_s
         self.velocity[index] = np.nan if velocity is None else velocity
         if age_s < -AHEAD_S:  # where the robot is cannot be told by a clock that is wrong
             age_s = np.inf
-        self._read_s[index] = now_s - max(age_s, 0.0)
-        while len(self._track) > 1 and self._track[1][0] <= now_s - RESPONSE_S:
+        self._read_s[index] = now_s - max(age_s, late_s)
+        while len(self._track) > 1 and self._track[1][0] <= at_s - RESPONSE_S:
             self._track.popleft()
-        self._track.append((now_s, self.measured.copy()))
+        self._track.append((at_s, self.measured.copy()))
         if blind or not (np.abs(self.measured - self._place) < self._near).all():
-            self._place, self._place_s = self.measured.copy(), now_s
+            self._place, self._place_s = self.measured.copy(), at_s
 
     def controller(
         self,
@@ -277,12 +282,17 @@ class RobotState:
         turns = np.where(self._continuous[index], np.round((q - position) / (2.0 * np.pi)), 0.0)
         return np.asarray(position + 2.0 * np.pi * turns)
 
-    # By when readings came, and gaps in them: what a stop is planned from and watched by, see
-    # `motion.stopping`.
+    # By when readings came, less what they were late, and gaps in them: what a stop is planned
+    # from and watched by, see `motion.stopping`.
+
+    @property
+    def heard_s(self) -> float:
+        """Of when the oldest joint's reading is."""
+        return float(self._heard_s.min())
 
     def blind(self, now_s: float) -> bool:
         """Whether a joint has not come for longer than the age limit."""
-        return not now_s - float(self._heard_s.min()) <= self._age_limit_s
+        return not now_s - self.heard_s <= self._age_limit_s
 
     def here(self, now_s: float) -> tuple[Array, Array] | None:
         """Joints and speeds (n,) now; None where they were not all read lately.
@@ -306,7 +316,7 @@ class RobotState:
             speed = np.where(np.abs(speed - slope) <= self._turned, speed, slope)
             beside = self._turned * max(float(times[-1] - times[0]), LEAST_TRACK_S)
             place = np.where(np.abs(read - middle) <= beside, read, middle)
-        here = place + speed * (now_s - float(np.min(self._heard_s)))
+        here = place + speed * (now_s - self.heard_s)
         return (here, speed) if np.isfinite(here).all() else None
 
     def _recent(self) -> tuple[Array, Array]:
@@ -360,14 +370,13 @@ class RobotState:
 
     def stood_s(self, now_s: float) -> float:
         """How long the joints were read in one place; 0 where they were not all read lately."""
-        return 0.0 if self.blind(now_s) else max(float(self._heard_s.min()) - self._place_s, 0.0)
+        return 0.0 if self.blind(now_s) else max(self.heard_s - self._place_s, 0.0)
 
     def follows(self, path: SentPath, now_s: float) -> bool:
         """Whether the robot is where a path has it, or was lately; True where it is not known."""
         if self.here(now_s) is None:
             return True
-        heard_s = float(np.min(self._heard_s))
-        times = np.linspace(heard_s - RESPONSE_S, now_s + LAG_S, FOLLOWED)
+        times = np.linspace(self.heard_s - RESPONSE_S, now_s + LAG_S, FOLLOWED)
         places = np.array([path.place(t) for t in times])
         near = self._near[path.index]
         q = self.unwrapped(path.index, self.measured[path.index], places[-1])

@@ -43,6 +43,7 @@ from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.motion.robot_watch import Lateness
 
 Answer = TypeVar("Answer")
 
@@ -103,6 +104,7 @@ class CorrectionSession:
         self._interrupted: tuple[SentPath | None, StreamPhase] = None, StreamPhase.IDLE
         # of each kind and source: the last stamp, ns, and when it came
         self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
+        self._lateness: dict[tuple[str, ...], Lateness] = {}
         self._refused: Counter[Reason] = Counter()
         self._last_refusal = ""
         self._overtaken = 0
@@ -318,19 +320,32 @@ class CorrectionSession:
         velocities of which one is not finite are none.
         """
         try:
+            stamp_s = state.stamp_ns * 1e-9
+            late_s = self.lateness(state.names).take(stamp_s, now_s, age_s)
             self._require_order("reading", state, state.names, now_s)
             index, column = self.robot.find(state)
             velocity = state.velocity
             if velocity is not None:
                 whole = len(velocity) == len(state.names)
                 velocity = velocity[column] if whole else None
-            self.robot.read(index, state.position[column], now_s, age_s, velocity)
+            self.robot.read(index, state.position[column], now_s, age_s, velocity, late_s)
             self.output.note_place(now_s)
             q, position, velocity = self._uncorrected(state, index, column, now_s)
         except RefusedError as error:
             raise self._count(error) from None
         self._taught[:] = q
         return JointCommand(state.names, position, velocity, state.stamp_ns, TAUGHT)
+
+    def lateness(self, names: tuple[str, ...]) -> Lateness:
+        """Of readings of these joints; many drivers share one."""
+        if names not in self._lateness and len(self._lateness) >= MOST_SOURCES:
+            names = ()
+        return self._lateness.setdefault(names, Lateness("joint states"))
+
+    def late(self, now_s: float) -> str:
+        """That readings come late, in words; empty where they do not."""
+        found = (each.words(now_s) for each in self._lateness.values())
+        return next(filter(None, found), "")
 
     def taught(
         self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float

@@ -50,7 +50,7 @@ from robocal_ros.motion.driver import (
     goal_tolerances,
     guarded,
 )
-from robocal_ros.motion.robot_watch import MotionReport
+from robocal_ros.motion.robot_watch import BEHIND_S, MotionReport
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.endpoints import ERROR, WARN, EndpointNode, Health, NotActiveError
@@ -314,10 +314,12 @@ class MaintenanceNode(RobotNode):
             return
         if fault := self._guard.fault_at(self.inputs[JOINTS].received - 1):
             raise InputError(fault)
-        self._motion.hear(message)
+        late_s = self._motion.hear(message)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
-        session.reading(sample.stamp_ns / NS, q, self._steady.now_s())
+        session.reading(sample.stamp_ns / NS, q, self._steady.now_s() - late_s)
+        if late_s > BEHIND_S:
+            self.take_waiting(JOINTS)
 
     def _take_gap(self, is_open: bool, echo: int | None) -> None:
         if self._session is not None:
@@ -441,8 +443,8 @@ class MaintenanceNode(RobotNode):
         health.values = values
         if status.state is MaintenanceState.FAULT:
             health.worsen(ERROR, status.fault)
-        if trouble := session.robot.trouble(self._steady.now_s()):
-            health.worsen(WARN, trouble)
+        for trouble in (session.robot.trouble(self._steady.now_s()), self._motion.late()):
+            health.worsen(WARN, trouble) if trouble else None
         faults = self._guard.fault, self._others.violation, self._sources.doubt(), status.trouble
         for words in filter(None, faults):
             health.worsen(ERROR, words)

@@ -46,7 +46,13 @@ from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import DrivingConfig, Housing, ToolBody
 from robocal_ros.motion.plan import LEAD_S, REACTION_S, JointPlan, MotionLimits
-from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport, RobotWatch, SpeedScaling
+from robocal_ros.motion.robot_watch import (
+    UNSAID_S,
+    Lateness,
+    MotionReport,
+    RobotWatch,
+    SpeedScaling,
+)
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS
 from robocal_ros.ros.endpoints import EndpointNode
@@ -67,21 +73,27 @@ class StatedController:
     """What a controller says of itself; times of a steady clock.
 
     ``velocities``: whether the hardware has any, as far as it is told. ``held_s``: when one that
-    pauses was last seen to give up a motion: its reference came to rest.
+    pauses was last seen to give up a motion: its reference came to rest. ``lateness``: of states,
+    which are gone by as of when they were, not of when they came.
     """
 
     def __init__(self) -> None:
+        self.lateness = Lateness("states of the controller")
         self._heard_s, self._ahead_s = -np.inf, np.inf
         self._stated: tuple[int, tuple[str, ...], Array, Array] | None = None
         self._paused_speed = 0.0  # of the reference, in a pause
         self.velocities, self.held_s = True, -np.inf
 
-    def take(self, message: Any, scaling: float | None, now_s: float) -> None:
-        """Take a ``JointTrajectoryControllerState``; ``scaling``: None where nobody tells it."""
+    def take(self, message: Any, scaling: float | None, now_s: float, *ages_s: float) -> None:
+        """Take a ``JointTrajectoryControllerState``; ``scaling``: None where nobody tells it.
+
+        ``ages_s``: its age by other clocks than ``now_s``, see `Lateness`.
+        """
         names, reference = tuple(message.joint_names), message.reference
         self._tells(np.array(message.feedback.velocities, dtype=np.float64), len(names))
         at_ns, before_s = stamp_ns(message.header.stamp), self._ahead_s
-        self._heard_s, self._ahead_s, self._stated = now_s, at_ns / NS - now_s, None
+        self._heard_s = now_s - self.lateness.take(at_ns / NS, now_s, *ages_s)
+        self._ahead_s, self._stated = at_ns / NS - self._heard_s, None
         if len(reference.positions) != len(names) or len(reference.velocities) != len(names):
             return  # a controller that holds may leave them out
         q, qd = np.array(reference.positions), np.array(reference.velocities)
@@ -382,8 +394,9 @@ class MotionDriver:
     of motions, see `goal_tolerances`; a stop has the controller's own, and is watched. ``robot``:
     where readings of the controller go now; None: nowhere. ``now``: their steady clock.
     ``hard_stop``: for a robot that does not obey.
-    ``action``: by which the next motion goes; empty: by the ``topic``. ``named`` is its name, where
-    it is given. ``way``: how the last motion went out, in words; empty before any.
+    ``lateness``: of joint states. ``action``: by which the next motion goes; empty: by the
+    ``topic``. ``named`` is its name, where it is given. ``way``: how the last motion went out, in
+    words; empty before any.
     """
 
     def __init__(
@@ -410,10 +423,11 @@ class MotionDriver:
         self.look()
         self.hard_stop = HardStopService(node, hard_stop)
         node.add_input(
-            JointTrajectoryControllerState, "controller_state", self._take_state, endpoints.SENSOR
+            JointTrajectoryControllerState, "controller_state", self._take_state, endpoints.NEWEST
         )
-        node.add_input(Float64, "speed_scaling", self._take_scaling, endpoints.SENSOR)
+        node.add_input(Float64, "speed_scaling", self._take_scaling, endpoints.NEWEST)
         self._controller = StatedController()
+        self.lateness = Lateness("joint states")
         self._scaling, self._rejected = SpeedScaling(), False
         self._first = self._newest = 0  # what was sent of the present motion, or stop
         self._stop: Callable[[], JointTrajectory] | None = None  # that may have been lost
@@ -546,7 +560,9 @@ class MotionDriver:
             self._index = {names: [names.index(name) for name in self._names]}
         index, count = self._index[names], len(names)
         self._scaling.controller(getattr(message, "speed_scaling_factor", np.nan), now_s)
-        self._controller.take(message, self._scaling.at(now_s), now_s)
+        age_s = (self._node.now_ns() - stamp_ns(message.header.stamp)) / NS
+        self._controller.take(message, self._scaling.at(now_s), now_s, age_s)
+        now_s -= self._controller.lateness.late_s
         if robot is not None:
             robot.held_s = self._controller.held_s
             if (scaling := self._scaling.at(now_s)) is not None:
@@ -558,9 +574,25 @@ class MotionDriver:
         if robot is not None:
             robot.controller(q, qd, now_s)
 
-    def hear(self, message: Any) -> None:
-        """Take a JointState, which may tell whether there are velocities."""
-        self._controller.hear(message.velocity, len(message.name), self._now())
+    def hear(self, message: Any) -> float:
+        """Take a JointState, which may tell whether there are velocities; how late it comes, s.
+
+        One without all joints is another driver's, and tells nothing of that.
+        """
+        now_s, at_ns = self._now(), stamp_ns(message.header.stamp)
+        self._controller.hear(message.velocity, len(message.name), now_s)
+        if not set(self._names) <= set(message.name):
+            return 0.0
+        return self.lateness.take(at_ns / NS, now_s, (self._node.now_ns() - at_ns) / NS)
+
+    def late(self) -> str:
+        """That readings of the robot are late, in words, which are logged too; else empty."""
+        now_s = self._now()
+        of = self.lateness, self._controller.lateness
+        words = "; ".join(filter(None, (each.words(now_s) for each in of)))
+        if words:
+            self._node.warn("joint_states", words)
+        return words
 
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()

@@ -55,6 +55,61 @@ class SpeedScaling:
         return None
 
 
+DRIFT = 6e-4  # two clocks run apart by less: NTP slews by 500 ppm, crystals err by 100
+USUAL_S = 0.01  # what is no later: stamps and messages scatter by as much
+BEHIND_S = (
+    0.03  # of readings that are later more wait: they are taken before anything is made of them
+)
+LATE_S, LATELY_S = 0.1, 5.0  # later ones are told of, for so long
+
+
+class Lateness:
+    """How late messages of one source come, by their own stamps; times of a steady clock.
+
+    Later than the quickest one: what the clocks differ by is in all of them alike. They are as late
+    as that clock has them which has them least, so that setting one of the receiver's makes nothing
+    late. A source's clock that is set back begins anew.
+
+    ``late_s``: the last message; 0 where that is usual, or it has no stamp.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self.late_s = 0.0
+        self._stamp_s = self._taken_s = -math.inf
+        self._least_s: tuple[float, ...] = ()
+        self._worst_s, self._worst_at_s = 0.0, -math.inf
+
+    def take(self, stamp_s: float, now_s: float, *ages_s: float) -> float:
+        """Take a message that comes now, of these ages by other clocks; how late it is."""
+        self.late_s = 0.0
+        if not stamp_s:
+            return 0.0
+        offsets = (now_s - stamp_s, *ages_s)
+        if stamp_s < self._stamp_s or len(offsets) != len(self._least_s):
+            self._least_s = offsets
+        drift_s = DRIFT * max(now_s - self._taken_s, 0.0)
+        least = tuple(map(min, offsets, [each + drift_s for each in self._least_s]))
+        self._stamp_s, self._taken_s, self._least_s = stamp_s, now_s, least
+        late_s = min(map(float.__sub__, offsets, least))
+        self.late_s = late_s if late_s > USUAL_S else 0.0
+        if self.late_s > LATE_S:
+            lately = now_s - self._worst_at_s <= LATELY_S
+            self._worst_s = max(self.late_s, self._worst_s * lately)
+            self._worst_at_s = now_s
+        return self.late_s
+
+    def words(self, now_s: float) -> str:
+        """That messages are late, and what to do; empty where none were lately."""
+        if now_s - self._worst_at_s > LATELY_S:
+            return ""
+        return (
+            f"{self._what} come up to {self._worst_s * 1e3:.0f} ms late, so that nobody knows "
+            "where the robot is now: this computer or its network has too much to do; give this "
+            "node a core of its own, end other processes, or let the controller publish less often"
+        )
+
+
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 LEAST, OLDEST_S = 5, 0.2  # of them, if not too old: one wild reading is outvoted
 REST_RAD = 1e-4  # a robot that rests moves less
@@ -131,7 +186,7 @@ class RobotWatch:
         self._away: tuple[float, float] | None = None  # by what is known now
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
-        """Take joints (n,); ``stamp_s`` on their own clock."""
+        """Take joints (n,) of the time ``now_s``; ``stamp_s`` on their own clock."""
         if self.scaling != 1.0 and not self.scaling_known(now_s):
             self._driven_s, self._at_s = self.driven_s(now_s), now_s
             self.scaling = self.unpaused = 1.0
@@ -199,6 +254,11 @@ class RobotWatch:
     def heard(self) -> bool:
         """Whether there is any reading."""
         return bool(self._readings)
+
+    @property
+    def heard_s(self) -> float:
+        """Of when the newest reading is."""
+        return self._heard_s
 
     @property
     def newest(self) -> tuple[float, Array] | None:
@@ -365,7 +425,8 @@ class RobotWatch:
         velocity = np.zeros(q.shape[1])
         if times[0] <= times[-1] - VELOCITY_S and not paused:
             velocity = self._slope(times, q)
-        here = np.median(q + (times[-1] - times)[:, None] * velocity, axis=0)
+        since_s = times[-1] - times + np.clip(now_s - self._heard_s, 0.0, OLDEST_S)
+        here = np.median(q + since_s[:, None] * velocity, axis=0)
         return here, np.clip(velocity / max(self.scaling, 0.1), -self._fastest, self._fastest)
 
     def blind(self, now_s: float) -> bool:
@@ -378,7 +439,9 @@ class RobotWatch:
 
     def seen_s(self, now_s: float) -> float:
         """What the robot is sent shows so late."""
-        return SEEN_S[self.reference(now_s) is not None] + self.silent_s
+        if self.reference(now_s) is not None:
+            return SEEN_S[True] + self.silent_s
+        return SEEN_S[False] + max(self.silent_s, now_s - self._heard_s)
 
     def to_stop(self, now_s: float) -> tuple[Array, Array]:
         """The `state` of a robot that did not obey a stop."""

@@ -32,11 +32,15 @@ class StoppedRobot(Protocol):
     ``scaling``: how fast the controller's clock runs, 0 to 1; ``held_s``: when a controller that
     pauses was last seen to give up a motion. The ``speed`` is that of the fastest joint in terms of
     the plan, NaN where it is not known; `to_stop` gives joints and velocities (n,), None where they
-    are not known. What the robot is sent shows ``seen_s`` late.
+    are not known. What the robot is sent shows ``seen_s`` late. ``heard_s``: of when its readings
+    are, however late they came.
     """
 
     scaling: float
     held_s: float
+
+    @property
+    def heard_s(self) -> float: ...  # noqa: D102
 
     def blind(self, now_s: float) -> bool: ...  # noqa: D102
     def at_rest(self, now_s: float) -> bool: ...  # noqa: D102
@@ -109,8 +113,8 @@ class WatchedStop:
             self._deaf = 0
             due = not blind and now_s - self._sent_s >= REPEAT_S
             return self._again(robot, now_s) if due else None
-        stood_s = now_s - max(self._sent_s, self._paused_s)
-        if not blind and stood_s > STANDS_S and robot.at_rest(now_s):
+        read_s = robot.heard_s - max(self._sent_s, self._paused_s)
+        if not blind and read_s > STANDS_S and robot.at_rest(now_s):
             self.under_way = False
             return None
         given_s = GIVE_UP_S + float(self._times[-1]) / max(robot.scaling, 0.1)

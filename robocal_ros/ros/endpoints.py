@@ -4,7 +4,7 @@
 import inspect
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -118,7 +118,8 @@ class EndpointNode(LifecycleNode):
         self._log_limit = LogLimit()
         self.async_group = ReentrantCallbackGroup()
         self._release: list[Callable[[], object]] = []
-        self._takers: list[tuple[Subscription, Callable[[Any], None]]] = []
+        self._takers: list[tuple[str, Subscription, Callable[[Any], None]]] = []
+        self._taking = False
 
     @property
     def state(self) -> str:
@@ -179,24 +180,35 @@ class EndpointNode(LifecycleNode):
             qos_overriding_options=overridable(),
             raw=raw,
         )
-        self._takers.append((subscription, receive))
+        self._takers.append((topic, subscription, receive))
         self._release.append(lambda: self.destroy_subscription(subscription))
         return subscription
 
-    def take_waiting(self) -> None:
+    def take_waiting(self, *topics: str, pick: Callable[[list[Any]], Iterable[Any]] = iter) -> None:
         """Take now what the inputs have received, in place of one message of each in its turn.
 
         So a call comes after all that was there before it, however long the node was busy.
+        ``topics``: of these inputs alone. ``pick``: which messages of an input are looked at.
+        Does nothing where it is called for one of the messages that it takes.
         """
-        for subscription, receive in self._takers:
-            for _ in range(MOST_WAITING):
-                with subscription.handle:
-                    taken = subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    )
-                if taken is None:
-                    break
-                receive(taken[0])
+        if self._taking:
+            return
+        self._taking = True
+        try:
+            for topic, subscription, receive in self._takers:
+                waiting: list[Any] = []
+                while (not topics or topic in topics) and len(waiting) < MOST_WAITING:
+                    with subscription.handle:
+                        taken = subscription.handle.take_message(
+                            subscription.msg_type, subscription.raw
+                        )
+                    if taken is None:
+                        break
+                    waiting.append(taken[0])
+                for message in pick(waiting):
+                    receive(message)
+        finally:
+            self._taking = False
 
     def add_output(self, kind: type, topic: str, profile: QoSProfile) -> Any:
         """Return a publisher that is silent while the node is inactive, until cleanup."""
@@ -276,15 +288,18 @@ class EndpointNode(LifecycleNode):
         while self._release:
             self._release.pop()()
 
+    def warn(self, where: str, words: str) -> None:
+        """Log a warning; not all of a flood."""
+        if self._log_limit.allows(where, words, time.monotonic()):
+            self.get_logger().warning(f"{where}: {words}")
+
     def _log(self, where: str, error: Exception) -> None:
         """Why something was refused, or a defect; not all of a flood."""
-        refused = isinstance(error, RobocalError)
-        words = str(error) if refused else "".join(traceback.format_exception(error))
-        if not self._log_limit.allows(where, words, time.monotonic()):
+        if isinstance(error, RobocalError):
+            self.warn(where, str(error))
             return
-        if refused:
-            self.get_logger().warning(f"{where}: {words}")
-        else:
+        words = "".join(traceback.format_exception(error))
+        if self._log_limit.allows(where, words, time.monotonic()):
             self.get_logger().error(f"{where}: a defect of this software, please report:\n{words}")
 
     def _require_active(self, name: str) -> None:

@@ -35,7 +35,7 @@ from robocal_ros.motion.plan import (
     ramp_of,
     start_near,
 )
-from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch
+from robocal_ros.motion.robot_watch import BEHIND_S, LeftPlanError, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
 from robocal_ros.tool.laser_frame import FEWEST_READINGS, JointPath
@@ -302,10 +302,14 @@ class ToolDriver:
         """Whether it moves the robot, or may at once."""
         return self.armed or self.phase is not DrivePhase.IDLE or self._stopping.under_way
 
-    def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
-        """Take joints (n,), in the arm's order, as they arrive; ``stamp_s`` on their own clock."""
-        self.robot.reading(stamp_s, q, now_s)
-        self.tick(now_s)
+    def reading(self, stamp_s: float, q: Array, now_s: float, late_s: float = 0.0) -> None:
+        """Take joints (n,), in the arm's order, as they arrive; ``stamp_s`` on their own clock.
+
+        After one that comes ``late_s`` late others wait, by which the robot is judged.
+        """
+        self.robot.reading(stamp_s, q, now_s - late_s)
+        if late_s <= BEHIND_S:
+            self.tick(now_s)
 
     def slept(self, for_s: float) -> None:
         """The host was suspended; call it before anything else with a time of afterwards."""

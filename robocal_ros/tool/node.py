@@ -420,6 +420,8 @@ class TcfNode(SessionNode[ToolSession]):
             motion.take(message) if kind == JOINTS else motion.beam(message)
         take_tool_message(session, kind, message)
         self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
+        if kind == JOINTS and motion is not None and motion.behind:
+            self.take_waiting(JOINTS)
         command = session.recognised()
         drives = motion is not None and motion.on_its_way()
         if command is not None and not (drives and command.name == TOOL_STEP):

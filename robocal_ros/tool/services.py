@@ -28,7 +28,7 @@ from robocal_ros.motion.driver import (
     require_limits,
 )
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.robot_watch import Gap, MotionReport
+from robocal_ros.motion.robot_watch import BEHIND_S, Gap, MotionReport
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.conversions import NS, StaticTf, header, pose_message, transform_message
 from robocal_ros.ros.endpoints import NotActiveError
@@ -316,13 +316,18 @@ class TcfMotion:
         """Take a JointState before the session does: what is odd stops the robot first."""
         if self.driver is None:
             return
-        self._motion.hear(message)
+        late_s = self._motion.hear(message)
         try:
             sample = joint_sample(message)
             q = sample.position[sample.order(self._names)]
         except InputError:  # the session counts it; without readings the robot stops
             return
-        self.driver.reading(sample.stamp_ns / NS, q, self._steady.now_s())
+        self.driver.reading(sample.stamp_ns / NS, q, self._steady.now_s(), late_s)
+
+    @property
+    def behind(self) -> bool:
+        """Whether the newest reading of the joints came late: others wait."""
+        return self._motion.lateness.late_s > BEHIND_S
 
     def beam(self, message: Any) -> None:
         """Take a BeamEvent, usable or not: on its way the tool breaks no beam."""
@@ -350,7 +355,9 @@ class TcfMotion:
 
     def trouble(self) -> str:
         """What is to be warned of; empty: nothing."""
-        return "" if self.driver is None else self.driver.trouble(self._steady.now_s())
+        if self.driver is None:
+            return ""
+        return self.driver.trouble(self._steady.now_s()) or self._motion.late()
 
     @property
     def fault(self) -> str:

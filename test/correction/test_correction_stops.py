@@ -185,6 +185,7 @@ class SimulatedController:
     ) -> None:
         self.now_s, self.losses, self.reports, self.scaling = 100.0, losses, reports, scaling
         self.period_s, self._read_s = period_s, -np.inf
+        self.late_s, self._read = 0.0, []  # readings come so late
         self.q, self.qd = HOME.copy(), SPEED.copy()
         self.state = RobotState(ARM, 0.2, np.full(6, 3.5e-4), ROBOT.max_velocity)
         limits = MotionLimits(stop_deceleration=ROBOT.max_acceleration)
@@ -237,8 +238,12 @@ class SimulatedController:
             "zero": np.zeros(6),
         }[self.reports]
         if self.now_s - self._read_s >= self.period_s - 1e-6:
-            self.state.read(np.arange(6), self.q.copy(), self.now_s, velocity=told)
+            self._read.append((self.now_s + self.late_s - 1e-9, self.q.copy(), told))
             self._read_s = self.now_s
+        while self._read and self._read[0][0] <= self.now_s:
+            _, q, told = self._read.pop(0)
+            everything, late_s = np.arange(6), self.late_s
+            self.state.read(everything, q, self.now_s, velocity=told, late_s=late_s)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / CYCLE_S)):
@@ -313,6 +318,20 @@ def test_readings_that_come_seldom_show_a_stop_late(period_s, reports, losses):
     robot.stops()
     assert not robot.qd.any()
     assert robot.stop.sent == losses + 1
+    assert not robot.stop.failed
+
+
+@pytest.mark.parametrize("reports", ["measured", "nan"])
+def test_late_readings_of_a_robot_that_stood_end_no_stop(reports):
+    """Finding: a stop that was lost was over, by readings of before the motion that it is of."""
+    robot = SimulatedController(losses=1, reports=reports)
+    robot.qd, robot.late_s = np.zeros(6), 0.15
+    robot.run(1.0)
+    robot.qd = SPEED.copy()
+    robot.run(0.04)
+    robot.stops()
+    assert robot.stop.sent >= 2
+    assert not robot.qd.any()
     assert not robot.stop.failed
 
 

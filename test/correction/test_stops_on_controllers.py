@@ -24,7 +24,7 @@ from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPIES, COPY_S, StatedController
 from robocal_ros.motion.plan import MotionLimits, stop
-from robocal_ros.motion.robot_watch import STANDS_S, RobotWatch
+from robocal_ros.motion.robot_watch import STANDS_S, Lateness, RobotWatch
 from robocal_ros.motion.stopping import WatchedStop
 
 SPEED = 1.0  # rad/s of the first joint
@@ -39,9 +39,12 @@ Q[:, 0], QD[:, 0] = HOME[0] - 2.0 + WAY, RATE
 
 
 class Driven:
-    """The session of a robot that drives, 2 s on its way, on a simulated controller."""
+    """The session of a robot that drives, 2 s on its way, on a simulated controller.
 
-    def __init__(self, velocities: bool, lag_s: float, told: bool) -> None:
+    What it tells since ``waits_s`` waits for a busy node, which now takes the first of it.
+    """
+
+    def __init__(self, velocities: bool, lag_s: float, told: bool, waits_s: float = 0.0) -> None:
         self.robot, self.velocities = Robot(), velocities
         robot = self.robot
         robot.at = Q[0]
@@ -52,20 +55,23 @@ class Driven:
         options = ControllerOptions(velocity_states=velocities)
         self.motion = JointMotion(Q[0], names=NAMES, options=options, lag_s=lag_s)
         self.motion.take(REACTION_S, Trajectory.of(NAMES, T[1:], Q[1:], QD[1:]))
-        self.stated = StatedController()
+        self.stated, self.lateness = StatedController(), Lateness("joint states")
         self.state = RobotState(NOMINAL, 0.2, np.full(6, 3.5e-4))
         self.state.told = lambda now: self.stated.reference(NAMES, now, 1.0)
-        for at_s in np.arange(1.8, 2.0, STATES_S):
+        for at_s in np.arange(1.6, 2.0 - waits_s, STATES_S):
             self.pass_to(float(at_s), told)
+        if waits_s:
+            self.pass_to(2.0 - waits_s, told, waits_s)
         robot.now = self.begin_s + 2.0
 
-    def pass_to(self, at_s: float, told: bool) -> None:
+    def pass_to(self, at_s: float, told: bool, waits_s: float = 0.0) -> None:
         """Until then; the controller tells its state, and the joints theirs."""
         self.motion.pass_to(at_s)
         q, qd, _, _, desired, rate, _ = self.motion.last()[1]
-        now_s, state = self.begin_s + at_s, np.floor(at_s / CYCLE_S + 1e-9) * CYCLE_S
+        now_s, state = self.begin_s + at_s + waits_s, np.floor(at_s / CYCLE_S + 1e-9) * CYCLE_S
+        late_s = self.lateness.take(at_s, now_s)
         speeds = qd if self.velocities else np.full(6, np.nan)
-        self.state.read(np.arange(6), q, now_s, velocity=speeds)
+        self.state.read(np.arange(6), q, now_s, velocity=speeds, late_s=late_s)
         if told:
             stamp = SimpleNamespace(sec=int(state), nanosec=round(state % 1 * 1e9))
             self.stated.take(
@@ -124,6 +130,16 @@ def by_readings(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
 STOPS = [by_its_path, by_readings]
 
 
+def even_change(velocities: bool) -> float:
+    """Of the command's speed in a cycle, by a stop that is not stamped.
+
+    A cubic makes up for a cycle. The first line, `FIRST_S` long, has the mean speed of its way,
+    less where it is a cycle late, the next one that of 10 ms further on.
+    """
+    lines = 0.5 * BRAKES * (FIRST_S + 0.01) + SPEED * CYCLE_S / FIRST_S
+    return 3.0 * BRAKES * CYCLE_S if velocities else lines
+
+
 @pytest.mark.parametrize("stop", STOPS)
 @pytest.mark.parametrize("velocities", [True, False])
 @pytest.mark.parametrize("lag_s", [0.0, LAG_S])
@@ -143,16 +159,34 @@ def test_a_stop_on_a_controller_that_tells_its_reference_never_steps(stop, veloc
 
 @pytest.mark.parametrize("stop", STOPS)
 @pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("waits_s", [0.04, 0.1, 0.2])
+def test_a_stop_by_what_a_busy_node_took_late_never_goes_back(waits_s, told, velocities, stop):
+    """Finding: states and readings that had waited looked new; the command stepped by 34 rad/s."""
+    speed, stamped = stop(Driven(velocities, 0.0, told, waits_s), 0.008)
+    assert stamped is (told and waits_s < 0.05)
+    assert np.min(speed) > -1e-3
+    assert np.max(np.abs(np.diff(speed))) < even_change(velocities)
+    assert speed[-1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_from_readings_that_are_too_late_no_stop_is_planned():
+    """It is stopped by its path, which it counts as following."""
+    driven = Driven(True, 0.0, True, waits_s=0.3)
+    session, now_s = driven.robot.session, driven.robot.now
+    assert driven.state.to_stop(now_s) is None
+    assert driven.state.follows(session.output.path, now_s)
+    assert driven.stated.reference(NAMES, now_s, 1.0) is None
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("velocities", [True, False])
 def test_without_its_reference_a_stop_steps_by_no_more_than_the_drives_lag(stop, velocities):
     """Any trajectory that is not stamped begins where the drives are: that is the controller's."""
     speed, stamped = stop(Driven(velocities, 0.0, told=False), 0.008)
     assert not stamped
     assert np.min(speed) > -1e-3
-    # A cubic makes up for a cycle. The first line, `FIRST_S` long, has the mean speed of its way,
-    # less where it is a cycle late, the next one that of 10 ms further on.
-    even = 3.0 * BRAKES * CYCLE_S
-    if not velocities:
-        even = 0.5 * BRAKES * (FIRST_S + 0.01) + SPEED * CYCLE_S / FIRST_S
+    even = even_change(velocities)
     assert np.max(np.abs(np.diff(speed))) < even
     speed, _ = stop(Driven(velocities, LAG_S, told=False), 0.008)
     back = SPEED * LAG_S / CYCLE_S  # in one cycle

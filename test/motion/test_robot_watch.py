@@ -12,7 +12,19 @@ from hypothesis import strategies as st
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing, MotionCell, ToolBody, joint_way
 from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, MotionLimits, stop
-from robocal_ros.motion.robot_watch import LEAST, PACE_S, TOLD_S, RobotWatch, SpeedScaling
+from robocal_ros.motion.robot_watch import (
+    LATE_S,
+    LATELY_S,
+    LEAST,
+    PACE_S,
+    STANDS_S,
+    TOLD_S,
+    USUAL_S,
+    Lateness,
+    RobotWatch,
+    SpeedScaling,
+)
+from robocal_ros.motion.stopping import WatchedStop
 
 ARM = load_robot("kr150_r3100")
 LIMITS = MotionLimits()
@@ -91,6 +103,89 @@ def test_a_span_that_rounding_ends_before_the_first_reading_is_not_there_yet():
     assert not watch.tells_speed(1.0)
     watch.reading(0.05, HOME, 0.05)
     assert watch.resting(span_s) == pytest.approx(HOME, abs=0.0)
+
+
+@given(share=st.floats(-1.0, 1.0), late_s=st.floats(0.0, 0.2))
+def test_a_stop_from_readings_that_came_late_begins_where_the_robot_is_now(
+    share: float, late_s: float
+) -> None:
+    """Finding: it began where the robot had been, and threw it back."""
+    times, q = steady(0.004, share * FASTEST)
+    found, velocity = seen(times, q).state(times[-1] + late_s, keeps=False)
+    assert np.allclose(found, HOME + late_s * share * FASTEST, rtol=0.0, atol=1e-9)
+    assert np.allclose(velocity, share * FASTEST, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.15, 0.25])
+def test_a_robot_stands_by_readings_from_after_its_stop_alone(late_s: float) -> None:
+    """Finding: readings of before a motion, which came late, ended the stop of that motion."""
+    watch, stopping = RobotWatch(ARM, DRIVING), WatchedStop(ARM, LIMITS)
+    times = 0.004 * np.arange(500)
+    for count, now_s in enumerate(times.tolist()):
+        watch.reading(now_s - late_s, HOME, now_s - late_s)
+        watch.silence.look(now_s)
+        if count == 250:
+            stopping.begin((HOME, 0.0 * HOME), now_s)
+        stopping.look(watch, now_s)
+        if stopping.under_way:
+            last_s = now_s
+    assert stopping.sent == 1
+    assert last_s == pytest.approx(times[250] + late_s + STANDS_S, abs=0.005)
+
+
+# ---- how late messages come ---------------------------------------------------------------------
+
+
+def latest(stamps: np.ndarray, came: np.ndarray, ages: np.ndarray | None = None) -> np.ndarray:
+    lateness, ages = Lateness("states"), came - stamps if ages is None else ages
+    rows = zip(stamps.tolist(), came.tolist(), ages.tolist(), strict=True)
+    return np.array([lateness.take(*row) for row in rows])
+
+
+@given(
+    offset_s=st.floats(-1e9, 1e9),
+    drift=st.floats(-6e-4, 6e-4),
+    jitter_s=st.floats(0.0, USUAL_S),
+)
+def test_clocks_that_differ_and_drift_make_nothing_late(
+    offset_s: float, drift: float, jitter_s: float
+) -> None:
+    came = 10.0 + np.arange(0.0, 3600.0, 1.0)
+    scatter = np.random.default_rng(0).uniform(0.0, jitter_s, len(came))
+    late = latest((1.0 + drift) * came + offset_s - scatter, came)
+    assert late.max() < 1e-6  # stamps of 1e9 s are kept to 0.1 us
+
+
+@pytest.mark.parametrize("lag_s", [0.05, 0.4, 3.0])
+def test_what_waits_for_a_busy_node_is_late_as_long_as_it_lasts(lag_s: float) -> None:
+    stamps = 1e9 + np.arange(0.0, 70.0, 0.004)
+    came = stamps - 1e9 + np.clip(stamps - 1e9 - 5.0, 0.0, lag_s)  # falls behind, and stays so
+    late = latest(stamps, came)
+    assert late[:1000].max() < 1e-6
+    assert late[-1] == pytest.approx(lag_s, abs=6e-4 * 70.0)
+
+
+@pytest.mark.parametrize("by_s", [-5.0, -0.5, -0.05, 0.05, 0.5, 5.0])
+@pytest.mark.parametrize("whose", ["sender", "receiver", "both"])
+def test_a_clock_that_is_set_makes_nothing_late(whose: str, by_s: float) -> None:
+    came = np.arange(0.0, 4.0, 0.004)
+    is_set = by_s * (came >= 2.0)
+    stamps = 1e9 + came + is_set * (whose != "receiver")
+    ages = 1e9 + came + is_set * (whose != "sender") - stamps
+    assert latest(stamps, came, ages).max() < 1e-6
+
+
+def test_late_messages_are_told_of_with_how_late_they_were():
+    lateness = Lateness("joint states")
+    assert lateness.take(0.0, 5.0) == 0.0  # no stamp
+    for at_s in (10.0, 10.1, 10.2):
+        lateness.take(at_s, at_s)
+    lateness.take(10.3, 10.3 + LATE_S)
+    assert lateness.words(10.5) == ""
+    lateness.take(10.4, 10.4 + 0.5)
+    lateness.take(11.0, 11.0)
+    assert "joint states come up to 500 ms late" in lateness.words(11.0)
+    assert lateness.words(11.0 + LATELY_S) == ""
 
 
 @given(late_s=st.floats(0.0, 0.12), lag_s=st.floats(0.0, 0.03), drives_s=st.floats(0.5, 0.9))

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who commands: several publishers at once, and publishers that vanish, over DDS."""
 
+import time
 from typing import Any
 
 import numpy as np
-from joint_correction_live import HOME, NODE, NOMINAL, Line, joints, trajectory
+from joint_correction_live import HOME, NAMES, NODE, NOMINAL, Line, joints, trajectory
 from rclpy.node import Node
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.ros import endpoints
+from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import WARN
 
 # A stream is a stream although other work on the machine may hold its messages up.
@@ -85,6 +86,31 @@ def test_a_stream_whose_publisher_vanishes_is_told(graph: Any) -> None:
     line.target()
     told: CorrectionStatus = line.told(commanders="")
     assert list(told.refused) == []
+
+
+def test_a_stop_while_readings_come_late_lies_ahead_on_the_way(graph: Any) -> None:
+    """Finding: the robot was taken to be where it had been, and was thrown back there."""
+    line = Line(graph, joint_state_age_s=0.2)
+
+    def reads(q: Any, late_s: float) -> None:
+        stamp = conversions.header(line.node.now_ns() - round(late_s * 1e9), "")
+        line.to_states.publish(joints(q, header=stamp))
+        graph.spin_for(0.02)
+
+    for _ in range(20):
+        reads(HOME, 0.0)
+    way = trajectory(np.stack([HOME, HOME + 0.9 * np.eye(6)[0]]), np.array([0.1, 5.0]))
+    line.to_path.publish(way)
+    line.wait(line.paths)
+    path, late_s = line.node._session.output.path, 0.4
+    graph.spin_for(late_s + 0.02)  # it falls behind
+    until_s = time.monotonic() + 2.0
+    while time.monotonic() < until_s:
+        reads(path.place(time.monotonic() - late_s), late_s)
+    line.to_path.publish(JointTrajectory(joint_names=NAMES))
+    stop = line.wait(line.paths, 2)
+    assert stop.points[0].positions[0] > path.place(time.monotonic())[0]
+    assert "joint states come up to" in line.report(WARN, "ms late").message
 
 
 def test_a_stranger_and_then_a_lease_are_both_told(graph: Any) -> None:

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import CalibrationQuality, GapOpen, MaintenanceStatus, ToolFrame
 from robocal_msgs.srv import Decide
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
@@ -17,7 +19,7 @@ from tool_driver import TAUGHT, TRUTH
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
-from robocal_ros.ros import endpoints
+from robocal_ros.ros import conversions, endpoints
 
 FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
 
@@ -67,6 +69,24 @@ def test_it_moves_nothing_without_a_heartbeat(graph: Any, tmp_path: Any) -> None
     refused = graph.call(SetBool, "/tcf_node/arm", data=True)
     assert not refused.success
     assert refused.message.startswith("gap_open was never heard")
+
+
+def test_joint_states_that_come_late_are_a_warning_to_who_moves_the_robot(
+    graph: Any, tmp_path: Any
+) -> None:
+    cell = LiveCell(graph, tmp_path, TRUTH, motion="trajectory")
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    message = JointState(name=list(cell.cell.arm.joint_names), position=[0.1] * 6)
+    for late_s in (0.0, 0.4):
+        graph.spin_for(late_s)  # it falls behind
+        for _ in range(10):
+            message.header = conversions.header(cell.node.now_ns() - round(late_s * 1e9), "")
+            cell.joints.publish(message)
+            graph.spin_for(0.01)
+    graph.spin_until(
+        lambda: any("joint states come up to" in s.message for m in said for s in m.status),
+        "it is told",
+    )
 
 
 @pytest.mark.parametrize("listens", [True, False])
