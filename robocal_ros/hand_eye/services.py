@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services of the hand-eye node: each call becomes a command to the session."""
 
+import os
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
@@ -239,6 +240,17 @@ class HandEyeFiles:
             return -1.0
         return sum(runs[1:] or runs) / len(runs[1:] or runs)
 
+    def _path(self, named: str) -> Path:
+        """The whole path of what a caller names, who does not see the node's folders."""
+        if not named:
+            raise InputError("path is empty: name the file")
+        try:
+            given = Path(named).expanduser()
+        except RuntimeError as error:
+            raise InputError(f"{error}: name the whole path", file=named) from error
+        whole = given if given.is_absolute() else self._folder() / given
+        return Path(os.path.normpath(whole))  # links in it are its owner's
+
     def _unsaved(self, data: DataSet | None) -> int:
         of, handles = self._saved
         samples = () if data is None else data.samples
@@ -251,7 +263,7 @@ class HandEyeFiles:
     async def _load(self, request: Any, response: Any) -> Any:
         from robocal_ros.bags.bags import read_data_set
 
-        path = _path(request)
+        path = self._path(request.path)
         document = read_data_set(path, self._session().nominal)
         outcome = await self.begin(Command(LOAD, {"path": str(path), "set": document}))
         if outcome.done:
@@ -260,7 +272,13 @@ class HandEyeFiles:
         return answer(response, outcome)
 
     def _save(self, request: Any, response: Any) -> Any:
-        response.samples, response.message = self._write(_path(request))
+        path, folder = self._path(request.path), self._folder()
+        if not path.is_relative_to(folder):
+            raise InputError(
+                f"data sets are written below {folder} alone: name the file without a folder",
+                file=request.path,
+            )
+        response.samples, response.message = self._write(path)
         response.success, response.status = True, int(Code.ACCEPT)
         return response
 
@@ -291,16 +309,6 @@ class HandEyeFiles:
         if points > MOST_POINTS:
             words += f"; {points} points are too many to load (at most {MOST_POINTS})"
         return len(rows), words
-
-
-def _path(request: Any) -> Path:
-    """The whole path: the caller does not see the node's working folder."""
-    if not request.path:
-        raise InputError("path is empty: name the file")
-    try:
-        return Path(request.path).expanduser().absolute()
-    except RuntimeError as error:
-        raise InputError(f"{error}: name the whole path", file=request.path) from error
 
 
 def start_arguments(

@@ -22,7 +22,7 @@ from robocal_ros.maintenance.accuracy import AcceptBounds, CycleResult, Maintena
 from robocal_ros.maintenance.session import MaintenanceSession, Status
 from robocal_ros.motion.driver import CONTROLLER, MOTION, driving_config, require_limits
 from robocal_ros.ros import conversions, endpoints
-from robocal_ros.ros.conversions import MM, joint_poses, joints_of
+from robocal_ros.ros.conversions import MM, NO_POSES, joint_poses, joints_of
 from robocal_ros.ros.endpoints import (
     DeferredActionServer,
     EndpointNode,
@@ -383,11 +383,13 @@ SETTINGS = (
         -1e5,
         1e5,
     ),
-    Setting(
+    number(
         "measuring_poses_deg",
-        [""],
-        "Measuring poses in their order, each a text of numbers as home_deg; none: no thermal "
+        NO_POSES,
+        "Measuring poses, one after the other, each as home_deg; at its default: no thermal "
         "measurement",
+        -1e5,
+        1e5,
     ),
     Setting(
         "laser",

@@ -235,18 +235,22 @@ def joints_of(arm: SerialArm, numbers: Sequence[float], name: str) -> Array:
     return np.where(arm.prismatic, given * MM, np.radians(given))
 
 
-def joint_poses(arm: SerialArm, texts: Sequence[str], name: str) -> Array:
-    """Poses (m, n) in rad (prismatic: m) of a parameter ``name``, a text for each; m may be 0.
+NO_POSES = [0.0]  # ROS knows no empty array of numbers: it would have no type
 
-    Raises `InputError` when a text is no list of a number for each joint.
+
+def joint_poses(arm: SerialArm, numbers: Sequence[float], name: str) -> Array:
+    """Poses (m, n) in rad (prismatic: m) of a parameter ``name``, all in one array, deg (mm).
+
+    None (0, n) of `NO_POSES`. Raises `InputError` when it has not a number for each joint.
     """
-    poses = []
-    for i, text in enumerate(texts, start=1):
-        try:
-            numbers = [float(word) for word in text.replace(",", " ").split()]
-        except ValueError as error:
-            raise InputError(f"{name}, pose {i}: '{text}' is no list of numbers") from error
-        poses.append(joints_of(arm, numbers, f"{name}, pose {i}"))
+    given = [] if list(numbers) == NO_POSES else list(numbers)
+    if len(given) % arm.n:
+        raise InputError(
+            f"{name} has {len(given)} numbers: {arm.name} has {arm.n} joints, one pose after the "
+            f"other has a multiple of {arm.n}"
+        )
+    rows = [given[i : i + arm.n] for i in range(0, len(given), arm.n)]
+    poses = [joints_of(arm, row, f"{name}, pose {i}") for i, row in enumerate(rows, start=1)]
     return np.array(poses, dtype=np.float64).reshape(-1, arm.n)
 
 

@@ -415,7 +415,7 @@ class FrameWatch:
         if others:
             return (
                 f"tf shows '{self._child}' below '{', '.join(others)}' already, it cannot stand "
-                f"below '{parent}' too: stop the node that publishes it, or rename sensor_frame"
+                f"below '{parent}' too: stop the node that publishes it, or rename one of them"
             )
         if parent not in self._seen:
             return ""

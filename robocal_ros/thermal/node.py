@@ -41,7 +41,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import run
-from robocal_ros.ros.conversions import MM, joint_poses, transform_message
+from robocal_ros.ros.conversions import MM, NO_POSES, joint_poses, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health, NotActiveError
 from robocal_ros.ros.parameters import (
     ORIGIN,
@@ -87,7 +87,7 @@ from robocal_ros.thermal.drift_following import (
 )
 from robocal_ros.thermal.identification import require_parameters
 from robocal_ros.thermal.proposing import SENSOR
-from robocal_ros.thermal.services import MeasuringRobotTopics
+from robocal_ros.thermal.services import MeasuringRobotTopics, SensorOnTf
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
 
 ACCURACY_S = 1.0
@@ -164,11 +164,13 @@ SETTINGS = (
         60.0,
         7 * 86400.0,
     ),
-    Setting(
+    number(
         "work_poses_deg",
-        [""],
-        "Working poses at which accuracy is judged, each a text of numbers, one for each joint "
-        "(sliding joint: mm); none: throughout the joint limits",
+        NO_POSES,
+        "Working poses at which accuracy is judged, one after the other, a number for each joint "
+        "(sliding joint: mm); at its default: throughout the joint limits",
+        -1e5,
+        1e5,
     ),
     number(
         "tip_mm",
@@ -425,15 +427,15 @@ class ThermalOutputs:
             )
         )
 
-    def sensor(self, T_base_sensor: Array, frame: str, stamp_ns: int) -> None:
-        """Say where the placed sensor stands."""
-        self._sensor.publish(
-            TransformStamped(
-                header=conversions.header(stamp_ns, self._base_frame),
-                child_frame_id=frame,
-                transform=conversions.transform_message(T_base_sensor),
-            )
+    def sensor(self, T_base_sensor: Array, frame: str, stamp_ns: int) -> TransformStamped:
+        """Say where the placed sensor stands; what was said."""
+        message = TransformStamped(
+            header=conversions.header(stamp_ns, self._base_frame),
+            child_frame_id=frame,
+            transform=conversions.transform_message(T_base_sensor),
         )
+        self._sensor.publish(message)
+        return message
 
 
 class ThermalNode(SessionNode[ThermalSession]):
@@ -457,6 +459,7 @@ class ThermalNode(SessionNode[ThermalSession]):
             self.robot.file_hash,
             settings["base_frame"],
         )
+        self._on_tf = SensorOnTf(self)
         self._data_clock = DataClock()
         ask = self._desk.ask
         ThermalServices(self.add_service, ask, history, self._nominal, settings, self._prior)
@@ -476,6 +479,11 @@ class ThermalNode(SessionNode[ThermalSession]):
         self._shown: tuple[Any, ...] = ()
         self.show_in_force()
 
+    def deactivate(self) -> None:
+        """End the session."""
+        self._on_tf.close()
+        super().deactivate()
+
     def take(self, session: ThermalSession, kind: str, message: Any) -> None:
         """Give a message of the input ``kind`` to the session."""
         take_message(session, kind, message)
@@ -490,7 +498,8 @@ class ThermalNode(SessionNode[ThermalSession]):
         return self._session.expected_drift()
 
     def polled(self, session: ThermalSession) -> None:
-        """End a cycle that is overdue."""
+        """End a cycle that is overdue; look at who else puts the sensor's frame onto tf."""
+        self._on_tf.poll()
         if (command := session.overdue()) is not None:
             self._desk.ask(command)
 
@@ -527,7 +536,8 @@ class ThermalNode(SessionNode[ThermalSession]):
         if sensor.model is not None and sensor.calibration_id and self._shown[3:] != shown[3:]:
             T_base_sensor = frames.invert(placed_of(sensor.model).T_sensor_base)
             stamp = history.get(sensor.calibration_id).stamp_ns
-            self._outputs.sensor(T_base_sensor, sensor.model["frame"], stamp)
+            shown_as = self._outputs.sensor(T_base_sensor, sensor.model["frame"], stamp)
+            self._on_tf.show(shown_as, T_base_sensor)
         self._shown = shown
         self._outputs.events.tell(configuration(session, self._topics), None)
 
@@ -555,6 +565,8 @@ class ThermalNode(SessionNode[ThermalSession]):
         lost = [topic for topic, count in self.inputs.items() if count.lost]
         if lost:
             health.worsen(WARN, f"messages lost on {', '.join(lost)}")
+        if taken := self._on_tf.fault():
+            health.worsen(WARN, taken)
 
 
 def main() -> None:

@@ -1,23 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of a measuring robot: where the flange truly is, and what its sensor sees in base."""
+"""Topics of a measuring robot: where the flange truly is, and what its sensor sees in base.
+
+And the frame of a placed sensor, on tf.
+"""
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import Point, PointStamped, PoseStamped
+from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
 from sensor_msgs.msg import PointCloud2
 
 from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.conversions import cloud, header, pose_message
+from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message
 from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.graph import FrameWatch
 from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, shot_of
 from robocal_ros.thermal.session import ThermalSession
 
 POINT, CLOUD = "point", "cloud"
 UNPLACED = "the sensor is not placed: capture the cold reference"
+
+
+class SensorOnTf:
+    """The placed sensor's frame on ``/tf_static``, unless another node puts it onto tf."""
+
+    def __init__(self, node: EndpointNode) -> None:
+        self._node, self._tf = node, StaticTf(node.add_output)
+        self._published: list[TransformStamped] = []
+        self._placed: tuple[TransformStamped, Array] | None = None
+        self._frames: FrameWatch | None = None
+
+    def show(self, message: TransformStamped, T_parent_sensor: Array) -> None:
+        """Publish it once it is known that nobody else does."""
+        if self._placed is None or self._placed[0].child_frame_id != message.child_frame_id:
+            self.close()
+            self._frames = FrameWatch(self._node, message.child_frame_id, self._published)
+        self._placed = message, T_parent_sensor
+        self.poll()
+
+    def poll(self) -> None:
+        """Look at what others put onto tf."""
+        if self._placed is None or self._frames is None:
+            return
+        self._frames.look()
+        self._frames.tick()
+        message, _ = self._placed
+        if self._frames.settled and message not in self._published[-1:] and not self.fault():
+            self._published.append(message)
+            self._tf.publish([message])
+
+    def fault(self) -> str:
+        """Why the frame cannot stand on tf; empty when it can, or when there is none."""
+        if self._placed is None or self._frames is None:
+            return ""
+        message, T_parent_sensor = self._placed
+        return self._tf.missing or self._frames.conflict(message.header.frame_id, T_parent_sensor)
+
+    def close(self) -> None:
+        """Listen no more."""
+        if self._frames is not None:
+            self._frames.close()
+        self._placed = self._frames = None
 
 
 class MeasuringRobotTopics:

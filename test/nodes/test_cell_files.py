@@ -105,5 +105,5 @@ def test_tool_and_poses_are_the_cells():
     assert given["spin_deg"] == pytest.approx(SPIN_RAD * 57.29577951308232)
     given = sections["/**/maintenance_node"]["ros__parameters"]
     assert given["home_deg"] == pytest.approx(np.degrees(poses("home")[0]).tolist())
-    taught = [[float(word) for word in text.split()] for text in given["measuring_poses_deg"]]
-    assert np.array(taught) == pytest.approx(np.degrees(poses("cycle")))
+    taught = np.array(given["measuring_poses_deg"]).reshape(-1, 6)
+    assert taught == pytest.approx(np.degrees(poses("cycle")))

@@ -60,8 +60,8 @@ def test_a_plc_saves_without_a_name(graph: Any, sensor: LiveSensor) -> None:
     assert (nothing.success, nothing.message[:10]) == (False, "0 CONFLICT")
 
 
-def test_what_is_dropped_unsaved_is_told(graph: Any, sensor: LiveSensor, tmp_path: Path) -> None:
-    path = str(tmp_path / "set.mcap")
+def test_what_is_dropped_unsaved_is_told(graph: Any, sensor: LiveSensor) -> None:
+    path = "set.mcap"
     assert graph.call(HandEyeFile, f"{NAME}/save", path=path).success
     sensor.capture(SHOTS[7][1])
     dropped = "1 samples were dropped that were not saved"
@@ -88,18 +88,26 @@ def test_a_disk_that_fails_is_told_and_the_candidate_stays(graph: Any, sensor: L
     assert "8 samples were dropped" in sensor.start().message
 
 
-def test_a_path_is_told_in_full(
+def test_a_caller_writes_below_the_folder_of_data_sets_alone(
     graph: Any, sensor: LiveSensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    (tmp_path / "home").mkdir()
-    for given, path in (("a.mcap", tmp_path / "a.mcap"), ("~/a.mcap", tmp_path / "home/a.mcap")):
-        saved = graph.call(HandEyeFile, f"{NAME}/save", path=given)
-        assert (saved.success, saved.message) == (True, f"8 samples saved in {path}")
-        assert path.is_file()
+    monkeypatch.setenv("HOME", str(tmp_path))
+    folder = graph.state / "K7" / "hand_eye"
+    path = folder / "a.mcap"
+    saved = graph.call(HandEyeFile, f"{NAME}/save", path="a.mcap")
+    assert (saved.success, saved.message) == (True, f"8 samples saved in {path}")
+    assert path.is_file()
+    before = sorted(tmp_path.rglob("*"))
+    for given in (str(tmp_path / "b.mcap"), "~/b.mcap", "../b.mcap", f"{folder}/../../b.mcap"):
+        refused = graph.call(HandEyeFile, f"{NAME}/save", path=given)
+        assert (refused.success, refused.status) == (False, Code.BAD_INPUT)
+        assert f"are written below {folder} alone" in refused.message
+    assert sorted(tmp_path.rglob("*")) == before
+    (tmp_path / "c.mcap").write_bytes(path.read_bytes())
+    for given, whole in (("a.mcap", path), ("~/c.mcap", tmp_path / "c.mcap")):
         loaded = graph.call(HandEyeFile, f"{NAME}/load", path=given)
-        assert (loaded.success, loaded.message.endswith(str(path))) == (True, True)
+        assert (loaded.success, loaded.message.endswith(str(whole))) == (True, True)
     nobody = graph.call(HandEyeFile, f"{NAME}/save", path="~nobody-of-this-name/a.mcap")
     assert (nobody.success, nobody.status) == (False, Code.BAD_INPUT)
     assert "name the whole path" in nobody.message

@@ -59,7 +59,7 @@ def test_a_camera_is_calibrated_from_images_and_replayed_to_the_last_bit(
     T = frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
     away = (T - board_set().cell.camera.matrices()[0]) @ [0.0, 0.0, 0.55, 1.0]
     assert np.linalg.norm(away[:3]) < 2e-3  # at the board; the limit of what is accepted
-    path = str(tmp_path / "set.mcap")
+    path = str(graph.state / "K7" / "hand_eye" / "set.mcap")
     assert graph.call(HandEyeFile, f"{NAME}/save", path=path).success
     assert [m.topic for m in read_bag(path)] == ["data_set", *["joint_states", "image"] * COUNT]
     loaded = graph.call(HandEyeFile, f"{NAME}/load", path=path)

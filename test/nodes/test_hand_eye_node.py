@@ -181,7 +181,7 @@ def test_a_moving_robot_is_not_captured_and_a_sample_is_removed(graph: Any, tmp_
 def test_a_saved_data_set_gives_the_identical_result_in_a_fresh_node(
     graph: Any, sensor: LiveSensor, tmp_path: Path
 ) -> None:
-    path = str(tmp_path / "set.mcap")
+    path = str(graph.state / "K7" / "hand_eye" / "set.mcap")
     nothing = graph.call(HandEyeFile, f"{NAME}/save", path=path)
     assert (nothing.success, nothing.status) == (False, Code.CONFLICT)
     sensor.sphere(8)

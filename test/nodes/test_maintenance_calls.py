@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
+import math
 import os
 import signal
 import sqlite3
@@ -351,7 +352,7 @@ def test_the_accuracy_of_another_robot_does_not_count(graph, other):
 
 @pytest.mark.parametrize("name", ["predicted_error_mm", "bound_mm", "due_in_s"])
 def test_a_figure_that_cannot_be_is_no_drift(graph, name):
-    poses = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
+    poses = [angle + 10.0 for angle in HOME_DEG]
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})
     states = graph.collect(AccuracyState, "accuracy_state", endpoints.LATCHED)
     drift = graph.publisher(AccuracyState, ACCURACY, endpoints.LATCHED)
@@ -534,10 +535,10 @@ def test_a_state_that_is_lost_is_a_fault(plc, graph):
     ("changes", "words"),
     [
         ({"home_deg": [0.0]}, "home_deg has 1 numbers, UR10 has 6 joints"),
-        ({"measuring_poses_deg": ["1 2 3"]}, "pose 1 has 3 numbers"),
-        ({"measuring_poses_deg": ["1 2 3 4 5 up"]}, "no list of numbers"),
+        ({"measuring_poses_deg": [1.0, 2.0, 3.0]}, "has 3 numbers: UR10 has 6 joints"),
+        ({"measuring_poses_deg": [0.0] * 11 + [math.nan]}, "nan"),
         ({"laser": "/nowhere.yaml"}, "no such"),
-        ({"measuring_poses_deg": ["0 0 0 0 0 400"]}, "wrist_3_joint"),
+        ({"measuring_poses_deg": [0.0] * 5 + [400.0]}, "wrist_3_joint"),
     ],
 )
 def test_what_cannot_be_driven_is_refused_at_the_start(graph, changes, words):

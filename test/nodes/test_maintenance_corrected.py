@@ -19,7 +19,7 @@ from robocal_ros.maintenance.node import ACCURACY, CORRECTION, MaintenanceNode
 from robocal_ros.ros import conversions, endpoints
 
 ARM = load_robot("ur10")
-POSES = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
+POSES = [angle + 10.0 for angle in HOME_DEG]
 SETTINGS = {"serial": "K7", "home_deg": HOME_DEG, "measuring_poses_deg": POSES}
 DRIFT = {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 600.0}
 TELLS_S = 1.0

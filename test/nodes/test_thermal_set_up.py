@@ -3,10 +3,12 @@
 
 import numpy as np
 from cell import Cell
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from robocal_msgs.srv import CalibrateSensor, PlanPoses
 from sensor_msgs.msg import JointState
 from shift import BALL, T_SENSOR_BASE, Shift, built, postures
+from tf2_msgs.msg import TFMessage
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
@@ -25,6 +27,7 @@ def test_from_an_unmounted_sphere_to_planned_poses(graph):
     nominal = load_robot("kr150_r3100")
     cell = Cell(graph, sensor_field_mm=FIELD_MM)
     sensors = graph.collect(TransformStamped, "/thermal_node/sensor", endpoints.LATCHED)
+    on_tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
     refused = graph.call(PlanPoses, "/thermal_node/plan_poses")
     assert (refused.success, refused.status) == (False, Code.CONFLICT)
     assert "calibrate_sensor first" in refused.message
@@ -51,6 +54,7 @@ def test_from_an_unmounted_sphere_to_planned_poses(graph):
     x = published.translation
     T = frames.transform_from_quat([x.x, x.y, x.z], q_xyzw)
     assert np.abs(T - frames.invert(inverse)).max() < 1e-14  # to rounding
+    graph.spin_until(lambda: on_tf and on_tf[-1].transforms == sensors[-1:], "it stands on tf")
 
     own = [JointState(name=list(nominal.joint_names), position=row) for row in q[:6]]
     planned = graph.call(PlanPoses, "/thermal_node/plan_poses", own=own)
@@ -68,6 +72,26 @@ def test_from_an_unmounted_sphere_to_planned_poses(graph):
     captured = cell.call("capture_reference")  # the samples are still there
     assert captured.samples == POSES
     assert [c.kind for c in cell.call("list").calibrations] == ["reference", "sensor", "sensor"]
+
+
+def test_a_sensor_frame_that_is_on_tf_already_is_left_to_the_other(graph):
+    nominal = load_robot("kr150_r3100")
+    theirs = TransformStamped(child_frame_id="sensor")
+    theirs.header.frame_id, theirs.transform.rotation.w = "world", 1.0
+    described = graph.probe.create_publisher(TFMessage, "/tf_static", endpoints.LATCHED)
+    described.publish(TFMessage(transforms=[theirs]))
+    cell = Cell(graph, sensor_field_mm=FIELD_MM)
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    cell.play(Shift(nominal.joint_names).visit(built(nominal), postures(nominal, POSES)))
+    assert placed(graph).success
+    why = "tf shows 'sensor' below 'world' already, it cannot stand below 'base' too"
+    graph.spin_until(lambda: any(why in s.message for a in said for s in a.status), why)
+    on_tf = graph.collect(TFMessage, "/tf_static", endpoints.LATCHED)
+    graph.spin_until(lambda: on_tf, "theirs is there")
+    graph.probe.destroy_publisher(described)  # the node looks anew, and puts it there itself
+    graph.spin_until(lambda: on_tf[-1].transforms != [theirs], "its own")
+    (own,) = on_tf[-1].transforms
+    assert (own.header.frame_id, own.child_frame_id) == ("base", "sensor")
 
 
 def _quat(rotation) -> list[float]:

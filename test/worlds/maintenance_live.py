@@ -121,13 +121,12 @@ class LiveCell:
     def start_maintenance(self, **changes: Any) -> None:
         self.statuses.clear()
         self.states.clear()
-        poses = ", ".join(f"'{' '.join(f'{x:.4f}' for x in pose)}'" for pose in POSES_DEG)
         settings = (
             self.tool
             | self.times
             | {
                 "home_deg": yaml_list(HOME_DEG),
-                "measuring_poses_deg": f"[{poses}]",
+                "measuring_poses_deg": yaml_list(np.ravel(POSES_DEG).tolist()),
                 "correction_silent_s": 0.0,  # nothing is produced
             }
         )
