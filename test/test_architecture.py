@@ -17,7 +17,7 @@ BELOW = GROUND | {
     "bags",
     "programs",
 }  # the capabilities, which know nothing of each other
-CAPABILITIES = {"thermal", "tool", "hand_eye", "correction"}
+CAPABILITIES = {"thermal", "tool", "hand_eye", "correction", "fixture"}
 ABOVE = BELOW | CAPABILITIES | {"maintenance"}
 # room -> rooms of ours that it may import beside itself
 MAY_IMPORT = {

@@ -48,6 +48,7 @@ from robocal_ros.cell_sim.faults import (
     JointReadings,
     size_of,
 )
+from robocal_ros.cell_sim.fixture import FeatureShot, FixtureStation
 from robocal_ros.cell_sim.gears import BacklashPlay
 from robocal_ros.cell_sim.kr150 import UNCORRECTED
 from robocal_ros.cell_sim.robot import (
@@ -107,6 +108,7 @@ class CellPlan:
     ``heat``: what warms it up; None: it stays cold.
     ``sphere``: what it shows to a sensor; None: nothing.
     ``profile``: what it looks at with a sensor of its own; None: nothing.
+    ``fixture``: what a sensor on the flange finds of a fixture; None: nothing.
     ``working`` (k, n): poses of its work, at which its tool is judged.
     """
 
@@ -124,6 +126,7 @@ class CellPlan:
     heat: HeatPlan | None = None
     sphere: SphereStation | None = None
     profile: ProfileStation | None = None
+    fixture: FixtureStation | None = None
     working: Array = field(default_factory=lambda: np.zeros((0, 0)))
     seed: int = 1
 
@@ -211,11 +214,13 @@ def kr150_cell(
     effects: Effects | None = None,
     points: int = 2000,
     profile: bool = False,
+    fixture: bool = False,
 ) -> CellPlan:
     """The cell with an individual robot, at home.
 
     ``nominal``: the type's arm; ``points`` of a sphere's cloud, 0: centres alone;
-    ``profile``: with a line laser on the flange. With ``effects.noise`` the encoders are noisy too,
+    ``profile``: with a line laser on the flange; ``fixture``: with a fixture, and a sensor on the
+    flange that finds its features. With ``effects.noise`` the encoders are noisy too,
     and show whole counts. The robot's drift has the published size: with the programme all day,
     45 % of the tip's coordinates at the working poses stay within 0.1 mm.
     """
@@ -234,6 +239,7 @@ def kr150_cell(
         heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),
         profile=line_laser if profile else None,
+        fixture=FixtureStation() if fixture else None,
         working=poses("work"),
         seed=seed,
     )
@@ -264,6 +270,7 @@ class Happened:
     ``edges``: those whose stamp has passed, in its order.
     ``shots``: measurements of the spheres that were told by now.
     ``profiles``: those that were told by now.
+    ``features``: points of a fixture that were found.
     ``temperatures``: of the motors.
     """
 
@@ -273,6 +280,7 @@ class Happened:
     edges: list[BeamEdge]
     shots: list[SphereShot]
     profiles: list[ProfileShot]
+    features: list[FeatureShot]
     temperatures: list[Temperatures]
 
 
@@ -329,6 +337,7 @@ class SimulatedCell:
         self._edges: list[BeamEdge] = []  # what waits until it is told
         self._shots: list[SphereShot] = []
         self._profiles: list[ProfileShot] = []
+        self._features: list[FeatureShot] = []
         self._temperatures: list[Temperatures] = []
         # What it loads at its first use shall not stop a motion.
         self._see_edges(np.arange(2), np.array([0.0, TICK_S]), np.tile(plan.q_start, (2, 1)))
@@ -421,11 +430,12 @@ class SimulatedCell:
             self._pass(min(last, (self._ticks // BEAT + 1) * BEAT))
         time_s, q, qd = (np.concatenate(parts) for parts in zip(*read, strict=True))
         now_s, temperatures, self._temperatures = self.now_s, self._temperatures, []
+        features, self._features = self._features, []
         edges = [edge for edge in self._edges if edge.time_s <= now_s]
         shots = [shot for shot in self._shots if shot.told_s <= now_s]
         profiles = [shot for shot in self._profiles if shot.told_s <= now_s]
         del self._edges[: len(edges)], self._shots[: len(shots)], self._profiles[: len(profiles)]
-        return Happened(time_s, q, qd, edges, shots, profiles, temperatures)
+        return Happened(time_s, q, qd, edges, shots, profiles, features, temperatures)
 
     def flange(self, time_s: Array) -> Array:
         """True T_base_flange (m, 4, 4) at times (m,), the robot as warm as it is now."""
@@ -498,6 +508,14 @@ class SimulatedCell:
                 at_s = tick * TICK_S
                 view = profile.shoot(self.flange(np.array([at_s]))[0], tick, at_s, self._draws)
                 self._profiles += [] if view is None else [view]
+
+        fixture = self.plan.fixture
+        if fixture is not None:
+            for tick in standstills(fixture, arm, ticks, q, stood):
+                at_s = tick * TICK_S
+                T = self.flange(np.array([at_s]))[0]
+                found = fixture.shoot(T, tick, at_s, self.faults, self._draws)
+                self._features += [] if found is None else [found]
 
     def _see_edges(self, ticks: Index, time_s: Array, q: Array) -> None:
         station = self.faults.station(self._station)

@@ -46,6 +46,7 @@ Fault = Literal[
     "station_knocked",
     "station_knocked_shift",
     "station_knocked_turn",
+    "fixture_moved",
 ]
 ControllerFault = Literal[
     "commands_lost",
@@ -83,6 +84,7 @@ SIZES: Mapping[AnyFault, tuple[float, float, str]] = {
     "station_knocked": (2.0, 1e-3, "mm"),
     "station_knocked_shift": (2.0, 1e-3, "mm"),
     "station_knocked_turn": (0.5, float(np.radians(1.0)), "deg"),
+    "fixture_moved": (0.5, 1e-3, "mm"),
 }
 """Faults that have a size: the usual one, the factor of its unit, and this unit."""
 
@@ -111,6 +113,7 @@ LASTING: frozenset[AnyFault] = frozenset(
         "station_knocked",
         "station_knocked_shift",
         "station_knocked_turn",
+        "fixture_moved",
     }
 )
 """What was moved or mounted stays so while other faults come and go."""
@@ -125,7 +128,8 @@ TURN_RAD_PER_M = 1.0
 BALL_KNOCK = np.array([0.6, 0.0, -0.8])  # flange axes
 HAND = np.array([0.7, -0.7, 0.0])  # base
 STATION_TURN_RAD_PER_M = float(np.radians(500.0))  # of a knock that also turns: 0.5 deg for 1 mm
-STATION_KNOCKED = 31  # names the draw of a knock's directions
+STATION_KNOCKED, FIXTURE_MOVED = 31, 37  # name the draw of a knock's directions
+FIXTURE_TURN_RAD_PER_M = float(np.radians(100.0))  # a plate of 0.4 m that is loose at one end
 CHATTER = 7  # edges that one edge becomes
 CHATTER_S = 3e-4
 AGAIN_S = 5e-3  # a double edge comes so much later
@@ -189,10 +193,21 @@ class Faults:
         both = self.size("station_knocked")
         shift_m = both + self.size("station_knocked_shift")
         turn_rad = both * STATION_TURN_RAD_PER_M + self.size("station_knocked_turn")
-        ways = np.random.default_rng([self.seed, STATION_KNOCKED]).standard_normal((2, 3))
+        return self._knock(STATION_KNOCKED, crossing, shift_m, turn_rad)
+
+    def T_fixture_move(self, middle: Array) -> Array:
+        """Takes points (4, 4) of the fixture, base, to where they are now.
+
+        It turns about its ``middle`` (3,) and shifts, both ways as of `T_station_knock`.
+        """
+        size = self.size("fixture_moved")
+        return self._knock(FIXTURE_MOVED, middle, size, size * FIXTURE_TURN_RAD_PER_M)
+
+    def _knock(self, what: int, about: Array, shift_m: float, turn_rad: float) -> Array:
+        ways = np.random.default_rng([self.seed, what]).standard_normal((2, 3))
         ways /= np.linalg.norm(ways, axis=1)[:, None]
         R = frames.exp_rotation(turn_rad * ways[1])
-        return frames.transform(R, crossing - R @ crossing + shift_m * ways[0])
+        return frames.transform(R, about - R @ about + shift_m * ways[0])
 
     def station(self, clean: BeamStation) -> BeamStation:
         """The station where a knock has put it, with dirt before the x-beam's receiver.

@@ -26,12 +26,14 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.cell_sim.cell import Happened, SimulatedCell, station_name
+from robocal_ros.cell_sim.fixture import FRAME
 from robocal_ros.cell_sim.trajectory_controller import (
     GoalState,
     Tolerances,
     Trajectory,
     TrajectoryGoal,
 )
+from robocal_ros.fixture.session import POINT
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
@@ -198,6 +200,8 @@ class CellOutputs:
             kinds |= {REFERENCE_SPHERE: PointStamped}
         if cell.plan.profile:
             kinds |= {PROFILE: PointCloud2}
+        if cell.plan.fixture:
+            kinds |= {POINT: PointStamped}
         if cell.heating:
             kinds |= {"motor_temperatures": Temperature}
         self._outputs = {
@@ -255,6 +259,8 @@ class CellOutputs:
         for view in came.profiles:
             frame = settings["profile_frame"]
             self._send(PROFILE, profile_cloud(stamp_ns(view.time_s), frame, view.points))
+        for feature in came.features:
+            self._send(POINT, point(stamp_ns(feature.at_s), FRAME, feature.point))
         for told in came.temperatures:
             for name, celsius in zip(names, told.celsius.tolist(), strict=True):
                 stamp = header(stamp_ns(told.time_s), name)

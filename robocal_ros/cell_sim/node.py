@@ -137,6 +137,7 @@ SETTINGS = (
     Setting("gears", False, "The robot's gears err as real ones do, and have backlash"),
     Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
     Setting("profile", False, "A line laser on the flange of the kr150"),
+    Setting("fixture", False, "A fixture of the kr150, and a sensor on the flange that finds it"),
     Setting("profile_frame", "profile_sensor", "Frame of the line laser"),
     Setting("station", "station", "Name of the beam station: frame_id of its edges"),
     number(
@@ -239,6 +240,7 @@ def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
             Effects(gears=settings["gears"]),
             points=settings["cloud_points"],
             profile=settings["profile"],
+            fixture=settings["fixture"],
         )
     else:
         plan = _tool_cell(settings)

@@ -265,6 +265,7 @@ class Stream(IntEnum):
     TEMPERATURES = 9
     PROFILES = 10
     LOST_COMMANDS = 11
+    FEATURES = 12
 
 
 class Draws:

@@ -613,8 +613,23 @@ class Standing:
         return ticks[moved & (ticks - 1 - before >= FEWEST)] - 1, ticks - last
 
 
+class MeasuresAtRest(Protocol):
+    """A station that measures when the robot rests."""
+
+    @property
+    def settle_s(self) -> float:
+        """Rest before the first measurement."""
+
+    @property
+    def period_s(self) -> float:
+        """Between two of them."""
+
+    def near(self, T_base_flange: Array) -> bool:
+        """Whether it may see something at a flange pose (4, 4) known to centimetres."""
+
+
 def standstills(
-    station: SphereStation | ProfileStation, arm: SerialArm, ticks: Index, q: Array, stood: Index
+    station: MeasuresAtRest, arm: SerialArm, ticks: Index, q: Array, stood: Index
 ) -> list[int]:
     """Ticks at which a station near the robot measures: it has ``stood`` (k,) for so many ticks.
 

@@ -84,6 +84,10 @@ EXAMPLES = {
     "hand-eye export": (
         "robocal hand-eye export --result mount.json --format urdf --parent tool0 --child laser"
     ),
+    "fixture": (
+        "robocal fixture --robot kr150_r3100 --fixture plate.yaml --points now.csv "
+        "--taught taught.csv --maker kuka --name BASE_DATA[3]"
+    ),
     "iso9283": (
         "robocal iso9283 --data docs/examples/positions.csv --commanded P1=1200,0,900 "
         "--commanded P2=1400,-350,650"

@@ -25,6 +25,7 @@ from robocal_ros.history.history_records import (
     THERMAL,
     TOOL,
     Entry,
+    fixture_kind,
     hand_eye_kind,
 )
 from robocal_ros.session.events import measured_with
@@ -160,14 +161,15 @@ def _time(stamp_ns: int) -> str:
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
 _KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL, LASER_FRAME, FRAME_SHIFT)
+KNOWN_KINDS = ", ".join((*_KINDS, hand_eye_kind("SENSOR"), fixture_kind("NAME")))
 
 
 def _kind(value: str) -> str:
-    """A kind of calibration; each sensor has its own."""
-    start = hand_eye_kind("")
-    if value not in _KINDS and (not value.startswith(start) or value == start):
-        known = ", ".join((*_KINDS, hand_eye_kind("SENSOR")))
-        raise argparse.ArgumentTypeError(f"'{value}' is none of {known}")
+    """A kind of calibration; each sensor and each fixture has its own."""
+    starts = (hand_eye_kind(""), fixture_kind(""))
+    named = value.startswith(starts) and value not in starts
+    if value not in _KINDS and not named:
+        raise argparse.ArgumentTypeError(f"'{value}' is none of {KNOWN_KINDS}")
     return value
 
 
@@ -243,7 +245,7 @@ def add_history(parser: argparse.ArgumentParser) -> None:
         type=_kind,
         metavar="KIND",
         default=THERMAL,
-        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
+        help=f"{KNOWN_KINDS}; default {THERMAL}",
     )
 
 

@@ -538,6 +538,10 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "cli.programs:frame_shift",
         "the shift of a controller's base and tool frame that serves the working poses best",
     ),
+    "fixture": CliCommand(
+        "fixture.cli:fixture",
+        "where a fixture stands by its planes, edges, holes and spheres, and what has moved",
+    ),
     "iso9283": CliCommand(
         "cli.identify:iso9283",
         "position accuracy and repeatability (AP, RP) of single poses as ISO 9283, 7.2, "

@@ -33,6 +33,7 @@ from robocal_ros.cli.main import (
     refusal,
 )
 from robocal_ros.cli.recording import UNASKED, BagOverview, find_robot, open_recording
+from robocal_ros.fixture.session import fixture_session_as_recorded, take_fixture_message
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.session import hand_eye_session_as_recorded, take_hand_eye_message
@@ -168,11 +169,32 @@ def replay_hand_eye(
     }
 
 
+def replay_fixture(
+    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+) -> Document:
+    """Replay what a fixture node recorded: each frame. Raises as `replay_commanded`."""
+    report, session = replay_commanded(
+        recording, arm, history, samples, fixture_session_as_recorded, take_fixture_message
+    )
+    final, in_force = None, session.current.fixture
+    if in_force is not None:
+        place = transform_document(in_force.T_base_fixture)
+        final = {"name": session.fixture.name, **place, "revision": session.in_force.revision}
+    return commanded_document(report, session, recording) | {
+        "fixtures": [
+            {"stamp": seconds(o.command.stamp_ns), **o.document}
+            for o in report.outcomes
+            if o.document is not None and o.calibration_id
+        ],
+        "final_fixture": final,
+    }
+
+
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
 Samples = Iterator[BagMessage]
 Watch = Callable[[str, BagOverview], Samples]
-_OF_OTHER_NODES = {"tool": replay_tool, "hand_eye": replay_hand_eye}
+_OF_OTHER_NODES = {"tool": replay_tool, "hand_eye": replay_hand_eye, "fixture": replay_fixture}
 
 
 @dataclass(frozen=True)
@@ -367,6 +389,7 @@ def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
 
 
 MOST_REASONS = 5
+_FINAL = ("final_tool", "final_sensor", "final_fixture")
 _NOTHING_ACCEPTED = (
     "Nothing was accepted: each cycle is judged against the model in force at the start."
 )
@@ -393,7 +416,7 @@ def show_replay(console: "Console", document: Document) -> None:
         words = f"{entry['command']}: {code}{entry['message']}"
         print_words(console, words, "red" if refused else "")
     if not thermal:
-        final = document["final_tool"] if "runs" in document else document["final_sensor"]
+        final = next(document[name] for name in _FINAL if name in document)
         if final is None:
             console.print("Nothing is in force at the end.")
         else:

@@ -159,6 +159,9 @@ def _recordings(
             if not recording.commands:
                 skipped[topic] = UNASKED
                 continue
+            if session_kind(configured) == "fixture":
+                skipped[topic] = "of a fixture: 'robocal replay' shows it"
+                continue
             if recording.configured is not None:
                 sessions.append(recording)
                 continue

@@ -37,6 +37,7 @@ MANDREL = "mandrel_reference"  # how the mandrel measures while the beam station
 LASER_FRAME = "laser_frame"  # where the mandrel found the beams of a station
 FRAME_SHIFT = "frame_shift"  # of a controller's base and tool frame, for one thermal model
 HAND_EYE = "hand_eye"  # where a sensor sits; see `hand_eye_kind`
+FIXTURE = "fixture"  # where a fixture stands; see `fixture_kind`
 # What is in force before anything was accepted; of other kinds nothing.
 BEFORE_ANY = {
     THERMAL: "the nominal model",
@@ -48,6 +49,11 @@ BEFORE_ANY = {
 def hand_eye_kind(sensor_frame: str) -> str:
     """Each sensor is calibrated on its own: the kind names its frame."""
     return f"{HAND_EYE}/{sensor_frame}"
+
+
+def fixture_kind(name: str) -> str:
+    """Each fixture has calibrations of its own: the kind says its name."""
+    return f"{FIXTURE}/{name}"
 
 
 class Action(StrEnum):

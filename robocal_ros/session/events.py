@@ -175,7 +175,7 @@ WHY = "in force when the recording began"
 
 
 # By kind of session: an argument that only its configuration has.
-OWN = {"thermal": "tracker", "tool": "healthy", "hand_eye": "sensor"}
+OWN = {"thermal": "tracker", "tool": "healthy", "hand_eye": "sensor", "fixture": "fixture"}
 
 
 def session_kind(configured: Command | None) -> str:

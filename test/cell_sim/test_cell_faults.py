@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from kr150_shift import ABOVE, CYCLE, HOME, WORK, cell_of, first_circle, went
+from measured_fixture import fixture_poses
 
 from bench.closed_loop.faults import proven, rights_by_size, shown, smallest_held
 from robocal_ros.cell_sim.cell import TAUGHT
@@ -19,11 +20,12 @@ EFFECTS = replace(Effects(), outliers=False)
 @cache
 def tour(fault: str = "none", size: float = 0.0):
     """Shows the ball twice, goes to the beams, drives a circle; all that was told on the way."""
-    cell = cell_of(7, EFFECTS, points=20)
+    cell = cell_of(7, EFFECTS, points=20, fixture=True)
     cell.set_fault(fault, size)
     shown = went(cell, [HOME, *CYCLE[:2], ABOVE])
     cell.drive(first_circle(cell))
     there = cell.advance(cell.motion.end_s + 0.5)
+    found = went(cell, [HOME, *fixture_poses()[:2]], 4.0, readings=False).features
     parts = [
         np.concatenate([getattr(part, name) for part in (shown, there)])
         for name in ("time_s", "q", "qd")
@@ -38,6 +40,7 @@ def tour(fault: str = "none", size: float = 0.0):
         "cloud": np.array([shot.points for shot in shown.shots]),
         "floor": np.array([shot.floor for shot in shown.shots]),
         "temperatures": np.array([t.celsius for t in shown.temperatures + there.temperatures]),
+        "features": np.array([feature.point for feature in found]),
         "error": cell.tcp_error(WORK),
         "tool": cell.tool.T_flange_tool,
     }
@@ -50,7 +53,7 @@ def same(a, b) -> bool:
 TOUCHED = {
     "collision": {"edges", "error", "tool"},
     "wrong_tool": {"edges", "error", "tool"},
-    "sensor_knocked": {"ball", "cloud", "floor"},
+    "sensor_knocked": {"ball", "cloud", "floor", "features"},
     "sphere_knocked": {"ball", "cloud"},
     "beam_dirty": {"edges"},
     "beam_x_dead": {"edges"},
@@ -63,7 +66,7 @@ TOUCHED = {
     "wrong_station": set(),
     "input_latency": {"edges"},
     "lost_messages": {
-        "edges", "stamps", "joints", "speeds", "shot stamps", "ball", "cloud", "floor",
+        "edges", "stamps", "joints", "speeds", "shot stamps", "ball", "cloud", "floor", "features",
     },
     "joints_silent": {"stamps", "joints", "speeds"},
     "frozen_clock": {"stamps"},
@@ -71,10 +74,11 @@ TOUCHED = {
     "sensor_clock_jump": {"shot stamps"},
     "frozen_encoder": {"joints", "speeds"},
     "swapped_temperatures": {"temperatures"},
-    "moved_by_hand": {"edges", "error", "ball", "cloud"},
+    "moved_by_hand": {"edges", "error", "ball", "cloud", "features"},
     "station_knocked": {"edges"},
     "station_knocked_shift": {"edges"},
     "station_knocked_turn": {"edges"},
+    "fixture_moved": {"features"},
 }  # fmt: skip
 
 

@@ -9,6 +9,8 @@ from camera_tables import camera_tables
 from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
+from fixture_driver import fixture_bag
+from fixture_tables import fixture_tables
 from hand_eye_bag import hand_eye_bag
 from hand_eye_tables import TRUE, hand_eye_tables
 from joint_errors import with_joint_errors
@@ -70,6 +72,7 @@ TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.cs
            "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
 CORRECT = ["correct-program", "--robot", ROBOT, "--model", "full.yaml"]
 POINTS = ["correct-points", "--robot", ROBOT, "--model", "full.yaml", "--data", "data.csv"]
+FIXTURE = ["fixture", "--robot", ROBOT, "--fixture", "plate.yaml"]
 SHIFT = ["frame-shift", "--robot", ROBOT, "--model", "full.yaml"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
@@ -119,6 +122,12 @@ CASES = {
         "replay.hand_eye.json",
         ["replay", "hand_eye.mcap"],
         ["replay", "hand_eye.mcap", "--robot", "kr150_r3100"],
+        (2, "WRONG_ROBOT"),
+    ),
+    "replay fixture": (
+        "replay.fixture.json",
+        ["replay", "fixture.mcap"],
+        ["replay", "fixture.mcap", "--robot", "ur10"],
         (2, "WRONG_ROBOT"),
     ),
     "validate": (
@@ -310,6 +319,12 @@ CASES = {
         [*SHIFT, "--poses", "nowhere.csv", "--maker", "kuka"],
         (2, "BAD_INPUT"),
     ),
+    "fixture": (
+        "fixture.json",
+        [*FIXTURE, "--points", "fixture_now.csv", "--taught", "fixture_taught.csv"],
+        [*FIXTURE, "--points", "nowhere.csv"],
+        (2, "BAD_INPUT"),
+    ),
     "iso9283": (
         "iso9283.json",
         ["iso9283", "--data", str(ROOT / "docs/examples/positions.csv"), "--commanded", "P1=1,2,3"],
@@ -371,6 +386,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "frames.dat").write_text(KUKA_FRAMES)
     work = joint_texts(postures(8, 7), load_robot(ROBOT))
     write_cells(folder / "work.csv", work)
+    fixture_tables(folder)
+    fixture_bag(folder / "fixture.mcap")
     table(folder / "data.csv", measured(60))
     table(folder / "few.csv", measured(3))
     visits = shift()

@@ -19,8 +19,10 @@ HOME, ABOVE = poses("home")[0], poses("tool")[0]
 CYCLE, WORK = poses("cycle"), poses("work")
 
 
-def cell_of(seed: int = 1, effects: Effects | None = None, points: int = 0) -> SimulatedCell:
-    return SimulatedCell(kr150_cell(NOMINAL, seed, effects, points))
+def cell_of(
+    seed: int = 1, effects: Effects | None = None, points: int = 0, fixture: bool = False
+) -> SimulatedCell:
+    return SimulatedCell(kr150_cell(NOMINAL, seed, effects, points, fixture=fixture))
 
 
 def go(cell: SimulatedCell, q, rest_s: float = 1.0) -> None:
