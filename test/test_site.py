@@ -66,6 +66,18 @@ def test_the_reference_has_every_interface(pages: ModuleType) -> None:
         assert file.read_text().rstrip() in text
 
 
+def test_each_numeric_room_has_a_page_and_a_place(pages: ModuleType) -> None:
+    placed = (ROOT / "mkdocs.yml").read_text()
+    for room in pages.NUMERIC:
+        assert f"- reference/api/{room}.md\n" in placed
+        files = re.findall(r"^::: robocal_ros\.(\w+)\.(\w+)$", pages.numeric(room), re.M)
+        assert {folder for folder, _ in files} == {room}
+        shown = {stem for _, stem in files}
+        assert not shown & {"node", "services", "messages", "cli"}
+        assert len(shown) > 3 - (room == "motion")
+    assert "robocal_ros.kinematics.arm\n" in pages.numeric("kinematics")
+
+
 @pytest.mark.ros
 @pytest.mark.skipif(not MKDOCS.exists(), reason="make docs has not installed mkdocs")
 def test_it_is_built_without_a_warning(pages: ModuleType, tmp_path: Path, monkeypatch) -> None:
@@ -73,6 +85,7 @@ def test_it_is_built_without_a_warning(pages: ModuleType, tmp_path: Path, monkey
     monkeypatch.setenv("COLUMNS", "100")
     pages.main()
     (tmp_path / "mkdocs.yml").write_text((ROOT / "mkdocs.yml").read_text())
+    (tmp_path / "robocal_ros").symlink_to(ROOT / "robocal_ros")
     done = subprocess.run(
         [MKDOCS, "build", "--strict"],
         cwd=tmp_path, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True,
@@ -80,4 +93,11 @@ def test_it_is_built_without_a_warning(pages: ModuleType, tmp_path: Path, monkey
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stderr
-    assert (tmp_path / "out" / "site" / "index.html").is_file()
+    site = tmp_path / "out" / "site"
+    assert (site / "index.html").is_file()
+    for room in pages.NUMERIC:
+        page = (site / "reference" / "api" / f"{room}.html").read_text()
+        assert 'class="doc doc-heading"' in page
+    least_squares = (site / "reference" / "api" / "estimation.html").read_text()
+    assert 'id="robocal_ros.estimation.assessment.Judgement"' in least_squares
+    assert "predicted_rms_m" in least_squares

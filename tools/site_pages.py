@@ -19,6 +19,10 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "docs")
 LINKED = ("config", "launch", "bench", "msg_defs")  # that pages lead to, shown as they are
+NUMERIC = (
+    "kinematics", "estimation", "identification", "thermal", "tool", "hand_eye", "correction",
+    "motion",
+)  # fmt: skip
 KINDS = {"msg": "Messages", "srv": "Services", "action": "Actions"}
 
 
@@ -90,6 +94,19 @@ def interfaces() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def numeric(room: str) -> str:
+    """What a room computes with, file by file, as its docstrings say; mkdocstrings reads them.
+
+    Not its commands, nor what knows ROS: `parameters`, `commands` and `interfaces` have these.
+    """
+    files = sorted((ROOT / "robocal_ros" / room).glob("*.py"))
+    texts = {path: path.read_text() for path in files if path.stem != "__init__"}
+    of_ros = re.compile(r"^\s*(?:from|import) (?:\w+_msgs|rclpy|robocal_ros\.(?:ros|cli))\b", re.M)
+    shown = [path.stem for path, text in texts.items() if not of_ros.search(text)]
+    parts = [f"# robocal_ros.{room}", *(f"::: robocal_ros.{room}.{stem}" for stem in shown)]
+    return "\n\n".join(parts) + "\n"
+
+
 def main() -> None:
     """Lay it out in the folder that is given."""
     folder = Path(sys.argv[1])
@@ -103,9 +120,10 @@ def main() -> None:
         else:
             shutil.copy(source, folder / name)
     reference = folder / "reference"
-    reference.mkdir()
+    (reference / "api").mkdir(parents=True)
     for name, text in (
         ("parameters", parameters()), ("commands", commands()), ("interfaces", interfaces()),
+        *((f"api/{room}", numeric(room)) for room in NUMERIC),
     ):  # fmt: skip
         (reference / f"{name}.md").write_text(text, encoding="utf-8")
 

@@ -86,12 +86,12 @@ def explain_mismatch(
 ) -> str:
     """Name the mistake with which the data fit and without which they do not; empty if none.
 
+    A mistake is named only when undoing it brings the median error from more than 20 mm to under
+    10 mm, and to a twentieth: no real deviation of a robot looks like that.
+
     Parameters
     ----------
     residual : errors (m, 3), m, of a plain fit to (or prediction of) measurements.
-
-    A mistake is named only when undoing it brings the median error from more than 20 mm to under
-    10 mm, and to a twentieth: no real deviation of a robot looks like that.
     """
     if len(data) > _ENOUGH_ROWS:
         data = data.take(np.linspace(0, len(data) - 1, _ENOUGH_ROWS).astype(np.int64))
