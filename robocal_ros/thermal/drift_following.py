@@ -386,6 +386,10 @@ class DriftFollower:
             self._forecast = (in_force, AccuracyForecast(self._tracker, in_force, self._work))
         return self._forecast[1]
 
+    def forecast_at(self, in_force: SerialArm, q: Array, tip: Array) -> AccuracyForecast:
+        """The same at joints (n,), of a point (3,) of the flange, m."""
+        return AccuracyForecast(self._tracker, in_force, Work(q[None], tip))
+
     def time_s(self, stamp_ns: int) -> float:
         """Time of the tracker's at a stamp; one before its last cycle is of another clock."""
         time_s, last_s = self._anchored_s(stamp_ns), self.state.tracker.time_s

@@ -32,6 +32,13 @@ class SensorShot:
     points: Array
     name: str = ""
 
+    def require_usable(self) -> None:
+        """Raise `InputError` when it has no stamp, or holds what is not finite."""
+        if self.stamp_ns <= 0:
+            raise InputError("no time stamp")
+        if not len(self.points) or not np.all(np.isfinite(self.points)):
+            raise InputError("points must be finite, one at least")
+
 
 def shot_of(message: Any, name: str) -> SensorShot:
     """The shot of a ``PointStamped`` or a ``PointCloud2``, without points that are missing.
@@ -50,11 +57,24 @@ def shot_of(message: Any, name: str) -> SensorShot:
 
 @dataclass(frozen=True, eq=False)
 class PlacedShot:
-    """A shot with the flange T_base_flange (4, 4) and its points (m, 3) in base, m."""
+    """A shot with the joints (n,), the flange T_base_flange (4, 4) and points (m, 3) in base, m."""
 
     shot: SensorShot
+    q: Array
     T_base_flange: Array
     points: Array
+
+
+def placed_shot(
+    shot: SensorShot, stream: JointStream, arm: SerialArm, T_flange_sensor: Array
+) -> PlacedShot:
+    """A shot with the joints of its instant.
+
+    Raises `InputError` when they are missing, or too far apart.
+    """
+    q = stream.at(shot.stamp_ns, LONGEST_GAP_S)
+    T = arm.fk(q)
+    return PlacedShot(shot, q, T, frames.apply(T @ T_flange_sensor, shot.points))
 
 
 @dataclass
@@ -70,10 +90,7 @@ class PointQueue:
         Raises `InputError` when it has no stamp, is stamped far ahead of the joints, holds what is
         not finite, or too many wait already.
         """
-        if shot.stamp_ns <= 0:
-            raise InputError("no time stamp")
-        if not len(shot.points) or not np.all(np.isfinite(shot.points)):
-            raise InputError("points must be finite, one at least")
+        shot.require_usable()
         newest = self.stream.newest_ns
         if newest is not None and shot.stamp_ns > newest + AHEAD_NS:
             raise _ahead(shot.stamp_ns - newest)
@@ -99,12 +116,9 @@ class PointQueue:
                 yield shot, _ahead(ahead_ns)
                 continue
             try:
-                q = self.stream.at(shot.stamp_ns, LONGEST_GAP_S)
+                yield shot, placed_shot(shot, self.stream, arm, T_flange_sensor)
             except RobocalError as error:
                 yield shot, error
-                continue
-            T = arm.fk(q)
-            yield shot, PlacedShot(shot, T, frames.apply(T @ T_flange_sensor, shot.points))
 
     def end(self) -> Iterator[tuple[SensorShot, RobocalError]]:
         """Shots that still wait, when no more joints will come."""

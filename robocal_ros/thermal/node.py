@@ -87,7 +87,11 @@ from robocal_ros.thermal.drift_following import (
 )
 from robocal_ros.thermal.identification import require_parameters
 from robocal_ros.thermal.proposing import SENSOR
+<<<<<<< HEAD
 from robocal_ros.thermal.services import MeasuringRobotTopics, SensorOnTf
+=======
+from robocal_ros.thermal.services import MeasuringRobotInterface
+>>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
 
 ACCURACY_S = 1.0
@@ -463,10 +467,10 @@ class ThermalNode(SessionNode[ThermalSession]):
         self._data_clock = DataClock()
         ask = self._desk.ask
         ThermalServices(self.add_service, ask, history, self._nominal, settings, self._prior)
-        self._measuring: MeasuringRobotTopics | None = None
+        self._measuring: MeasuringRobotInterface | None = None
         if self._config.arrangement == FLANGE:
             frame = settings["base_frame"]
-            self._measuring = MeasuringRobotTopics(self, frame, lambda: self._session)
+            self._measuring = MeasuringRobotInterface(self, frame, lambda: self._session)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
 
     def new_session(self, history: CalibrationHistory) -> ThermalSession:

@@ -263,6 +263,23 @@ class ColdReference:
         """Each pose and target of the visit once."""
         return ColdSpots.of(self.cell, self.data, on_flange=self.spheres is not None)
 
+    @cached_property
+    def static_error_m(self) -> float:
+        """Of a measuring robot: rms distance, m, by which the cold arm misses what it will see.
+
+        By how it misses the spheres of the cold visit: what its static errors and the mounting
+        leave, over what mounting and centres leave free, and as much more as unseen poses miss a
+        regression by that was made at others (Breiman and Freedman 1983, random design).
+        """
+        if self.spheres is None:
+            raise ValueError("a sensor that stands still has no spheres in the cell")
+        seen = frames.apply(self.cell.arm.fk(self.spheres.q), self.cell.T_flange_target[:, :3, 3])
+        miss = seen - self.spheres.centre
+        unknowns = 6 + 3 * len(set(self.spheres.sphere))
+        free = miss.size - unknowns  # 6 at the fewest: `hand_eye_start` needs so many
+        unseen = 1.0 + unknowns / (free - 1)
+        return float(np.sqrt(3.0 * np.sum(miss**2) / free * unseen))
+
 
 def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
     """Place base and targets from a cold visit with the cold model ``arm``.

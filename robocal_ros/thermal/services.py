@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
+<<<<<<< HEAD
 """Topics of a measuring robot: where the flange truly is, and what its sensor sees in base.
 
 And the frame of a placed sensor, on tf.
 """
+=======
+"""A measuring robot: where the flange truly is, and what its sensor sees in base."""
+>>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 
 from collections.abc import Callable
 from functools import partial
@@ -11,6 +15,7 @@ from typing import Any
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
 from sensor_msgs.msg import PointCloud2
 
+<<<<<<< HEAD
 from robocal_ros.ground.errors import InputError, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
@@ -19,12 +24,30 @@ from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.graph import FrameWatch
 from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, shot_of
+=======
+from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
+from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.conversions import cloud, header, pose_message
+from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
+from robocal_ros.thermal.measured_points import (
+    PlacedShot,
+    PointQueue,
+    SensorShot,
+    placed_shot,
+    shot_of,
+)
+from robocal_ros.thermal.reference import SpheresInCell
+>>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 from robocal_ros.thermal.session import ThermalSession
 
 POINT, CLOUD = "point", "cloud"
+MOST_POINTS = 1000  # of a call: their doubts take a tenth of a second
 UNPLACED = "the sensor is not placed: capture the cold reference"
 
 
+<<<<<<< HEAD
 class SensorOnTf:
     """The placed sensor's frame on ``/tf_static``, unless another node puts it onto tf."""
 
@@ -69,6 +92,10 @@ class SensorOnTf:
 
 class MeasuringRobotTopics:
     """``point`` and ``cloud`` in, the same in base out, and the flange beside them.
+=======
+class MeasuringRobotInterface:
+    """``point`` and ``cloud`` in, the same in base out, and the flange beside them; also on call.
+>>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 
     ``session``: of the node; None while it is inactive. It counts what cannot be placed.
     """
@@ -87,6 +114,9 @@ class MeasuringRobotTopics:
         self._pose = node.add_output(PoseStamped, "~/flange_pose", endpoints.STREAM)
         self._point = node.add_output(PointStamped, "~/corrected_point", endpoints.RELIABLE)
         self._cloud = node.add_output(PointCloud2, "~/corrected_cloud", endpoints.RELIABLE)
+        from robocal_msgs.srv import CorrectPoints  # of this arrangement alone
+
+        node.add_service(CorrectPoints, "~/correct_points", self._correct)
 
     def joints_came(self, session: ThermalSession) -> None:
         """Tell where the flange is by the model in force, and place what waited for joints."""
@@ -109,12 +139,7 @@ class MeasuringRobotTopics:
         if session is None:
             return
         try:
-            reference = session.reference
-            if reference is None or reference.spheres is None:
-                raise InputError(UNPLACED)
-            shot, known = shot_of(message, name), reference.spheres.frame
-            if shot.frame != known:
-                raise InputError(f"frame '{shot.frame}' is not the placed sensor's, '{known}'")
+            shot = _of_the_sensor(shot_of(message, name), _placed_sensor(session))
             if self._queue is None or self._queue.stream is not session.desk.stream:
                 self._queue = PointQueue(session.desk.stream)
             self._queue.add(shot)
@@ -139,6 +164,59 @@ class MeasuringRobotTopics:
         if shot.name == CLOUD:
             self._cloud.publish(cloud(shot.stamp_ns, self._base, placed.points))
             return
+        self._point.publish(self._told(placed))
+
+    def _told(self, placed: PlacedShot) -> PointStamped:
         x, y, z = placed.points[0].tolist()
-        told = PointStamped(header=header(shot.stamp_ns, self._base), point=Point(x=x, y=y, z=z))
-        self._point.publish(told)
+        stamp = header(placed.shot.stamp_ns, self._base)
+        return PointStamped(header=stamp, point=Point(x=x, y=y, z=z))
+
+    def _correct(self, request: Any, response: Any) -> Any:
+        """Place what can be placed now; each other point gets its reason."""
+        session = self._session()
+        if session is None:
+            raise NotActiveError("no session: activate the node")
+        spheres, count = _placed_sensor(session), len(request.points)
+        if not 0 < count <= MOST_POINTS:
+            raise LimitError(f"{count} points: 1 to {MOST_POINTS} are placed at a time")
+        arm, stream = self._model(session), session.desk.stream
+        placed: dict[int, PlacedShot] = {}
+        response.reasons = [""] * count
+        for i, message in enumerate(request.points):
+            try:
+                shot = _of_the_sensor(shot_of(message, POINT), spheres)
+                shot.require_usable()
+                placed[i] = placed_shot(shot, stream, arm, spheres.T_flange_sensor)
+            except RobocalError as error:
+                response.reasons[i] = str(error)
+        sigma = session.placing_sigma_m(list(placed.values()))
+        response.sigma_mm = [-1.0] * count
+        for i, sigma_m in zip(placed, sigma.tolist(), strict=True):
+            response.sigma_mm[i] = 1e3 * sigma_m
+        nowhere = Point(x=float("nan"), y=float("nan"), z=float("nan"))
+        response.corrected = [
+            self._told(placed[i])
+            if i in placed
+            else PointStamped(header=header(stamp_ns(m.header.stamp), self._base), point=nowhere)
+            for i, m in enumerate(request.points)
+        ]
+        response.success = len(placed) == count
+        response.status = int(Code.ACCEPT if response.success else Code.BAD_INPUT)
+        response.message = f"{len(placed)} of {count} points in {self._base}"
+        if not response.success:
+            i = min(set(range(count)) - set(placed))
+            response.message += f"; point {i + 1}: {response.reasons[i]}"
+        return response
+
+
+def _placed_sensor(session: ThermalSession) -> SpheresInCell:
+    reference = session.reference
+    if reference is None or reference.spheres is None:
+        raise InputError(UNPLACED)
+    return reference.spheres
+
+
+def _of_the_sensor(shot: SensorShot, spheres: SpheresInCell) -> SensorShot:
+    if shot.frame != spheres.frame:
+        raise InputError(f"frame '{shot.frame}' is not the placed sensor's, '{spheres.frame}'")
+    return shot

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StorageError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import (
@@ -55,6 +56,7 @@ from robocal_ros.thermal.drift_following import (
     InForce,
     ThermalConfig,
 )
+from robocal_ros.thermal.measured_points import PlacedShot
 from robocal_ros.thermal.observations import (
     TIME_OUT,
     Beside,
@@ -287,6 +289,30 @@ class ThermalSession(SessionBase):
                 return self._judged(follower, stamp_ns)
         except RobocalError as error:
             return Accuracy(AccuracyLevel.FAULT, str(error))
+
+    def placing_sigma_m(self, placed: Sequence[PlacedShot]) -> Array:
+        """One sigma (m,), m, the norm over all axes, of the first point of shots in base.
+
+        Of the drift that the model in force misses at that posture and point, as the tracker
+        expects it at the stamp; of the arm and the mounting, as the spheres tell it that the cold
+        reference saw; and of a measurement. A common move of the base is in none of them.
+
+        Raises `ConflictError` where something was moved since.
+        """
+        follower, reference = self.follower, self.reference
+        if follower is None or reference is None or not placed:
+            return np.zeros(0)
+        if follower.state.moved:
+            raise ConflictError(follower.state.moved)
+        static_m = reference.static_error_m
+        last_ns = max(one.shot.stamp_ns for one in placed)
+        found = []
+        with follower.looking_ahead(self.temperatures.between(follower.read_ns, last_ns)):
+            for one in placed:
+                tip = frames.apply(frames.invert(one.T_base_flange), one.points[:1])[0]
+                forecast = follower.forecast_at(self.current.arm, one.q, tip)
+                found.append(forecast.at(follower.time_s(one.shot.stamp_ns)).rms_m)
+        return np.hypot(found, static_m)
 
     def _judged(self, follower: DriftFollower, stamp_ns: int) -> Accuracy:
         config, time_s = self.config, follower.time_s(stamp_ns)

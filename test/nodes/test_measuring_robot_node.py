@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from cell import DEEP, Cell
 from geometry_msgs.msg import Point, PointStamped, PoseStamped
+from robocal_msgs.srv import CorrectPoints
+from scipy.stats import chi2
 from sensor_msgs.msg import PointCloud2
 from shift import T_FLANGE_SENSOR, MeasuringShift, built, looking, warmed
 
@@ -49,10 +51,15 @@ class MeasuringCell:
         lost = np.full((1, 3), np.nan)  # where nothing returned
         self.cloud.publish(cloud(stamp, frame, np.vstack([SEEN, lost])))
 
-    def mount(self) -> np.ndarray:
-        """T_flange_sensor (4, 4) of the cold reference, as the session's record tells it."""
+    def reference(self) -> dict[str, Any]:
+        """The cold reference, as the session's record tells it."""
         last = [e for e in self.cell.events if e.command == "configure"][-1]
-        return np.array(json.loads(last.arguments)["arguments"]["reference"]["T_flange_sensor"])
+        told: dict[str, Any] = json.loads(last.arguments)["arguments"]["reference"]
+        return told
+
+
+def correct(graph: Any, points: list[PointStamped]) -> Any:
+    return graph.call(CorrectPoints, "/thermal_node/correct_points", points=points)
 
 
 @pytest.fixture
@@ -89,7 +96,7 @@ def test_points_are_told_in_base_by_the_model_in_force(measuring, graph):
     # drift at hand is told, of what a model without it would miss.
     warmth = frames.apply(warm.fk(q) @ T_FLANGE_SENSOR, SEEN[:1])[0]
     drift = warmth - frames.apply(measuring.cold.fk(q) @ T_FLANGE_SENSOR, SEEN[:1])[0]
-    mount = measuring.mount()
+    mount = np.array(measuring.reference()["T_flange_sensor"])
     told_drift = told - frames.apply(measuring.nominal.fk(q) @ mount, SEEN[:1])[0]
     assert np.linalg.norm(drift) > 2e-4
     assert np.linalg.norm(told_drift - drift) < 0.5 * np.linalg.norm(drift)
@@ -115,3 +122,49 @@ def test_what_cannot_be_placed_is_counted(graph):
     graph.spin_until(lambda: told("no joint readings about"), "older than the joint readings")
     assert not measuring.points
     assert not measuring.clouds
+
+
+def test_points_are_placed_on_call_with_what_they_are_worth(measuring, graph):
+    """A sphere seen from poses that no cycle visited is where it was when cold, within sigma."""
+    cell, shift = measuring.cell, measuring.shift
+    warm = warmed(measuring.cold)
+    cell.play(shift.visit(warm, measuring.q, after_h=2.0))
+    found = cell.call("identify", cycle_id="warm")
+    assert cell.call("accept", id=found.candidate_id, by="me").success
+    graph.spin_until(lambda: cell.models[-1].revision == 1, "the model is in force")
+    way = list(shift.visit(warm, looking(12, seed=21)))
+    cell.play([s for s in way if isinstance(s, JointSample)])
+    newest = way[-1].stamp_ns
+    graph.spin_until(
+        lambda: stamp_ns(measuring.poses[-1].header.stamp) == newest, "the joints came"
+    )
+    seen = [s for s in way if not isinstance(s, JointSample)]
+    asked = [
+        PointStamped(header=header(s.stamp_ns, FRAME), point=Point(x=x, y=y, z=z))
+        for s in seen
+        for x, y, z in [s.position_m.tolist()]
+    ]
+    told = correct(graph, asked)
+    assert told.success, told.message
+    assert list(told.reasons) == [""] * len(seen)
+    reference = measuring.reference()
+    centres = dict(zip(reference["sphere"], np.array(reference["centre"]), strict=True))
+    places = np.array([[p.point.x, p.point.y, p.point.z] for p in told.corrected])
+    off = places - np.array([centres[s.target] for s in seen])
+    sigma = np.array(told.sigma_mm) * 1e-3
+    assert np.all(sigma > 0.0)
+    # Errors of a rigid arm's parameters are common to all of them: some six independent numbers.
+    ratio = np.mean(np.sum(off**2, axis=1)) / np.mean(sigma**2)
+    low, high = chi2.ppf([0.0005, 0.9995], 6) / 6
+    assert low < ratio < high
+
+    late, early = asked[0], asked[1]
+    late.header.stamp = header(newest + 5_000_000, FRAME).stamp
+    early.header.stamp = header(newest - 3600_000_000_000, FRAME).stamp
+    asked[2].header.frame_id = "another"
+    part = correct(graph, asked[:4])
+    assert (part.success, part.status) == (False, Code.BAD_INPUT)
+    assert [bool(why) for why in part.reasons] == [True, True, True, False]
+    assert [s < 0.0 for s in part.sigma_mm] == [True, True, True, False]
+    assert np.isnan(part.corrected[0].point.x)
+    assert part.corrected[3].point == told.corrected[3].point
