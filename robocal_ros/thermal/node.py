@@ -87,11 +87,7 @@ from robocal_ros.thermal.drift_following import (
 )
 from robocal_ros.thermal.identification import require_parameters
 from robocal_ros.thermal.proposing import SENSOR
-<<<<<<< HEAD
-from robocal_ros.thermal.services import MeasuringRobotTopics, SensorOnTf
-=======
-from robocal_ros.thermal.services import MeasuringRobotInterface
->>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
+from robocal_ros.thermal.services import MeasuringRobotInterface, SensorOnTf
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
 
 ACCURACY_S = 1.0

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-<<<<<<< HEAD
-"""Topics of a measuring robot: where the flange truly is, and what its sensor sees in base.
+"""A measuring robot: where the flange truly is, and what its sensor sees in base.
 
 And the frame of a placed sensor, on tf.
 """
-=======
-"""A measuring robot: where the flange truly is, and what its sensor sees in base."""
->>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 
 from collections.abc import Callable
 from functools import partial
@@ -15,22 +11,14 @@ from typing import Any
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
 from sensor_msgs.msg import PointCloud2
 
-<<<<<<< HEAD
-from robocal_ros.ground.errors import InputError, RobocalError
-from robocal_ros.ground.frames import Array
-from robocal_ros.kinematics import SerialArm
-from robocal_ros.ros import endpoints
-from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message
-from robocal_ros.ros.endpoints import EndpointNode
-from robocal_ros.ros.graph import FrameWatch
-from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, shot_of
-=======
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.conversions import cloud, header, pose_message
+from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
+from robocal_ros.ros.graph import FrameWatch
 from robocal_ros.thermal.measured_points import (
     PlacedShot,
     PointQueue,
@@ -39,7 +27,6 @@ from robocal_ros.thermal.measured_points import (
     shot_of,
 )
 from robocal_ros.thermal.reference import SpheresInCell
->>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 from robocal_ros.thermal.session import ThermalSession
 
 POINT, CLOUD = "point", "cloud"
@@ -47,7 +34,6 @@ MOST_POINTS = 1000  # of a call: their doubts take a tenth of a second
 UNPLACED = "the sensor is not placed: capture the cold reference"
 
 
-<<<<<<< HEAD
 class SensorOnTf:
     """The placed sensor's frame on ``/tf_static``, unless another node puts it onto tf."""
 
@@ -90,12 +76,8 @@ class SensorOnTf:
         self._placed = self._frames = None
 
 
-class MeasuringRobotTopics:
-    """``point`` and ``cloud`` in, the same in base out, and the flange beside them.
-=======
 class MeasuringRobotInterface:
     """``point`` and ``cloud`` in, the same in base out, and the flange beside them; also on call.
->>>>>>> 8666fe50 (thermal_node of a measuring robot places stamped points on call, each with its sigma or the reason why it has no place)
 
     ``session``: of the node; None while it is inactive. It counts what cannot be placed.
     """
