@@ -24,7 +24,8 @@ BESIDE_M = 6e-4  # from a corner: so far its rounded top reaches (measured: up t
 FEWEST_POINTS = 20  # of a surface beside it
 DEGREES = (2, 3, 4)
 CLEAR = 3.0  # standard errors of what a left-out profile gains, as the ratio of its squares
-LARGEST = 0.01  # of the field's depth: makers state a tenth of it and less
+STATED = 1e-3  # of the field's depth, as makers state it
+LARGEST = 10.0 * STATED
 SCALE = 0.01  # one sigma of the scale of z, which arcs hardly show, and the mount does
 RIDGE = 1e-9  # of the trace: keeps directions solvable that nothing shows
 
@@ -133,6 +134,7 @@ class SensorLinearity:
     ``rms_m``, ``max_m``: of the error at the points that showed it.
     ``residual_m``, ``left_out_m``: rms of residuals without it, and with one that is
     found from the other profiles.
+    ``assumed``: not seen; none is taken out, and ``covariance`` and ``rms_m`` are as makers state.
     """
 
     low: Array
@@ -144,6 +146,7 @@ class SensorLinearity:
     max_m: float
     residual_m: float
     left_out_m: float
+    assumed: bool = False
 
     def corrected(self, points: Array) -> Array:
         """Points (n, 2) without the error; beyond the field it is that of the field's end."""
@@ -202,22 +205,25 @@ def _basis(points: Array, low: Array, high: Array, degree: int) -> Array:
 def fit_linearity(
     curves: Sequence[SeenCurve], poses: NDArray[np.int64], towards: bool
 ) -> SensorLinearity | None:
-    """The error of z that curves have in common; None where left-out ones do not clearly show it.
+    """The error of z that curves have in common; assumed where left-out ones show it not clearly.
 
     ``poses`` (a,): which pose each is of; those of one are left out together, for they show the
-    same place of the field.
+    same place of the field. None without curves.
     """
     groups, group = np.unique(poses, return_inverse=True)
-    if len(groups) < FEWEST_POSES:
+    if not len(groups):
         return None
     member = np.eye(len(groups))[group].T  # (g, a)
     every = np.concatenate([curve.points for curve in curves])
     low, high = every.min(axis=0), every.max(axis=0)
+    unseen = _unseen(every, low, high)
+    if len(groups) < FEWEST_POSES:
+        return unseen
     seen = [curve.seen(towards) for curve in curves]
     shown = [np.linalg.qr(J)[0] for J, _, _ in seen]
     residuals = [r - Q @ (Q.T @ r) for (_, r, _), Q in zip(seen, shown, strict=True)]
     squares = member @ np.array([r @ r for r in residuals])
-    best: SensorLinearity | None = None
+    best = unseen
     for degree in DEGREES:
         shapes = []
         for curve, (_, _, share), Q in zip(curves, seen, shown, strict=True):
@@ -234,7 +240,7 @@ def fit_linearity(
         if gain.mean() <= CLEAR * gain.std(ddof=1) / np.sqrt(len(groups)):
             continue
         left_out_m = float(np.sqrt(missed.sum() / len(every)))
-        if best is not None and left_out_m >= best.left_out_m:
+        if not best.assumed and left_out_m >= best.left_out_m:
             continue
         inverse = np.linalg.inv(total + ridge)
         found = inverse @ right
@@ -252,3 +258,15 @@ def fit_linearity(
             float(np.sqrt(squares.sum() / len(every))), left_out_m,
         )  # fmt: skip
     return best
+
+
+def _unseen(points: Array, low: Array, high: Array) -> SensorLinearity:
+    """None that is known, at the size that makers state, so that the mount allows for it."""
+    sigma_m = STATED * (high[1] - low[1])
+    basis = _basis(points, low, high, DEGREES[0])
+    none = np.zeros(basis.shape[1])
+    covariance = sigma_m**2 * np.eye(len(none))
+    rms_m = sigma_m * float(np.sqrt(np.mean(np.sum(basis**2, axis=1))))
+    return SensorLinearity(
+        low, high, DEGREES[0], none, covariance, rms_m, 0.0, 0.0, 0.0, assumed=True
+    )

@@ -125,7 +125,8 @@ def _result_of(
     }
     if linearity is not None:
         own_m = float(expected_error_m(of_it[:6, :6], field - pivot))
-        more["linearity"] = linearity.document() | {"working_error_mm": own_m * 1e3}
+        if not linearity.assumed:
+            more["linearity"] = linearity.document() | {"working_error_mm": own_m * 1e3}
         error_m = float(np.hypot(error_m, linearity.rms_m))  # of points as the sensor tells them
     found: Document = {}
     for task, view, place, read in zip(tasks, fit.views, fit.state.places, reads, strict=True):
@@ -149,7 +150,7 @@ def _result_of(
         working_error_m=error_m,
         pivot=pivot,
         place=fit.state.places[0] if alone else None,
-        linearity=linearity,
+        linearity=None if linearity is None or linearity.assumed else linearity,
         unobservable=tuple(weak_directions(fit, settings.limit_m) if uncertain else ()),
         verdict=verdict,
         more=more,
@@ -618,7 +619,8 @@ def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read]
     starts, fits = [], []
     unseen: list[RobocalError] = []
     reads = [features(task, data) for task, data in parts]
-    known = next((read.linearity for read in reads if read.linearity is not None), None)
+    every = [read.linearity for read in reads if read.linearity is not None]
+    known = min(every, key=lambda own: own.assumed, default=None)
     if known is not None:  # one sensor has one
         reads = [
             read if read.linearity is known else task.read(data, None, known)

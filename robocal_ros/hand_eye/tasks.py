@@ -239,8 +239,8 @@ def straightened(
                 shown += own
                 poses += [int(pose[i])] * len(own)
         known = fit_linearity(shown, np.array(poses, dtype=np.int64), towards)
-    if known is None:
-        return data, found, None
+    if known is None or known.assumed:
+        return data, found, known
     profiles = [
         replace(one, points=known.corrected(one.points)) if isinstance(one, Profile) else one
         for one in data.profiles

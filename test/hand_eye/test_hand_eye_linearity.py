@@ -9,7 +9,15 @@ import pytest
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import HandEyeCell, PoseRobot
-from bench.hand_eye_worlds import RADIUS_M, SETTINGS, X, edge_set, sphere_set
+from bench.hand_eye_worlds import (
+    RADIUS_M,
+    SETTINGS,
+    X,
+    edge_set,
+    sphere_set,
+    squared_error,
+    step_world,
+)
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.linearity import SensorLinearity
@@ -122,7 +130,7 @@ def test_what_is_in_force_is_taken_not_found_anew(runs):
     few = replace(
         data, names=data.names[:7], T_base_flange=data.T_base_flange[:7], profiles=data.profiles[:7]
     )
-    assert task.read(few).linearity is None
+    assert task.read(few).linearity.assumed
     with_it, without = (verify(task, few, mount, SETTINGS, one) for one in (told, None))
     assert np.sqrt(np.mean(with_it.distance_m**2)) < np.sqrt(np.mean(without.distance_m**2))
 
@@ -135,3 +143,14 @@ def test_targets_together_have_one(runs, edges):
     assert found.working_error_m < runs[0][1].working_error_m
     step = increment(found.T_flange_sensor, X, found.pivot)
     assert step @ np.linalg.solve(found.covariance, step) < chi2.ppf(1.0 - 1e-3, 6)
+
+
+def test_what_few_poses_of_stairs_do_not_show_of_it_is_in_the_covariance():
+    """Without it the squared errors are 2.2 times what is told (60 sets); it is of 0.02 mm."""
+    squared = []
+    for seed in range(10):
+        rng = np.random.default_rng([71, seed])
+        result = step_world(rng).shot(rng).solve()
+        assert result.linearity is None
+        squared.append(squared_error(result))
+    assert sum(squared) < chi2.ppf(0.999, 6 * len(squared))
