@@ -69,7 +69,7 @@ setup(
     maintainer="robocal_ros maintainers",
     maintainer_email="maintainers@robocal-ros.example",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "cell_sim/*.csv"]},
+    package_data={NAME: ["py.typed", "cell_sim/*.csv", "panel/panel.*", "panel/words.yaml"]},
     data_files=[
         *([] if WHEEL else AMENT_FILES),
         (str(SHARE), ["package.xml"]),
@@ -80,6 +80,7 @@ setup(
     extras_require={
         "cluster": [f"{name}>={OLDEST[name]}" for name in CLUSTER],
         "plc": [f"asyncua~={OLDEST['asyncua']}"],  # its inner parts are used
+        "panel": [f"{name}>={OLDEST[name]}" for name in ("aiohttp", "cryptography")],
         "dev": [f"{name}=={version}" for name, version in DEV.items()],
     },
     zip_safe=False,
@@ -91,6 +92,7 @@ setup(
             "thermal_node = robocal_ros.thermal.node:main",
             "joint_correction_node = robocal_ros.correction.node:main",
             "plc_bridge_node = robocal_ros.plc.node:main",
+            "panel_node = robocal_ros.panel.node:main",
             "adapter_node = robocal_ros.adapter.node:main",
             "cell_sim_node = robocal_ros.cell_sim.node:main",
             "maintenance_node = robocal_ros.maintenance.node:main",

@@ -43,6 +43,7 @@ ARGUMENTS = {
         "cell_sim_node in place of robot, sensor and beams; never in the graph of a real robot",
     ),
     "plc": ("false", "plc_bridge_node too, the PLC's OPC UA server; params has its security_dir"),
+    "panel": ("false", "panel_node too, the page for a browser; params has its security_dir"),
     "params": (
         IfElseSubstitution(
             LaunchConfiguration("simulated"),
@@ -107,6 +108,7 @@ def generate_launch_description():
     """Describe the nodes."""
     simulated = IfCondition(LaunchConfiguration("simulated"))
     plc = IfCondition(LaunchConfiguration("plc"))
+    panel = IfCondition(LaunchConfiguration("panel"))
     return LaunchDescription(
         [
             *(
@@ -115,6 +117,7 @@ def generate_launch_description():
             ),
             *(cell_node(name) for name in NODES),
             cell_node("plc_bridge_node", plc),
+            cell_node("panel_node", panel),
             cell_node("cell_sim_node", simulated),
         ]
     )

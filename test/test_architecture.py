@@ -33,6 +33,7 @@ MAY_IMPORT = {
     "bags": GROUND | {"ros", "motion"},
     "adapter": {"ground", "ros"},
     "plc": {"ground", "ros", "adapter"},
+    "panel": {"ground", "ros", "history", "plc"},
     **dict.fromkeys(CAPABILITIES, BELOW),
     "maintenance": BELOW | CAPABILITIES,
     "report": ABOVE,

@@ -24,7 +24,6 @@ from robocal_ros.history.history_records import (
     MANDREL,
     THERMAL,
     TOOL,
-    Entry,
     fixture_kind,
     hand_eye_kind,
 )
@@ -284,7 +283,7 @@ def _list(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
             {"kind": h.kind, "revision": h.revision, "calibration_id": h.calibration_id}
             for h in history.heads()
         ],
-        "calibrations": [_entry(entry) for entry in history.list(args.limit)],
+        "calibrations": [entry.document() for entry in history.list(args.limit)],
     }
     return document, show_list
 
@@ -292,7 +291,7 @@ def _list(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
 def _show_history(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     entry = history.get(args.id)
     document = {
-        "calibration": _entry(entry),
+        "calibration": entry.document(),
         "document": history.document(entry.id),
         "model": history.model(entry.id),
         "inputs": {
@@ -377,26 +376,6 @@ def _decided(
         "by": _by(args),
         "reason": args.reason,
         "verdict": {"accept": True, "code": "ACCEPT", "reason": said},
-    }
-
-
-def _entry(entry: Entry) -> Document:
-    return {
-        "id": entry.id,
-        "revision": entry.revision,
-        "kind": entry.kind,
-        "state": entry.state.value,
-        "code": entry.code.name,
-        "reason": entry.reason,
-        "candidate_rms_mm": entry.candidate_rms_mm,
-        "model_hash": entry.model_hash,
-        "based_on": entry.based_on,
-        "cycle_id": entry.cycle_id,
-        "stamp_ns": entry.stamp_ns,
-        "created_ns": entry.created_ns,
-        "software": entry.software,
-        "method": entry.method,
-        "decisions": [asdict(made) | {"action": made.action.value} for made in entry.decisions],
     }
 
 

@@ -7,7 +7,7 @@ and move a robot. So each document, model and set of inputs is compared with its
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
@@ -167,6 +167,26 @@ class Entry(Candidate):
     state: CalibrationState
     revision: int
     decisions: tuple[Decision, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Plain values, as a person is shown them."""
+        return {
+            "id": self.id,
+            "revision": self.revision,
+            "kind": self.kind,
+            "state": self.state.value,
+            "code": self.code.name,
+            "reason": self.reason,
+            "candidate_rms_mm": self.candidate_rms_mm,
+            "model_hash": self.model_hash,
+            "based_on": self.based_on,
+            "cycle_id": self.cycle_id,
+            "stamp_ns": self.stamp_ns,
+            "created_ns": self.created_ns,
+            "software": self.software,
+            "method": self.method,
+            "decisions": [asdict(made) | {"action": made.action.value} for made in self.decisions],
+        }
 
 
 def require_measured_with(

@@ -34,6 +34,7 @@ MOST_REJECTED = 20  # certificates that are kept for a person to look at
 KEY_BITS = 2048  # the least that Basic256Sha256 takes (OPC 10000-7), and quick for a PLC
 SCRYPT = {"n": 2**14, "r": 8, "p": 1}  # RFC 7914; 16 MB and some 50 ms for each guess
 SHORTEST_PASSWORD, LONGEST = 10, 100
+LOCKED_AFTER, LOCKED_S = 5, 10.0  # wrong passwords of a name, and how long nobody has it then
 FILE_VERSION = 1
 
 
@@ -120,6 +121,31 @@ class Users:
         }
         document = {"version": FILE_VERSION, "users": users}
         write_private(self._path, json.dumps(document, indent=1).encode())
+
+
+class Logins:
+    """Logins of a folder's users; who guesses a name's password is locked out for a while."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._wrong: dict[str, list[float]] = {}
+
+    def login(self, name: str, password: str, now_s: float) -> Role | str:
+        """The role, or why there is none, in words; ``now_s``: steady clock."""
+        name = name[:LONGEST]
+        wrong = [at_s for at_s in self._wrong.get(name, ()) if now_s - at_s < LOCKED_S]
+        if len(wrong) >= LOCKED_AFTER:
+            return f"login of {quoted(name)} is locked: {len(wrong)} wrong passwords"
+        try:
+            role = Users(self._folder).login(name, password)
+        except InputError as error:
+            return f"nobody can log in: {error}"
+        if role is None:
+            lately = {of: at for of, at in self._wrong.items() if now_s - at[-1] < LOCKED_S}
+            self._wrong = lately | {name: [*wrong, now_s]}  # of a guess each 50 ms at the most
+            return f"login of {quoted(name)} is refused: no such user, or password"
+        self._wrong.pop(name, None)
+        return role
 
 
 def write_private(path: Path, data: bytes) -> None:
@@ -233,6 +259,15 @@ def application_uri(certificate: x509.Certificate) -> str:
         return str(names.get_values_for_type(x509.UniformResourceIdentifier)[0])
     except (x509.ExtensionNotFound, IndexError) as error:
         raise InputError("the certificate has no application URI among its names") from error
+
+
+def certified_hosts(certificate: x509.Certificate) -> frozenset[str]:
+    """Names of the machine that it is for; none where it names none."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return frozenset()
+    return frozenset(names.get_values_for_type(x509.DNSName))
 
 
 class Trust:

@@ -25,11 +25,10 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import header
-from robocal_ros.ros.endpoints import ERROR, WARN, Health
+from robocal_ros.ros.endpoints import ERROR, WARN, Health, Refusal, ServiceCalls
 from robocal_ros.ros.parameters import Setting, number
 
 GAP_OPEN, EVENTS = "gap_open", "beam_events"
-SHOW_ANSWERS_S = 1.0  # how often calls that nobody waits for any more are let go
 EXPIRES_DAYS = 30  # warned of so long before
 SERVICES: Mapping[str, Any] = {
     "run": RunMaintenanceCycle,
@@ -130,7 +129,6 @@ class PlcBridgeNode(HouseNode):
         self._server: Any = None
         self._handed: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._wake: Any = None
-        self._pending: dict[Any, tuple[float, Any]] = {}
         self._heartbeat_s = float("-inf")
         self._gap_lock = threading.Lock()  # nothing opens the gap after a deactivation
         self._gap_acts = False
@@ -163,10 +161,7 @@ class PlcBridgeNode(HouseNode):
         self._gap = self.add_output(GapOpen, GAP_OPEN, endpoints.HEARTBEAT)
         beams = tuple(settings["beams"])
         self._edges = self.add_output(BeamEvent, EVENTS, endpoints.RELIABLE) if beams else None
-        self._calls = {
-            name: self.add_client(kind, f"maintenance_node/{name}")
-            for name, kind in SERVICES.items()
-        }
+        self._calls = ServiceCalls(self, "maintenance_node", SERVICES)
         self._wake = self.create_guard_condition(self._take)
         self._release.append(lambda: self.destroy_guard_condition(self._wake))
         timing = InputTiming(settings["beam_latency_ms"] * 1e-3, settings["beam_jitter_ms"] * 1e-3)
@@ -185,7 +180,6 @@ class PlcBridgeNode(HouseNode):
         )
         for topic, kind in MESSAGES.items():
             self._watch(kind, topic)
-        self.add_timer(SHOW_ANSWERS_S, self._let_go, steady=True)
 
     def _watch(self, kind: type, topic: str) -> None:
         """Show a topic; not by `add_input`: it is shown while nothing acts."""
@@ -211,7 +205,6 @@ class PlcBridgeNode(HouseNode):
         server, self._server = self._server, None
         if server is not None:
             server.stop()
-        self._pending.clear()
 
     # ---- from the cell to the PLC ---------------------------------------------------------------
 
@@ -286,25 +279,20 @@ class PlcBridgeNode(HouseNode):
             )
 
     def _call(self, called: Any) -> None:
-        client = self._calls[called.method.service]
-        if time.monotonic() > called.until_s:  # this process paused, and the PLC was told so
-            self._tell(f"{called.method.name} of {called.user} came too late and is not passed on")
-        elif not self.is_active:
-            called.answer("BadInvalidState")
-        elif not client.service_is_ready():
-            called.answer("BadNoCommunication")
-        else:
-            request = SERVICES[called.method.service].Request(**called.fields)
-            if hasattr(request, "by"):
-                request.by = called.user
-            future = client.call_async(request)
-            self._pending[future] = time.monotonic(), client
-            future.add_done_callback(partial(self._answered, called))
+        method = called.method
+        done = partial(self._answered, called)
+        match self._calls.call(method.service, called.fields, called.user, called.until_s, done):
+            case Refusal.LATE:  # the PLC was told so
+                self._tell(f"{method.name} of {called.user} came too late and is not passed on")
+            case Refusal.INACTIVE:
+                called.answer("BadInvalidState")
+            case Refusal.ABSENT:
+                called.answer("BadNoCommunication")
 
-    def _answered(self, called: Any, future: Any) -> None:
-        self._pending.pop(future, None)
+    def _answered(self, called: Any, response: Any) -> None:
         try:
-            response = future.result()
+            if isinstance(response, Exception):
+                raise response
             outputs = [item.variant(item.value(response)) for item in called.method.outputs]
         except Exception as error:
             self._log(called.method.name, error)
@@ -314,14 +302,6 @@ class PlcBridgeNode(HouseNode):
         if called.method.name != "Status":  # which a PLC asks again and again
             words = f"{called.user} called {called.method.name}: {response.message}"
             self.get_logger().info(words)
-
-    def _let_go(self) -> None:
-        """Forget calls that were not answered: the PLC was told so."""
-        now_s = time.monotonic()
-        for future, (began_s, client) in list(self._pending.items()):
-            if now_s - began_s > SHOW_ANSWERS_S:
-                del self._pending[future]
-                client.remove_pending_request(future)
 
     def _tell(self, words: str) -> None:
         self._notice = time.monotonic(), words

@@ -34,13 +34,12 @@ from cryptography.hazmat.primitives import serialization
 
 from robocal_ros.adapter.inputs import InputTiming
 from robocal_ros.ground.errors import InputError
-from robocal_ros.ground.files import quoted
 from robocal_ros.plc.access import (
     KEY,
     SERVER,
+    Logins,
     Role,
     Trust,
-    Users,
     application_uri,
     read_certificate,
 )
@@ -60,7 +59,6 @@ MOST_CONNECTIONS = 30
 MOST_STRANGERS = 20  # connections whose channel no trusted certificate has opened; beside those
 MOST_ITEMS, MOST_BROWSED = 500, 100  # of one request
 MOST_CALLS = 10  # of one request; and so many requests of a session may wait
-LOCKED_AFTER, LOCKED_S = 5, 10.0  # wrong passwords of a name, and how long nobody has it then
 CALL = ua.NodeId(ua.ObjectIds.CallRequest_Encoding_DefaultBinary)
 NO_SECURITY = "http://opcfoundation.org/UA/SecurityPolicy#None"
 T = TypeVar("T")
@@ -113,9 +111,7 @@ class Door:
     """
 
     def __init__(self, folder: Path, hand: Handover) -> None:
-        self._folder, self._hand = folder, hand
-        self._trust = Trust(folder)
-        self._wrong: dict[str, list[float]] = {}
+        self._hand, self._trust, self._logins = hand, Trust(folder), Logins(folder)
         self.answers: dict[Login, PlcUser | None] = {}  # for the one pass that follows
         self._one = asyncio.Lock()
 
@@ -153,22 +149,10 @@ class Door:
         if why := self.untrusted(login.certificate):
             self._hand(Notice(f"a client is turned away: {why}"))
             return None
-        now_s = time.monotonic()
-        wrong = [at_s for at_s in self._wrong.get(name, ()) if now_s - at_s < LOCKED_S]
-        if len(wrong) >= LOCKED_AFTER:
-            self._hand(Notice(f"login of {quoted(name)} is locked: {len(wrong)} wrong passwords"))
+        rights = self._logins.login(name, login.password, time.monotonic())
+        if isinstance(rights, str):
+            self._hand(Notice(rights))
             return None
-        try:
-            rights = Users(self._folder).login(name, login.password)
-        except InputError as error:
-            self._hand(Notice(f"nobody can log in: {error}"))
-            return None
-        if rights is None:
-            lately = {of: at for of, at in self._wrong.items() if now_s - at[-1] < LOCKED_S}
-            self._wrong = lately | {name: [*wrong, now_s]}  # of a guess each 50 ms at the most
-            self._hand(Notice(f"login of {quoted(name)} is refused: no such user, or password"))
-            return None
-        self._wrong.pop(name, None)
         return PlcUser(name=name, rights=rights)
 
 

@@ -4,9 +4,10 @@
 import inspect
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -74,6 +75,14 @@ MOST_WAITING = 10_000  # messages of an input that are taken at once
 def trigger_text(number: int, status: Code, message: str) -> str:
     """The answer of a Trigger twin: id, code and words, in this order, one blank between."""
     return f"{number} {status.name} {message}"
+
+
+class Refusal(Enum):
+    """Why a call was not passed on."""
+
+    LATE = "too late"
+    INACTIVE = "this node is not active"
+    ABSENT = "nobody serves it"
 
 
 class NotActiveError(RobocalError):
@@ -374,6 +383,65 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+
+FORGOTTEN_S = 1.0  # how often calls that nobody waits for any more are let go
+
+
+class ServiceCalls:
+    """Calls to services of another node, for people and machines beside the graph.
+
+    Whoever waits is told by its own clock that nobody answered; a call that comes after that is not
+    passed on, as its caller may have asked again. Works while ``node`` is configured.
+    """
+
+    def __init__(self, node: EndpointNode, server: str, kinds: Mapping[str, Any]) -> None:
+        self._node, self._kinds = node, kinds
+        self._clients = {
+            name: node.add_client(kind, f"{server}/{name}") for name, kind in kinds.items()
+        }
+        self._pending: dict[Any, tuple[float, Any]] = {}
+        node.add_timer(FORGOTTEN_S, self._let_go, steady=True)
+
+    def call(
+        self,
+        name: str,
+        fields: Mapping[str, Any],
+        by: str,
+        until_s: float,
+        answered: Callable[[Any], None],
+    ) -> Refusal | None:
+        """Call; ``answered`` is given the response, or the exception. Returns why it did not.
+
+        ``by``: who decides, where the request has a place for that. ``until_s``: steady clock.
+        """
+        client = self._clients[name]
+        if time.monotonic() > until_s:  # this process paused meanwhile
+            return Refusal.LATE
+        if not self._node.is_active:
+            return Refusal.INACTIVE
+        if not client.service_is_ready():
+            return Refusal.ABSENT
+        request = self._kinds[name].Request(**fields)
+        if hasattr(request, "by"):
+            request.by = by
+
+        def done(future: Any) -> None:
+            self._pending.pop(future, None)
+            error = future.exception()
+            answered(future.result() if error is None else error)
+
+        future = client.call_async(request)
+        self._pending[future] = until_s, client
+        future.add_done_callback(done)
+        return None
+
+    def _let_go(self) -> None:
+        now_s = time.monotonic()
+        for future, (until_s, client) in list(self._pending.items()):
+            if now_s > until_s + FORGOTTEN_S:
+                del self._pending[future]
+                client.remove_pending_request(future)
 
 
 RESULT_KEPT_S = 60  # for callers that ask late

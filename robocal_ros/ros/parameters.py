@@ -33,7 +33,7 @@ SHARED = frozenset({
     "input_period_ms", "joint_acceleration_deg_s2", "joint_gap_s", "joint_velocity_deg_s",
     "laser", "mandrel_length_mm", "mandrel_quat_xyzw", "mandrel_radius_mm", "mandrel_xyz_mm",
     "method", "motion_late_s", "motion_silence_s", "opening_radius_mm", "profile_frame",
-    "repeatability_mm", "retract_mm", "robot", "seed", "sensor_frame", "serial",
+    "repeatability_mm", "retract_mm", "robot", "security_dir", "seed", "sensor_frame", "serial",
     "standstill_after_s", "standstill_before_s", "standstill_tolerance_deg", "state_dir", "station",
     "stop_deceleration_deg_s2", "target", "taught_quat_xyzw", "taught_xyz_mm",
     "tcp_acceleration_mm_s2", "tcp_speed_mm_s", "tolerance_mm", "tool_frame", "tool_length_mm",

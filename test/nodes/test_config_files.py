@@ -30,6 +30,7 @@ from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.driver import MOTION
+from robocal_ros.panel.node import PanelNode
 from robocal_ros.plc.node import PlcBridgeNode
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.ros.parameters import SHARED, Setting
@@ -51,6 +52,7 @@ NODES = (
     JointCorrectionNode,
     AdapterNode,
     PlcBridgeNode,
+    PanelNode,
 )
 PAGES = {
     ThermalNode: "thermal_node",

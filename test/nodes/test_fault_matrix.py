@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 from maintenance_live import LiveCell
+from panel_faults import heard, wrongly_told
+from panel_page import accuracy
 from robocal_msgs.msg import MaintenanceStatus
 from robocal_msgs.srv import GetMaintenance, RunMaintenanceCycle
 from std_msgs.msg import String
@@ -22,6 +24,8 @@ from bench.closed_loop.faults import RIGHT
 from bench.live.cell import TRUTH, set_fault
 from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.errors import Code
+from robocal_ros.panel.node import SOURCES
+from robocal_ros.panel.state import ACCURACY, STATUS, PanelState, plain
 from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
@@ -45,6 +49,7 @@ class FaultCell:
 
     def __init__(self, graph: Any, folder: Path) -> None:
         self.graph, self.cell = graph, LiveCell(graph, folder)
+        self.misled: list[str] = []
         self.truths = graph.collect(String, TRUTH, endpoints.LATCHED)
         self.until(lambda: self.told("/tcf_node/arm", SetBool, data=True), "armed")
         for _ in range(3):  # one that a busy machine breaks off is asked for again
@@ -81,6 +86,13 @@ class FaultCell:
         self.until(lambda: self.status(cycle_id).result.code != Code.NONE, cycle_id)
         return self.status(cycle_id)
 
+    def page(self, fault: Fault, state: MaintenanceStatus) -> str:
+        """Why the page does not send a person to what has the fault; empty: it does."""
+        panel = PanelState()
+        said = {STATUS: plain(state, SOURCES[STATUS][2]), ACCURACY: accuracy("DEGRADED")}
+        heard(panel, said, 0.0)
+        return wrongly_told(fault, panel, 0.0)
+
     def tried(self, fault: Fault) -> tuple[Code, str]:
         """The code of one gap with a fault, of whoever must tell it, and how the gap ended."""
         set_fault(self.graph.call, fault)
@@ -88,6 +100,7 @@ class FaultCell:
         state, result = ended.state, ended.result
         code = Code(state.fault_code or result.tool_found_code)
         faulty = state.state == MaintenanceStatus.FAULT
+        self.misled.append(self.page(fault, state))
         end = "fault" if faulty else "at home" * self.cell.at_home()
         set_fault(self.graph.call, "none")
         self.graph.spin_for(AHEAD_S)
@@ -110,3 +123,4 @@ def test_each_fault_has_its_code_within_one_cycle(graph: Any, tmp_path: Path) ->
     wrong = {fault: said for fault, said in told.items() if said[0] is not RIGHT[fault]}
     assert not wrong
     assert all(end for _, end in told.values()), told
+    assert not any(cell.misled), cell.misled

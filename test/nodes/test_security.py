@@ -116,6 +116,7 @@ def test_it_allows_what_the_node_has_and_no_more(graph: Any, tmp_path: Path) -> 
         "maintenance_node": laser | moves,
         "cell_sim_node": {"profile": True, "run_program": True},
         "plc_bridge_node": plc | {"host": "127.0.0.1", "beams": ["x"]},
+        "panel_node": {"page_port": free_port()},
         "adapter_node": {"input": "bool", "profile_input": "scan", "profile_frame": "scanner"},
     }
     robot = {"robot": "kr150_r3100"}
@@ -176,7 +177,8 @@ def test_three_may_move_the_robot_and_one_opens_the_gap() -> None:
 
 @pytest.mark.parametrize("call", ["accept", "reject", "rollback"])
 def test_who_decides(call: str) -> None:
-    assert who("request", f"/maintenance_node/{call}") == {"engineer", "plc_bridge_node"}
+    doors = {"plc_bridge_node"} | ({"panel_node"} if call != "rollback" else set())
+    assert who("request", f"/maintenance_node/{call}") == {"engineer", *doors}
     for node in ("thermal_node", "tcf_node", "hand_eye_node"):
         assert who("request", f"/{node}/{call}") == {"engineer"}
 

@@ -27,7 +27,6 @@ from robocal_ros.plc.cell import EdgeWritten, MethodCalled
 from robocal_ros.plc.inputs import Heartbeat
 from robocal_ros.plc.model import METHODS
 from robocal_ros.plc.server import (
-    LOCKED_AFTER,
     MOST_CALLS,
     MOST_STRANGERS,
     Door,
@@ -252,7 +251,7 @@ def test_sessions_with_wrong_certificates_and_passwords_open_nothing(
         client = guesser.do(guesser.secured(guesser.made("plc", password)))
         guesser.do(client.connect())
 
-    for number in range(LOCKED_AFTER):
+    for number in range(access.LOCKED_AFTER):
         with pytest.raises(ua.UaStatusCodeError):
             login(f"guess {number}")
     with pytest.raises(ua.UaStatusCodeError):
@@ -290,7 +289,7 @@ def test_names_that_nobody_has_unlock_none(tmp_path: Path, monkeypatch: pytest.M
     door = Door(tmp_path, told.append)
     monkeypatch.setattr(door, "untrusted", lambda certificate: "")
     monkeypatch.setattr(access.Users, "login", lambda *_: None)  # which takes its time
-    for number in range(LOCKED_AFTER):
+    for number in range(access.LOCKED_AFTER):
         assert door.admit(Login("plc", f"guess {number}", b"")) is None
     for number in range(120):
         assert door.admit(Login(f"nobody {number}", "guess", b"")) is None
