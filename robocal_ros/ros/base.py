@@ -234,6 +234,28 @@ class QuietMemory:
         gc.enable()
 
 
+class _Unwoken:
+    """A guard condition that nothing triggers."""
+
+    def trigger(self) -> None:
+        """Wake nobody."""
+
+
+class OneThreadExecutor(SingleThreadedExecutor):
+    """Builds one wait set for each callback, where rclpy's builds two: a fourth of a node's load.
+
+    rclpy wakes itself after a callback, for those that another thread held back as its group was
+    taken. In one thread the next wait set is only built when the callback has ended or awaits.
+    """
+
+    def _make_handler(self, *given: Any) -> Any:
+        guard, self._guard = self._guard, _Unwoken()
+        try:
+            return super()._make_handler(*given)
+        finally:
+            self._guard = guard
+
+
 SPIN_S = 0.5
 ENDING = {signal.SIGINT, signal.SIGTERM}
 
@@ -271,7 +293,7 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
 
 def _executor(events: bool) -> Executor:
     if not events:
-        return SingleThreadedExecutor()
+        return OneThreadExecutor()
     from rclpy.experimental.events_executor import EventsExecutor
 
     return EventsExecutor()

@@ -18,7 +18,6 @@ import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -27,6 +26,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.ros import endpoints
+from robocal_ros.ros.base import OneThreadExecutor
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another
@@ -143,7 +143,7 @@ class Graph:
         self.context = Context()
         rclpy.init(args=[], context=self.context, domain_id=domain)
         self.probe = Node("probe", context=self.context, start_parameter_services=False)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = OneThreadExecutor(context=self.context)
         self.executor.add_node(self.probe)
         self._environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),

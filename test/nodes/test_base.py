@@ -226,6 +226,19 @@ def test_parameters_describe_themselves(graph: Any) -> None:
     assert "badly" in start_fails.additional_constraints
 
 
+def test_a_callback_does_not_wake_its_executor(graph: Any, monkeypatch: Any) -> None:
+    """After it one wait set is built, and waited with until the time is over."""
+    node = graph.add(Doubler)
+    graph.publisher(Float64, "/number").publish(Float64(data=1.0))
+    graph.spin_until(lambda: node.inputs["number"].received)
+    built = []
+    get_nodes = graph.executor.get_nodes
+    monkeypatch.setattr(graph.executor, "get_nodes", lambda: built.append(1) or get_nodes())
+    node._diagnostics._timer.cancel()  # nothing else is to come
+    graph.executor.spin_once(timeout_sec=0.05)
+    assert len(built) == 1
+
+
 def test_an_invalid_message_is_counted_and_does_no_harm(graph: Any) -> None:
     node = graph.add(Doubler)
     doubled = graph.collect(Float64, "/doubler/doubled")
