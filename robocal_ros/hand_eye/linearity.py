@@ -198,8 +198,12 @@ def _basis(points: Array, low: Array, high: Array, degree: int) -> Array:
     """Products of Legendre's polynomials in x and z (n, k), of degrees from 2, then z alone."""
     u, w = np.clip(2.0 * (points - low) / (high - low) - 1.0, -1.0, 1.0).T
     x, z = (np.polynomial.legendre.legvander(side, degree) for side in (u, w))
-    pairs = [(i, k) for i in range(degree + 1) for k in range(degree + 1 - i) if i + k >= 2]
-    return np.column_stack([*(x[:, i] * z[:, k] for i, k in pairs), z[:, 1]])
+    return np.column_stack([*(x[:, i] * z[:, k] for i, k in _degrees(degree)), z[:, 1]])
+
+
+def _degrees(degree: int) -> list[tuple[int, int]]:
+    """Of the products in x and z, up to their sum."""
+    return [(i, k) for i in range(degree + 1) for k in range(degree + 1 - i) if i + k >= 2]
 
 
 def fit_linearity(
@@ -224,10 +228,14 @@ def fit_linearity(
     residuals = [r - Q @ (Q.T @ r) for (_, r, _), Q in zip(seen, shown, strict=True)]
     squares = member @ np.array([r @ r for r in residuals])
     best = unseen
+    products, whole = _degrees(DEGREES[-1]), _basis(every, low, high, DEGREES[-1])
+    begins = np.cumsum([len(curve.points) for curve in curves])[:-1]
     for degree in DEGREES:
+        some = [n for n, pair in enumerate(products) if sum(pair) <= degree]
+        basis = np.ascontiguousarray(whole[:, [*some, -1]])
         shapes = []
-        for curve, (_, _, share), Q in zip(curves, seen, shown, strict=True):
-            along = share[:, None] * _basis(curve.points, low, high, degree)[:, :-1]
+        for part, (_, _, share), Q in zip(np.split(basis, begins), seen, shown, strict=True):
+            along = share[:, None] * part[:, :-1]
             shapes.append(along - Q @ (Q.T @ along))
         normals = np.tensordot(member, np.array([A.T @ A for A in shapes]), axes=1)
         rights = member @ np.array([A.T @ r for A, r in zip(shapes, residuals, strict=True)])
@@ -249,7 +257,7 @@ def fit_linearity(
         covariance[:-1, :-1] = inverse @ (scores.T @ scores) @ inverse
         covariance[-1, -1] = (SCALE * 0.5 * (high[1] - low[1])) ** 2
         found = np.append(found, 0.0)
-        error = _basis(every, low, high, degree) @ found
+        error = basis @ found
         if np.max(np.abs(error)) > LARGEST * (high[1] - low[1]):
             continue  # curves at one place of the field do not tell it apart from themselves
         best = SensorLinearity(

@@ -248,6 +248,8 @@ class OneThreadExecutor(SingleThreadedExecutor):
     taken. In one thread the next wait set is only built when the callback has ended or awaits.
     """
 
+    _guard: Any
+
     def _make_handler(self, *given: Any) -> Any:
         guard, self._guard = self._guard, _Unwoken()
         try:
