@@ -234,7 +234,7 @@ class QuietMemory:
         gc.enable()
 
 
-class _Unwoken:
+class _WakesNobody:
     """A guard condition that nothing triggers."""
 
     def trigger(self) -> None:
@@ -244,18 +244,28 @@ class _Unwoken:
 class OneThreadExecutor(SingleThreadedExecutor):
     """Builds one wait set for each callback, where rclpy's builds two: a fourth of a node's load.
 
-    rclpy wakes itself after a callback, for those that another thread held back as its group was
-    taken. In one thread the next wait set is only built when the callback has ended or awaits.
+    rclpy's handler of a callback wakes the executor after it, for those that another thread held
+    back as its group was taken. In one thread the next wait set is only built when the callback
+    has ended or awaits. Whoever else wakes the executor does; an rclpy that names its guard or
+    its handlers otherwise is used as it is.
     """
 
-    _guard: Any
+    _made_in = 0  # the thread that makes a handler
+
+    @property
+    def _guard(self) -> Any:
+        return _WakesNobody() if self._made_in == threading.get_ident() else self._wakes
+
+    @_guard.setter
+    def _guard(self, guard: Any) -> None:
+        self._wakes = guard
 
     def _make_handler(self, *given: Any) -> Any:
-        guard, self._guard = self._guard, _Unwoken()
+        self._made_in = threading.get_ident()
         try:
             return super()._make_handler(*given)
         finally:
-            self._guard = guard
+            self._made_in = 0
 
 
 SPIN_S = 0.5
