@@ -95,6 +95,8 @@ setup(
             "panel_node = robocal_ros.panel.node:main",
             "adapter_node = robocal_ros.adapter.node:main",
             "cell_sim_node = robocal_ros.cell_sim.node:main",
+            "fixture_node = robocal_ros.fixture.node:main",
+            "sharing_node = robocal_ros.maintenance.sharing_node:main",
             "maintenance_node = robocal_ros.maintenance.node:main",
             "replay_node = robocal_ros.bags.replay_node:main",
             "recorder_node = robocal_ros.bags.recorder_node:main",

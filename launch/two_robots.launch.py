@@ -2,10 +2,14 @@
 """Starts the nodes of two robots, each in a namespace and with a parameter file of its own.
 
 ros2 launch robocal_ros two_robots.launch.py left_params:=left.yaml right_params:=right.yaml
+
+Where they share a sensor or a station, shared:=true: sharing_node gives the gap to one at a time.
 """
 
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
@@ -20,7 +24,21 @@ def share(*path):
 
 def generate_launch_description():
     """Describe both cells."""
-    actions = []
+    actions = [
+        DeclareLaunchArgument(
+            "shared",
+            default_value="false",
+            description="Both measure in one place: each PLC publishes gap_wanted, sharing_node "
+            "the gap_open of one at a time (docs/sharing.md)",
+        ),
+        Node(
+            package="robocal_ros",
+            executable="sharing_node",
+            name="sharing_node",
+            parameters=[share("config", "sharing_node.yaml"), {"robots": list(ROBOTS)}],
+            condition=IfCondition(LaunchConfiguration("shared")),
+        ),
+    ]
     for robot in ROBOTS:
         params = f"{robot}_params"
         given = {"namespace": robot, "params": LaunchConfiguration(params)}

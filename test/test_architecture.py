@@ -43,7 +43,7 @@ MAY_IMPORT = {
 COMMANDS = {"cli", "cli_sensors"}  # files of a room
 ROS_FILES = {
     "node", "messages", "action", "settings", "services", "report",
-    "graph", "driver", "replay_node", "recorder_node",
+    "graph", "driver", "replay_node", "recorder_node", "sharing_node",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",

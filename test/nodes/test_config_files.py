@@ -24,11 +24,13 @@ from robocal_ros.bags.replay_node import ReplayNode
 from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.fixture.node import FixtureNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.maintenance.sharing_node import SharingNode
 from robocal_ros.motion.driver import MOTION
 from robocal_ros.panel.node import PanelNode
 from robocal_ros.plc.node import PlcBridgeNode
@@ -53,6 +55,8 @@ NODES = (
     AdapterNode,
     PlcBridgeNode,
     PanelNode,
+    FixtureNode,
+    SharingNode,
 )
 PAGES = {
     ThermalNode: "thermal_node",
@@ -61,6 +65,7 @@ PAGES = {
     MaintenanceNode: "maintenance_node",
     JointCorrectionNode: "joint_correction",
     RecorderNode: "bags",
+    FixtureNode: "fixture",
 }
 
 

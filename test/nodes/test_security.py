@@ -6,6 +6,7 @@ made of is judged, in the form of sros2's policy.xsd 0.2.0.
 """
 
 import contextlib
+import json
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -16,6 +17,8 @@ import pytest
 from test_config_files import NODES
 
 from bench.live.opc_ua import free_port, security_folder
+from robocal_ros.cell_sim.fixture import PLATE
+from robocal_ros.fixture.files import fixture_document
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "config" / "security"
@@ -108,15 +111,17 @@ def test_it_allows_what_the_node_has_and_no_more(graph: Any, tmp_path: Path) -> 
     allowed = policies()
     moves = {"follow_joint_trajectory": ACTION.removeprefix("/"), "hard_stop_service": "hard_stop"}
     laser = {"laser": str(CELL / "kr150_laser.yaml")}
+    (tmp_path / "plate.yaml").write_text(json.dumps(fixture_document(PLATE)))
     plc = {"security_dir": str(security_folder(tmp_path)), "port": free_port()}
     given: dict[str, dict[str, Any]] = {
         "thermal_node": {"arrangement": "flange-sensor"},  # which has all of the other's topics
         "tcf_node": laser | moves,
         "joint_correction_node": moves,
         "maintenance_node": laser | moves,
-        "cell_sim_node": {"profile": True, "run_program": True},
+        "cell_sim_node": {"profile": True, "fixture": True, "run_program": True},
         "plc_bridge_node": plc | {"host": "127.0.0.1", "beams": ["x"]},
         "panel_node": {"page_port": free_port()},
+        "fixture_node": {"fixture_file": str(tmp_path / "plate.yaml")},
         "adapter_node": {"input": "bool", "profile_input": "scan", "profile_frame": "scanner"},
     }
     robot = {"robot": "kr150_r3100"}
@@ -179,7 +184,7 @@ def test_three_may_move_the_robot_and_one_opens_the_gap() -> None:
 def test_who_decides(call: str) -> None:
     doors = {"plc_bridge_node"} | ({"panel_node"} if call != "rollback" else set())
     assert who("request", f"/maintenance_node/{call}") == {"engineer", *doors}
-    for node in ("thermal_node", "tcf_node", "hand_eye_node"):
+    for node in ("thermal_node", "tcf_node", "hand_eye_node", "fixture_node"):
         assert who("request", f"/{node}/{call}") == {"engineer"}
 
 

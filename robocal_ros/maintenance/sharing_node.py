@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gives the gap to one of several robots that share a sensor or a station (docs/sharing.md)."""
+
+import time
+from functools import partial
+from typing import Any
+
+from robocal_msgs.msg import GapOpen, MaintenanceStatus
+from std_msgs.msg import String
+
+from robocal_ros.ground.errors import InputError
+from robocal_ros.maintenance.sharing import SharedPlace
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.base import HouseNode, run
+from robocal_ros.ros.endpoints import WARN, Health
+from robocal_ros.ros.parameters import Setting, number
+
+LOOK_S = 0.05
+BUSY = (MaintenanceStatus.RUNNING, MaintenanceStatus.BREAKING_OFF)
+SETTINGS = (
+    Setting("robots", ["left", "right"], "Namespaces of the robots that share the place"),
+    number(
+        "lease_s",
+        10.0,
+        "A robot of which neither heartbeat nor status came for so long has lost the place",
+        1.0,
+        3600.0,
+    ),
+)
+
+
+class SharingNode(HouseNode):
+    """Passes the heartbeat of one robot's PLC on, and of all others a closed gap."""
+
+    NAME = "sharing_node"
+    SETTINGS = SETTINGS
+
+    def configure(self) -> None:
+        """Open each robot's topics. Raises `InputError` for fewer than two robots."""
+        robots = self.settings["robots"]
+        if len(set(robots)) < 2 or len(set(robots)) != len(robots) or "" in robots:
+            raise InputError(f"robots is {robots}: name two namespaces or more, each once")
+        self._gaps = {}
+        for name in robots:
+            self.add_input(
+                GapOpen, f"{name}/gap_wanted", partial(self._wanted, name), endpoints.HEARTBEAT
+            )
+            self.add_input(
+                MaintenanceStatus,
+                f"{name}/maintenance_node/status",
+                partial(self._status, name),
+                endpoints.LATCHED,
+            )
+            self._gaps[name] = self.add_output(GapOpen, f"{name}/gap_open", endpoints.HEARTBEAT)
+        self._holder = self.add_output(String, "~/holder", endpoints.LATCHED)
+        self.add_timer(LOOK_S, self._look, steady=True)
+
+    def activate(self) -> None:
+        """Begin: whoever may be in the place already has a lease's time to say so."""
+        settings = self.settings
+        self._place = SharedPlace(settings["robots"], settings["lease_s"], time.monotonic())
+        self._told: str | None = None
+        self._look()
+
+    def _wanted(self, name: str, message: Any) -> None:
+        # As it came: only its own PLC may echo a robot's beat, and a late one counts as late.
+        message.open = self._place.want(name, bool(message.open), time.monotonic())
+        self._gaps[name].publish(message)
+        self._look()
+
+    def _status(self, name: str, message: Any) -> None:
+        out = bool(message.at_home) and message.state not in BUSY
+        self._place.tell(name, out, time.monotonic())
+        self._look()
+
+    def _look(self) -> None:
+        """Say who has the place, where that has changed."""
+        holder = self._place.holder(time.monotonic())
+        if holder != self._told:
+            self._told = holder
+            self._holder.publish(String(data=holder))
+            self.get_logger().info(f"{holder} has the place" if holder else "nobody has the place")
+
+    def health(self) -> Health:
+        """Who has the place, and who waits for it."""
+        now_s, health = time.monotonic(), Health()
+        health.values = {"holder": self._told or "nobody"}
+        if why := self._place.why(now_s):
+            health.worsen(WARN, why)
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(SharingNode)

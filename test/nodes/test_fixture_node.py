@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""fixture_node over DDS: taught, moved, measured, accepted, rolled back."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fixture_driver import mounted, visit
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from measured_fixture import ARM, FRAME, PLATE, MeasuredFixture
+from rclpy.qos import HistoryPolicy, QoSProfile
+from robocal_msgs.msg import CalibrationQuality
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from robocal_ros.fixture.files import fixture_document
+from robocal_ros.fixture.node import FixtureNode
+from robocal_ros.fixture.session import POINT
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import Code
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.ros import endpoints
+from robocal_ros.ros.conversions import header
+
+STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
+NAME = "/fixture_node"
+
+
+@pytest.fixture
+def cell(graph, tmp_path):
+    with CalibrationHistory.open("F1", model_hash=ARM.model_hash, state_dir=tmp_path) as history:
+        mounted(history)
+    file = tmp_path / "plate.yaml"
+    file.write_text(json.dumps(fixture_document(PLATE)))
+    frame = graph.collect(PoseWithCovarianceStamped, f"{NAME}/frame", endpoints.LATCHED)
+    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", endpoints.LATCHED)
+    settings = {"robot": "kr150_r3100", "serial": "F1", "state_dir": str(tmp_path)}
+    settings |= {"fixture_file": str(file), "sensor_frame": FRAME}
+    node = graph.add(FixtureNode, settings)
+    out = {JOINTS: graph.publisher(JointState, JOINTS, STREAM)}
+    out[POINT] = graph.publisher(PointStamped, POINT, STREAM)
+    graph.spin_for(0.2)
+    told = []
+
+    def show(points, begin_s):
+        """Publish what a gap's standstills give, and see it taken."""
+        for one in visit(points, begin_s):
+            sample = one.message
+            if one.topic == JOINTS:
+                message = JointState(header=header(sample.stamp_ns, ""))
+                message.name, message.position = list(sample.names), sample.position.tolist()
+            else:
+                message = PointStamped(header=header(sample.stamp_ns, sample.frame))
+                message.point.x, message.point.y, message.point.z = sample.p.tolist()
+            out[one.topic].publish(message)
+            told.append(one)  # at most two are on their way, so that topics stay in step
+            graph.spin_until(lambda: sum(c.received for c in node.inputs.values()) >= len(told) - 2)
+        graph.spin_until(lambda: node._session.points == len(points))
+
+    def call(name):
+        answer = graph.call(Trigger, f"{NAME}/{name}_trigger")
+        return answer.success, answer.message
+
+    return SimpleNamespace(show=show, call=call, frame=frame, quality=quality, graph=graph)
+
+
+def test_a_fixture_is_taught_found_moved_accepted_and_rolled_back(cell):
+    world = MeasuredFixture(3)
+    cell.show(world.points(world.faults(), 3, 1), 10.0)
+    assert cell.call("measure")[1].split()[1] == "CONFLICT", "nothing is taught yet"
+    assert cell.call("teach")[0]
+    assert cell.call("accept")[0]
+    cell.graph.spin_until(lambda: len(cell.frame) == 1)
+    cell.show(world.points(world.faults("fixture_moved", 5e-4), 2, 2), 100.0)
+    done, words = cell.call("measure")
+    assert done, words
+    assert "plate moved by 0.5" in words
+    cell.graph.spin_until(lambda: cell.quality[-1].code == Code.ACCEPT)
+    assert cell.call("accept")[0]
+    cell.graph.spin_until(lambda: len(cell.frame) == 2)
+    told = cell.frame[-1].pose
+    assert np.all(np.diag(np.reshape(told.covariance, (6, 6))) > 0.0)
+    before, after = (
+        frames.transform_from_quat(
+            np.array([p.position.x, p.position.y, p.position.z]),
+            np.array([p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w]),
+        )
+        for p in (one.pose.pose for one in cell.frame[-2:])
+    )
+    change = SimpleNamespace(change=after @ frames.invert(before))
+    assert world.worst_m(change, "fixture_moved", 5e-4) < 1e-4
+    assert cell.call("rollback")[0]
+    cell.graph.spin_until(lambda: len(cell.frame) == 3)
+    assert cell.frame[-1].pose.pose.position.x == cell.frame[0].pose.pose.position.x
