@@ -14,13 +14,14 @@ import json
 import shutil
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 
 from demo_output import Moment, Story, show, tell
 
-from bench.live.cell import set_fault
+from bench.live.cell import SERIAL, set_fault
 from bench.live.graph import CellController, LiveError
 from bench.live.plc import GAP_S, Judge, Plc
 from bench.live.running import live_cell, validate
@@ -29,6 +30,7 @@ from robocal_ros.ground.errors import RobocalError
 
 OUT = ROOT / "out"
 COLLISION_MM = 2.0
+PAGE_PORT = 8480
 
 
 class Demo:
@@ -80,6 +82,9 @@ def main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with live_cell(folder, recordings, tell) as (controller, plc):
+            if find_spec("aiohttp"):  # of the extra [panel]
+                controller.start(folder, "panel_node", {"serial": SERIAL, "page_port": PAGE_PORT})
+                tell(f"the page for the people at the line: http://127.0.0.1:{PAGE_PORT}")
             demo = Demo(controller, plc)
             demo.run()
         story = demo.story
