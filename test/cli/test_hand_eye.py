@@ -64,6 +64,17 @@ def sphere(made) -> Any:
     return robocal("sphere", *shots(made / "sphere"), "--radius-mm", 20)
 
 
+def several(folder: Path) -> list[object]:
+    """Words of the sphere, the stairs and the edge together."""
+    return [word for kind in ("sphere", "step", "line") for word in (f"--{kind}", folder / kind)]
+
+
+@pytest.fixture(scope="module")
+def together(made) -> Any:
+    """The document of several targets together, judged by other shots."""
+    return robocal("joint", *HEIGHTS, *several(made), "--check", "check.csv")
+
+
 def line_of(kind: str) -> tuple[str, list[str]]:
     return ("line", ["--line-kind", "groove"]) if kind == "groove" else (kind, [])
 
@@ -114,19 +125,16 @@ class TestRecovered:
         away = pose_of(found)[:3, 3] - TRUE[:3, 3]
         assert 0.0 < np.linalg.norm(away) < 1e-2  # a closed form: a start, not a result
 
-    def test_several_targets_together_are_better_than_each(self, made, sphere):
-        words = [word for kind in ("sphere", "step", "line") for word in (f"--{kind}", made / kind)]
-        found = robocal("joint", *HEIGHTS, *words)
+    def test_several_targets_together_are_better_than_each(self, together, sphere):
+        found = together
         assert chi_square(found) < FAR_OFF
         assert found["working_error_mm"] < sphere["working_error_mm"]
         names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
         assert names == set(found["target"]) == {"sphere", "step", "line"}
 
-    def test_other_shots_judge_several_targets_together(self, made, tmp_path):
-        words = [word for kind in ("sphere", "step") for word in (f"--{kind}", made / kind)]
-        words += ["--line", tmp_path / "line"]
+    def test_other_shots_judge_several_targets_together(self, made, together, tmp_path):
+        words, found = [*several(made)[:-1], tmp_path / "line"], together
         shutil.copytree(made / "line", tmp_path / "line")
-        found = robocal("joint", *HEIGHTS, *words, "--check", "check.csv")
         assert found["verdict"]["accept"]
         judges = [
             robocal(kind, *shots(made / kind), *target(made / kind), "--check", check)
@@ -246,16 +254,11 @@ class TestMistakes:
         found = self.refused("BAD_INPUT", "a thousand times too small", run=self.sphere(folder))
         assert found["error"]["file"].endswith("s3.csv")
 
-    @pytest.mark.parametrize(
-        ("undone", "words"),
-        [
-            (lambda T: np.roll(T, 1, axis=0), "shifted by one"),
-            (lambda T: T * LEFT_HANDED, "y of their positions negated: they come from a left-hand"),
-        ],
-    )
-    def test_poses_that_fit_when_put_right(self, tmp_path, undone, words):
+    def test_poses_that_fit_when_put_right(self, tmp_path):
+        """One of the mistakes of test_hand_eye_solve."""
         some = shots_of("sphere")
-        write_part(tmp_path, "poses", some, range(SHOTS), undone(some.T_base_flange[:SHOTS]))
+        write_part(tmp_path, "poses", some, range(SHOTS), some.T_base_flange[:SHOTS] * LEFT_HANDED)
+        words = "y of their positions negated: they come from a left-hand"
         self.refused("RESIDUAL_TOO_LARGE", words, run=self.sphere(tmp_path))
 
     def test_a_left_handed_target(self, made, tmp_path):
