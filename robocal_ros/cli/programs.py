@@ -4,13 +4,12 @@
 import argparse
 import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robocal_ros import __version__
 from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
@@ -27,10 +26,10 @@ from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, WrongRobotError
 from robocal_ros.ground.files import read_bytes, read_text, write_bytes
-from robocal_ros.ground.frames import Array, transform_document
+from robocal_ros.ground.frames import Array
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
-from robocal_ros.history.history_records import FRAME_SHIFT, THERMAL, Proposal
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
@@ -43,8 +42,16 @@ from robocal_ros.programs.correcting import (
     report,
 )
 from robocal_ros.programs.fanuc import FanucDialect
-from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_shift, given_shift
+from robocal_ros.programs.frame_shift import LEVER_M, PARTS, best_shift, given_shift
 from robocal_ros.programs.points import Dialect, frame_given
+from robocal_ros.thermal.frame_shifts import (
+    FrameShiftInForce,
+    errors_of,
+    keep_shift,
+    shift_document,
+    shift_in_force,
+    shift_verdict,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -303,7 +310,6 @@ _SHIFT_EXAMPLE = """example:
       --tool 'TOOL_DATA[1]=0,0,300,0,0,0' --base 'BASE_DATA[2]=900,0,400,0,0,0'
 """
 _TURNED_MM = 1e3 * LEVER_M
-WORTH_IT = 0.9  # of the error: less of a gain is not worth a change of the controller's frames
 
 
 def add_frame_shift(parser: argparse.ArgumentParser) -> None:
@@ -373,7 +379,7 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     bases = bases or [("", np.eye(4))]
     if (args.keep or args.in_force) and args.robot_serial is None:
         raise InputError("--keep and --in-force are about a history: give --robot-serial")
-    in_force = None if args.robot_serial is None else _shift_in_force(args, models, q, tools[0][1])
+    in_force = None if args.robot_serial is None else _in_force(args, models, q, tools[0][1])
     if args.in_force:
         still = FrameShiftInForce(0, given_shift(models, q, tools[0][1], np.eye(4), np.eye(4)))
         shift = (in_force or still).shift
@@ -403,106 +409,30 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
         "model_hash": nominal.model_hash,
         "maker": args.maker,
         "text": words,
-        **_shift_document(shift, names, args.limit_mm),
+        **shift_document(shift, names, args.limit_mm),
         "in_force": None,
         "calibration_id": None,
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
     }
     if in_force is not None:
-        errors = _errors(in_force.shift.after, args.limit_mm)
+        errors = errors_of(in_force.shift.after, args.limit_mm)
         document["in_force"] = {"revision": in_force.revision, **errors}
-    verdict = _shift_verdict(document, args.in_force)
+    verdict = shift_verdict(document, args.in_force)
     document["verdict"] = verdict_document(verdict)
     if args.keep:
-        document["calibration_id"] = _keep(args, models, shift, q, document, verdict)
+        with model_history(args, nominal) as history:
+            document["calibration_id"] = keep_shift(
+                history, nominal, shift, q, document, verdict, time.time_ns()
+            )
     return CliResult(document, _show_shift)
 
 
-@dataclass(frozen=True, eq=False)
-class FrameShiftInForce:
-    """A shift of the history, judged with the present model."""
-
-    revision: int
-    shift: FrameShift
-
-
-def _shift_in_force(
+def _in_force(
     args: argparse.Namespace, models: CorrectionModels, q: Array, T_flange_tool: Array
 ) -> FrameShiftInForce | None:
-    """The shift in force; None where the frames are as they were."""
     with model_history(args, models.nominal) as history:
-        head = history.head(FRAME_SHIFT)
-        if head.calibration_id is None:
-            return None
-        kept = history.model(head.calibration_id)
-    T_base, T_tool = (np.array(kept[name]) for name in ("T_base_shift", "T_tool_shift"))
-    return FrameShiftInForce(head.revision, given_shift(models, q, T_flange_tool, T_base, T_tool))
-
-
-def _shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -> Document:
-    poses = zip(names, _sizes(shift.before), _sizes(shift.after), strict=True)
-    return {
-        "T_base_shift": transform_document(shift.T_base_shift),
-        "T_tool_shift": transform_document(shift.T_tool_shift),
-        "before": _errors(shift.before, limit_mm),
-        "after": _errors(shift.after, limit_mm),
-        "poses": [{"name": name, "before": one, "after": other} for name, one, other in poses],
-    }
-
-
-def _shift_verdict(document: Document, only_judged: bool) -> Verdict:
-    """Whether the shift is worth entering: against what is in force, else the frames as given."""
-    was, now = document["in_force"], document["after"]["rms_mm"]
-    with_what = "without a shift" if was is None else f"with that of revision {was['revision']}"
-    rms = (document["before"] if was is None else was)["rms_mm"]
-    if only_judged:
-        gone = now <= document["before"]["rms_mm"]
-        code = Code.ACCEPT if gone else Code.WORSE_THAN_CURRENT
-        return Verdict(
-            code, f"{document['before']['rms_mm']:.3f} mm rms are {now:.3f} mm {with_what}"
-        )
-    words = f"{rms:.3f} mm rms {with_what} become {now:.3f} mm"
-    if now <= WORTH_IT * rms:
-        return Verdict(Code.ACCEPT, words)
-    hint = "correct the program instead" if was is None else "the frames in force still serve"
-    return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{words}: {hint}")
-
-
-def _keep(
-    args: argparse.Namespace,
-    models: CorrectionModels,
-    shift: FrameShift,
-    q: Array,
-    document: Document,
-    verdict: Verdict,
-) -> int:
-    """Put a shift into the history; its number there."""
-    now = time.time_ns()
-    with model_history(args, models.nominal) as history:
-        thermal = history.head(THERMAL)
-        return history.propose(
-            Proposal(
-                kind=FRAME_SHIFT,
-                model_hash=models.nominal.model_hash,
-                based_on=history.head(FRAME_SHIFT).revision,
-                cycle_id="",
-                stamp_ns=now,
-                created_ns=now,
-                software=__version__,
-                method="frame-shift",
-                code=verdict.code,
-                reason=verdict.reason,
-                candidate_rms_mm=document["after"]["rms_mm"],
-                document=document,
-                model={
-                    "T_base_shift": shift.T_base_shift.tolist(),
-                    "T_tool_shift": shift.T_tool_shift.tolist(),
-                    "thermal_revision": thermal.revision,
-                },
-                inputs={"q": q},
-            )
-        )
+        return shift_in_force(history, models, q, T_flange_tool)
 
 
 def _working_poses(path: Path, arm: SerialArm) -> tuple[Array, tuple[str, ...], Array | None]:
@@ -518,20 +448,6 @@ def _working_poses(path: Path, arm: SerialArm) -> tuple[Array, tuple[str, ...], 
     if weight is not None and (np.any(weight < 0.0) or not np.any(weight > 0.0)):
         raise InputError("weights are 0 or above, and not all 0", file=str(path), column="weight")
     return q, read_samples(table, tuple(map(str, table.rows))), weight
-
-
-def _sizes(twist: Array) -> list[Document]:
-    return [
-        {"mm": 1e3 * float(np.linalg.norm(e[:3])), "deg": float(np.degrees(np.linalg.norm(e[3:])))}
-        for e in twist
-    ]
-
-
-def _errors(twist: Array, limit_mm: float) -> Document:
-    mm = 1e3 * np.linalg.norm(twist[:, :3], axis=1)
-    share = float(np.mean(1e3 * np.abs(twist[:, :3]) <= limit_mm))
-    rms = float(np.sqrt(np.mean(mm**2)))
-    return {"rms_mm": rms, "max_mm": float(np.max(mm)), "share_within_limit": share}
 
 
 def _show_shift(console: "Console", document: Document) -> None:

@@ -87,7 +87,12 @@ from robocal_ros.thermal.drift_following import (
 )
 from robocal_ros.thermal.identification import require_parameters
 from robocal_ros.thermal.proposing import SENSOR
-from robocal_ros.thermal.services import MeasuringRobotInterface, SensorOnTf
+from robocal_ros.thermal.services import (
+    FRAMES_OF,
+    FrameShiftInterface,
+    MeasuringRobotInterface,
+    SensorOnTf,
+)
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
 
 ACCURACY_S = 1.0
@@ -179,6 +184,13 @@ SETTINGS = (
         -5000.0,
         5000.0,
         check=count_fault(3),
+    ),
+    Setting(
+        "shift_frames_of",
+        FRAMES_OF[0],
+        "Model that the programs were made with whose frames are shifted: the nominal one, or, "
+        "taught by hand, the commissioned robot's",
+        choices=FRAMES_OF,
     ),
     *advanced(
         number(
@@ -463,6 +475,13 @@ class ThermalNode(SessionNode[ThermalSession]):
         self._data_clock = DataClock()
         ask = self._desk.ask
         ThermalServices(self.add_service, ask, history, self._nominal, settings, self._prior)
+        T_flange_tool, tip_m = self._nominal.T_flange_tool.copy(), self._config.tip_m
+        if tip_m:
+            T_flange_tool[:3, 3] = tip_m
+        work = np.array(self._config.work_poses).reshape(-1, self._nominal.n)
+        self._shifts = FrameShiftInterface(
+            self, history, lambda: self._session, work, T_flange_tool, settings
+        )
         self._measuring: MeasuringRobotInterface | None = None
         if self._config.arrangement == FLANGE:
             frame = settings["base_frame"]
@@ -477,6 +496,7 @@ class ThermalNode(SessionNode[ThermalSession]):
         """Begin a session; it knows nothing of what was measured before."""
         super().activate()
         self._shown: tuple[Any, ...] = ()
+        self._shifts.look(again=True)
         self.show_in_force()
 
     def deactivate(self) -> None:
@@ -499,6 +519,7 @@ class ThermalNode(SessionNode[ThermalSession]):
 
     def polled(self, session: ThermalSession) -> None:
         """End a cycle that is overdue; look at who else puts the sensor's frame onto tf."""
+        self._shifts.look()
         self._on_tf.poll()
         if (command := session.overdue()) is not None:
             self._desk.ask(command)

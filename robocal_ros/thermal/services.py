@@ -1,24 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """A measuring robot: where the flange truly is, and what its sensor sees in base.
 
-And the frame of a placed sensor, on tf.
+And the frame of a placed sensor, on tf; and the shift of a controller's frames, for robots that ROS
+does not command.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
 from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
 
-from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    LimitError,
+    RobocalError,
+)
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import FRAME_SHIFT
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.programs.correcting import CorrectionModels
+from robocal_ros.programs.frame_shift import PARTS, best_shift
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message
-from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
+from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message, transform_message
+from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.ros.graph import FrameWatch
+from robocal_ros.ros.session_node import TWIN, trigger_answer
+from robocal_ros.session.events import ACCEPT, ONLY, ROLLBACK, Command, decide
+from robocal_ros.thermal.frame_shifts import (
+    errors_of,
+    keep_shift,
+    shift_document,
+    shift_in_force,
+    shift_verdict,
+)
 from robocal_ros.thermal.measured_points import (
     PlacedShot,
     PointQueue,
@@ -31,6 +54,7 @@ from robocal_ros.thermal.session import ThermalSession
 
 POINT, CLOUD = "point", "cloud"
 MOST_POINTS = 1000  # of a call: their doubts take a tenth of a second
+LIMIT_MM = 0.1  # of the share of coordinates that is told
 UNPLACED = "the sensor is not placed: capture the cold reference"
 
 
@@ -202,3 +226,92 @@ def _of_the_sensor(shot: SensorShot, spheres: SpheresInCell) -> SensorShot:
     if shot.frame != spheres.frame:
         raise InputError(f"frame '{shot.frame}' is not the placed sensor's, '{spheres.frame}'")
     return shot
+
+
+FRAMES_OF = ("nominal", "commissioned")  # which model a program was made with
+
+
+class FrameShiftInterface:
+    """The shift of base and tool frame that serves the working poses best: found, kept, told.
+
+    Nothing else of the session depends on it, so that it needs no place in a recording.
+
+    ``work`` (k, n): the poses; ``T_flange_tool`` (4, 4); ``settings``: of the node.
+    """
+
+    def __init__(
+        self,
+        node: EndpointNode,
+        history: CalibrationHistory,
+        session: Callable[[], ThermalSession | None],
+        work: Array,
+        T_flange_tool: Array,
+        settings: Mapping[str, Any],
+    ) -> None:
+        self._node, self._history, self._session = node, history, session
+        self._work, self._T_flange_tool = work, T_flange_tool
+        self._settings, self._shown = settings, -1
+        self._outputs = {
+            part: node.add_output(TransformStamped, f"~/{part}_shift", endpoints.LATCHED)
+            for part in PARTS
+        }
+        node.add_service(Trigger, "~/shift_frames_trigger", self._find)
+        node.add_service(Trigger, "~/accept_shift_trigger", self._decider(ACCEPT, {"choose": ONLY}))
+        node.add_service(
+            Trigger, "~/rollback_shift_trigger", self._decider(ROLLBACK, {"previous": True})
+        )
+
+    def _find(self, request: Any, response: Any) -> Any:
+        """Find the shift for the model in force, judge it, keep it as a candidate."""
+        session = self._session()
+        if session is None or not len(self._work):
+            raise ConflictError("no working poses: give work_poses_deg, a shift serves those")
+        current, q, T = session.current, self._work, self._T_flange_tool
+        of = self._settings["shift_frames_of"]
+        reference = current.commissioned if of == FRAMES_OF[1] else session.nominal
+        models = CorrectionModels(session.nominal, current.arm, reference)
+        shift = best_shift(models, q, T)
+        names = tuple(str(i + 1) for i in range(len(q)))
+        document = {
+            **shift_document(shift, names, LIMIT_MM),
+            "in_force": None,
+            "shift_frames_of": of,
+        }
+        if (kept := shift_in_force(self._history, models, q, T)) is not None:
+            errors = errors_of(kept.shift.after, LIMIT_MM)
+            document["in_force"] = {"revision": kept.revision, **errors}
+        verdict = shift_verdict(document, only_judged=False)
+        number = keep_shift(
+            self._history, session.nominal, shift, q, document, verdict, time.time_ns()
+        )
+        response.success = verdict.accept
+        response.message = trigger_text(number, verdict.code, verdict.reason)
+        return response
+
+    def _decider(self, name: str, arguments: Mapping[str, Any]) -> Callable[[Any, Any], Any]:
+        def serve(request: Any, response: Any) -> Any:
+            command = Command(name, {"by": TWIN, **arguments})
+            expected = self._history.head(FRAME_SHIFT).revision
+            outcome = decide(self._history, command, expected, time.time_ns(), FRAME_SHIFT)
+            self.look()
+            return trigger_answer(response, outcome)
+
+        return serve
+
+    def look(self, again: bool = False) -> None:
+        """Tell what is in force, where that has changed, or ``again``."""
+        head = self._history.head(FRAME_SHIFT)
+        if self._shown == head.revision and not again:
+            return
+        self._shown = head.revision
+        number = head.calibration_id
+        stamp_ns = self._history.get(number).stamp_ns if number else 0
+        for part, frame in zip(PARTS, (self._settings["base_frame"], "tool"), strict=True):
+            T = np.eye(4) if head.model is None else np.array(head.model[f"T_{part}_shift"])
+            self._outputs[part].publish(
+                TransformStamped(
+                    header=header(stamp_ns, frame),
+                    child_frame_id=f"{frame}_shifted",
+                    transform=transform_message(T),
+                )
+            )

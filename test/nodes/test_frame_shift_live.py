@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shift of frames by thermal_node over DDS: found, accepted, told, rolled back."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from robot_programs import NOMINAL, T_FLANGE_TOOL, drifted, postures
+from std_srvs.srv import Trigger
+
+from robocal_ros.ground import frames
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL
+from robocal_ros.kinematics.arm import model_document
+from robocal_ros.programs.correcting import CorrectionModels
+from robocal_ros.programs.frame_shift import PARTS, best_shift
+from robocal_ros.ros import endpoints
+from robocal_ros.session.events import bring_into_force
+from robocal_ros.thermal.node import ThermalNode
+
+ACTUAL, WORK = drifted(NOMINAL, 1), postures(8, 7)
+TIP = T_FLANGE_TOOL[:3, 3]
+
+
+def shift_of(message):
+    t, r = message.transform.translation, message.transform.rotation
+    return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_shift_is_found_accepted_told_and_rolled_back(graph, tmp_path, poses):
+    with CalibrationHistory.open("S1", model_hash=NOMINAL.model_hash, state_dir=tmp_path) as kept:
+        bring_into_force(kept, THERMAL, NOMINAL, model_document(ACTUAL), "test")
+    told = {
+        part: graph.collect(TransformStamped, f"/thermal_node/{part}_shift", endpoints.LATCHED)
+        for part in PARTS
+    }
+    work = np.degrees(WORK).ravel().tolist()
+    settings = {"serial": "S1", "state_dir": str(tmp_path), "tip_mm": (1e3 * TIP).tolist()}
+    graph.add(ThermalNode, settings | ({"work_poses_deg": work} if poses else {}))
+    graph.spin_until(lambda: all(told[part] for part in PARTS))
+    assert all(np.array_equal(shift_of(told[part][-1]), np.eye(4)) for part in PARTS)
+
+    def call(name):
+        done = graph.call(Trigger, f"/thermal_node/{name}_trigger")
+        return done.success, done.message.split()[1]
+
+    if not poses:
+        assert call("shift_frames") == (False, "CONFLICT")
+        return
+    assert call("accept_shift") == (False, "CONFLICT"), "nothing is pending"
+    assert call("shift_frames") == (True, "ACCEPT")
+    assert call("accept_shift")[0]
+    graph.spin_until(lambda: all(len(told[part]) == 2 for part in PARTS))
+    T = NOMINAL.T_flange_tool.copy()
+    T[:3, 3] = TIP
+    best = best_shift(CorrectionModels(NOMINAL, ACTUAL, NOMINAL), WORK, T)
+    np.testing.assert_allclose(shift_of(told["base"][-1]), best.T_base_shift, atol=1e-9)
+    np.testing.assert_allclose(shift_of(told["tool"][-1]), best.T_tool_shift, atol=1e-9)
+    # with the same model a new one gains nothing over what is in force
+    assert call("shift_frames") == (False, "NO_SIGNIFICANT_GAIN")
+    assert call("rollback_shift")[0]
+    graph.spin_until(lambda: all(len(told[part]) == 3 for part in PARTS))
+    assert np.array_equal(shift_of(told["base"][-1]), np.eye(4))
