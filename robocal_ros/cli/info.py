@@ -145,14 +145,26 @@ def _file(path: Path) -> Told:
 
 def _history(path: Path) -> Told:
     from robocal_ros.history.calibrations import CalibrationHistory
+    from robocal_ros.history.history_records import THERMAL
 
     serial, folder = path.stem, path.absolute().parent
     with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
         heads = history.heads()
         facts = [("calibrations", str(len(history.list(1_000_000))))]
         facts += [(f"{head.kind} in force", f"revision {head.revision}") for head in heads]
-    command = f"robocal history list --state {_typed(path.parent)} --robot-serial {_typed(serial)}"
-    return f"history of the robot with serial {serial}", facts, [command]
+    of = f"--state {_typed(path.parent)} --robot-serial {_typed(serial)}"
+    commands = [f"robocal history list {of}", f"robocal history corrections {of}"]
+    newest = {head.calibration_id: head.kind for head in heads if head.calibration_id}
+    for number, kind in newest.items():
+        commands += [
+            f"robocal history show {number} {of} --json",
+            f"robocal history rollback --kind {_typed(kind)} {of}",
+        ]
+        if kind == THERMAL:
+            commands.append(
+                f"robocal correct-program PROGRAM.src --robot ROBOT {of} --output CORRECTED.src"
+            )
+    return f"history of the robot with serial {serial}", facts, commands
 
 
 def _table(path: Path) -> Told:
@@ -253,17 +265,42 @@ def _kinematics(path: Path, found: Any) -> Told:
 
 
 def _result(path: Path, found: Any) -> Told:
-    verdict = found["verdict"]
+    """A command's document, or one with a ``document`` and a ``model`` as the history shows it."""
+    shown = found.get("document")
+    held = shown if isinstance(shown, Mapping) else found
+    verdict = held.get("verdict", "none")
     if isinstance(verdict, Mapping):
         verdict = f"{verdict.get('code')}: {verdict.get('reason')}"
-    facts = [("verdict", str(verdict))]
-    return "result of a robocal command", facts, []
+    file = _typed(path)
+    commands = []
+    for parent, frame in (("flange", "tool0"), ("base", "base")):
+        if held.get(f"T_{parent}_sensor") is not None:
+            commands.append(
+                f"robocal hand-eye export --result {file} --format urdf --parent {frame} "
+                "--child SENSOR"
+            )
+    if held.get("T_flange_sensor") is not None:
+        commands.append(
+            f"robocal hand-eye verify --result {file} --target-kind sphere --radius-mm RADIUS "
+            "--poses POSES.csv --profiles PROFILES"
+        )
+    if held.get("tcp_mm") is not None:
+        commands.append(f"robocal tool export --tool {file} --format kuka")
+    model = found.get("model")
+    if path.suffix == ".json" and isinstance(model, Mapping) and "joint_names" in model:
+        commands.append(
+            f"robocal correct-program PROGRAM.src --robot ROBOT --model {file} "
+            "--output CORRECTED.src"
+        )
+    what = "calibration of a history" if held is shown else "result of a robocal command"
+    return what, [("verdict", str(verdict))], commands
 
 
 KINDS: tuple[tuple[set[str], Callable[[Path, Any], Told]], ...] = (
     ({"convention", "joints"}, _robot),
     ({"points_mm", "reach_mm"}, _laser),
     ({"kinematics"}, _kinematics),
+    ({"calibration", "document", "inputs"}, _result),
     ({"verdict"}, _result),
 )
 """Keys that a kind of document has, and what is told of it."""

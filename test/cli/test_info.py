@@ -2,17 +2,21 @@
 """``robocal info``: each kind of file is known, and the commands that it names take it."""
 
 import argparse
+import json
 import shlex
 from pathlib import Path
 
 import pytest
 from command import ROOT, robocal, robocal_json
+from histories import BY
+from history_workers import proposal
 from recordings import plain_bag, shift
 from tool_runs import run_tables
 
 from robocal_ros.cli import main
 from robocal_ros.cli.examples import EXAMPLES
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.kinematics.urdf import urdf_of
 
@@ -34,7 +38,7 @@ def takes(command: str) -> None:
     words = shlex.split(command)
     if words[0] == "robocal":
         parser = main.CommandParser(prog="robocal")
-        numbers = {"UP": "400", "DOWN": "360"}
+        numbers = {"UP": "400", "DOWN": "360", "RADIUS": "20"}
         arguments = [numbers.get(word, word) for word in words[1:]]
         named = [word for word in arguments if not word.startswith("-")]
         main._declare(parser, "command", main.COMMANDS, named)
@@ -67,11 +71,21 @@ def made(tmp_path_factory):
     (folder / "bad.yaml").write_text("convention: dh\njoints: []\n")
     (folder / "result.json").write_text('{"verdict": {"code": "ACCEPT", "reason": "good"}}')
     (folder / "verdict.json").write_text('{"verdict": "good"}')
+    good = {"verdict": {"accept": True, "code": "ACCEPT", "reason": "good"}}
+    place = {"xyz_mm": [60.0, -40.0, 110.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    (folder / "mount.json").write_text(json.dumps(good | {"T_flange_sensor": place}))
+    tip = {"tcp_mm": place["xyz_mm"], "quat_xyzw": place["quat_xyzw"]}
+    (folder / "tool.json").write_text(json.dumps(good | tip))
     (folder / "empty.yaml").write_text("kinematics:\n")
     (folder / "cell 4.csv").write_bytes((TABLES / "measured.csv").read_bytes())
     nominal = load_robot("ur10")
     with CalibrationHistory.open("R7", model_hash=nominal.model_hash, state_dir=folder):
         pass
+    warm = {"model_hash": nominal.model_hash, "model": model_document(nominal)}
+    with CalibrationHistory.open("R8", model_hash=nominal.model_hash, state_dir=folder) as history:
+        history.accept(history.propose(proposal(**warm)), **BY)
+    shown = robocal("history", "show", "1", "--state", folder, "--robot-serial", "R8", "--json")
+    (folder / "shown.json").write_text(shown.stdout)
     return folder
 
 
@@ -91,6 +105,10 @@ def made(tmp_path_factory):
         ("empty.yaml", "kinematics of a Universal Robots arm", ""),
         ("cell 4.csv", "measurements: joints, and where", "joints: 6"),
         ("R7.sqlite", "history of the robot with serial R7", "calibrations: 0"),
+        ("R8.sqlite", "history of the robot with serial R8", "thermal in force: revision 1"),
+        ("shown.json", "calibration of a history", "verdict: "),
+        ("mount.json", "result of a robocal command", "ACCEPT: good"),
+        ("tool.json", "result of a robocal command", "ACCEPT: good"),
     ],
 )
 def test_a_file_that_was_made_is_known(made, name, kind, fact):
@@ -118,10 +136,30 @@ def test_the_help_of_each_command_has_an_example_that_it_takes():
 
 def test_what_it_names_runs_as_printed(made, monkeypatch):
     monkeypatch.chdir(made)
-    for file in ("robot.urdf", "R7.sqlite"):
-        command = robocal_json("info.json", "info", file)["commands"][0]
-        done = robocal(*shlex.split(command)[1:])
-        assert done.returncode == 0, (command, done.stderr)
+    for file, count in (
+        ("robot.urdf", 1), ("R7.sqlite", 2), ("R8.sqlite", 3), ("mount.json", 1), ("tool.json", 1),
+    ):  # fmt: skip
+        for command in robocal_json("info.json", "info", file)["commands"][:count]:
+            done = robocal(*shlex.split(command)[1:])
+            assert done.returncode == 0, (command, done.stderr)
+    assert "verify" in " ".join(robocal_json("info.json", "info", "mount.json")["commands"])
+
+
+def test_a_model_of_a_history_is_taken_where_it_is_named(made, monkeypatch):
+    monkeypatch.chdir(made)
+    Path("PROGRAM.src").write_text(
+        "DEF weld()\nLIN {X 900, Y 0, Z 900, A 0, B 90, C 0, S 2, T 2}\nEND\n"
+    )
+    for file in ("R8.sqlite", "shown.json"):
+        (command,) = (
+            one for one in robocal_json("info.json", "info", file)["commands"]
+            if "correct-program" in one
+        )  # fmt: skip
+        words = [{"ROBOT": "ur10"}.get(word, word) for word in shlex.split(command)]
+        Path("CORRECTED.src").unlink(missing_ok=True)
+        done = robocal(*words[1:])
+        assert "Traceback" not in done.stderr
+        assert done.returncode == 0, (command, done.stdout, done.stderr)
 
 
 def test_what_is_of_no_kind_is_said(tmp_path: Path):
