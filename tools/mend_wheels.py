@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point the ROS wheels' CMake files at this machine's Python and NumPy headers.
 
-The wheels were built elsewhere and name that machine's paths. Run once with the venv's Python;
-a second run finds nothing to do.
+The wheels were built elsewhere and name that machine's paths. A wheel holds no links either: of a
+library that has several names it holds as many copies, which become links to one. Run once with the
+venv's Python; a second run finds nothing to do.
 """
 
+import filecmp
 import sys
 import sysconfig
 from pathlib import Path
@@ -36,5 +38,19 @@ def mend(share: Path) -> int:
     return changed
 
 
+def link(folder: Path) -> int:
+    """Make links of names of a library, ``x.so``, that are copies of ``x.so.2``; how many."""
+    linked = 0
+    for path in sorted(folder.glob("*.so*"), key=lambda path: len(path.name), reverse=True):
+        for shorter in folder.glob("*.so*"):
+            is_name = path.name.startswith(f"{shorter.name}.")
+            if is_name and not shorter.is_symlink() and filecmp.cmp(path, shorter, shallow=False):
+                shorter.unlink()
+                shorter.symlink_to(path.name)
+                linked += 1
+    return linked
+
+
 if __name__ == "__main__":
     print(f"mended {mend(Path(sys.prefix, 'share'))} CMake files")
+    print(f"made links of {link(Path(sys.prefix, 'lib'))} copies of libraries")
