@@ -20,6 +20,9 @@ CLOSE = 1e-12  # relative
 SMALLEST_SHARE = 1e-9  # of the numbers, so that a fit that takes up all of them is no division by 0
 TINY = 1e-200
 ROUNDING = 1e-15
+LOST = 1e-11  # of the largest: a sum of data and prior has lost digits of what is so small
+NEITHER = 1e-13  # of the largest: what neither data nor prior hold
+ROUNDINGS = 2e-14  # share of a direction's information that data must have, over the least of all
 NO_MEAN = 2.0  # up to so many numbers a squared error over its reported variance (F) has no mean
 
 
@@ -45,15 +48,8 @@ class Freedom:
     @classmethod
     def of(cls, count: int, told: Array, data: Array, prior: Array) -> "Freedom":
         """From A, W and P (k, k); what neither data nor prior determine takes up nothing."""
-        pinned = float(np.trace(prior))
-        unit = float(np.trace(data)) / pinned if pinned else 1.0
-        whole = data + unit * prior
-        size = 1.0 / np.sqrt(np.maximum(np.diag(whole), TINY))
-        weight, axes = np.linalg.eigh(whole * np.outer(size, size))
-        root = size[:, None] * axes / np.sqrt(np.maximum(weight, ROUNDING * weight[-1]))
-        share, turn = np.linalg.eigh(root.T @ data @ root)
-        V = root @ turn
-        shown = np.clip(share, 0.0, 1.0) if pinned else np.ones(len(data))
+        unit, share, V, _ = _both_diagonal(data, prior)
+        shown = np.clip(share, 0.0, 1.0) if np.any(prior) else np.ones(len(data))
         tells = np.where(shown > ROUNDING, np.sum(V * (told @ V), axis=0), 0.0)
         return cls(count, tells, shown, unit)
 
@@ -91,6 +87,22 @@ class Freedom:
 
     def _held(self, squared: float) -> Array:
         return (1.0 - self.data) * (squared / self.unit)
+
+
+def _both_diagonal(data: Array, prior: Array) -> tuple[float, Array, Array, float]:
+    """Directions (k, k), columns V, in which W + unit P is one and W the diagonal ``share`` (k,).
+
+    ``unit``: a variance at which data W and prior P (k, k) weigh alike; last: the least eigenvalue
+    of W + unit P, over the greatest, with a diagonal of ones.
+    """
+    pinned = float(np.trace(prior))
+    unit = float(np.trace(data)) / pinned if pinned else 1.0
+    whole = data + unit * prior
+    size = 1.0 / np.sqrt(np.maximum(np.diag(whole), TINY))
+    weight, axes = np.linalg.eigh(whole * np.outer(size, size))
+    root = size[:, None] * axes / np.sqrt(np.maximum(weight, ROUNDING * weight[-1]))
+    share, turn = np.linalg.eigh(root.T @ data @ root)
+    return unit, share, root @ turn, float(weight[0] / weight[-1])
 
 
 def require_told(left: float) -> None:
@@ -358,10 +370,21 @@ class Descent(Generic[S]):
         return np.array([values[int(n)] for n in self.sizes])
 
     def posterior(self, normal: Array, scale: float) -> Array:
-        """Covariance (k, k) of the unknowns from the data's normal matrix."""
+        """Covariance (k, k) of the unknowns from the data's normal matrix.
+
+        The sum of an almost exact normal matrix and a prior has lost what only the prior holds:
+        then by the directions in which both are diagonal. Not a number where neither holds one.
+        """
         information = normal / scale**2 + self.prior
         unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        inverse = np.linalg.inv(information * np.outer(unit, unit))
+        scaled = information * np.outer(unit, unit)
+        if np.any(self.prior) and np.linalg.eigvalsh(scaled)[0] < LOST:
+            balance, share, axes, least = _both_diagonal(normal, self.prior)
+            if least < NEITHER:
+                return np.full_like(normal, np.nan)
+            share = np.where(share > ROUNDINGS / least, np.minimum(share, 1.0), 0.0)
+            return np.asarray(axes / (share / scale**2 + (1.0 - share) / balance) @ axes.T)
+        inverse = np.linalg.inv(scaled)
         return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
 
     def inliers(self, run: DescentState[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:

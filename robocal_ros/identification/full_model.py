@@ -38,6 +38,9 @@ from robocal_ros.identification.solve import Identification, Method, identify
 from robocal_ros.kinematics import SerialArm
 
 _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry alone
+# Huber's loss still lets one that is off by 0.1 m tell more than many sound ones: beyond 8 sigma a
+# sample waits until there is a model that says what it should be.
+GROSS_WEIGHT = 1.0 / 3.0
 # The evidence trusts a noise that is normal and alike everywhere; errors at poses left out do not:
 # these must fall, and clearly up to so many poses, which also outnumber the other unknowns.
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
@@ -395,6 +398,7 @@ def _by_rounds(problem: _FullProblem, torque: Array | None) -> "_Solved | None":
     for _ in range(_ROBUST_ROUNDS):
         residual, rows = problem.linearise(at.cell, at.terms)
         weight = problem.robust_weight(residual)
+        weight[weight < GROSS_WEIGHT] = 0.0
         weight *= problem.visit_share(residual, weight)
         at = _round(problem, at, residual, rows, weight)
     keep = problem.inliers(*problem.left_out(at, weight))

@@ -99,3 +99,20 @@ def test_a_step_that_overshoots_for_ever_is_shortened(share, start):
     assert run.converged
     assert abs(run.state[0]) < STEP_TOLERANCE  # of the sigma, which is one
     assert run.iterations < 20
+
+
+@pytest.mark.parametrize("sigma", [1e-10, 1e-9, 1e-6, 1e-3])
+def test_a_prior_counts_beside_almost_exact_data(sigma):
+    """Of six numbers the data show four; the other two are known as well as before."""
+    rng = np.random.default_rng(3)
+    turn = np.linalg.qr(rng.standard_normal((6, 6)))[0]
+    J = rng.standard_normal((100, 4)) @ turn[:4]
+    prior = np.eye(6) / 3e-3**2
+    descent = Descent(Rough(0.0), prior, 0, np.full(100, 1))
+    covariance = descent.posterior(J.T @ J, sigma) @ turn.T
+    shown = np.linalg.inv(turn[:4] @ (J.T @ J / sigma**2 + prior) @ turn[:4].T)
+    rounding = np.finfo(float).eps * 3e-3**2  # of a matrix that holds both
+    np.testing.assert_allclose(turn[:4] @ covariance[:, :4], shown, rtol=1e-6, atol=rounding)
+    np.testing.assert_allclose(
+        turn[4:] @ covariance[:, 4:], 3e-3**2 * np.eye(2), rtol=1e-6, atol=1e-11
+    )

@@ -166,6 +166,35 @@ def test_a_robot_that_only_sags_has_compliances_alone():
     assert rms_mm(found, check) < 0.5 * rms_mm(plain, check)
 
 
+def test_gross_rows_cost_no_more_than_their_number():
+    """A tracker's wrong reflector, 0.1 m off, in each tenth row; and some millimetres."""
+    robot = BentRobot(1)
+    data, check = robot.measured(robot.poses(400)), robot.measured(robot.poses(600), 0.0)
+    bad = robot.rng.choice(400, 40, replace=False)
+    for size in (0.1, 0.003):
+        position = data.position.copy()
+        way = robot.rng.standard_normal((40, 3))
+        position[bad] += size * way / np.linalg.norm(way, axis=1, keepdims=True)
+        found = identify_full(robot.nominal, replace(data, position=position))
+        assert set(found.rejected) >= {data.sample[i] for i in bad}
+        without = identify_full(robot.nominal, data.take(np.delete(np.arange(400), bad)))
+        assert rms_mm(found, check) < 1.02 * rms_mm(without, check)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 1e-9, 1e-7])
+def test_almost_exact_data_are_solved(noise_m):
+    """Of a robot with errors in its geometry alone; what a target cannot show is the prior's."""
+    robot = BentRobot(2, size_rad=0.0, compliance=np.zeros(6), noise_m=noise_m)
+    data, check = robot.measured(robot.poses(250)), robot.measured(robot.poses(100), 0.0)
+    found = identify_full(robot.nominal, data)
+    # 27 numbers of 750 are found; rounding of positions of 2 m is 1e-15 of them
+    assert rms_mm(found, check) <= 1e3 * max(0.5 * noise_m, 1e-12)
+    target = np.zeros(100, dtype=np.int64)
+    assert np.all(np.linalg.eigvalsh(found.predicted_variance(check.q, target)) > 0.0)
+    if noise_m:
+        assert found.noise_m == pytest.approx(noise_m, rel=4.0 / np.sqrt(2 * 720))
+
+
 def test_of_data_without_noise_rounding_is_not_learned():
     robot = BentRobot(3, size_rad=0.0, compliance=np.zeros(6), noise_m=0.0)
     found = identify_full(robot.nominal, robot.measured(robot.poses(200)))
