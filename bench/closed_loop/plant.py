@@ -204,7 +204,8 @@ class Plant:
         self.is_open = False
 
     def _show_ball(self, suite: Suite, rounds: int) -> None:
-        for pose in [*np.tile(CYCLE, (rounds, 1)), HOME]:
+        # Each round from home, as a cycle: so backlash cancels.
+        for pose in np.tile(np.vstack([CYCLE, HOME]), (rounds, 1)):
             self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))
             self.listen(self.cell.motion.end_s)
             self.listen(self.now_s + DWELL_S)

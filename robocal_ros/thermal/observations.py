@@ -49,11 +49,13 @@ class Observation:
     """A measured target with the joints ``q`` (n,) at that instant.
 
     ``ready_ns``: stamp of the joint reading that completed it.
+    ``side`` (n,): which way each joint went last, see `JointStream.side`.
     """
 
     sample: PointSample
     q: Array
     ready_ns: int
+    side: Array
 
 
 def one_per_visit(observations: Sequence[Observation], same_rad: float) -> list[Observation]:
@@ -102,6 +104,7 @@ def as_measurements(
         rotation=np.array(rotations) if complete else None,
         sigma=None if sigma_m is None else np.hypot(sigma_m, [s.sigma_m for s in samples]),
         stamp_ns=np.array([s.stamp_ns for s in samples], dtype=np.int64),
+        side=np.array([o.side for o in observations]),
     )
 
 
@@ -274,7 +277,11 @@ class ObservationDesk:
         if reading is None:
             self.ignored.add(topic, refused)
             return True
-        self._observed.append(Observation(sample, reading.q, reading.ready_ns))
+        self._observed.append(
+            Observation(
+                sample, reading.q, reading.ready_ns, self.stream.side(stamp_ns, self.rule.gap_s)
+            )
+        )
         if len(self._observed) > MOST_KEPT:
             self.ignored.add(self._observed.pop(0).sample.topic, "no command used it")
         return True

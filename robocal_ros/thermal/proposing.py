@@ -52,6 +52,7 @@ from robocal_ros.thermal.observations import Beside
 from robocal_ros.thermal.reference import (
     COMMISSIONED,
     ColdReference,
+    ColdSpots,
     capture_reference,
     drift_share,
     drift_size_m,
@@ -211,6 +212,10 @@ class Proposer:
             names = config.drift_parameters or self._nominal.parameters.names
             found = identify_subset(spots, data, names, sigma_m=config.sigma_m)
             judged = judge_cycle(found, spots, in_force=in_force, sigma_m=config.sigma_m)
+        verdict = judged.verdict
+        if words := other_sides(spots, data):
+            verdict = replace(verdict, reason=f"{verdict.reason}; {words}")
+            judged = replace(judged, verdict=verdict)
         model = (
             model_document(found.arm)
             | held
@@ -228,7 +233,7 @@ class Proposer:
                 "missing": [n for n in range(1, spots.poses + 1) if n not in visited],
             }
         }
-        return document, model, judged.verdict
+        return document, model, verdict
 
     def _require_functions(self) -> Document:
         """The load of the reference's model, of which a drift holds functions and compliances.
@@ -269,6 +274,8 @@ class Proposer:
             )
         command, expected, from_what = self._expected(command)
         message += which_arm + from_what
+        if words := other_sides(reference.spots, reference.data):
+            message += f"; {words}"
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
         verdict = Verdict(Code.ACCEPT, message)
         model = (
@@ -359,6 +366,27 @@ class Proposer:
         if verdict.accept:
             self._accept(chosen, command, "placed", wall_ns)
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
+
+
+NAMED_SHARE = 0.25  # of a joint's backlash
+
+
+def other_sides(spots: ColdSpots, data: Measurements) -> str:
+    """Say at which poses joints came from another side than when cold; empty: at none.
+
+    Of a cold visit itself: at which poses its rounds differ.
+    """
+    if data.side is None:
+        return ""
+    other = spots.other_side(spots.match(data), data.side) > NAMED_SHARE
+    poses = spots.visited(data.q[other.any(axis=1)])
+    if not poses:
+        return ""
+    names = [spots.cell.arm.joint_names[j] for j in np.flatnonzero(other.any(axis=0))]
+    return (
+        f"reached from another side: {', '.join(names)} at pose {', '.join(map(str, poses))}, "
+        "where backlash counts as noise; begin each round at the same place"
+    )
 
 
 def _load_of(model: Document) -> Document:

@@ -25,6 +25,8 @@ from robocal_ros.kinematics.tables import measurements_of, read_table
 
 SAME_VISIT_RAD = float(np.radians(0.5))
 FEWEST_TO_JUDGE = 3  # visits of a spot, so that the others outvote a wrong one
+# Of a joint that came from another side: as an IRB 1600's (docs/simulation.md).
+LOST_MOTION_RAD = 7e-5
 CONTRADICTION = 8.0  # median distances from the spot's median; noise alone stays below 5
 
 
@@ -40,6 +42,7 @@ class ColdSpots:
     ``first`` (s,): the first of them.
     ``rejected``: names of cold measurements that other visits of the same spot contradict.
     ``on_flange``: whether the sensor is on the flange: see `SpheresInCell`.
+    ``side`` (s, n): which way each joint went last, mean of the visits; None: not known.
     """
 
     cell: CellModel
@@ -50,6 +53,7 @@ class ColdSpots:
     first: Index
     rejected: tuple[str, ...] = ()
     on_flange: bool = False
+    side: Array | None = None
 
     @classmethod
     def of(cls, cell: CellModel, data: Measurements, *, on_flange: bool = False) -> "ColdSpots":
@@ -68,7 +72,8 @@ class ColdSpots:
         first = np.array([int(np.flatnonzero(spot == s)[0]) for s in range(len(visits))])
         rejected = tuple(data.sample[i] for i in np.flatnonzero(~keep))
         q, static = mean @ data.q, mean @ error
-        return cls(cell, q, target[first], static, visits, first, rejected, on_flange)
+        side = None if data.side is None else mean @ data.side
+        return cls(cell, q, target[first], static, visits, first, rejected, on_flange, side)
 
     def knows(self, q: Array) -> NDArray[np.bool_]:
         """Which joint readings (m, n) are those of a cold visit: all joints within 0.5 deg."""
@@ -122,22 +127,47 @@ class ColdSpots:
     def average(self, warm: Measurements, sigma_m: float) -> Measurements:
         """Average the visits of each spot; ``sigma`` is of the mean.
 
+        It holds the backlash of joints that came from another side than when cold.
+
         ``sigma_m``: of one visit, where the measurements have none of their own.
 
         Raises `InputError` when a measurement has no cold counterpart.
         """
-        _, place, count = np.unique(self.match(warm), return_inverse=True, return_counts=True)
+        spot, place, count = np.unique(self.match(warm), return_inverse=True, return_counts=True)
         mean = np.zeros((len(count), len(warm)))
         mean[place, np.arange(len(warm))] = 1.0 / count[place]
         sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
+        side = None if warm.side is None else mean @ warm.side
+        lag_m = LOST_MOTION_RAD * np.linalg.norm(
+            self.other_side(spot, side) * self._lever[spot], axis=1
+        )
         rows = [np.flatnonzero(place == i) for i in range(len(count))]
         return Measurements(
             q=mean @ warm.q,
             position=mean @ warm.position,
             target=tuple(warm.target[row[0]] for row in rows),
             sample=tuple("+".join(warm.sample[i] for i in row) for row in rows),
-            sigma=np.sqrt(mean**2 @ sigma**2),
+            sigma=np.hypot(np.sqrt(mean**2 @ sigma**2), lag_m),
+            side=side,
         )
+
+    def other_side(self, spot: Index, side: Array | None) -> Array:
+        """By what share (m, n) of its backlash each joint is not as it was at spots (m,) when cold.
+
+        ``side`` (m, n): which way it went last; a joint of which that is not known counts as 0.
+        """
+        if side is None or self.side is None:
+            return np.zeros((len(spot), self.cell.arm.n))
+        cold = self.side[spot]
+        return np.where((side == 0.0) | (cold == 0.0), 0.0, 0.5 * np.abs(side - cold))
+
+    @cached_property
+    def _lever(self) -> Array:
+        """How far (s, n) one coordinate of a spot moves with each joint, rms of three, m."""
+        J, own = self.cell.arm.jacobian(self.q), self.cell.T_flange_target[self.target, :3, 3]
+        arm = np.einsum("mij,mj->mi", self.cell.arm.fk(self.q)[:, :3, :3], own)
+        moved = J[:, :3] + np.cross(J[:, 3:], arm[:, :, None], axis=1)
+        return np.asarray(np.linalg.norm(moved, axis=1) / np.sqrt(3.0))
 
     def drift(self, warm: Measurements) -> Array:
         """Displacement (m, 3) of the targets since the cold visit, m, measuring axes.
@@ -331,6 +361,7 @@ def reference_document(reference: ColdReference) -> Document:
         "target": list(data.target),
         "sample": list(data.sample),
         "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
+        "side": None if data.side is None else data.side.tolist(),
         "fixed": reference.fixed.tolist(),
         "temperature": None if temperature is None else temperature.tolist(),
     }
@@ -353,13 +384,14 @@ def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
         tuple(document["targets"]),
         np.array(document["T_flange_target"]),
     )
-    stamps = document["stamp_ns"]
+    stamps, side = document["stamp_ns"], document.get("side")  # older ones have no side
     data = Measurements(
         q=np.array(document["q"]),
         position=np.array(document["position"]),
         target=tuple(document["target"]),
         sample=tuple(document["sample"]),
         stamp_ns=None if stamps is None else np.array(stamps, dtype=np.int64),
+        side=None if side is None else np.array(side),
     )
     warmth, spheres = document["temperature"], None
     if "T_flange_sensor" in document:

@@ -334,7 +334,7 @@ def test_a_cycle_may_bring_a_second_target_to_the_same_poses():
             at_ns = (start_s + i) * 1_000_000_000
             for again in range(2):  # measured twice in a row
                 sample = PointSample(at_ns + again, "hall", target, np.zeros(3))
-                yield Observation(sample, np.full(6, 0.1 * pose), at_ns + again)
+                yield Observation(sample, np.full(6, 0.1 * pose), at_ns + again, np.zeros(6))
 
     found = [one for start_s in (0, 100, 200) for one in cycle(start_s)]
     commands = [command for command, _ in automatic_commands(found)]

@@ -310,3 +310,21 @@ def test_where_the_clock_jumps_the_order_of_arrival_does_not_matter(jump_ms):
     stamps = found.pop()[0]
     on_new_clock = tuple(ms + jump_ms for ms in (102_350, 102_650, 103_650))
     assert stamps == (on_new_clock if jump_ms < 0 else (100_650, 101_650, *on_new_clock))
+
+
+def test_a_stream_knows_which_way_each_joint_went_last():
+    """Of a joint that came, of one that came back by less than its play may be, of one at rest."""
+    stream = JointStream(("a", "b", "c"))
+    way = [(0.0, 0.0, 0.5), (0.01, 0.01, 0.5), (0.02, 0.02, 0.5), (0.01, 0.0199, 0.5)]
+    for i, q in enumerate([*way, way[-1]]):
+        stream.add(JointSample((i + 1) * 100 * MS, ("a", "b", "c"), np.array(q)), 10**9)
+    assert stream.side(500 * MS, 0.25).tolist() == [-1.0, 1.0, 0.0]
+    assert stream.side(300 * MS, 0.25).tolist() == [1.0, 1.0, 0.0]
+    assert stream.side(1 * MS, 0.25).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_what_happened_in_a_pause_of_the_readings_is_not_known():
+    stream = JointStream(NAMES)
+    for ms, q in ((100, (0.0, 0.0)), (200, (0.1, 0.1)), (900, (0.1, 0.2)), (1000, (0.1, 0.3))):
+        stream.add(joints(ms, *q), 10**9)
+    assert stream.side(1000 * MS, 0.25).tolist() == [0.0, 1.0]
