@@ -234,11 +234,16 @@ class QuietMemory:
         gc.enable()
 
 
-class _WakesNobody:
-    """A guard condition that nothing triggers."""
+class _WakesLater:
+    """An executor's guard condition for one callback: silent in the turn in which this begins."""
+
+    def __init__(self, executor: "OneThreadExecutor") -> None:
+        self._executor, self._turn = executor, executor.turn
 
     def trigger(self) -> None:
-        """Wake nobody."""
+        """Wake the executor for those that wait for a callback that had awaited something."""
+        if self._executor.turn != self._turn:
+            self._executor.wake()
 
 
 class OneThreadExecutor(SingleThreadedExecutor):
@@ -246,19 +251,24 @@ class OneThreadExecutor(SingleThreadedExecutor):
 
     rclpy's handler of a callback wakes the executor after it, for those that another thread held
     back as its group was taken. In one thread the next wait set is only built when the callback
-    has ended or awaits. Whoever else wakes the executor does; an rclpy that names its guard or
-    its handlers otherwise is used as it is.
+    has ended or awaits; one that ends later wakes it, and whoever else does. An rclpy that names
+    its guard or its handlers otherwise is used as it is.
     """
 
+    turn = 0  # number of the callback that runs
     _made_in = 0  # the thread that makes a handler
 
     @property
     def _guard(self) -> Any:
-        return _WakesNobody() if self._made_in == threading.get_ident() else self._wakes
+        return _WakesLater(self) if self._made_in == threading.get_ident() else self._wakes
 
     @_guard.setter
     def _guard(self, guard: Any) -> None:
         self._wakes = guard
+
+    def _spin_once_impl(self, *given: Any, **named: Any) -> None:
+        self.turn += 1
+        super()._spin_once_impl(*given, **named)
 
     def _make_handler(self, *given: Any) -> Any:
         self._made_in = threading.get_ident()
