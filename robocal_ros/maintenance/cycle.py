@@ -20,11 +20,11 @@ from robocal_ros.maintenance.robot_interface import (
     Script,
     SilentError,
 )
-from robocal_ros.session.events import LEAVE, ROLLBACK, Command, Outcome
+from robocal_ros.session.events import LEAVE, REJECT, ROLLBACK, Command, Outcome
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
-from robocal_ros.tool.session import FULL, QUICK
+from robocal_ros.tool.session import FULL, QUICK, WITNESS
 
 NS = 1_000_000_000
 NODE = "thermal node"
@@ -194,6 +194,7 @@ class ToolOutcome:
     candidate_id: int = 0  # of the full measurement; 0 without
     accepted: bool = False  # without a person, and it stayed
     fault: str = ""  # why an accepted tool that failed its check is still in force; empty: none is
+    mandrel: str = ""  # what it said, but for a station that has moved
     note: str = ""  # why not, or what a person must know
     left: str = ""  # what did not fit
 
@@ -212,7 +213,8 @@ class ToolOutcome:
 
     def messages(self) -> list[str]:
         """What was found first, what came last, and what else there is to say; each once."""
-        found = [each.message for each in (self.first, self.last) if each] + [self.note]
+        found = [each.message for each in (self.first, self.last) if each]
+        found += [self.mandrel, self.note]
         found = list(dict.fromkeys(filter(None, found)))
         return [text for text in found if not any(text in o for o in found if o is not text)]
 
@@ -252,8 +254,9 @@ class ToolPart:
                 if record.postponed and record.candidate == waiting.id:  # for a longer gap
                     outcome.candidate_id = waiting.id
                     yield from self._settle(cycle_id)
-                else:
-                    outcome.note = f"tool candidate {waiting.id} waits for a decision"
+                    return
+                outcome.note = f"tool candidate {waiting.id} waits for a decision"
+                yield from self._ask_mandrel(cycle_id, waiting.id)
             return
         if wanted == QUICK:
             if not (yield from self._check(f"{cycle_id}/check", goes_on=True)):
@@ -263,17 +266,49 @@ class ToolPart:
                 recent = 0.0 <= self._age_s(record.full_ns) < every_s
                 if every_s <= 0.0 or recent or not self._cell.fits(self._cell.tool_worst_s(FULL)):
                     return  # only when time allows
-        answer = yield from self._measured(FULL, f"{cycle_id}/full")
+        candidate = yield from self._measured_anew(f"{cycle_id}/full")
+        if candidate and not (yield from self._ask_mandrel(cycle_id, candidate)):
+            yield from self._settle(cycle_id)
+
+    def _measured_anew(self, name: str) -> Script[int]:
+        """A full measurement; the candidate that is to be settled, 0: none."""
+        outcome = self.outcome
+        answer = yield from self._measured(FULL, name)
         if answer is None:
-            return
+            return 0
         outcome.candidate_id = answer.candidate_id
         if answer.code is Code.NO_SIGNIFICANT_GAIN:
-            return
+            return 0
         outcome.bent = answer.done and outcome.checked != "pass"
-        if answer.done:
-            yield from self._settle(cycle_id)
-        else:
+        if not answer.done:
             outcome.note = f"tool measurement {answer.candidate_id}: {answer.message}"
+        return answer.candidate_id if answer.done else 0
+
+    def _ask_mandrel(self, cycle_id: str, candidate: int) -> Script[bool]:
+        """Whose is a change in doubt, the tool's or the station's? Whether a mandrel has told it.
+
+        Where the station has moved the candidate is rejected. Where it stands the tool is measured
+        once more, and judged with that.
+        """
+        cell, outcome = self._cell, self.outcome
+        if cell.config.driving.mandrel is None or not self._decider.in_doubt(candidate):
+            return False
+        told = yield from self._measured(WITNESS, f"{cycle_id}/witness")
+        if told is None or not (told.done or told.code is Code.STATION_MOVED):
+            return False
+
+        def reject() -> Outcome:
+            return self._decider.decide(REJECT, candidate, BY, told.message, self.wall_ns)
+
+        yield  # what was kept just before may have taken its time
+        self._decided((yield from patiently(cell, reject)))
+        if not told.done:
+            outcome.candidate_id = candidate
+            return True
+        self._memory.note_tool(answer="recalibrate", candidate=0)
+        if (yield from self._measured_anew(f"{cycle_id}/again")):
+            yield from self._settle(cycle_id)
+        return True
 
     def _due(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
@@ -343,6 +378,9 @@ class ToolPart:
     def _learn(self, mode: str, answer: DriverAnswer) -> None:
         """Remember it at once: the run may be broken off on the way home."""
         outcome, memory = self.outcome, self._memory
+        if mode == WITNESS and answer.code is not Code.STATION_MOVED:
+            outcome.mandrel = f"mandrel: {answer.message}"
+            return
         outcome.take(answer)
         about = {"revision": self._revision, "thermal_id": self._through, "words": answer.message}
         moved = answer.code is Code.STATION_MOVED
@@ -376,10 +414,10 @@ class ToolPart:
         """The answer, where it is of the tool in force; kept while nothing moves."""
         outcome = self.outcome
         current = self._revision == self._decider.revision(TOOL)
-        if answer.has_result and not current:
+        if answer.has_result and not current and mode != WITNESS:
             self._memory.tool, outcome.fault = before, ""
         self._memory.save()
-        if answer.has_result and current:
+        if mode == WITNESS or (answer.has_result and current):
             return answer
         outcome.left = f"tool measurement ({mode})"
         outcome.note = f"{outcome.left}: {answer.message}"

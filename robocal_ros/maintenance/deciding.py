@@ -107,6 +107,10 @@ class Decider:
         """Whether it is this one."""
         return self.head(kind).calibration_id == calibration_id
 
+    def in_doubt(self, calibration_id: int) -> bool:
+        """Whether nothing proves that a tool candidate is the tool's change, not the station's."""
+        return self._history.model(calibration_id).get("cause") != "tool"
+
     def accepted_here(self, calibration_id: int) -> bool:
         """Whether it is in force since it was accepted without a person."""
         entry = self._history.get(calibration_id)
@@ -254,7 +258,7 @@ class Decider:
                 f"deg from the taught one (allowed without a person {bounds.tool_m * 1e3:.2f} mm, "
                 f"{np.degrees(bounds.tool_rad):.2f} deg)"
             )
-        if model.get("cause") != "tool":
+        if self.in_doubt(calibration_id):
             return (
                 "nothing proves that the tool has changed and not the beam station: look at both, "
                 "then accept or reject it"

@@ -110,10 +110,17 @@ class Ways:
         return min(routes, key=lambda route: route.plan.duration_s)
 
     def home(self, place: Line, q: Array) -> Route:
-        """The way home, also from the station. Raises `LimitError` when there is none."""
+        """The way home, also from the station. Raises `LimitError` when there is none.
+
+        From there the tip leads that hangs lower, the tool's or the mandrel's: it is in the beams.
+        """
         if place != STATION:
             return self.to(place, q, HOME)
-        plan = departure(self.station, q, self._home)
+        cells = [self.station]
+        if (mandrel := self.station.beside) is not None:
+            cells.append(replace(self.station, tool=mandrel, beside=self.station.tool))
+        lower = min(cells, key=lambda cell: cell.in_laser(cell.T_base_tip(q)[:3, 3])[2])
+        plan = departure(lower, q, self._home)
         return Route(plan, ((STATION[0], HOME),), (plan.duration_s,))
 
     def _require_time(self, tool_home_s: float) -> None:

@@ -14,11 +14,13 @@ from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim import cell as simulated
 from robocal_ros.cell_sim.beams import RoundTool, bent
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.accuracy import AcceptBounds, Times
+from robocal_ros.maintenance.mover import STATION
 from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.drift_following import ThermalConfig
@@ -402,3 +404,46 @@ def test_a_calibration_of_another_kind_is_decided_elsewhere(history):
     )  # fmt: skip
     with pytest.raises(InputError, match="decide elsewhere"):
         cell.maintenance.decide(ACCEPT, number, "plc", "", cell.wall_ns)
+
+
+# Across the flange, so that the tool lies above the housing while it stands in the beams.
+ACROSS = frames.exp_rotation(np.radians([-85.0, 0.0, 0.0]))
+MANDREL = frames.transform(ACROSS, 0.17 * ACROSS[:, 2] + [0.0, 0.0, 0.02])
+SMALL_BEND = bent(TAUGHT, [3e-4, 0.0, 0.0], [0.0, 3e-3, 0.0])  # its tilt drowns in the noise
+
+
+@pytest.mark.parametrize("knocked", [True, False])
+def test_a_mandrel_settles_in_the_cycle_what_has_changed(tmp_path, knocked):
+    """A shift of 0.3 mm of the station or of the tool, which the tool's own run cannot tell."""
+    bounds = AcceptBounds(automatic=True, tool_m=0.01, tool_rad=0.1)
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        slow = Times(full_s=60.0, tool_home_s=30.0)  # 50 mm/s, and the flange turns by 85 deg
+        cell = MaintainedCell(
+            history, TAUGHT, mandrel=MANDREL, poses=POSES[:0], bounds=bounds, times=slow
+        )
+        cell.run(0.5)
+        for mode in ("reference", "witness reference"):
+            cell.driver.arm(cell.now_s)
+            cell.measure(mode)
+            cell.run(100.0, until=cell.at_rest)
+            cell.run(0.5)
+            assert cell.outcomes[-1].status is Code.ACCEPT, cell.outcomes[-1].message
+        home = cell.maintenance.ways.home(STATION, cell.q).plan
+        cell.send(home)
+        cell.run(home.duration_s + 1.0)
+        if knocked:
+            station = cell.cell.station
+            side = 3e-4 * cell.cell.laser.T_base_laser[:3, 0]
+            x, y = (replace(b, start=b.start + side, end=b.end + side) for b in station.beams)
+            cell.cell.station = replace(station, beams=(x, y))
+        else:
+            cell.tool = RoundTool.cylinder(SMALL_BEND, 0.0025)
+        result = cell.maintain("c1", 1.5 * GAP_S)
+        if knocked:
+            assert result.tool_code is Code.STATION_MOVED, result.message
+            assert result.accepted == ()
+            assert not history.pending(TOOL, 1)
+        else:
+            assert result.accepted == (result.tool_id,), result.message
+            found = KnownTool.of_document(history.model(result.tool_id)).T_flange_tool
+            assert np.linalg.norm(found[:3, 3] - SMALL_BEND[:3, 3]) < 1.5e-4

@@ -56,6 +56,7 @@ class Robot:
             config = replace(config, mandrel=ToolBody(mandrel, 0.08, 0.008, 0.05, "mandrel"))
             self.mandrel = RoundTool.cylinder(mandrel, 0.004)
         self.gap, self.beating = Gap(STALE_S), True
+        self.driving = config
         self.driver = ToolDriver(self.session, config, self.send, self.ask, self.closed)
         self.tool = RoundTool.cylinder(tool, 0.0025)
         self.rng = np.random.default_rng(3)

@@ -7,7 +7,7 @@ What the maintenance asks is carried out by calling the sessions themselves, as 
 from typing import Any
 
 import numpy as np
-from driven_robot import HOUSING, PERIOD_S, AheadMotion, Robot
+from driven_robot import PERIOD_S, AheadMotion, Robot
 from maintenance_cell import BEAT_S, HOME, Shelf
 from shift import BALL, NOISE_M, T_SENSOR_BASE, warmed
 from tool_driver import TAUGHT
@@ -16,7 +16,7 @@ from bench.closed_loop.carrying import Carrier
 from robocal_ros.ground.samples import JointSample, PointSample
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
 from robocal_ros.maintenance.session import MaintenanceSession
-from robocal_ros.motion.cell import DrivingConfig, joint_way
+from robocal_ros.motion.cell import joint_way
 from robocal_ros.session.events import CAPTURE_REFERENCE, Command, Outcome
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.session import ThermalSession
@@ -44,19 +44,24 @@ class MaintainedCell(Robot):
     """
 
     def __init__(
-        self, history: Any, tool: np.ndarray = TAUGHT, *, from_s: float = 0.0, **changes: Any
+        self,
+        history: Any,
+        tool: np.ndarray = TAUGHT,
+        mandrel: np.ndarray | None = None,
+        *,
+        from_s: float = 0.0,
+        **changes: Any,
     ) -> None:
-        super().__init__(history, tool)
+        super().__init__(history, tool, mandrel)
         self.now_s, self.shift_s = from_s, -from_s  # the controller's clock stands between gaps
         self.history = history
         self.arm = self.cell.arm
         self.motion, self.q = AheadMotion(HOME), HOME.copy()
-        driving = DrivingConfig(HOUSING, 0.1, 0.008, 0.05)
         settings: dict[str, Any] = {
             "home": HOME,
             "poses": POSES,
             "T_flange_tool": TAUGHT,
-            "driving": driving,
+            "driving": self.driving,
             "T_base_laser": self.cell.laser.T_base_laser,
             "tolerance_m": TOLERANCE_M,
             "correction_silent_s": 0.0,  # nothing is produced
