@@ -516,11 +516,15 @@ class LineTask(Task):
         return np.stack([self.target.point_base, self.target.direction_base])
 
     def classic(self, view: TargetView, near: MountState) -> MountState:
-        """The least sum of squared distances from the line, every feature alike."""
+        """The least sum of squared distances from the line, every feature alike.
+
+        Where it still crept along what the poses hardly show, as far as it came: how far that is
+        from the best estimate is told, and judged.
+        """
         alike = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
         view = TargetView(view.model, replace(view.sightings, covariance=alike))
         problem = MountProblem((view,), PoseNoise(0.0, 0.0), near)
-        return solve(problem, near, robust=False, sizes=problem.sizes).settled()
+        return solve(problem, near, robust=False, sizes=problem.sizes).state
 
     def placed(self, view: TargetView, T_flange_sensor: Array) -> Array:
         """Where it is known to be, or along the middle of the points that were seen."""

@@ -35,6 +35,7 @@ from bench.hand_eye_cell import (
     step_shots,
 )
 from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
+from robocal_ros.estimation import estimation
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,
@@ -45,8 +46,16 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.mount_problem import in_plane
-from robocal_ros.hand_eye.result import HandEyeSettings, point_covariance
-from robocal_ros.hand_eye.solve import features, held_out, look, solve_joint, solve_task, verify
+from robocal_ros.hand_eye.result import HandEyeSettings, apart, point_covariance
+from robocal_ros.hand_eye.solve import (
+    features,
+    field_of,
+    held_out,
+    look,
+    solve_joint,
+    solve_task,
+    verify,
+)
 from robocal_ros.hand_eye.stairs import nine_unknowns, task_of
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import HandEyeData
@@ -301,6 +310,23 @@ def test_a_place_that_was_not_reached_blames_no_mount(result, monkeypatch):
     monkeypatch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
     with pytest.raises(RankDeficientError, match="still crept"):
         verify(line_task(), edge, result.T_flange_sensor, SETTINGS)
+
+
+def test_a_classic_line_that_creeps_is_a_weak_answer(monkeypatch):
+    """It stops after one step: as far off as it then is from the best estimate, it says."""
+    edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
+    best = solve_task(line_task(), edge, "best", SETTINGS)
+
+    def stopped(*given, **named):
+        with monkeypatch.context() as patch:
+            patch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
+            return estimation.solve(*given, **named)
+
+    monkeypatch.setattr("robocal_ros.hand_eye.tasks.solve", stopped)
+    found = solve_task(line_task(), edge, "classic", SETTINGS)
+    away_m = apart(found.T_flange_sensor, best.T_flange_sensor, field_of(edge))
+    assert 0.0 < away_m <= found.working_error_m
+    assert found.verdict.accept == (found.working_error_m <= SETTINGS.limit_m)
 
 
 class TestStepMistakes:
