@@ -75,6 +75,21 @@ def _joints(value: str) -> Array:
         raise argparse.ArgumentTypeError(f"'{value}' is no list of joints in degrees") from error
 
 
+def _external(value: str) -> tuple[int, Array]:
+    """Type of an external axis such as ``1=1,0,0`` or ``2=still``."""
+    number, _, way = value.partition("=")
+    try:
+        along = np.zeros(3) if way == "still" else np.array([float(v) for v in way.split(",")])
+        right = along.shape == (3,) and (way == "still" or abs(np.linalg.norm(along) - 1.0) < 1e-3)
+        if not right or not 1 <= int(number) <= 6:
+            raise ValueError(value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"'{value}' is no number of an axis, 1 to 6, with 'still' or a direction of length 1"
+        ) from error
+    return int(number), along
+
+
 def add_given_model(parser: argparse.ArgumentParser) -> None:
     """Offer the robot, and the model that it truly has."""
     parser.add_argument(
@@ -212,6 +227,26 @@ def add_correct_program(parser: argparse.ArgumentParser) -> None:
         metavar="Q1,Q2,…",
         help="joints near which the first point is that has no configuration",
     )
+    parser.add_argument(
+        "--external",
+        type=_external,
+        action="append",
+        default=[],
+        metavar="N=X,Y,Z",
+        help="external axis N carries the robot along X,Y,Z of its base, so many mm as the program "
+        "says; N=still: it carries neither the robot nor what the poses are in",
+    )
+    _add_bounds(parser)
+    parser.add_argument(
+        "--j23",
+        type=float,
+        default=1.0,
+        metavar="K",
+        help="FANUC: the robot file's joint 3 is J3 + K J2, default 1",
+    )
+
+
+def _add_bounds(parser: argparse.ArgumentParser) -> None:
     for name, default, what in (("mm", 5.0, "of the flange"), ("deg", 1.0, "of a joint")):
         parser.add_argument(
             f"--largest-{name}",
@@ -220,13 +255,6 @@ def add_correct_program(parser: argparse.ArgumentParser) -> None:
             metavar="S",
             help=f"largest correction {what}, default {default:g}",
         )
-    parser.add_argument(
-        "--j23",
-        type=float,
-        default=1.0,
-        metavar="K",
-        help="FANUC: the robot file's joint 3 is J3 + K J2, default 1",
-    )
 
 
 def run_correct_program(args: argparse.Namespace) -> CliResult:
@@ -247,7 +275,9 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     given = dict(frame_given(dialect.maker, words) for words in args.frame)
     for path in args.frames:
         given = dict(dialect.read(_program_text(path, dialect)).frames) | given
-    correction = ProgramCorrection(dialect, models, given, args.tool, args.base, args.posture_deg)
+    correction = ProgramCorrection(
+        dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
+    )
     done = correction.correct(_program_text(args.program, dialect))
     document = report(done)
     left = document["count"]["not_corrected"]

@@ -25,7 +25,15 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.programs.conventions import numbers_of, pose_of
 from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.krl import KrlDialect
-from robocal_ros.programs.points import Dialect, Field, Program, ProgramPoint, spliced, written
+from robocal_ros.programs.points import (
+    Dialect,
+    Field,
+    Program,
+    ProgramPoint,
+    base_moved,
+    spliced,
+    written,
+)
 from robocal_ros.programs.postures import chosen_posture, is_singular, reach, stance_of
 from robocal_ros.programs.rapid import RapidDialect
 from robocal_ros.programs.urscript import UrScriptDialect
@@ -94,7 +102,8 @@ class ProgramCorrection:
 
     ``given``: frames beside those of the program, by name. ``tool``, ``frame``: names of those of
     points for which the program says none. ``posture`` (n,): joints near which the first point is
-    whose configuration nothing says; None: it is not corrected.
+    whose configuration nothing says; None: it is not corrected. ``external``: where external axes
+    carry the robot, see `base_moved`.
     """
 
     def __init__(
@@ -105,8 +114,10 @@ class ProgramCorrection:
         tool: str | None = None,
         frame: str | None = None,
         posture: Array | None = None,
+        external: Mapping[int, Array] | None = None,
     ) -> None:
         self._dialect, self._models = dialect, models
+        self._external = external or {}
         self._given = {name.lower(): T for name, T in (given or {}).items()}
         self._tool, self._frame, self._before = tool, frame, posture
 
@@ -129,7 +140,9 @@ class ProgramCorrection:
             raise LimitError(point.problem)
         ends = np.eye(4), np.eye(4)
         if not point.joints:
-            ends = self._end(point, "frame", known), self._end(point, "tool", known)
+            T_base_frame = self._end(point, "frame", known).copy()
+            T_base_frame[:3, 3] -= base_moved(point, self._external)
+            ends = T_base_frame, self._end(point, "tool", known)
         T_base_frame, tool = ends
         nominal = self._models.nominal
         if point.joints:

@@ -27,7 +27,6 @@ from robocal_ros.programs.points import (
     Program,
     ProgramPoint,
     Stance,
-    external_problem,
     line_of,
     require_numbers,
 )
@@ -130,9 +129,8 @@ def _point(text: str, name: str, line: int, start: int, end: int) -> ProgramPoin
     problem = require_numbers(fields)
     if not joints and len(fields) < 6:
         problem = "has no pose"
-    extra = [part for one, part in found.items() if one.startswith("E")]
-    problem = problem or external_problem(extra)
-    point = ProgramPoint(name, line, fields, joints, DEGREE, problem=problem)
+    external = {int(one[1:]): part for one, part in found.items() if re.fullmatch(r"E\d", one)}
+    point = ProgramPoint(name, line, fields, joints, DEGREE, external=external, problem=problem)
     if joints or problem:
         return point
     frames = _FRAMES.search(text, start, end)

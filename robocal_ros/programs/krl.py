@@ -26,7 +26,6 @@ from robocal_ros.programs.points import (
     Program,
     ProgramPoint,
     Stance,
-    external_problem,
     line_of,
     masked,
     require_numbers,
@@ -177,13 +176,12 @@ def _point(text: str, clean: str, braces: re.Match[str], used: set[str]) -> Prog
         problem = "leaves components as they are at run time: " + ", ".join(
             name for name in names if name not in parts
         )
-    extra = [parts[name] for name in EXTERNAL if name in parts]
-    problem = problem or external_problem(extra)
+    external = {i: parts[name] for i, name in enumerate(EXTERNAL, start=1) if name in parts}
     marks: dict[str, Field] = {name: parts[name] for name in ("S", "T") if name in parts}
     point = ProgramPoint(title, line, fields, joints, DEGREE, marks=marks, problem=problem)
     if joints or problem:
         return replace(point, marks={})
-    return replace(point, posture=_posture(parts))
+    return replace(point, posture=_posture(parts), external=external)
 
 
 def bits_of(mark: Field) -> int | None:

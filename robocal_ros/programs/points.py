@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import Maker, pose_of
 
@@ -21,6 +21,7 @@ NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _NUMBER = re.compile(NUMBER)
 # How near to zero, or to a quadrant's end, a joint is on either side of it, rad.
 EDGE = 1e-6
+AT_ZERO = 1e-9
 NOT_CONNECTED = 8.9e8  # ABB writes 9E9, some tools 9E8 or 1E10, for an axis that is not there
 
 
@@ -78,6 +79,7 @@ class ProgramPoint:
     ``joints``: whether it is given by joints; ``joint_unit``: rad of one unit of theirs.
     ``tool``, ``frame``: names of the frames that a pose refers to; None: the program does not say.
     ``marks``: what says the posture, by the names that its dialect has for them.
+    ``external``: of a pose the axes beside the robot's own that it says, by number from 1.
     ``problem``: why it cannot be corrected, whatever the model; empty: it can.
     """
 
@@ -90,6 +92,7 @@ class ProgramPoint:
     frame: str | None = None
     posture: Posture = field(default_factory=Posture)
     marks: Mapping[str, Field] = field(default_factory=dict)
+    external: Mapping[int, Field] = field(default_factory=dict)
     problem: str = ""
     order: int = 0  # in which the program comes to it, as far as its text tells
 
@@ -162,12 +165,26 @@ class Dialect(ABC):
         return {}
 
 
-def external_problem(extra: Sequence[Field]) -> str:
-    """Why external axes forbid a correction; empty where they stand at zero or are none."""
-    for number, part in enumerate(extra, start=1):
-        if abs(part.value) >= 1e-9 and part.value < NOT_CONNECTED:
-            return f"external axis {number} is at {part.text.strip()}: it may carry robot or part"
-    return ""
+def base_moved(point: ProgramPoint, ways: Mapping[int, Array]) -> Array:
+    """By which external axes have moved the robot's base (3,), m, in the axes of the base.
+
+    ``ways``: of an axis the unit vector (3,) along which a millimetre of it carries the robot, zero
+    where it carries neither the robot nor what the poses are in. Raises `LimitError` for an axis
+    that is not at zero and of which nothing is known.
+    """
+    moved = np.zeros(3)
+    for number, part in point.external.items():
+        value = part.value
+        if abs(value) < AT_ZERO or value >= NOT_CONNECTED:
+            continue
+        words = f"external axis {number} is at {part.text.strip()}"
+        if number not in ways:
+            raise LimitError(f"{words}: it may carry robot or part; say which by --external")
+        if np.any(ways[number]):
+            if not np.isfinite(value):
+                raise LimitError(f"{words}, which is no number")
+            moved += 1e-3 * value * ways[number]
+    return moved
 
 
 def line_of(text: str, at: int) -> int:

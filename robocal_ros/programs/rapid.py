@@ -26,7 +26,6 @@ from robocal_ros.programs.points import (
     ProgramPoint,
     Stance,
     arguments,
-    external_problem,
     line_of,
     masked,
     matching,
@@ -151,14 +150,16 @@ def _points(text: str, title: str, name: str, tree: Tree) -> list[tuple[str, Pro
             found for i, part in parts for found in _points(text, f"{title}{{{i}}}", name, part)
         ]
     if joints is not None:
-        fields, extra = tuple(joints[0]), joints[1]
-        problem = require_numbers(fields) or external_problem(extra)
+        fields = tuple(joints[0])
+        problem = require_numbers(fields)
         line = line_of(text, fields[0].start)
         return [(name, ProgramPoint(title, line, fields, True, DEGREE, problem=problem))]
     assert target is not None
     fields, configured = (*target[0], *target[1]), target[2]
-    problem = require_numbers((*fields, *configured)) or external_problem(target[3])
-    point = ProgramPoint(title, line_of(text, fields[0].start), fields, problem=problem)
+    problem = require_numbers((*fields, *configured))
+    external = dict(enumerate(target[3], start=1))
+    line = line_of(text, fields[0].start)
+    point = ProgramPoint(title, line, fields, external=external, problem=problem)
     if not problem:
         marks = dict(zip(("cf1", "cf4", "cf6", "cfx"), configured, strict=True))
         point = replace(point, marks=marks, posture=_posture(marks))

@@ -101,6 +101,22 @@ def test_frames_and_bounds_come_from_the_command_line(folder: Path, capsys):
     assert "NAME=X,Y,Z" in document["error"]["message"]
 
 
+def test_a_track_is_told_by_its_direction(folder: Path, capsys):
+    text = (folder / "weld.dat").read_bytes().replace(b"E1 0.0", b"E1 812.5")
+    (folder / "track.dat").write_bytes(text)
+    _, unknown = command(capsys, "track.dat", *MODEL, *KNOWN)
+    reasons = {p["reason"] for p in unknown["points"] if p["by"] == "pose"}
+    assert reasons == {"external axis 1 is at 812.5: it may carry robot or part; say which by "
+                       "--external"}  # fmt: skip
+    _, still = command(capsys, "track.dat", *MODEL, *KNOWN, "--external", "1=still")
+    _, before = command(capsys, "weld.dat", *MODEL, *KNOWN)
+    assert [p["shift_mm"] for p in still["points"]] == [p["shift_mm"] for p in before["points"]]
+    for wrong in ("1=1,1,0", "1=0,1", "7=still", "a=still", "1"):
+        status, document = command(capsys, "track.dat", *MODEL, *KNOWN, "--external", wrong)
+        assert status == 2
+        assert "'still' or a direction of length 1" in document["error"]["message"]
+
+
 def test_the_model_is_a_robot_file_a_shown_calibration_or_the_one_in_force(folder: Path, capsys):
     _, of_file = command(capsys, "weld.dat", *MODEL, *KNOWN)
     shown = {"model": model_document(ACTUAL), "document": {}}

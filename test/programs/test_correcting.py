@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import robot_programs
 from robot_programs import (
     FRAME_TURN,
     NOMINAL,
@@ -131,6 +132,56 @@ def test_a_taught_program_is_corrected_for_what_changed_since(maker):
         was = ACTUAL.fk(inverse(NOMINAL, meant[None], q)[0])
         away = missed(warm.fk(inverse(NOMINAL, T[None], q)[0]), was)
         assert away[0] <= (1.0 if maker == "ur" else 1e-3) * limit + 1e-8
+
+
+TRACK_MM, ALONG = 812.5, np.array([0.6, -0.8, 0.0])
+
+
+def at_track(maker: str, text: str) -> str:
+    """The same text with the first external axis of its poses at `TRACK_MM`."""
+    if maker == "kuka":
+        return re.sub(r"(,T \d+,E1) 0\.0", rf"\g<1> {TRACK_MM}", text)
+    if maker == "abb":
+        return re.sub(r"(robtarget.*)\[9E9,", rf"\g<1>[{TRACK_MM},", text)
+    return re.sub(r"(\tR = [^\r\n]*deg)", rf"\g<1>,\r\n\tE1=   {TRACK_MM}  mm", text)
+
+
+@pytest.mark.parametrize("maker", ["kuka", "abb", "fanuc"])
+def test_a_track_that_carries_the_robot(maker, monkeypatch):
+    """The robot in the same postures, further along: its poses are in a frame that stands."""
+    carried, fixed = np.eye(4), robot_programs.relative
+    carried[:3, 3] = 1e-3 * TRACK_MM * ALONG
+    moved = np.linalg.inv(T_BASE_FRAME) @ carried @ T_BASE_FRAME
+    monkeypatch.setattr(robot_programs, "relative", lambda q: moved @ fixed(q))
+    written = programs(POINTS, JOINTS)[maker]
+    text = at_track(maker, written.text)
+    assert text.count(f"{TRACK_MM}") == len(POINTS)
+
+    def by(external):
+        options = {"given": written.frames, "external": external}
+        return ProgramCorrection(dialect_of(written.suffix), MODELS, **options).correct(text)
+
+    done = by({1: ALONG})
+    assert [one.reason for one in done.points] == [""] * len(done.points)
+    assert done.text.count(f"{TRACK_MM}") == len(POINTS)  # the axis stays
+    # half the last digit of six numbers of what is taught, and of what is written
+    left_m = 1e-3 * 2.0 * np.sqrt(3.0) * 0.5 * 10.0 ** -written.decimals[0] + 1e-6
+    poses = [one for one in done.points if not one.point.joints]
+    for q, T, one in zip(POINTS, poses_in(maker, done.text)[0], poses, strict=True):
+        reached = inverse(NOMINAL, (np.linalg.inv(carried) @ T)[None], q)[0]
+        assert missed(ACTUAL.fk(reached), NOMINAL.fk(one.q))[0] < left_m
+        assert missed(NOMINAL.fk(one.q), NOMINAL.fk(q))[0] < left_m  # the posture that was meant
+    for one in by({}).points:
+        assert one.point.joints or "external axis 1 is at 812.5" in one.reason
+
+
+@pytest.mark.parametrize("maker", ["kuka", "abb", "fanuc"])
+def test_an_axis_that_carries_nothing_changes_nothing(maker):
+    program = WRITTEN[maker]
+    text, still = at_track(maker, program.text), {1: np.zeros(3)}
+    dialect = dialect_of(program.suffix)
+    done = ProgramCorrection(dialect, MODELS, program.frames, external=still).correct(text)
+    assert done.text == at_track(maker, corrected(maker).text)
 
 
 @pytest.mark.parametrize("maker", ["kuka", "abb", "fanuc"])
