@@ -7,7 +7,10 @@ processes, and the robot stands.
 
 import contextlib
 import json
+import os
+import shutil
 import struct
+import subprocess
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from datetime import UTC, datetime, timedelta
@@ -16,6 +19,7 @@ from typing import Any
 
 import pytest
 from asyncua import ua
+from cryptography.hazmat.primitives.serialization import Encoding
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from pymodbus.client import ModbusTcpClient
@@ -23,7 +27,7 @@ from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatu
 from std_srvs.srv import Trigger
 from test_maintenance_calls import Plc, candidates, process
 
-from bench.live.opc_ua import PlcClient, free_port, security_folder
+from bench.live.opc_ua import OPERATOR, PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
@@ -327,6 +331,42 @@ def test_a_gap_by_the_register_map_of_modbus(line):
     assert until(lambda found: found["Answer.Number"] == 2)["Answer.Status"] == Code.CONFLICT
     gateway.close()
     line.graph.spin_until(lambda: line.doing, "the gap closes by its own rule", 5.0)
+
+
+def test_a_gap_by_another_stack(line, tmp_path):
+    """node-opcua, which shares no code with asyncua: what asyncua's own client would not notice."""
+    node = shutil.which("node")
+    look = [str(node), "-e", "require('node-opcua-client')"]
+    if node is None or subprocess.run(look, capture_output=True, check=False).returncode:
+        pytest.skip("no node-opcua-client: npm install it, and name its node_modules in NODE_PATH")
+    own = line.folder / access.CLIENTS / "line.der"
+    pem = tmp_path / "line.pem"
+    pem.write_bytes(access.read_certificate(own).public_bytes(Encoding.PEM))
+    line.quiet()
+    script = Path(__file__).parents[1] / "plc" / "other_stack.cjs"
+    url, key = f"opc.tcp://127.0.0.1:{line.port}/robocal", own.with_name("line_key.pem")
+    with (tmp_path / "seen").open("w") as output, (tmp_path / "said").open("w") as errors:
+        plc = subprocess.Popen(
+            [node, script, url, pem, key, *OPERATOR, "4715"],
+            env=os.environ | {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)},
+            stdout=output,
+            stderr=errors,
+        )
+    try:
+        line.graph.spin_until(lambda: plc.poll() is not None, "the other stack", 150.0)
+    finally:
+        plc.kill()
+    assert plc.returncode == 0, (tmp_path / "said").read_text()
+    seen = json.loads((tmp_path / "seen").read_text())
+    assert {"Accuracy", "Maintenance", "LastCycle", "Gap", "Methods"} <= {*seen["objects"]}
+    assert seen["codes"] == [code.name for code in Code]
+    assert (seen["wrongType"], seen["readOnly"]) == ("BadTypeMismatch", "BadNotWritable")
+    assert (seen["accept"], seen["missing"]) == ("BadUserAccessDenied", "BadArgumentsMissing")
+    assert seen["heartbeat"] == "Good"
+    assert seen["run"][:3] == ["Good", True, Code.ACCEPT]
+    assert (seen["lastCode"], seen["status"][:2]) == (Code.ACCEPT, ["Good", True])
+    assert line.maintenance.statuses[-1].last.cycle_id == "4715"
+    line.graph.spin_until(lambda: line.doing, "it has closed the gap", 5.0)
 
 
 # ---- who gets in --------------------------------------------------------------------------------
