@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled algebra of the joint correction: goals, residuals, and the damping of weak directions.
 
 Twists [v; w] in base axes at the tool, m and rad. Where they are weighed against each other, and in

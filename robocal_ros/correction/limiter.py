@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The last thing in the command path: how the offset between what comes in and goes out may change.
 
 Whatever is upstream (a new model or tool, enabling, a refusal, a command of some joints, a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled correction of six turning joints without a branch, for many points at once.
 
 Newton's method as in `solution`, with three matrices (of a `large` change of the tool four) and two

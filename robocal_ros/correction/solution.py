@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled solution of the joint correction: one point, a point through all stages, or many.
 
 Nearly all points of six turning joints are solved by `six_axis`; the others, and all other arms,

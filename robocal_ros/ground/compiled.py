@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kernels, kept on disk until the source of any of them changes.
 
 Numba forgets kept machine code when the file of its function changes, but not when the function

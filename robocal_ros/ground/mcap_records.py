@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the messages lie in a run of MCAP records: found by a compiled scan.
 
 Source: the MCAP specification, https://mcap.dev/spec: a record is an opcode (1 byte) and a length

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint states as they come over the wire, many at a time, and the points of trajectories.
 
 Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState``: after four bytes

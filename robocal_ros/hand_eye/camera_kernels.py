@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled parts of a camera's hand-eye calibration: its model, and the likelihood of its noise.
 
 Poses (m, 4, 4) as of ``pose_pairs``; rows of six are position and turn along the camera's axes.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled sums over Jacobians most of whose columns are zero in each sample.
 
 Of a joint's function a pose sees four splines of a hundred or more. A sample's rows are kept

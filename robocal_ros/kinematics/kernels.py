@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kinematics of serial arms: forward kinematics and Jacobians over many poses.
 
 Every kernel takes ``links`` (n, 9): d, theta, a, cos/sin alpha, cos/sin beta, sign, prismatic

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled parts of Newton's method on poses: residual, geometric Jacobian, solution.
 
 Poses (4, 4) in base, twists [v; w] in base axes at the pose's origin; angles in rad, lengths in m.
