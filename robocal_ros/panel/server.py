@@ -42,6 +42,7 @@ ANSWER_S = 2.0  # maintenance_node answers within
 EVENT_S, SOONEST_S = 1.0, 0.2  # between two events: at the most, and where much changes
 WRITE_S = 10.0  # a browser that takes longer to read is let go
 REQUEST_S = 10.0  # a connection that has not asked for anything by then, too
+KEPT_S = 30.0  # one that asks for nothing more is let go: aiohttp keeps it for an hour
 MOST_CONNECTIONS, MOST_VIEWERS, MOST_LOGINS = 100, 40, 4
 MOST_BYTES = 4096  # of a request's body
 LONGEST_REASON = 200
@@ -178,7 +179,11 @@ class PanelServer:
         self._changed = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         runner = web.AppRunner(
-            self._application(), handle_signals=False, access_log=None, shutdown_timeout=0.5
+            self._application(),
+            handle_signals=False,
+            access_log=None,
+            shutdown_timeout=0.5,
+            keepalive_timeout=KEPT_S,
         )
         await runner.setup()
         serve = runner.server

@@ -429,6 +429,32 @@ def test_a_port_that_is_taken_is_told_and_tried_again():
     late.stop()
 
 
+def test_who_asks_once_and_stays_is_let_go(monkeypatch):
+    monkeypatch.setattr(served, "MOST_CONNECTIONS", 5)
+    monkeypatch.setattr(served, "KEPT_S", 1.0)
+    cell = Cell()
+    asked = []
+    try:
+        for _ in range(5):  # all that there are, and no more than half of a second request
+            one = socket.create_connection(("127.0.0.1", cell.port), 10.0)
+            one.sendall(f"GET /session HTTP/1.1\r\nHost: 127.0.0.1:{cell.port}\r\n\r\n".encode())
+            assert one.recv(10_000).startswith(b"HTTP/1.1 200")
+            one.sendall(b"GET / HTTP/1.1\r\nHost: 127")
+            asked.append(one)
+        for one in asked:
+            while one.recv(10_000):
+                pass
+        client = Client(cell)
+        try:
+            assert client.get("/session")[0] == 200
+        finally:
+            client.close()
+    finally:
+        for one in asked:
+            one.close()
+        cell.close()
+
+
 def test_a_stalled_reader_is_let_go_and_holds_up_nobody(monkeypatch):
     monkeypatch.setattr(served, "WRITE_S", 0.5)
     cell = Cell()
