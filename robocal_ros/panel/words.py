@@ -20,6 +20,7 @@ STEPS: Mapping[str, str] = {
     "thermal_ends": r"thermal cycle ends",
     "check": r"tool measurement \(quick\)",
     "full": r"tool measurement \((?:full|reference)\)",
+    "mandrel": r"tool measurement \(witness\)",
     "home": r"on its way home",
     "broken_off": r"is broken off",
     "fault": r"fault",
