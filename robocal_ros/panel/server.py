@@ -37,7 +37,7 @@ from robocal_ros.panel.state import ACCURACY, PanelState, Values
 
 AGAIN_S = 2.0  # between two trials to listen, or to start anew after a defect
 STOP_S = 3.0
-LOOK_S = 1.0  # at history and connections
+LOOK_S = 1.0  # at history, users and connections
 ANSWER_S = 2.0  # maintenance_node answers within
 EVENT_S, SOONEST_S = 1.0, 0.2  # between two events: at the most, and where much changes
 WRITE_S = 10.0  # a browser that takes longer to read is let go
@@ -210,6 +210,8 @@ class PanelServer:
             self.trouble = ""
             while not self._stopped:
                 await self._look_at_history()
+                if self._sessions is not None:
+                    await self._loop.run_in_executor(self._doorman, self._sessions.look)
                 for connection, since_s in [*silent.items()]:
                     if time.monotonic() - since_s > REQUEST_S:
                         del silent[connection]

@@ -46,7 +46,8 @@ class PanelSession:
 class PanelSessions:
     """Logins and sessions of a folder of users; times of a steady clock.
 
-    `login` and `allowed` read the folder, and `login` computes a hash: not for an event loop.
+    `login`, `allowed` and `look` read the folder, and `login` computes a hash: not for an event
+    loop.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -61,7 +62,7 @@ class PanelSessions:
         account = Users(self._folder).accounts[name]
         made = PanelSession(name, role, account, secrets.token_urlsafe(32), now_s, now_s)
         token = secrets.token_urlsafe(32)
-        lasting = {t: s for t, s in self._sessions.items() if not s.ended(now_s)}
+        lasting = {t: s for t, s in [*self._sessions.items()] if not s.ended(now_s)}
         while len(lasting) >= MOST_SESSIONS:
             del lasting[min(lasting, key=lambda t: lasting[t].used_s)]
         self._sessions = lasting | {token: made}
@@ -78,6 +79,18 @@ class PanelSessions:
     def end(self, token: str) -> None:
         """Log out."""
         self._sessions.pop(token, None)
+
+    def look(self) -> None:
+        """End the sessions of users who were taken out, or given another password or role."""
+        if not self._sessions:
+            return
+        try:
+            accounts = Users(self._folder).accounts
+        except (InputError, OSError):  # nobody is known any more
+            accounts = {}
+        for token, session in [*self._sessions.items()]:
+            if accounts.get(session.user) != session.account:
+                self.end(token)
 
     def allowed(self, session: PanelSession, act: str, now_s: float) -> bool:
         """Whether its user may do this, by the table of users as it is now."""
