@@ -55,11 +55,11 @@ class SpeedScaling:
         return None
 
 
-DRIFT = 6e-4  # two clocks run apart by less: NTP slews by 500 ppm, crystals err by 100
+# Two clocks run apart by less: ntpd slews by 500 ppm, crystals err by 100. chronyd slews by up to
+# 83 333 (maxslewrate of chrony.conf): what it takes back makes messages late, and is told of.
+DRIFT = 6e-4
 USUAL_S = 0.01  # what is no later: stamps and messages scatter by as much
-BEHIND_S = (
-    0.03  # of readings that are later more wait: they are taken before anything is made of them
-)
+BEHIND_S = 0.03  # after later ones more wait: they are taken before anything is made of them
 LATE_S, LATELY_S = 0.1, 5.0  # later ones are told of, for so long
 
 
@@ -106,7 +106,9 @@ class Lateness:
         return (
             f"{self._what} come up to {self._worst_s * 1e3:.0f} ms late, so that nobody knows "
             "where the robot is now: this computer or its network has too much to do; give this "
-            "node a core of its own, end other processes, or let the controller publish less often"
+            "node a core of its own, end other processes, or let the controller publish less "
+            "often. Has the robot's computer set its clock back bit by bit (chronyd)? Then "
+            "configure this node anew"
         )
 
 

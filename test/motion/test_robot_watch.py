@@ -175,6 +175,22 @@ def test_a_clock_that_is_set_makes_nothing_late(whose: str, by_s: float) -> None
     assert latest(stamps, came, ages).max() < 1e-6
 
 
+def test_a_clock_that_chronyd_takes_back_makes_late_and_never_early():
+    """0.5 s at 83 333 ppm, on the robot's computer alone; what to do is told, until it is over."""
+    lateness, late = Lateness("states"), []
+    for now_s in np.arange(0.0, 900.0, 0.02).tolist():
+        stamp_s = 1e9 + now_s + 0.5 - min(max(now_s - 20.0, 0.0) / 12.0, 0.5)
+        late.append(lateness.take(stamp_s, now_s, 1e9 + now_s - stamp_s))
+        if now_s == 30.0:
+            assert "configure this node anew" in lateness.words(now_s)
+    assert 0.48 < max(late) <= 0.5 + 1e-6
+    made_up_s = (0.5 - USUAL_S) / 6e-4
+    assert max(late[round((26.0 + made_up_s) / 0.02) :]) == 0.0
+    again = Lateness("states")  # as after `configure`
+    assert again.take(stamp_s, now_s, 1e9 + now_s - stamp_s) == 0.0
+    assert lateness.words(now_s) == ""
+
+
 def test_late_messages_are_told_of_with_how_late_they_were():
     lateness = Lateness("joint states")
     assert lateness.take(0.0, 5.0) == 0.0  # no stamp
