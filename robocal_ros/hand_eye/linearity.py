@@ -212,13 +212,13 @@ def fit_linearity(
     """The error of z that curves have in common; assumed where left-out ones show it not clearly.
 
     ``poses`` (a,): which pose each is of; those of one are left out together, for they show the
-    same place of the field. None without curves.
+    same place of the field. None without curves, or where all their points are of one height.
     """
     groups, group = np.unique(poses, return_inverse=True)
-    if not len(groups):
+    every = np.concatenate([np.empty((0, 2)), *(curve.points for curve in curves)])
+    if not len(every) or np.ptp(every[:, 1]) == 0.0:
         return None
     member = np.eye(len(groups))[group].T  # (g, a)
-    every = np.concatenate([curve.points for curve in curves])
     low, high = every.min(axis=0), every.max(axis=0)
     unseen = _unseen(every, low, high)
     if len(groups) < FEWEST_POSES:

@@ -20,7 +20,7 @@ from bench.hand_eye_worlds import (
 )
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.linearity import SensorLinearity
+from robocal_ros.hand_eye.linearity import SeenLine, SensorLinearity, fit_linearity
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import increment
 from robocal_ros.hand_eye.solve import solve_joint, solve_task, verify
@@ -154,3 +154,10 @@ def test_what_few_poses_of_stairs_do_not_show_of_it_is_in_the_covariance():
         assert result.linearity is None
         squared.append(squared_error(result))
     assert sum(squared) < chi2.ppf(0.999, 6 * len(squared))
+
+
+@pytest.mark.parametrize("poses", [1, 5, 12])
+def test_profiles_of_one_height_show_none_of_it_and_allow_for_none(poses):
+    flat = SeenLine(np.column_stack([np.linspace(-0.01, 0.01, 50), np.full(50, 0.1)]))
+    assert fit_linearity([flat] * poses, np.arange(poses), towards=True) is None
+    assert fit_linearity([], np.arange(0), towards=True) is None
