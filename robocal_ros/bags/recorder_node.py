@@ -42,6 +42,7 @@ TOPICS = (
     "motor_temperatures",
     "profile",
     "target_pose",
+    "tracker_point",
     "fixture_point",
     "gap_open",
     "motion_lease",

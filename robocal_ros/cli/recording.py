@@ -25,6 +25,7 @@ from robocal_ros.bags.replay import (
     topic_kind,
 )
 from robocal_ros.cli.main import describe_robot
+from robocal_ros.fixture.session import POINT
 from robocal_ros.ground.errors import InputError, WrongRobotError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import (
@@ -44,7 +45,7 @@ from robocal_ros.kinematics.robots import robot_folders
 from robocal_ros.session.events import Command
 from robocal_ros.tool.edges import EDGES
 
-MEASURED = (*MEASURING, EDGES, *SHOTS)
+MEASURED = (*MEASURING, EDGES, *SHOTS, POINT)
 UNASKED = "while this was recorded nobody gave its node a command"
 INPUTS = (JOINTS, *MEASURED, TEMPERATURES)
 _POSES = (
@@ -65,6 +66,7 @@ TYPES = {  # of the messages that an input is read from, where others may look l
     TARGET_POSE: ("geometry_msgs/msg/PoseStamped",),
     IMAGE: ("sensor_msgs/msg/Image",),
     TRACKER_POINT: _POINTS,
+    POINT: ("geometry_msgs/msg/PointStamped",),
     EVENTS: ("robocal_msgs/msg/SessionEvent",),
 }
 

@@ -5,6 +5,8 @@ import json
 
 import numpy as np
 import pytest
+from command import robocal_json
+from fixture_driver import fixture_bag
 from fixture_tables import MOVED_M, fixture_tables
 from measured_fixture import ARM, PLATE
 
@@ -82,3 +84,12 @@ def test_taught_kept_accepted_and_compared_with_what_is_in_force(folder, capsys)
     assert now["verdict"]["code"] == "ACCEPT"
     back = ["history", "rollback", "--to", "nominal", "--kind", kind, "--state", str(folder)]
     assert main([*back, "--by", "test", "--reason", "test", "--json"]) == 0
+
+
+def test_a_recording_of_a_fixture_is_replayed_without_a_warning(tmp_path):
+    fixture_bag(tmp_path / "fixture.mcap")
+    document = robocal_json("replay.fixture.json", "replay", tmp_path / "fixture.mcap")
+    assert document["warnings"] == []
+    assert [f["verdict"]["code"] for f in document["fixtures"]] == ["ACCEPT", "ACCEPT"]
+    words = "replay", tmp_path / "fixture.mcap", "--topic", "fixture_point:=/fixture_point"
+    assert robocal_json("replay.fixture.json", *words)["fixtures"] == document["fixtures"]

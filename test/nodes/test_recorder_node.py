@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
+import json
 import os
 import shutil
 import socket
@@ -27,7 +28,10 @@ from robocal_ros.bags.bag_writer import (
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.bags.mcap_files import encode
 from robocal_ros.bags.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
+from robocal_ros.cell_sim.fixture import PLATE
 from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.fixture.files import fixture_document
+from robocal_ros.fixture.node import FixtureNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
@@ -368,6 +372,7 @@ NODES = {
     ThermalNode: {},
     TcfNode: {"motion": "trajectory"},
     HandEyeNode: {},
+    FixtureNode: {"robot": "kr150_r3100"},
     JointCorrectionNode: {},
     MaintenanceNode: {"home_deg": [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]},
 }
@@ -378,6 +383,10 @@ def test_what_a_node_takes_and_how_it_moves_the_robot_is_recorded(graph, tmp_pat
     given = dict(NODES[kind])
     if kind is TcfNode:
         given |= {"laser": written_laser(tmp_path, noisy_cell())}
+    if kind is FixtureNode:
+        file = tmp_path / "plate.yaml"
+        file.write_text(json.dumps(fixture_document(PLATE)))
+        given |= {"fixture_file": str(file)}
     node = graph.add(kind, given)
     assert node.state == "active"
     recorded = {graph.probe.resolve_topic_name(topic) for topic in TOPICS}
