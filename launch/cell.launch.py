@@ -44,6 +44,7 @@ ARGUMENTS = {
     ),
     "plc": ("false", "plc_bridge_node too, the PLC's OPC UA server; params has its security_dir"),
     "panel": ("false", "panel_node too, the page for a browser; params has its security_dir"),
+    "fixture": ("false", "fixture_node too; params has its fixture_file"),
     "params": (
         IfElseSubstitution(
             LaunchConfiguration("simulated"),
@@ -107,8 +108,7 @@ def cell_node(name, condition=None):
 def generate_launch_description():
     """Describe the nodes."""
     simulated = IfCondition(LaunchConfiguration("simulated"))
-    plc = IfCondition(LaunchConfiguration("plc"))
-    panel = IfCondition(LaunchConfiguration("panel"))
+    others = ("plc_bridge_node", "plc"), ("panel_node", "panel"), ("fixture_node", "fixture")
     return LaunchDescription(
         [
             *(
@@ -116,8 +116,7 @@ def generate_launch_description():
                 for name, (default, meaning) in ARGUMENTS.items()
             ),
             *(cell_node(name) for name in NODES),
-            cell_node("plc_bridge_node", plc),
-            cell_node("panel_node", panel),
+            *(cell_node(name, IfCondition(LaunchConfiguration(asked))) for name, asked in others),
             cell_node("cell_sim_node", simulated),
         ]
     )

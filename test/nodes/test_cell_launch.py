@@ -49,8 +49,9 @@ def test_each_of_two_robots_must_be_given_its_own_file():
     """What they had in common by default, the serial, would give them one history."""
     calls = [n for n in ast.walk(tree("two_robots")) if isinstance(n, ast.Call)]
     declared = [c for c in calls if getattr(c.func, "id", "") == "DeclareLaunchArgument"]
-    assert declared
-    assert not any(k.arg == "default_value" for c in declared for k in c.keywords)
+    of_a_robot = [c for c in declared if ast.unparse(c.args[0]) == "params"]
+    assert of_a_robot
+    assert not any(k.arg == "default_value" for c in of_a_robot for k in c.keywords)
 
 
 def test_a_replay_has_its_own_serial_after_the_parameters_of_the_cell():
@@ -68,8 +69,8 @@ def test_a_replay_has_its_own_serial_after_the_parameters_of_the_cell():
 def test_all_nodes_of_a_cell_are_started():
     scripts = {e.name for e in metadata.distribution("robocal-ros").entry_points}
     nodes = {name for name in scripts if name.endswith("_node")}
-    # for a recording; for drivers and PLCs that need one
-    nodes -= {"replay_node", "adapter_node", "plc_bridge_node"}
+    # for a recording; for drivers that need one; of several cells
+    nodes -= {"replay_node", "adapter_node", "sharing_node"}
     assert nodes <= words(tree("cell"))
 
 

@@ -36,7 +36,8 @@ from robocal_ros.tool.laser_frame import read_laser_for
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 SETTINGS = {node.NAME: {s.name: s for s in settings(node)} for node in NODES}
-OTHERS = {"replay_node", "adapter_node", "plc_bridge_node", "panel_node", "cell_sim_node"}
+ASKED_FOR = {"plc_bridge_node", "panel_node", "fixture_node", "cell_sim_node"}
+OTHERS = {"replay_node", "adapter_node", "sharing_node"} | ASKED_FOR
 CELL = {n.NAME for n in NODES} - OTHERS
 DRIVERS = (ROOT / "docs" / "drivers.md").read_text()
 FACTS = set(re.findall(r"^\| `([\w/]+)` \|", DRIVERS, re.MULTILINE))

@@ -52,7 +52,7 @@ class Plc:
         self.node = start()
         self.gap = graph.publisher(GapOpen, "gap_open") if bridge else None
         self.joints = graph.publisher(JointState, "joint_states")
-        self.sent = 0
+        self.begun_ns = time.monotonic_ns()
         graph.probe.create_timer(PERIOD_S, self._beat)
         assert not self.run("").success  # discovers the call
         graph.spin_until(lambda: self.statuses and self._ready(self.statuses[-1]), "it is ready")
@@ -61,9 +61,8 @@ class Plc:
         return bool(status.at_home and not (status.doing and self.beating))
 
     def _beat(self) -> None:
-        self.sent += 1
         message = JointState(name=self.names, position=self.q.tolist())
-        ns = self.sent * round(PERIOD_S * 1e9)
+        ns = time.monotonic_ns() - self.begun_ns
         message.header.stamp = Time(sec=1000 + ns // 10**9, nanosec=ns % 10**9)
         self.joints.publish(message)
         if self.beating:
