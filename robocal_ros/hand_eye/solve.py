@@ -111,8 +111,9 @@ def _result_of(
     linearity = next((read.linearity for read in reads if read.linearity is not None), None)
     of_it = np.zeros_like(fit.covariance)
     if linearity is not None:
-        _, of_it = _bent(fit, reads, linearity)
-    fit = replace(fit, covariance=fit.covariance + of_it)
+        _, of_it, wider = _bent(fit, reads, linearity)
+        wider = wider if settings.noise() is None else 1.0
+        fit = replace(fit, covariance=wider * fit.covariance + of_it)
     error_m = float(expected_error_m(fit.covariance[:6, :6], field - pivot))
     shots = len(data.names)
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
@@ -157,12 +158,16 @@ def _result_of(
     )
 
 
-def _bent(fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity) -> tuple[Array, Array]:
+def _bent(
+    fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity
+) -> tuple[Array, Array, float]:
     """What mount and linearity say of each other, linearised at a fit.
 
     The step (n,) of the coefficients to where both are likeliest: the curves' own form tells them
     with their covariance, the mount's residuals the rest. Then what is left unknown of them in the
     covariance (k, k) of the fit's unknowns: that of both together less that where they are known.
+    And how much wider the noise's square is which these residuals tell: they tell the coefficients
+    too, as many as the prior leaves to them (its effective number, Gull 1989).
     """
     pulled = {name: pull for read in reads for name, pull in read.pulled.items()}
     pull = np.array([pulled[name] for name in fit.names])
@@ -174,13 +179,17 @@ def _bent(fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity) -> t
     r, prior = residual.ravel(), problem.prior()
     known = np.linalg.pinv(J.T @ J + prior, hermitian=True)
     moved = known @ J.T @ P  # how the unknowns follow the coefficients
-    own = P.T @ P - P.T @ J @ moved + np.linalg.pinv(linearity.covariance, hermitian=True)
+    known_before = np.linalg.pinv(linearity.covariance, hermitian=True)
+    own = P.T @ P - P.T @ J @ moved + known_before
     values, vectors = np.linalg.eigh(own)
     seen = values > 0.0
     spread = vectors[:, seen] / np.sqrt(values[seen])
     slope = P.T @ r - moved.T @ (J.T @ r + prior @ problem.deviation(fit.state))
     step = -spread @ (spread.T @ slope)
-    return np.asarray(step), np.asarray((moved @ spread) @ (moved @ spread).T)
+    told = float(np.sum(seen) - np.sum((known_before @ spread) * spread))
+    numbers = max(noise_numbers(problem), 1)
+    wider = numbers / max(numbers - told, 1.0)
+    return np.asarray(step), np.asarray((moved @ spread) @ (moved @ spread).T), wider
 
 
 def _with_linearity(
@@ -190,7 +199,7 @@ def _with_linearity(
     linearity = next((read.linearity for read in reads if read.linearity is not None), None)
     if linearity is None:
         return fit, reads
-    step, _ = _bent(fit, reads, linearity)
+    step, _, _ = _bent(fit, reads, linearity)
     own = replace(linearity, coefficients=linearity.coefficients + step)
     without_it = []
     for read in reads:
