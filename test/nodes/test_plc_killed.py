@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from asyncua import ua
-from maintenance_live import HOME_DEG, LiveCell
+from maintenance_live import HOME_DEG, SERIAL, LiveCell
 from robocal_msgs.msg import MaintenanceStatus
+from test_maintenance_calls import proposed
 from test_plc_bridge import DISAPPEARS_S, refused
 
 from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
+from robocal_ros.history.calibrations import CalibrationHistory
 
 pytestmark = pytest.mark.cell
 GAP_S = 150.0
@@ -191,3 +193,19 @@ def test_killed_while_the_robot_moves_it_stops_and_a_person_looks(
     assert again[:2] == [True, Code.ACCEPT]
     assert again[4] == Code.CONFLICT
     assert line.status.last.run == runs
+
+
+def test_killed_while_a_decision_waits_it_waits_on(line: KilledBridge) -> None:
+    model_hash, state = line.cell.arm.model_hash, line.graph.state
+    with CalibrationHistory.open(SERIAL, model_hash=model_hash, state_dir=state) as history:
+        waits = proposed(history, 0)
+    line.graph.spin_until(lambda: line.status.thermal_pending == waits, "it waits")
+    line.killed(moves=False)
+    line.start()
+    line.says_the_truth()
+    assert line.do(line.plc, line.plc.read("Candidates.ThermalId")) == waits
+    taken = line.call("Accept", waits, "seen", client=line.ada)
+    assert taken[:2] == [True, Code.ACCEPT], taken
+    with CalibrationHistory.open(SERIAL, model_hash=model_hash, state_dir=state) as history:
+        (last,) = history.decisions(newest=1)
+    assert (last.calibration_id, last.by, last.reason) == (waits, "ada", "seen")
