@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page for the people at the line, in any browser: docs/panel.md."""
 
-import contextlib
-import queue
 import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -20,7 +18,14 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.panel.state import ACCURACY, CORRECTION, LONGEST_TEXT, STATUS, plain
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
-from robocal_ros.ros.endpoints import ERROR, WARN, Health, Refusal, ServiceCalls
+from robocal_ros.ros.endpoints import (
+    ERROR,
+    WARN,
+    ExecutorQueue,
+    Health,
+    Refusal,
+    ServiceCalls,
+)
 from robocal_ros.ros.parameters import Setting, number
 from robocal_ros.ros.session_node import STATE_DIR
 
@@ -104,8 +109,6 @@ class PanelNode(HouseNode):
     def __init__(self, **options: Any) -> None:
         self._server: Any = None
         self._expires: datetime | None = None
-        self._handed: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._wake: Any = None
         super().__init__(**options)
 
     def configure(self) -> None:
@@ -134,8 +137,7 @@ class PanelNode(HouseNode):
                 "the page is not encrypted and nobody can log in: give security_dir"
             )
         self._calls = ServiceCalls(self, "maintenance_node", SERVICES)
-        self._wake = self.create_guard_condition(self._take)
-        self._release.append(lambda: self.destroy_guard_condition(self._wake))
+        handed = ExecutorQueue(self, "the page", self._take)
         state_dir = settings[STATE_DIR.name]
         self._server = PanelServer(
             PanelSettings(
@@ -148,8 +150,8 @@ class PanelNode(HouseNode):
                 None if folder is None else encryption(folder),
                 host_names(names),
             ),
-            self._hand,
-            self._hand,
+            handed.put,
+            handed.put,
         )
         for name in SOURCES:
             self._watch(name)
@@ -176,25 +178,11 @@ class PanelNode(HouseNode):
         if server is not None:
             server.stop()
 
-    def _hand(self, handed: Any) -> None:
-        """Take what the server's thread hands over; carried out in the executor's."""
-        self._handed.put(handed)
-        with contextlib.suppress(Exception):  # the node is being destroyed
-            self._wake.trigger()
-
-    def _take(self) -> None:
-        while True:
-            try:
-                handed = self._handed.get_nowait()
-            except queue.Empty:
-                return
-            try:
-                if isinstance(handed, str):
-                    self._tell(handed)
-                else:
-                    self._act(handed)
-            except Exception as error:
-                self._log("the page", error)
+    def _take(self, handed: Any) -> None:
+        if isinstance(handed, str):
+            self._tell(handed)
+        else:
+            self._act(handed)
 
     def _tell(self, words: str) -> None:
         if self._log_limit.allows("the page", words, time.monotonic()):

@@ -4,8 +4,6 @@
 docs/plc.md.
 """
 
-import contextlib
-import queue
 import threading
 import time
 from collections.abc import Mapping
@@ -25,7 +23,14 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import header
-from robocal_ros.ros.endpoints import ERROR, WARN, Health, Refusal, ServiceCalls
+from robocal_ros.ros.endpoints import (
+    ERROR,
+    WARN,
+    ExecutorQueue,
+    Health,
+    Refusal,
+    ServiceCalls,
+)
 from robocal_ros.ros.parameters import Setting, number
 
 GAP_OPEN, EVENTS = "gap_open", "beam_events"
@@ -127,8 +132,6 @@ class PlcBridgeNode(HouseNode):
 
     def __init__(self, **options: Any) -> None:
         self._server: Any = None
-        self._handed: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._wake: Any = None
         self._heartbeat_s = float("-inf")
         self._gap_lock = threading.Lock()  # nothing opens the gap after a deactivation
         self._gap_acts = False
@@ -162,8 +165,7 @@ class PlcBridgeNode(HouseNode):
         beams = tuple(settings["beams"])
         self._edges = self.add_output(BeamEvent, EVENTS, endpoints.RELIABLE) if beams else None
         self._calls = ServiceCalls(self, "maintenance_node", SERVICES)
-        self._wake = self.create_guard_condition(self._take)
-        self._release.append(lambda: self.destroy_guard_condition(self._wake))
+        self._handed = ExecutorQueue(self, "a PLC's request", self._take)
         timing = InputTiming(settings["beam_latency_ms"] * 1e-3, settings["beam_jitter_ms"] * 1e-3)
         self._server = ServerThread(
             ServerSettings(
@@ -237,27 +239,17 @@ class PlcBridgeNode(HouseNode):
             except Exception as error:  # it is being destroyed
                 handed = Notice(f"a heartbeat is lost: {type(error).__name__}: {error}")
         self._handed.put(handed)
-        with contextlib.suppress(Exception):  # the node is being destroyed
-            self._wake.trigger()
 
-    def _take(self) -> None:
+    def _take(self, handed: Any) -> None:
         from robocal_ros.plc.cell import EdgeWritten, MethodCalled, Notice
 
-        while True:
-            try:
-                handed = self._handed.get_nowait()
-            except queue.Empty:
-                return
-            try:
-                match handed:
-                    case EdgeWritten(beam=beam, edge=edge):
-                        self._pass_edge(beam, edge)
-                    case MethodCalled():
-                        self._call(handed)
-                    case Notice(words=words):
-                        self._tell(words)
-            except Exception as error:
-                self._log("a PLC's request", error)
+        match handed:
+            case EdgeWritten(beam=beam, edge=edge):
+                self._pass_edge(beam, edge)
+            case MethodCalled():
+                self._call(handed)
+            case Notice(words=words):
+                self._tell(words)
 
     def _pass_heartbeat(self, heartbeat: Any) -> None:
         stamped = header(self.now_ns(), "")

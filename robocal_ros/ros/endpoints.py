@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inputs, outputs, services and timers of a lifecycle node; their QoS; its diagnostics."""
 
+import contextlib
 import inspect
+import queue
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
@@ -383,6 +385,36 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+
+class ExecutorQueue:
+    """What other threads hand over, taken in the executor's while ``node`` is configured.
+
+    ``take`` is given one after the other; what it raises is logged as of ``where``.
+    """
+
+    def __init__(self, node: EndpointNode, where: str, take: Callable[[Any], None]) -> None:
+        self._node, self._where, self._take = node, where, take
+        self._waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._wake = node.create_guard_condition(self._take_all)
+        node._release.append(lambda: node.destroy_guard_condition(self._wake))
+
+    def put(self, handed: Any) -> None:
+        """Hand over, from any thread."""
+        self._waiting.put(handed)
+        with contextlib.suppress(Exception):  # the node is being destroyed
+            self._wake.trigger()
+
+    def _take_all(self) -> None:
+        while True:
+            try:
+                handed = self._waiting.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                self._take(handed)
+            except Exception as error:
+                self._node._log(self._where, error)
 
 
 FORGOTTEN_S = 1.0  # how often calls that nobody waits for any more are let go
