@@ -82,8 +82,22 @@ def test_taught_kept_accepted_and_compared_with_what_is_in_force(folder, capsys)
     status, now = command(capsys, "--points", "fixture_now.csv", *kept, "--keep")
     assert now["revision"] == 1
     assert now["verdict"]["code"] == "ACCEPT"
+    with CalibrationHistory.open("R1", model_hash=ARM.model_hash, state_dir=folder) as history:
+        inputs = history.inputs(now["calibration_id"])
+    assert set(inputs) == {"name", "instrument", "q", "T_base_flange", "p"}
+    assert {len(rows) for rows in inputs.values()} == {len(inputs["p"])}
     back = ["history", "rollback", "--to", "nominal", "--kind", kind, "--state", str(folder)]
     assert main([*back, "--by", "test", "--reason", "test", "--json"]) == 0
+
+
+def test_a_taught_table_that_is_refused_is_told(folder, capsys):
+    strict = "--form-mm", "0.001"  # no sensor measures a feature so well
+    alone = command(capsys, "--points", "fixture_taught.csv", *strict)[1]["verdict"]
+    assert alone["code"] == "RESIDUAL_TOO_LARGE"
+    taught = "--taught", "fixture_taught.csv"
+    document = command(capsys, "--points", "fixture_now.csv", *taught, *strict)[1]
+    assert document["warnings"] == [f"fixture_taught.csv: {alone['reason']}"]
+    assert command(capsys, "--points", "fixture_now.csv", *taught)[1]["warnings"] == []
 
 
 def test_a_recording_of_a_fixture_is_replayed_without_a_warning(tmp_path):
