@@ -33,7 +33,7 @@ help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 14
 
 demo: setup  ## a simulated cell in closed loop through the live nodes, report in out/report/
-	$(ROS) python bags/demo.py
+	$(HURRIES) $(ROS) python bags/demo.py
 
 # Live cells of up to six processes, and motions that are judged by time, come first, two at a time;
 # then the other node tests, three at a time. Where the user may, they go before whatever else runs on

@@ -50,7 +50,8 @@ DEMO_NEEDS = (
     "__init__", "cell_samples", "demo", "measured_runs", "processes", "startup", "tables",
     "closed_loop.__init__", "closed_loop.carrying", "closed_loop.plant", "closed_loop.setting",
     "closed_loop.suite", "closed_loop.words",
-    "live.__init__", "live.cell", "live.graph", "live.plc", "live.running",
+    "live.__init__", "live.cell", "live.graph", "live.lines", "live.opc_ua", "live.plc",
+    "live.running",
 )  # fmt: skip
 
 # Of ament's layout. In a wheel the second would take the place of pip's own script.

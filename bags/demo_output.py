@@ -5,6 +5,7 @@ import os
 import webbrowser
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from bench.demo import GOAL_S
 from bench.live.plc import Gap
@@ -28,28 +29,37 @@ class Story:
 
     moments: list[Moment] = field(default_factory=list)
     gaps: list[Gap] = field(default_factory=list)
+    page: dict[str, Any] | None = None  # what panel_node shows at the end
 
     def document(self) -> dict[str, object]:
         """Plain values."""
         moments = [asdict(moment) for moment in self.moments]
-        return {"simulated": True, "moments": moments, "gaps": [_gap(gap) for gap in self.gaps]}
+        gaps = [_gap(gap) for gap in self.gaps]
+        return {"simulated": True, "moments": moments, "gaps": gaps, "page": self.page}
 
 
 def _gap(gap: Gap) -> dict[str, object]:
     result = gap.result
     codes = {
-        name: Code(getattr(result, name)).name
-        for name in ("code", "thermal_code", "tool_found_code", "tool_code")
+        name: Code(getattr(result, name)).name for name in ("code", "tool_found_code", "tool_code")
     }
+    thermal = [Code(r.thermal_code).name for r in gap.results if r.thermal_code != Code.NONE]
     return {
         "gap": gap.name,
         "length_s": gap.length_s,
         "used_s": gap.used_s,
         **codes,
+        "thermal_codes": thermal,
         "complete": result.complete,
-        "accepted": list(result.accepted),
+        "accepted": accepted(gap),
         "message": result.message,
+        "broken_off": [broken.message for broken in gap.results[:-1]],
     }
+
+
+def accepted(gap: Gap) -> list[int]:
+    """What came into force in it."""
+    return [number for result in gap.results for number in result.accepted]
 
 
 def tell(words: str) -> None:
@@ -57,7 +67,7 @@ def tell(words: str) -> None:
     print(f"  {words}", flush=True)
 
 
-def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
+def show(story: Story, page: Path, seconds: float, nodes: int, *, opened: bool) -> None:
     """Print the summary; open the page where there is a desktop."""
     from rich.console import Console
     from rich.table import Table
@@ -76,10 +86,13 @@ def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
     console.print()
     for gap in story.gaps:
         result = gap.result
-        brought = ", ".join(map(str, result.accepted)) or "nothing"
+        brought = ", ".join(map(str, accepted(gap))) or "nothing"
+        thermal = next((r.thermal_code for r in gap.results[::-1] if r.thermal_code), Code.NONE)
+        broken = len(gap.results) - 1
         console.print(
-            f"{gap.name}: {gap.used_s:.0f} of {gap.length_s:.0f} s; thermal "
-            f"{Code(result.thermal_code).name}, tool found {Code(result.tool_found_code).name}, "
+            f"{gap.name}: {gap.used_s:.0f} of {gap.length_s:.0f} s; "
+            f"{f'broken off {broken} times by a busy computer; ' if broken else ''}thermal "
+            f"{Code(thermal).name}, tool found {Code(result.tool_found_code).name}, "
             f"then {Code(result.tool_code).name}; "
             f"came into force: {brought}"
         )
@@ -87,6 +100,6 @@ def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
     console.print(f"\n{near}", soft_wrap=True)
     missed = " MISSED" if seconds > GOAL_S else ""
     took = f"{seconds:.0f} s (goal {GOAL_S:.0f} s{missed})"
-    console.print(f"[dim]{took}, six nodes as processes over DDS[/dim]")
+    console.print(f"[dim]{took}, {nodes} nodes as processes over DDS[/dim]")
     if opened and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.as_uri())

@@ -47,7 +47,8 @@ def demo_table(seconds: float) -> Table:
         "demo",
         "The demo, from its start to its report",
         ("what", "took, s", "goal"),
-        "Once, set up before: six nodes as processes, in real time, and the recording replayed.",
+        "Once, set up before: the cell's nodes and its PLC as processes, in real time, and the "
+        "recording replayed.",
     )
     table.add("make demo", seconds, Goal(seconds, GOAL_S))
     return table

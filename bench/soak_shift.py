@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live shift at real time: six nodes of a cell as processes over DDS, driven by a PLC's calls.
+"""A live shift at real time: a cell's nodes as processes over DDS, driven by a PLC over OPC UA.
 
 ``tools/with_ros python -m bench.soak_shift --seconds 900`` for a look; an hour is the default.
 With ``--keep`` it writes docs/figures/soak_shift.md too. The cell is the demo's, simulated.

@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
-from bench.processes import ENDS_WITH_PARENT
+from bench.processes import ENDS_WITH_PARENT, hand_nice_on
 from bench.startup import EXECUTABLES
 from robocal_ros.ros import endpoints
 
@@ -62,7 +62,11 @@ class Executable:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
+                # Linux shares cores out by session (autogroup): eight processes in one of many
+                # sessions would starve.
+                start_new_session=True,
             )
+        hand_nice_on(self.pid)
 
     @property
     def pid(self) -> int:

@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A PLC as asyncua's own client: its certificate, its user, its program's heartbeat, its calls."""
+"""A PLC as asyncua's own client: its certificate, its user, its program's heartbeat, its calls.
+
+`PlcClient` is one in a thread, `PlcProcess` one in a process of its own.
+"""
 
 import asyncio
+import contextlib
 import logging
+import multiprocessing
+import os
 import socket
 import threading
 import time
@@ -15,12 +21,13 @@ from typing import Any
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
+from bench.processes import hand_nice_on
 from robocal_ros.plc import access
 from robocal_ros.plc.access import Role, Users
 
 OPERATOR, ENGINEER = ("plc", "a plc's password"), ("ada", "an engineer's password")
 PASSWORDS = dict((OPERATOR, ENGINEER))
-PROGRAM_S = 0.05  # the program's cycle
+PROGRAM_S, BEATS_MS = 0.05, 20.0  # the program's cycle; how often its client looks for a beat
 NAMESPACE = "urn:robocal_ros:cell"
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
@@ -52,6 +59,7 @@ class PlcClient:
         self.written: list[int] = []
         self.refused: list[str] = []
         self._beat = 0
+        self._came = asyncio.Event()
         self._watched: Client | None = None
         self.index = 2
         self.client: Client
@@ -137,22 +145,25 @@ class PlcClient:
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """A beat has come, as asyncua tells a subscription."""
         self._beat = value or 0
+        self._came.set()
 
     async def _watch(self) -> None:
         """Subscribe the beat, of each session anew."""
         if self._watched is not self.client:
             self._beat, client = 0, self.client
-            beats = await client.create_subscription(1e3 * PROGRAM_S, self)
+            beats = await client.create_subscription(BEATS_MS, self)
             await beats.subscribe_data_change(self.node("Gap.Beat"))
             self._watched = client
 
     async def program(self) -> None:
         """The PLC's program: it copies the newest beat in each cycle while it gives the gap.
 
-        Beats come by a subscription, so that writing waits for no reading.
+        Beats come by a subscription, so that writing waits for no reading; each is echoed at once.
         """
         while True:
-            await asyncio.sleep(PROGRAM_S)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._came.wait(), PROGRAM_S)
+            self._came.clear()
             if not self.beating:
                 continue
             try:
@@ -181,3 +192,69 @@ class PlcClient:
             logging.getLogger(__name__).debug("leaves: %s", error)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(5.0)
+
+
+class PlcProcess:
+    """A `PlcClient` that shares neither interpreter nor session with who asks it.
+
+    A real PLC has a processor of its own: what goes on here must not hold its heartbeat up. It
+    ends with its owner.
+    """
+
+    def __init__(
+        self, folder: Path, port: int, user: str = OPERATOR[0], name: str = "line"
+    ) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        arguments = other, folder, port, user, name
+        self._process = context.Process(target=_serve, args=arguments, daemon=True)
+        self._process.start()
+        other.close()
+
+    def ask(self, what: str, *arguments: Any) -> None:
+        """Ask for what the client can do, by its name."""
+        self._pipe.send((what, arguments))
+
+    def answered(self) -> bool:
+        """Whether `answer` waits for nothing."""
+        return self._pipe.poll()
+
+    def answer(self) -> Any:
+        """What was answered; raises `ConnectionError` with the words of what went wrong."""
+        done, value = self._pipe.recv()
+        if not done:
+            raise ConnectionError(value)
+        return value
+
+    def close(self) -> None:
+        """End its heartbeat and itself."""
+        self._pipe.close()
+        self._process.join(10.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def _serve(pipe: Any, folder: Path, port: int, user: str, name: str) -> None:
+    """The process of a PLC: until its owner is gone."""
+    os.setsid()
+    hand_nice_on(os.getpid())
+    plc = PlcClient(folder, port, user, name)
+    plc.is_open = False
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            what, arguments = pipe.recv()
+            try:
+                if what == "give":
+                    (plc.is_open,) = arguments
+                    found = None
+                elif what == "begin":
+                    plc.beating, found = True, None
+                    plc.start(plc.program())
+                else:
+                    found = plc.start(getattr(plc, what)(*arguments)).result()
+            except Exception as error:
+                pipe.send((False, f"{type(error).__name__}: {error}"))
+            else:
+                pipe.send((True, found))
+    plc.close()

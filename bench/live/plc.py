@@ -1,24 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The PLC's bridge: heartbeat, programme, maintenance's services, and the correction's node
-(/joint_correction_node/status and enable). Nothing else.
+"""The PLC of the cell: it gives gaps, calls for maintenance, and lets the robot produce.
 
-What it knows of the cell it has from these and from ``accuracy_state``, as a PLC does. `Judge`
-listens to the simulator's truth, for judging alone.
+What it knows of the cell it has by its `Line`. By ROS it does what is none of its own: the
+programme's trajectories, and switching the correction on. `Judge` listens to the simulator's truth,
+for judging alone.
 """
 
 import json
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rclpy.exceptions import InvalidHandle
-from robocal_msgs.msg import AccuracyState, CorrectionStatus, GapOpen, MaintenanceStatus
-from robocal_msgs.srv import GetMaintenance, RunMaintenanceCycle
+from robocal_msgs.msg import CorrectionStatus, MaintenanceStatus
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -26,78 +23,67 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from bench.cell_samples import programme
 from bench.live.cell import PROGRAM, ROBOT, TRUTH
 from bench.live.graph import CellController, LiveError
+from bench.live.lines import Answer, Line
 from robocal_ros.cell_sim.cell import poses
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 
-BEAT_S = 0.05  # a PLC's program goes round many times for each beat
 GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
 START_S = 120.0  # of all nodes, on a machine with much else to do
-ASK_S = 0.2  # between two calls of ~/status
+ASK_S = 0.2  # between two looks at the cell
+GIVE_UP_S, WAIT_S = 600.0, 3.0  # a gap that broke off is given again, each time after longer
 LEAD = 4  # rests at home, a second each: after a gap the offset grows there, by 2 deg/s
 EACH = 9  # of the cell's working poses one in so many is visited
 SPEED_RAD_S, REST_S = 1.8, 0.1  # as fast as the slowest drive goes: the demo is short
+BY_HAND_RAD_S, STANDS_RAD = 0.5, 1e-4
 STATES = ("NONE", "OK", "DUE", "DEGRADED", "EXPIRED", "FAULT")  # of AccuracyState, by number
 
 
 @dataclass(frozen=True)
 class Gap:
-    """How a gap was used: its length and what the maintenance took of it, s; its result."""
+    """How a gap was used: its length and what the maintenance took of it, s; its results.
+
+    The last one is of the cycle that left nothing; those before it were broken off, as the gap had
+    closed by its own rule.
+    """
 
     name: str
     length_s: float
     used_s: float
-    result: Any
+    results: tuple[Any, ...]
+
+    @property
+    def result(self) -> Any:
+        """As it ended."""
+        return self.results[-1]
 
 
 class Plc:
     """Opens gaps, has the maintenance run in them, lets the robot produce between them."""
 
-    def __init__(self, controller: CellController, tell: Callable[[str], None]) -> None:
-        self._controller, self._tell = controller, tell
-        self._is_open, self._beats = False, True
-        self._gap = controller.publisher(GapOpen, "gap_open")
+    def __init__(self, controller: CellController, line: Line, tell: Callable[[str], None]) -> None:
+        self._controller, self._line, self._tell = controller, line, tell
         self._program = controller.publisher(JointTrajectory, PROGRAM)
-        self._accuracy: deque[AccuracyState] = deque(maxlen=1)
         self._correction: deque[CorrectionStatus] = deque(maxlen=1)
-        controller.listen(AccuracyState, "accuracy_state", self._accuracy, endpoints.LATCHED)
         status = "/joint_correction_node/status"
         controller.listen(CorrectionStatus, status, self._correction, endpoints.LATCHED)
-        self._maintenance: deque[MaintenanceStatus] = deque(maxlen=1)
-        beats = "/maintenance_node/status"
-        controller.listen(MaintenanceStatus, beats, self._maintenance, endpoints.LATCHED)
-        self._heart = threading.Thread(target=self._beat, daemon=True)
-        self._heart.start()
+        self._joints: deque[JointState] = deque(maxlen=1)
+        taught = "/joint_correction_node/joint_states"
+        controller.listen(JointState, taught, self._joints, endpoints.RELIABLE)
         self._names = list(load_robot(ROBOT).joint_names)
-        home = poses("home")[0]
-        way = [*[home] * LEAD, *poses("work")[::EACH], home]
-        self._time, self._q, *_ = programme(home, way, SPEED_RAD_S, REST_S)
-
-    def _beat(self) -> None:
-        """As a PLC does it: whatever else goes on here."""
-        while self._beats:
-            with suppress(InvalidHandle):  # the graph ends
-                self._gap.publish(GapOpen(open=self._is_open, echo=self._newest_beat()))
-            time.sleep(BEAT_S)
-
-    def _newest_beat(self) -> int:
-        return self._maintenance[-1].beat if self._maintenance else 0
-
-    def close(self) -> None:
-        """End the heartbeat."""
-        self._beats = False
-        self._heart.join()
+        self._home = poses("home")[0]
+        self._way = [*[self._home] * LEAD, *poses("work")[::EACH], self._home]
 
     # ---- before the shift -----------------------------------------------------------------------
 
     def take_over(self) -> None:
         """Wait until all nodes are there, and switch the correction on."""
         controller = self._controller
-        controller.wait(lambda: self._accuracy, "accuracy_state", START_S)
+        self._line.take_over(START_S)
         controller.wait(lambda: self._correction, "the joint correction")
-        controller.wait(lambda: self._status("").state.at_home, "a robot at home")
-        controller.wait(lambda: self._status("").state.disarmed, "a disarmed tcf_node")
+        controller.wait(self._at_home, "a robot at home")
+        controller.wait(lambda: self._line.look().maintenance.disarmed, "a disarmed tcf_node")
         controller.wait(lambda: self._program.get_subscription_count() > 0, "the programme's way")
         answer = controller.call(SetBool, "/joint_correction_node/enable", data=True)
         if not answer.success:
@@ -105,15 +91,29 @@ class Plc:
 
     def line(self) -> tuple[str, str]:
         """What the line reads now: state, and its words."""
-        last = self._accuracy[-1]
-        return STATES[last.state], last.reason
+        read = self._line.look().accuracy
+        return STATES[read.state], read.reason
+
+    def _at_home(self) -> bool:
+        return bool(self._line.look().maintenance.at_home)
 
     # ---- production -----------------------------------------------------------------------------
 
     def produce(self, halfway: Callable[[], None] | None = None) -> None:
         """A pass of the programme as taught; what corrects it stands on its way to the robot."""
+        self._drive(self._home, self._way, SPEED_RAD_S, halfway)
+
+    def _drive(
+        self,
+        start: np.ndarray,
+        way: list[np.ndarray],
+        speed_rad_s: float,
+        halfway: Callable[[], None] | None = None,
+    ) -> None:
+        """From where the robot stands (n,) through poses (n,) to home."""
         message = JointTrajectory(joint_names=self._names)
-        for at, q in zip(self._time, self._q, strict=True):
+        times, joints, *_ = programme(start, way, speed_rad_s, REST_S)
+        for at, q in zip(times, joints, strict=True):
             zero = [0.0] * len(q)
             point = JointTrajectoryPoint(positions=q.tolist(), velocities=zero, accelerations=zero)
             seconds, rest = divmod(float(at), 1.0)
@@ -121,13 +121,13 @@ class Plc:
             point.time_from_start.nanosec = int(rest * 1e9)
             message.points.append(point)
         refused = sum(self._correction[-1].refused) if self._correction else 0
-        begin_s, end_s = time.monotonic(), float(self._time[-1])
+        begin_s, end_s = time.monotonic(), float(times[-1])
         self._program.publish(message)
         if halfway is not None:
             self._until(begin_s + 0.5 * end_s)
             halfway()
         self._until(begin_s + end_s + REST_S)
-        self._controller.wait(lambda: self._status("").state.at_home, "the robot at home")
+        self._controller.wait(self._at_home, "the robot at home")
         now = sum(self._correction[-1].refused)
         if now > refused:
             raise LiveError(f"the correction refused the programme: {self._correction[-1]}")
@@ -138,41 +138,81 @@ class Plc:
     # ---- gaps -----------------------------------------------------------------------------------
 
     def gap(self, name: str, length_s: float) -> Gap:
-        """A gap: let the maintenance run in it, take the robot back when it says so."""
-        self._is_open, begin_s = True, time.monotonic()
+        """A gap: let the maintenance run in it, take the robot back when it says so.
+
+        Where something is left, as it closes by its own rule when this machine was busy for half
+        a second, a person sees to the fault, if any, and it is given again, as on a line, when
+        the machine may have less to do.
+
+        Raises
+        ------
+        LiveError
+            When no cycle begins, or something is still left after `GIVE_UP_S`.
+        """
+        begin_s, results = time.monotonic(), []
+        while True:
+            again = len(results)
+            result, fault = self._cycle(name + "+" * again, length_s)
+            results.append(result)
+            if result.code == Code.ACCEPT and result.complete:
+                return Gap(name, length_s, time.monotonic() - begin_s, tuple(results))
+            if time.monotonic() - begin_s > GIVE_UP_S:
+                raise LiveError(f"{name}: {result.message}")
+            self._tell(f"broken off, so again, as this computer is too busy: {result.message}")
+            if fault:
+                self._see_to_it()
+            self._until(time.monotonic() + WAIT_S * (again + 1))
+
+    def _cycle(self, name: str, length_s: float) -> tuple[Any, str]:
+        """One cycle in a gap: its result, and the fault with which it ended."""
+        self._line.is_open, begin_s = True, time.monotonic()
         try:
             answer = self._begin(name, begin_s + length_s)
             if not answer.success:
-                raise LiveError(f"{name} cannot begin: {Code(answer.status).name} {answer.message}")
-            said, result = "", None
-            while result is None:
+                words = f"{Code(answer.status).name} {answer.message}"
+                raise LiveError(f"{name} cannot begin: {words}")
+            said = ""
+            while True:
                 self._until(time.monotonic() + ASK_S)
-                told = self._status(name)
-                if told.state.doing and told.state.doing != said:
-                    said = told.state.doing
+                now = self._line.look().maintenance
+                if now.doing and now.doing != said:
+                    said = now.doing
                     self._tell(f"{time.monotonic() - begin_s:5.1f} s  {said}")
-                if told.state.state == MaintenanceStatus.FAULT:
-                    raise LiveError(f"{name}: {told.state.fault}")
-                if told.result.code != Code.NONE and told.state.at_home:
-                    result = told.result
-            used_s = time.monotonic() - begin_s
+                ended = now.last.cycle_id == name and now.last.code != Code.NONE
+                if ended and (now.at_home or now.state == MaintenanceStatus.FAULT):
+                    return now.last, now.fault
         finally:
-            self._is_open = False
-        return Gap(name, length_s, used_s, result)
+            self._line.is_open = False
 
-    def _begin(self, name: str, end_s: float) -> Any:
+    def _begin(self, name: str, end_s: float) -> Answer:
         """The heartbeat may not have been heard yet: a call that was refused may come again."""
         deadline, answer = time.monotonic() + 2.0, None
         while answer is None or (answer.status == Code.CONFLICT and time.monotonic() < deadline):
             self._until(time.monotonic() + ASK_S)
-            left_s = end_s - time.monotonic()
-            answer = self._controller.call(
-                RunMaintenanceCycle, "/maintenance_node/run", cycle_id=name, gap_s=left_s
-            )
+            answer = self._line.run(name, end_s - time.monotonic())
         return answer
 
-    def _status(self, name: str) -> Any:
-        return self._controller.call(GetMaintenance, "/maintenance_node/status", cycle_id=name)
+    def _see_to_it(self) -> None:
+        """A person looks, drives the robot home by hand and acknowledges the fault."""
+        stood: list[np.ndarray] = []
+
+        def stands() -> bool:
+            self._until(time.monotonic() + ASK_S)
+            here = dict(zip(self._joints[-1].name, self._joints[-1].position, strict=True))
+            stood.append(np.array([here[name] for name in self._names]))
+            return len(stood) > 2 and bool(np.ptp(stood[-3:], axis=0).max() < STANDS_RAD)
+
+        self._controller.wait(stands, "a robot that stands")
+        self._tell("a person drives the robot home and acknowledges the fault")
+        self._drive(stood[-1], [self._home], BY_HAND_RAD_S)
+        answers: list[Answer] = []
+
+        def acknowledged() -> bool:
+            self._until(time.monotonic() + ASK_S)
+            answers.append(self._line.acknowledge())
+            return answers[-1].success
+
+        self._controller.wait(acknowledged, "the end of the fault")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from bench.live.cell import PARAMETERS, commission, wiring, write_settings
 from bench.live.graph import CellController, LiveError
+from bench.live.lines import Line, OpcUaLine, RosLine
 from bench.live.plc import Plc
 from bench.startup import ROOT
 
@@ -30,21 +31,35 @@ def live_cell(
     """
     tell("commissioning the cold cell, in one process")
     made = commission(folder)
-    controller, plc = CellController(), None
+    controller = CellController()
+    line: Line | None = None
     try:
         files = PARAMETERS, folder / "cell.yaml"
         write_settings(made, recordings, files[1])
         for name, wires in wiring().items():
             controller.start(folder, name, {}, wires, files)
-        plc = Plc(controller, tell)
-        tell("waiting for six nodes, three hours of work later")
+        line = _line(controller, folder, tell)
+        plc = Plc(controller, line, tell)
+        tell(f"waiting for {len(controller.pids)} nodes, three hours of work later")
         plc.take_over()
         yield controller, plc
         controller.end_nodes()  # completes the recording
     finally:
-        if plc is not None:
-            plc.close()
+        if line is not None:
+            line.close()
         controller.close()
+
+
+def _line(controller: CellController, folder: Path, tell: Callable[[str], None]) -> Line:
+    """The PLC's way to the cell: by OPC UA, where its library is installed."""
+    try:
+        line = OpcUaLine(controller, folder / "plc")
+    except ImportError as error:
+        tell(f"{error}, which robocal_ros[plc] brings: the PLC calls by ROS, not by OPC UA")
+        return RosLine(controller)
+    controller.start(folder, "plc_bridge_node", line.parameters)
+    tell("the PLC: certificates and users are made, its gaps go by OPC UA alone")
+    return line
 
 
 def validate(recordings: Path, report: Path) -> Path:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole demo: a PLC bridge drives a cell of six processes by service calls alone."""
+"""The whole demo: a PLC drives a cell of processes by OPC UA, and its page shows it."""
 
 import csv
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from domains import free_domain
 
-from bench.live.cell import TRUTH
+from bench.live.cell import SERIAL, TRUTH
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.cell_sim.trajectory_controller import ROOM
@@ -21,8 +21,7 @@ from robocal_ros.ground.errors import Code
 pytestmark = pytest.mark.cell
 
 ROOT = Path(__file__).parent.parent.parent
-LONGEST_S = 240.0
-TRIES = 3
+LONGEST_S = 1800.0  # where nothing else runs: some 110 s
 WITHIN_MM = 0.3  # what docs/simulation.md calls recovered
 BENT_MM = 2.0
 NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what it was measured with
@@ -32,16 +31,13 @@ NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what i
 def demo(tmp_path_factory) -> tuple[str, dict, Path]:
     """What the demo printed, what it told of its story, and its folder.
 
-    A computer that is busy for half a second closes a gap in mid-measurement, as it must: again.
+    A computer that is busy for half a second closes a gap in mid-measurement, as it must: the demo
+    has it seen to, and gives it again.
     """
-    for _ in range(TRIES):
-        out = tmp_path_factory.mktemp("demo")
-        done = played(out)
-        story = (out / "story.json").read_text() if done.returncode == 0 else done.stderr
-        if "gap_open is silent" not in story:
-            break
+    out = tmp_path_factory.mktemp("demo")
+    done = played(out)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout, json.loads(story), out
+    return done.stdout, json.loads((out / "story.json").read_text()), out
 
 
 def played(out: Path) -> subprocess.CompletedProcess[str]:
@@ -70,16 +66,16 @@ def test_the_shift_goes_as_it_should(demo):
         assert f"{moment['with_mm']:.3f}" in printed
     assert "simulated" in printed
     # Whether it is met is judged where nothing else runs: `bench.demo`.
-    assert re.search(r"^\d+ s \(goal 180 s( MISSED)?\), six nodes", printed, re.MULTILINE)
+    assert re.search(r"^\d+ s \(goal 180 s( MISSED)?\), 8 nodes", printed, re.MULTILINE)
 
 
 def test_the_gaps_are_kept_and_used(demo):
     _, story, _ = demo
     first, second = story["gaps"]
     for gap in (first, second):
-        assert gap["used_s"] <= gap["length_s"]
+        assert gap["broken_off"] or gap["used_s"] <= gap["length_s"]
         assert (gap["code"], gap["complete"]) == (Code.ACCEPT.name, True)
-    assert first["thermal_code"] == Code.ACCEPT.name
+    assert first["thermal_codes"][0] == Code.ACCEPT.name
     assert (first["tool_found_code"], second["tool_found_code"]) == ("ACCEPT", "LIMIT_EXCEEDED")
     assert second["tool_code"] == Code.ACCEPT.name
     assert first["accepted"]
@@ -117,10 +113,40 @@ def test_the_recording_gives_the_live_results_again(demo):
         assert session["differs"] == []
     cycles = kinds["thermal"]["cycles"]
     assert [cycle["verdict"]["code"] for cycle in cycles] == [
-        gap["thermal_code"] for gap in story["gaps"]
+        code for gap in story["gaps"] for code in gap["thermal_codes"]
     ]
     page = (out / "report" / "report.html").read_text()
     assert "bit for bit" in page
     assert "simulated" in page
     rows = list(csv.DictReader((out / "report" / "decisions.csv").open()))
-    assert sum(row["command"] == "run_maintenance" for row in rows) == 2
+    runs = sum(1 + len(gap["broken_off"]) for gap in story["gaps"])
+    assert sum(row["command"] == "run_maintenance" for row in rows) == runs
+
+
+def test_the_plc_spoke_opc_ua_alone(demo):
+    """The bridge's log names who called, and nobody else has published the gap."""
+    printed, story, out = demo
+    assert "its gaps go by OPC UA alone" in printed
+    log = (out / "plc_bridge_node.log").read_text()
+    runs = sum(1 + len(gap["broken_off"]) for gap in story["gaps"])
+    assert log.count("plc called Run: ") >= runs
+    assert log.count("ada called Acknowledge: ") >= printed.count("acknowledges the fault")
+
+
+def test_the_page_shows_what_the_line_reads(demo):
+    """As fetched by HTTP at the end: the last gap, its result in force, nothing that waits."""
+    printed, story, _ = demo
+    page, gap = story["page"], story["gaps"][-1]
+    assert re.search(
+        r"the page for the people at the line: http://127\.0\.0\.1:\d+$", printed, re.M
+    )
+    assert page["headline"] == story["moments"][-1]["state"] == "OK"
+    assert (page["serial"], page["at_home"], page["waiting"]) == (SERIAL, True, [])
+    assert page["cycle_id"] == gap["gap"] + "+" * len(gap["broken_off"])
+    assert [page["last"][name] for name in ("code", "complete")] == ["ACCEPT", True]
+    assert page["steps"]
+    accepted = {number for of in story["gaps"] for number in of["accepted"]}
+    assert accepted <= set(page["shift"]["accepted"])
+    if not gap["broken_off"]:
+        assert page["last"]["tool_found_code"] == "LIMIT_EXCEEDED"
+        assert page["tasks"][0]["key"] == "LIMIT_EXCEEDED/tool mended"
