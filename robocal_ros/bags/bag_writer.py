@@ -135,9 +135,6 @@ class BagWriter:
         ``message``: an object with the type's attributes (of rclpy, of a bag), a mapping of its
         fields (those left out are zero or empty), or its CDR as bytes.
         ``publish_time_ns``: the log time when it is not given.
-
-        Raises `InputError` when the type is not known; `ValueError` when a mapping has a field that
-        the type has not.
         """
         channel = self._channel(topic, full_name(msgtype))
         data = message
@@ -500,8 +497,6 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
     The newest one stays, and so do those that a process writes or that `keep` marked. One that
     cannot be deleted or measured does not hold up the others. Where deleting all of them did not
     free enough, none is deleted for that.
-
-    Raises `OSError` when the folder or its disk cannot be looked at.
     """
     if not parent.is_dir():
         return FreedSpace((), {}, 0)

@@ -285,10 +285,7 @@ def read_bag(
 
 
 def bag_info(path: str | Path) -> BagInfo:
-    """Topics, counts and times of a bag.
-
-    Raises `InputError` when it cannot be read.
-    """
+    """Topics, counts and times of a bag."""
     with BagReader(path) as bag:
         return bag.info
 

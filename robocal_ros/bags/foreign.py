@@ -108,10 +108,7 @@ class ForeignBagReader(BagReader):
         raw: bool = False,
         blocks: Collection[str] = (),
     ) -> Iterator[BagMessage]:
-        """As `BagReader.messages`; joint states come one by one.
-
-        Raises `InputError` when a type is not known, or a message cannot be decoded.
-        """
+        """As `BagReader.messages`; joint states come one by one."""
         read = (self._messages(reader, topics, raw) for reader in self._readers)
         yield from merge(*read, key=lambda recorded: recorded.log_time_ns)
 
@@ -211,8 +208,6 @@ def stream_timing(
 
     A stream comes at more than 5 Hz, and while the robot moves too. The first 15 minutes are looked
     at.
-
-    Raises `InputError` when the bag cannot be read.
     """
     seen = _Seen.of(reader, inputs, arm)
     return {

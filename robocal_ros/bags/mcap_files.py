@@ -132,8 +132,6 @@ def encode(msgtype: str, value: Any) -> memoryview:
     """CDR of a message: any object with the type's attributes, or a mapping of its fields.
 
     Fields that a mapping leaves out are zero or empty, as in ROS.
-
-    Raises `ValueError` when a mapping has a field that the type has not.
     """
     store = ros_types()
     message = value if isinstance(value, store.types[msgtype]) else _build(store, msgtype, value)

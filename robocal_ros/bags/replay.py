@@ -59,10 +59,7 @@ def topic_kind(topic: str) -> str:
 
 
 def first_configuration(messages: Iterable[RecordedMessage]) -> Command | None:
-    """The first configuration among the events: whose they are, and the names of the inputs.
-
-    Raises `InputError` when it cannot be read.
-    """
+    """The first configuration among the events: whose they are, and the names of the inputs."""
     for recorded in messages:
         if (event := recorded.message).command == events.CONFIGURE:
             return read_command(event.command, stamp_ns(event.stamp), event.arguments)
@@ -80,8 +77,6 @@ def read_events(
     ``from_ns`` is the stamp of the first recorded joint reading. What was commanded before it is
     in the bag only because the topic is latched; its samples are not. It is left out, and the
     configuration is the one that it led to.
-
-    Raises `InputError` when an event cannot be read.
     """
     configured: Command | None = None
     model: Any = None

@@ -214,10 +214,7 @@ def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
 
 
 def describe_robot(name: str) -> "tuple[RobotDescription, list[str]]":
-    """Read a robot file; beside it warnings of what it leaves open.
-
-    Raises `InputError` when there is no such robot, or its file is not as docs/files.md says.
-    """
+    """Read a robot file; beside it warnings of what it leaves open."""
     from robocal_ros.kinematics.robots import load_description
 
     description = load_description(name)
@@ -449,7 +446,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         },
     ),
     "correct-points": CliCommand(
-        "thermal.cli_sensors:correct_points",
+        "thermal.cli:correct_points",
         "carry what a sensor on the flange measured to base, with the model of the robot as it is",
     ),
     "tool": CliGroup(
@@ -556,11 +553,11 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
         "turn the factory calibration of a Universal Robots arm into a robot file",
     ),
     "import-urdf": CliCommand(
-        "cli.urdf:import_urdf",
+        "cli.robot:import_urdf",
         "turn a URDF, or a kinematics.yaml of Universal Robots' description, into a robot file",
     ),
     "export-urdf": CliCommand(
-        "cli.urdf:export_urdf",
+        "cli.robot:export_urdf",
         "put a robot file's kinematics, as identified, into a URDF or such a kinematics.yaml",
     ),
     "plc": CliGroup(

@@ -44,7 +44,7 @@ from robocal_ros.programs.correcting import (
 from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.frame_shift import LEVER_M, PARTS, best_shift, given_shift
 from robocal_ros.programs.points import Dialect, frame_given
-from robocal_ros.thermal.frame_shifts import (
+from robocal_ros.thermal.proposing import (
     FrameShiftInForce,
     errors_of,
     keep_shift,
@@ -127,10 +127,7 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
 
 
 def given_models(args: argparse.Namespace) -> tuple[CorrectionModels, list[str]]:
-    """The models of `add_model_options`, and warnings.
-
-    Raises `InputError` where one cannot be read, `WrongRobotError` where it is of another robot.
-    """
+    """The models of `add_model_options`, and warnings."""
     robot, warnings = describe_robot(args.robot)
     nominal = robot.arm
     actual = given_model(args, nominal)

@@ -89,8 +89,6 @@ def validated(jobs: "Sequence[Job]", workers: int, scheduler: str | None) -> "It
     ``workers``: processes on this machine (see `warm_up`); with one all is done in this process.
     ``scheduler``: address of a running Dask cluster, which is used instead; it must see the bags by
     the same paths, and have this software.
-
-    Raises `InputError` when Dask is not there, or the cluster does not answer or has no worker.
     """
     if scheduler is not None:
         with _cluster(scheduler) as client:

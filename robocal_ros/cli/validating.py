@@ -620,10 +620,7 @@ def changes_of(
 
 
 def cell_courses(reader: BagReader, truth: BagTruth) -> list[CellCourse]:
-    """The course of the true error of each cell that a bag tells of.
-
-    Raises `InputError` when it cannot be read.
-    """
+    """The course of the true error of each cell that a bag tells of."""
     if not truth.states:
         return []
     lines = {

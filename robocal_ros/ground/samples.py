@@ -300,10 +300,7 @@ MOST_POINTS = 5_000_000
 
 
 def cloud_points(message: Any) -> Array:
-    """Points (n, 3), m, of the fields x, y, z; missing points stay not-a-number.
-
-    Raises as `cloud_columns`.
-    """
+    """Points (n, 3), m, of the fields x, y, z; missing points stay not-a-number."""
     return cloud_columns(message, "xyz")
 
 

@@ -615,9 +615,6 @@ def calibrate_streams(
     """Place a camera from two streams; the result's ``more`` tells the offset.
 
     ``check``: a stream of the robot at times of the camera's that judge the result.
-
-    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError`, `ResidualError` as
-    `pair_streams` and `calibrate_camera`, and for a check of times that were used to solve.
     """
     how = settings or CameraSettings()
     found = pair_streams(robot, camera, mount, how.noise)

@@ -221,12 +221,7 @@ def find_corners(image: Image, board: Chessboard) -> Array | None:
 def see_boards(
     images: Sequence[tuple[str, Image]], board: Chessboard, intrinsics: Intrinsics | None = None
 ) -> SeenBoards:
-    """Find the board in named images, and the intrinsics from the same images if none are given.
-
-    Raises `TooFewSamplesError` when no image, or too few for the intrinsics, shows the board;
-    `InputError` when images have another size than the intrinsics say; `RankDeficientError` when
-    the images do not show the intrinsics.
-    """
+    """Find the board in named images, and the intrinsics from the same images if none are given."""
     rejected: dict[str, str] = {}
     sizes = [(image.shape[1], image.shape[0]) for _, image in images]
     size = intrinsics.size if intrinsics else max(sizes, key=sizes.count, default=(0, 0))
@@ -250,11 +245,7 @@ def boards_of_corners(
     names: Sequence[str], corners: Array, board: Chessboard, size: tuple[int, int],
     intrinsics: Intrinsics | None = None, rejected: dict[str, str] | None = None,
 ) -> SeenBoards:  # fmt: skip
-    """The same from corners (m, n, 2), px.
-
-    Raises `TooFewSamplesError` or `RankDeficientError` as `see_boards`; `InputError` when no camera
-    sees a board as the corners lie.
-    """
+    """The same from corners (m, n, 2), px."""
     out = dict(rejected or {})
     _require(len(names), intrinsics, out)
     seen = _solve(tuple(names), corners, board, size, intrinsics)

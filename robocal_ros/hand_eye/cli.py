@@ -53,9 +53,12 @@ from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, Profile, SensorDescr
 from robocal_ros.hand_eye.result import (
     METHODS,
     HandEyeSettings,
+    TouchTest,
     by_shot,
+    compared,
     hand_eye_document,
     shots_of,
+    touch_test,
 )
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
@@ -69,7 +72,6 @@ from robocal_ros.hand_eye.targets import (
     read_target,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData
-from robocal_ros.hand_eye.touch_test import TouchTest, compared, touch_test
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot, read_fields
 from robocal_ros.session.events import session_kind
@@ -306,10 +308,6 @@ def read_bag_shots(
     """Shots of a bag, and the profiles that are none with the reason.
 
     ``topics``: input to topic, where given.
-
-    Raises `InputError` when the bag cannot be read, or lacks what is needed; `WrongRobotError`
-    when a data file was made with another robot; `TooFewSamplesError` when no profile was taken at
-    standstill.
     """
     with open_bag(path) as reader:
         if DATA_SET not in reader.info.topics:

@@ -75,10 +75,6 @@ class Shot:
 
         That is position, m, and quaternion x, y, z, w of the target in the sensor frame. Of an
         image its grey pixels (h, w), 8 bits. Of a point (1, 3), m, tracker frame.
-
-        Raises as `cloud_profile`, and `InputError` when the message is no image that is read, a
-        value of a pose or a point is not finite, a quaternion is not of unit length or a point is
-        farther away than trackers measure.
         """
         return self._values
 

@@ -216,10 +216,7 @@ def read_scanned_points(path: Path, arm: SerialArm | None = None) -> ScannedPoin
 
 
 def read_touched_points(path: Path) -> dict[str, Array]:
-    """Places (3,) in base, m, of touched points by name.
-
-    Raises `InputError` for a table that is not so, and for a point that is there twice.
-    """
+    """Places (3,) in base, m, of touched points by name."""
     columns = ("point", *POSITION["mm"])
     table = read_cells(path, lambda header, file: check_plain(header, file, columns))
     require_different(table, "point")
@@ -250,10 +247,7 @@ def read_profile(path: Path, name: str, sensor: SensorDescription = DEFAULT) -> 
 def read_profiles(
     folder: Path, table: PoseTable, sensor: SensorDescription = DEFAULT
 ) -> list[Profile | TooFewSamplesError]:
-    """Profiles (m,) of the shots; for one that shows next to nothing the reason.
-
-    Raises `InputError` when a file is missing (all are looked for first), or is no profile.
-    """
+    """Profiles (m,) of the shots; for one that shows next to nothing the reason."""
     profiles: list[Profile | TooFewSamplesError] = []
     for path, name in zip(table.files_in(folder), table.names, strict=True):
         try:
@@ -274,10 +268,7 @@ def write_pose_table(
     stamp_ns: NDArray[np.int64] | None = None,
     mark: Sequence[str] | None = None,
 ) -> None:
-    """Write a table of shots in millimetres and quaternions, ``joints`` (q (m, n)) beside them.
-
-    Raises `InputError` when it cannot be written.
-    """
+    """Write a table of shots in millimetres and quaternions, ``joints`` (q (m, n)) beside them."""
     columns: dict[str, list[str]] = {}
     if names is not None:
         columns["sample"] = list(names)
@@ -448,10 +439,7 @@ def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) ->
 
 
 def read_images(folder: Path, table: PoseTable) -> tuple[list[tuple[str, Image]], dict[str, str]]:
-    """Named grey images of the shots that a table names, and why any of them cannot be read.
-
-    Raises `InputError` when a file is missing.
-    """
+    """Named grey images of the shots that a table names, and why any of them cannot be read."""
     images, rejected = [], {}
     for path, name in zip(table.files_in(folder), table.names, strict=True):
         try:

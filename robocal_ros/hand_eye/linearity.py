@@ -164,10 +164,7 @@ class SensorLinearity:
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "SensorLinearity":
-        """As `document` told it, but for the covariance.
-
-        Raises `KeyError`, `TypeError` or `ValueError` for what is none.
-        """
+        """As `document` told it, but for the covariance."""
         coefficients = 1e-6 * np.array(document["coefficients_um"], dtype=np.float64)
         low, high = (
             1e-3 * np.array(document[name], dtype=np.float64) for name in ("low_mm", "high_mm")

@@ -147,9 +147,6 @@ def fit_mount(
     """Estimate the sensor's pose and what is unknown of its targets.
 
     ``noise``: of reported poses; None to estimate it.
-
-    Raises `TooFewSamplesError`: fewer equations than unknowns; `RankDeficientError` when poses
-    leave a direction open; its words say which motion is missing.
     """
     rejected: dict[str, str] = {}
     state = start

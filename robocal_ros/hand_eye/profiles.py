@@ -255,8 +255,6 @@ def columns_profile(
 
     ``width``: of an organised cloud, whose rows are profiles; else 0. All profiles of a standstill
     share its pose, whose error is larger than what a mean of them would lower.
-
-    Raises as `profile_of`, and `InputError` for points that are in no plane y.
     """
     told = columns["z"]
     z: Array = (
@@ -350,9 +348,6 @@ def cloud_profile(message: Any, sensor: SensorDescription = DEFAULT) -> Profile:
     """The profile of a ``sensor_msgs/PointCloud2``: one profile, or several of one standstill.
 
     These are the rows of an organised cloud, or told by a field, by y, or where x begins anew.
-
-    Raises `InputError` when the message is no cloud that is read, or points are not in a plane y;
-    `TooFewSamplesError` when nearly nothing was seen.
     """
     fields = [field.name for field in message.fields]
     # A cloud of x, y and z is expected: that y is missing is told, unless other fields are named.

@@ -623,11 +623,7 @@ def configuration(session: HandEyeSession, topics: Mapping[str, str]) -> Command
 def hand_eye_session_as_recorded(
     nominal: SerialArm, history: CalibrationHistory, configured: Command, software: str
 ) -> HandEyeSession:
-    """Make a session with the recorded settings; an empty history gets what was in force.
-
-    Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
-    configuration cannot be read.
-    """
+    """Make a session with the recorded settings; an empty history gets what was in force."""
     arguments = recorded_arguments(nominal, configured, ("model", OWN["hand_eye"]))
     config = HandEyeConfig.of_document(arguments["config"])
     in_force = {

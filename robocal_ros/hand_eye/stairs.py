@@ -258,8 +258,6 @@ def nine_unknowns(value: Array, p_flange: Array) -> Array:
     p = x r1 + z r3 + t by linear least squares (step-target paper, eqs. 12 to 15), then the second
     column r2 = r3 x r1 (its eq. 16 has them the other way round, which is left-handed) and the
     rotation nearest to the three.
-
-    Raises as `closed_corners`.
     """
     closed_corners(value, p_flange)  # refuses what is not determined
     A = np.column_stack([value[:, :2], np.ones(len(value))])

@@ -247,10 +247,7 @@ def _array(value: Any) -> Any:
 
 
 def read_target(path: Path) -> Target:
-    """Read a target file.
-
-    Raises `InputError`, naming file and key, when it is not as its contract says.
-    """
+    """Read a target file."""
     top = read_fields(path, "target file")
     kind = top.choice("kind", KINDS)
     if kind == "sphere":
@@ -392,10 +389,7 @@ def _check_near(fields: Fields, key: str, point_mm: Array) -> None:
 
 
 def read_tracker_target(path: Path) -> TrackerTarget:
-    """Read the target file of a calibration by laser tracker.
-
-    Raises `InputError`, naming file and key, when it is not as docs/hand_eye_tracker.md says.
-    """
+    """Read the target file of a calibration by laser tracker."""
     top = read_fields(path, "target file")
     top.choice("kind", ("tracker",))
     return _tracker(top)

@@ -210,10 +210,7 @@ def read_with(
     linearity: SensorLinearity | None,
     T_flange_sensor: Array | None = None,
 ) -> Read:
-    """Features by what is known of the sensor: its linearity is not looked for.
-
-    Raises as `Task.read`.
-    """
+    """Features by what is known of the sensor: its linearity is not looked for."""
     known = replace(task, plain=linearity is None)
     return known.read(data, T_flange_sensor, linearity)
 

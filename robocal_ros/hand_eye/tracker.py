@@ -460,11 +460,7 @@ def solve_tracker(
     method: Method = "best",
     limit_m: float = LIMIT_M,
 ) -> HandEyeResult:
-    """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted.
-
-    Raises `InputError`, `TooFewSamplesError`, `RankDeficientError`, `ResidualError`, saying what
-    the measurements lack.
-    """
+    """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted."""
     classic = solve_classic(data, target, noise)
     problem, estimate = solve_best(data, target, noise, classic)
     best = _result(data, target, classic, estimate.state, "best")

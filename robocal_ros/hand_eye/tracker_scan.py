@@ -385,11 +385,7 @@ class _Match:
 
 
 def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise) -> Classic:
-    """Both poses in closed form.
-
-    Raises `RobocalError`, naming what the data lack; see `fit_axes`, `flange_pose`, `tracked_cube`,
-    `find_planes`.
-    """
+    """Both poses in closed form."""
     data.require_enough()
     axes = fit_axes(data, noise.tracker_m)
     T_tracker_flange = flange_pose(data, axes, target)

@@ -304,10 +304,7 @@ def read_candidate(connection: sqlite3.Connection, calibration_id: int) -> Candi
 
 
 def read_json(connection: sqlite3.Connection, calibration_id: int, name: str) -> dict[str, Any]:
-    """Document or model of a calibration.
-
-    Raises `InputError`: unknown id; `DamagedError`: its bytes are not those that were stored.
-    """
+    """Document or model of a calibration."""
     found: dict[str, Any] = json.loads(_read(connection, calibration_id, name))
     return found
 

@@ -88,10 +88,7 @@ def kinematic_model(
     state: int,
     stamp: Header,
 ) -> KinematicModel:
-    """A model document (``model_document``) as a message.
-
-    Raises `InputError` when a number is not finite.
-    """
+    """A model document (``model_document``) as a message."""
     mdh = np.array(model["mdh"], dtype=np.float64)
     covariance = np.array(model.get("covariance", []), dtype=np.float64)
     _require_finite("model", [*mdh.ravel(), *covariance.ravel(), *np.ravel(model["T_base_root"])])
@@ -158,10 +155,7 @@ def verdict_message(
 
 
 def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Header) -> Any:
-    """The verdict on a thermal model; without one the figures are 0 and the reason says why.
-
-    Raises `InputError` when a figure is not finite.
-    """
+    """The verdict on a thermal model; without one the figures are 0 and the reason says why."""
     cycle_id = str(outcome.command.arguments.get("cycle_id", ""))
     message = verdict_message(outcome, robot=robot, serial=serial, stamp=stamp, cycle_id=cycle_id)
     document = outcome.document
@@ -180,10 +174,7 @@ def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Heade
 
 
 def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
-    """Tell errors, mm, by the names ``mean_mm``, ``rms_mm``, ``p95_mm`` and ``max_mm``.
-
-    Raises `InputError` when one is not finite.
-    """
+    """Tell errors, mm, by the names ``mean_mm``, ``rms_mm``, ``p95_mm`` and ``max_mm``."""
     for name in _ERRORS:
         _require_finite(f"{whose}_{name}", [errors[name]])
         setattr(message, f"{whose}_{name}", float(errors[name]))

@@ -171,10 +171,7 @@ def history_notice(settings: Mapping[str, Any]) -> str:
 
 
 def acknowledge_history(settings: Mapping[str, Any], by: str) -> None:
-    """Write down that somebody knows of a damaged history.
-
-    Raises `StorageError` when it cannot be written.
-    """
+    """Write down that somebody knows of a damaged history."""
     folder = _folder(settings) or state_folder()
     acknowledge(history_path(settings["serial"] or NO_SERIAL, folder), by, time.time_ns())
 

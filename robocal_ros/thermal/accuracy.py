@@ -141,9 +141,6 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
 
     The covariance is ``learn_drift``'s; its size, and the time of approach, are those with which
     each shift is most likely under what the others teach (one shift alone judges itself).
-
-    Raises `InputError` when a cycle does not belong to its cold visit; `TooFewSamplesError` with
-    fewer than ten cycles.
     """
     sigma_m = visit_noise(shifts)
 

@@ -485,10 +485,7 @@ def _best(design: Design, chosen: list[int]) -> int:
 
 
 def plan_poses(design: Design, candidates: Array, count: int, rng: np.random.Generator) -> PosePlan:
-    """Choose poses, and put them in the order of the shortest way.
-
-    Raises `TooFewSamplesError` with fewer candidates than poses wanted.
-    """
+    """Choose poses, and put them in the order of the shortest way."""
     chosen = choose(design, count)
     draws = [
         design.error(rng.choice(len(candidates), count, replace=False).tolist())
@@ -556,9 +553,6 @@ def plan_cycle(
     ``prior`` (k, k): covariance of the expected drift, SI; ``sigma_m`` of one visit's coordinate.
     ``working`` (w, n): poses where the tool must be right; None: all over the joint limits.
     ``own`` (o, n): measuring poses to compare with, or None.
-
-    Raises `LimitError` or `TooFewSamplesError` when the sphere cannot be brought into the field
-    often enough.
     """
     tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
     cell = CellModel(arm, sensor.T_sensor_base, ("sphere",), tool)

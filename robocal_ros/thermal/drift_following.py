@@ -423,10 +423,7 @@ class Following:
 
     @property
     def follower(self) -> DriftFollower | None:
-        """None without a reference.
-
-        Raises `StorageError` when the cycles kept so far cannot be read.
-        """
+        """None without a reference."""
         current = self._current
         if current.reference is None:
             return None

@@ -298,8 +298,6 @@ def identify_flange_sensor(
 
     The parameters have building tolerances as prior, scaled to what the data show
     (`fitted_prior`).
-
-    Raises `TooFewSamplesError` or `RankDeficientError` when the data cannot answer.
     """
     start = hand_eye_start(arm, data)
     sigma = np.ones(len(data)) if data.sigma is None else data.sigma
@@ -362,8 +360,6 @@ def identify_and_judge_flange_sensor(
     """Identify from sessions and judge on ``check``, in which only the centres are refitted.
 
     Without ``check`` a ``share`` of the poses of the sessions is held out.
-
-    Raises `TooFewSamplesError` or `RankDeficientError` when the data cannot answer.
     """
     train = in_sessions(sessions)
     if check is None:

@@ -243,10 +243,7 @@ SETTINGS = (
 
 
 def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig:
-    """Settings of the session, in SI.
-
-    Raises `InputError` when a working pose has not a number for each joint.
-    """
+    """Settings of the session, in SI."""
     poses = joint_poses(arm, settings["work_poses_deg"], "work_poses_deg").tolist()
     tip_mm = settings["tip_mm"]
     return ThermalConfig(

@@ -130,8 +130,6 @@ class ColdSpots:
         It holds the backlash of joints that came from another side than when cold.
 
         ``sigma_m``: of one visit, where the measurements have none of their own.
-
-        Raises `InputError` when a measurement has no cold counterpart.
         """
         spot, place, count = np.unique(self.match(warm), return_inverse=True, return_counts=True)
         mean = np.zeros((len(count), len(warm)))
@@ -277,10 +275,7 @@ class ColdReference:
     spheres: SpheresInCell | None = None
 
     def placed(self, data: Measurements) -> Measurements:
-        """Measurements as places of the cell's targets: they are, but of a measuring robot.
-
-        Raises as `SpheresInCell.placed`.
-        """
+        """Measurements as places of the cell's targets: they are, but of a measuring robot."""
         return data if self.spheres is None else self.spheres.placed(self.cell, data)
 
     @property
@@ -627,8 +622,6 @@ def measured_errors(
     Against the cold visit: the cold model itself leaves the whole drift. Visits of one pose are
     averaged; the noise of both visits is in it. ``left_out``: names of averaged visits that no
     model can fit. ``sigma_m``: of a coordinate of one visit.
-
-    Raises `InputError` when a measurement has no cold counterpart.
     """
     spots, cold = reference.spots, reference.cell.arm
     data = spots.average(warm, sigma_m)

@@ -77,10 +77,7 @@ class DriftHistory:
         )
 
     def residual(self, chosen: Sequence[int]) -> Array:
-        """What is left (t, 3c) at the check points with some parameters (columns) identified.
-
-        Raises `TooFewSamplesError` or `RankDeficientError` when the spots do not determine them.
-        """
+        """What is left (t, 3c) at the check points with some parameters (columns) identified."""
         if not len(chosen):
             return self.check
         found = subset_drift(self.displacement, self.rows, chosen, self.names)

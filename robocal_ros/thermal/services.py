@@ -35,19 +35,19 @@ from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.ros.graph import FrameWatch
 from robocal_ros.ros.session_node import TWIN, trigger_answer
 from robocal_ros.session.events import ACCEPT, ONLY, ROLLBACK, Command, decide
-from robocal_ros.thermal.frame_shifts import (
-    errors_of,
-    keep_shift,
-    shift_document,
-    shift_in_force,
-    shift_verdict,
-)
-from robocal_ros.thermal.measured_points import (
+from robocal_ros.thermal.observations import (
     PlacedShot,
     PointQueue,
     SensorShot,
     placed_shot,
     shot_of,
+)
+from robocal_ros.thermal.proposing import (
+    errors_of,
+    keep_shift,
+    shift_document,
+    shift_in_force,
+    shift_verdict,
 )
 from robocal_ros.thermal.reference import SpheresInCell
 from robocal_ros.thermal.session import ThermalSession

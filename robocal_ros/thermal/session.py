@@ -56,7 +56,6 @@ from robocal_ros.thermal.drift_following import (
     InForce,
     ThermalConfig,
 )
-from robocal_ros.thermal.measured_points import PlacedShot
 from robocal_ros.thermal.observations import (
     TIME_OUT,
     Beside,
@@ -64,6 +63,7 @@ from robocal_ros.thermal.observations import (
     Observation,
     ObservationDesk,
     OpenCycle,
+    PlacedShot,
     Windows,
 )
 from robocal_ros.thermal.proposing import Proposer
@@ -360,11 +360,7 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
 def session_as_recorded(
     nominal: SerialArm, history: CalibrationHistory, configured: Command, software: str
 ) -> ThermalSession:
-    """Make a session with the recorded settings; an empty history gets what was in force.
-
-    Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
-    configuration cannot be read.
-    """
+    """Make a session with the recorded settings; an empty history gets what was in force."""
     arguments = recorded_arguments(nominal, configured, ("model", "reference", OWN["thermal"]))
     in_force = {THERMAL: arguments["model"], REFERENCE: arguments["reference"]}
     tracker = arguments[OWN["thermal"]]

@@ -363,9 +363,6 @@ class DriftTracker:
         waiting must not make it plausible.
 
         ``cycle.sigma`` (m,), where given, is each coordinate's noise.
-
-        Raises `InputError` when a sample has no cold counterpart; `StaleError` when the cycle is
-        older than the last one.
         """
         if doubt_s is not None and not (early := self._examine(cycle, doubt_s)[0]).applied:
             return early

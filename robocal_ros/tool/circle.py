@@ -103,8 +103,6 @@ def label_edges(
     Between the restore of a shadow and the next break the arc's middle is exactly above or below
     the beam's middle: a latency up to a quarter of a turn does not confuse it. The first edge may
     be a restore, and there may be several turns.
-
-    Raises `BeamError` when a beam has fewer than four edges, or they do not come in turn.
     """
     parts = []
     for b, beam in enumerate(BEAMS):

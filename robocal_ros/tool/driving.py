@@ -102,9 +102,6 @@ def approach(
     retract height, within its opening at the higher of both ends, so that no beam is broken on the
     way; there from circle to circle straight. Each part is a straight line of the tip from rest to
     rest, as fast as all limits allow.
-
-    Raises `LimitError` where the way passes a joint limit, the reach, a singularity, or the
-    housing.
     """
     q = _joints(cell, q_now)
     here, there = cell.T_base_tip(q), cell.tip_of(start_pose(step, cell.limits))

@@ -81,10 +81,7 @@ STATES = {"1": True, "true": True, "0": False, "false": False}
 
 
 def read_beam_points(path: Path) -> dict[str, Array]:
-    """Flange positions (3,), base, m, by the name of their edge; of one measured often the mean.
-
-    Raises `InputError`, with file, row and column, when the table is not as docs/tool.md says.
-    """
+    """Flange positions (3,), base, m, by the name of their edge; of one measured often the mean."""
     table = read_cells(path, lambda header, file: check_plain(header, file, ("point", *POSITION)))
     positions = _positions(table)
     names = np.array(table.words("point"))
@@ -177,10 +174,7 @@ def read_joint_path(path: Path, arm: SerialArm) -> tuple[JointPath, int]:
 
 
 def read_flange_poses(path: Path) -> Array:
-    """T_base_flange (m, 4, 4).
-
-    Raises `InputError` as `read_beam_points`; without an orientation.
-    """
+    """T_base_flange (m, 4, 4)."""
     return _poses(path)[1]
 
 

@@ -496,9 +496,6 @@ def quick_check(
 
     Pass: a deviation at the limit would look as small as this in at most 5 % of cases;
     recalibrate: one at the limit would look as large in at most 5 %; else it cannot be told.
-
-    Raises `BeamError`, `RankDeficientError`, `ResidualError` as `estimate_tool`: edges that are
-    missing or make no sense also ask for a full run.
     """
     beside = sideways_check(laser, path, steps, stored, rule, noise=noise)
     if beside.answer == "recalibrate":

@@ -178,10 +178,7 @@ class LaserFile:
 
 
 def write_laser(path: Path, placed: LaserFile) -> None:
-    """Write a laser file in millimetres, all digits kept; the file appears whole or not.
-
-    Raises `InputError` when it cannot be written.
-    """
+    """Write a laser file in millimetres, all digits kept; the file appears whole or not."""
     laser = placed.laser
     document: Document = {
         "station": placed.station,
@@ -226,11 +223,7 @@ def read_laser(path: Path) -> LaserFile:
 
 
 def read_laser_for(path: Path, arm: SerialArm) -> LaserFile:
-    """Read a laser file that was made with ``arm``.
-
-    Raises `InputError` as `read_laser`; `WrongRobotError` when it was made with another nominal
-    model.
-    """
+    """Read a laser file that was made with ``arm``."""
     placed = read_laser(path)
     require_made_for(arm, path, placed.robot, placed.model_hash, "place the beams")
     return placed
@@ -359,9 +352,6 @@ def axis_from_centres(
     ``T_base_flange``: poses of the flange at the circles' centres, both of one orientation, the
     second lower. ``centre``: (2,) tool's centre in the beam plane then, laser frame, m. In the
     laser frame the axis is (O1 - O2) - dz z (thesis eq. 4-11, from the tip's side).
-
-    Raises `RankDeficientError` when both circles are at one height, or the axis lies nearly in the
-    beam plane.
     """
     R_laser_base = laser.T_base_laser[:3, :3].T
     moved = R_laser_base @ (T_base_flange[1][:3, 3] - T_base_flange[0][:3, 3])

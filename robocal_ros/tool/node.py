@@ -165,10 +165,7 @@ SETTINGS = (
 
 
 def taught_tool(settings: Mapping[str, Any], nominal: SerialArm) -> NDArray[np.float64]:
-    """T_flange_tool (4, 4) as taught: by the parameters, else by the robot file.
-
-    Raises `InputError` when the quaternion is not of unit length.
-    """
+    """T_flange_tool (4, 4) as taught: by the parameters, else by the robot file."""
     given = given_pose(settings, "taught")
     return nominal.T_flange_tool if given is None else given
 
@@ -176,10 +173,7 @@ def taught_tool(settings: Mapping[str, Any], nominal: SerialArm) -> NDArray[np.f
 def session_config(
     settings: Mapping[str, Any], laser: LaserFrame, station: str, taught: NDArray[np.float64]
 ) -> ToolConfig:
-    """Settings of the session, in SI.
-
-    Raises `InputError` when a length or speed is out of range.
-    """
+    """Settings of the session, in SI."""
     return ToolConfig(
         points_m=rows_of(laser.points),
         taught=rows_of(taught),

@@ -496,11 +496,7 @@ class ToolRun:
         return self._watched().over(self._seconds(stamp_ns), place)
 
     def take(self, edges: Sequence[EdgeSample], stamps: NDArray[np.int64], q: Array) -> None:
-        """Add the awaited step with its edges and joint readings.
-
-        Raises `RobocalError` when the edges make no sense, no tool explains the steps so far, or
-        they differ from the healthy tool's in what no bend changes.
-        """
+        """Add the awaited step with its edges and joint readings."""
         step, rule = self.awaited, self.config.input
         beams: list[Beam] = [sample.beam for sample in edges]
         found = [sample.edge(self.begun_ns, rule.sigma_s) for sample in edges]

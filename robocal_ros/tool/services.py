@@ -290,11 +290,7 @@ class TcfMotion:
         node.add_timer(TICK_S, self._tick, steady=True)
 
     def activate(self, session: ToolSession) -> None:
-        """Begin, disarmed.
-
-        Raises `InputError` when a limit is given for another number of joints, or the robot has
-        none.
-        """
+        """Begin, disarmed."""
         require_limits(session.nominal, self._config)
         self._looked_s = -math.inf
         self.driver = ToolDriver(

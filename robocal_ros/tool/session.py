@@ -224,10 +224,7 @@ class ToolResults:
         return None
 
     def finish(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
-        """Solve a complete run.
-
-        Raises `RobocalError` when no tool explains it, or the result cannot be kept.
-        """
+        """Solve a complete run."""
         ends = {
             FULL: self._full,
             QUICK: self._quick,
@@ -663,11 +660,7 @@ def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
 def tool_session_as_recorded(
     nominal: SerialArm, history: CalibrationHistory, configured: Command, software: str
 ) -> ToolSession:
-    """Make a session with the recorded settings; an empty history gets what was in force.
-
-    Raises `WrongRobotError`: the recording was made with another nominal model; `InputError`: the
-    configuration cannot be read.
-    """
+    """Make a session with the recorded settings; an empty history gets what was in force."""
     arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
     config = ToolConfig.of_document(arguments["config"])
     in_force = {kind: arguments[name] for name, kind in IN_FORCE.items()}

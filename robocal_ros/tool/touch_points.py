@@ -196,8 +196,6 @@ def sweep_axis(
 
     ``up``, ``down`` (2,): flange x_b at break and restore of each beam; ``turned_*`` the same after
     the turn by 90 deg. In m.
-
-    Raises `InputError` when an edge is missing.
     """
     lean = _middle(up, "upper beam") - _middle(down, "lower beam")
     turned = _middle(turned_up, "upper beam, turned") - _middle(turned_down, "lower beam, turned")

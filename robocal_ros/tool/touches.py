@@ -63,10 +63,7 @@ class TouchLog:
         return Outcome(command, Code.ACCEPT, f"{count} touches are forgotten")
 
     def solve(self, arm: SerialArm, in_force: KnownTool, thermal_revision: int) -> TouchedTip:
-        """Find the tip with the model ``arm``, and judge it; the orientation stays.
-
-        Raises `RobocalError` when the touches cannot answer.
-        """
+        """Find the tip with the model ``arm``, and judge it; the orientation stays."""
         q = np.array(self._touches).reshape(-1, arm.n)
         fit = fit_four(arm.fk(q))
         T = frames.transform(in_force.T_flange_tool[:3, :3], fit.tip)

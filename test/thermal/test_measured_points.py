@@ -10,7 +10,7 @@ from command import robocal, robocal_json
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.ground.samples import JointSample, JointStream
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.thermal.measured_points import MOST_WAITING, PlacedShot, PointQueue, SensorShot
+from robocal_ros.thermal.observations import MOST_SHOTS, PlacedShot, PointQueue, SensorShot
 
 ARM = load_robot("kr150_r3100")
 BEGIN_S, PERIOD_S, READINGS = 1000.0, 0.02, 100
@@ -28,11 +28,11 @@ def test_a_shot_that_came_before_the_joints_and_is_far_ahead_holds_no_other():
     for i in range(READINGS):
         stamp_ns = round((BEGIN_S + i * PERIOD_S) * 1e9)
         stream.add(JointSample(stamp_ns, ARM.joint_names, Q), 250_000_000)
-    for i in range(MOST_WAITING - 1):
+    for i in range(MOST_SHOTS - 1):
         queue.add(shot(BEGIN_S + 0.5 + i * 1e-3))
     (_, error), *others = queue.ready(ARM, np.eye(4))
     assert "3998.0 s ahead" in str(error)
-    assert len(others) == MOST_WAITING - 1
+    assert len(others) == MOST_SHOTS - 1
     assert all(isinstance(placed, PlacedShot) for _, placed in others)
 
 

@@ -16,7 +16,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.thermal.drift_following import FLANGE, ThermalConfig
-from robocal_ros.thermal.measured_points import PlacedShot, PointQueue, SensorShot
+from robocal_ros.thermal.observations import PlacedShot, PointQueue, SensorShot
 from robocal_ros.thermal.screening import share_within
 from robocal_ros.thermal.session import ThermalSession
 
