@@ -29,7 +29,7 @@ from bench.hand_eye_worlds import (
     step_world,
 )
 from bench.tables import Goal, Table
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import RankDeficientError, RobocalError
 from robocal_ros.hand_eye.planning import (
     PlannedLine,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects, Warmth
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel, Identification, identify

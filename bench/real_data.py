@@ -10,7 +10,7 @@ import numpy as np
 from bench.tables import Goal, Table
 from bench.ur10_campaigns import data_folder, halves, load_campaign
 from robocal_ros.estimation.assessment import ErrorSummary, summarise
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.frames import Index
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.full_model import identify_full

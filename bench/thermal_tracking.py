@@ -17,7 +17,7 @@ from bench.tables import Goal, Table
 from bench.thermal_shifts import MEASURING, PARTS, SEEDS, Measured, cell_of
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.accuracy import (
     EarlierShift,

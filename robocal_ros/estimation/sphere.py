@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.estimation.estimation import FALSE_REJECTION, chi2_quantile
 from robocal_ros.estimation.surfaces import (
     FEWEST_POINTS,
     MAD,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.estimation.estimation import FALSE_REJECTION, chi2_quantile
 from robocal_ros.ground.errors import TooFewSamplesError
 from robocal_ros.ground.frames import Array, Mask
 

@@ -362,7 +362,7 @@ class Linear:
 
 
 class MountProblem:
-    """``estimation.descent.Problem`` of a sensor and targets; a sample is a profile or a sighting.
+    """`Problem` of a sensor and targets; a sample is a profile or a sighting.
 
     The increments (v, w) of the sensor, its axes, shift the pivot and turn about it.
 

@@ -190,7 +190,7 @@ OF_FACE = 2  # rows of a profile for each face; then come those of the sphere
 
 @dataclass(frozen=True, eq=False)
 class TrackerProblem:
-    """Residuals of all measurements; see `estimation.descent.Problem`.
+    """Residuals of all measurements; see `estimation.estimation.Problem`.
 
     ``start``: the state at which the noise of the joints is turned into noise of the rows.
     ``lines``, ``caps``: what the profiles show of the faces and of the sphere, noise included.

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from robocal_ros.estimation.assessment import pose_groups
-from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.estimation.estimation import FALSE_REJECTION, chi2_quantile
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Index, Mask
 from robocal_ros.ground.samples import Measurements

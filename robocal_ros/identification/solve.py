@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation import estimation
-from robocal_ros.estimation.descent import require_told
-from robocal_ros.estimation.estimation import describe, observability
+from robocal_ros.estimation.estimation import describe, observability, require_told
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError
 from robocal_ros.ground.frames import Array

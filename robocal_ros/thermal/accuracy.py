@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import Measurements

@@ -17,8 +17,7 @@ from robocal_ros.estimation.assessment import (
     too_narrow,
     verdict_document,
 )
-from robocal_ros.estimation.descent import chi2_quantile
-from robocal_ros.estimation.estimation import Observability, describe, observability
+from robocal_ros.estimation.estimation import Observability, chi2_quantile, describe, observability
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.frames import Array, Document, Index

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import FEWEST_GROUPS, LARGEST_RMS_M, pose_groups, summarise
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, ResidualError
 from robocal_ros.ground.frames import Array, Document, Index

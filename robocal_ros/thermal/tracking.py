@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Judgement, Verdict
-from robocal_ros.estimation.descent import chi2_quantile
-from robocal_ros.estimation.estimation import describe, observability
+from robocal_ros.estimation.estimation import chi2_quantile, describe, observability
 from robocal_ros.ground.errors import Code, InputError, StaleError, TooFewSamplesError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements

@@ -15,8 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
-from robocal_ros.estimation.estimation import Estimate, solve
+from robocal_ros.estimation.estimation import SOUND_FIT, Estimate, chi2_quantile, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, ResidualError
 from robocal_ros.ground.frames import Array

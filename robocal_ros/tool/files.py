@@ -28,7 +28,7 @@ from robocal_ros.programs.conventions import Load, Maker, tool_text
 from robocal_ros.tool.circle import CircleFit
 from robocal_ros.tool.crossed_model import BeamStep, ToolEstimate
 from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge, StepKind, debounced
-from robocal_ros.tool.judging import KnownTool, QuickCheck, ToolChange
+from robocal_ros.tool.judging import KnownTool, QuickCheck
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, first_rotation
 from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height, TouchFit
 
@@ -359,11 +359,6 @@ def touch_document(fit: TouchFit) -> Document:
         "touches": len(far),
         "verdict": verdict_document(fit.verdict),
     }
-
-
-def change_document(change: ToolChange) -> Document:
-    """How far a tool has moved."""
-    return {"tip_mm": change.tip_m * 1e3, "axis_deg": float(np.degrees(change.axis_rad))}
 
 
 def check_document(check: QuickCheck, verdict: Verdict) -> Document:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import Array, Document
@@ -210,6 +210,10 @@ class ToolChange:
 
     tip_m: float
     axis_rad: float
+
+    def document(self) -> Document:
+        """In the units people read."""
+        return {"tip_mm": self.tip_m * 1e3, "axis_deg": float(np.degrees(self.axis_rad))}
 
 
 def change_between(before: Array, after: Array) -> ToolChange:

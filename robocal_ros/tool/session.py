@@ -46,7 +46,7 @@ from robocal_ros.tool.edges import (
     EdgeSample,
     edge_sample,
 )
-from robocal_ros.tool.files import change_document, check_document, run_document
+from robocal_ros.tool.files import check_document, run_document
 from robocal_ros.tool.judging import (
     SMALL_M,
     Answer,
@@ -83,7 +83,7 @@ from robocal_ros.tool.station import (
     station_shift,
     station_verdict,
 )
-from robocal_ros.tool.touches import TouchedTip, TouchLog
+from robocal_ros.tool.touch_points import TouchedTip, TouchLog
 
 
 class ToolInForce(HistoryFollower):
@@ -258,7 +258,7 @@ class ToolResults:
         witness = self._with_mandrel(witness, found, shift, command)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         document = run_document(found, estimate, run.circles, verdict) | {
-            "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
+            "change": change_between(in_force.T_flange_tool, found.T_flange_tool).document(),
             "absolute": absolute,
             "witness": witness.document(),
         }
@@ -279,7 +279,7 @@ class ToolResults:
         kind = MANDREL if mandrel else HEALTHY_TOOL
         verdict = judge_healthy(found, estimate, taught)
         document = run_document(found, estimate, run.circles, verdict)
-        document["change"] = change_document(change_between(taught, found.T_flange_tool))
+        document["change"] = change_between(taught, found.T_flange_tool).document()
         own: Document = {"traits": run.traits(estimate).document()}
         if mandrel:
             own = {"mandrel": taught.tolist()}

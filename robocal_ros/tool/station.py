@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robocal_ros.estimation.assessment import Verdict
-from robocal_ros.estimation.descent import SOUND_FIT, chi2_quantile
-from robocal_ros.estimation.estimation import solve
+from robocal_ros.estimation.estimation import SOUND_FIT, chi2_quantile, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, ResidualError
 from robocal_ros.ground.frames import Array, Document

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from robocal_ros.estimation.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent, DescentState
+from robocal_ros.estimation.estimation import FIRST_TOLERANCE, STEP_TOLERANCE, Descent, DescentState
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from robocal_ros.estimation.descent import chi2_quantile
-from robocal_ros.estimation.estimation import describe, observability, solve
+from robocal_ros.estimation.estimation import chi2_quantile, describe, observability, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 

@@ -307,7 +307,7 @@ def test_targets_together_find_a_wrong_radius(share):
 
 def test_a_place_that_was_not_reached_blames_no_mount(result, monkeypatch):
     edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
-    monkeypatch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
+    monkeypatch.setattr("robocal_ros.estimation.estimation.MOST_ITERATIONS", 1)
     with pytest.raises(RankDeficientError, match="still crept"):
         verify(line_task(), edge, result.T_flange_sensor, SETTINGS)
 
@@ -319,7 +319,7 @@ def test_a_classic_line_that_creeps_is_a_weak_answer(monkeypatch):
 
     def stopped(*given, **named):
         with monkeypatch.context() as patch:
-            patch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
+            patch.setattr("robocal_ros.estimation.estimation.MOST_ITERATIONS", 1)
             return estimation.solve(*given, **named)
 
     monkeypatch.setattr("robocal_ros.hand_eye.tasks.solve", stopped)

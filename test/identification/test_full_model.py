@@ -9,7 +9,7 @@ import pytest
 from bent_robot import COMPLIANCE, LOWER, NOISE_M, UPPER, BentRobot
 from scipy.linalg import null_space
 
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import full_model, identify, identify_and_judge, row_kernels

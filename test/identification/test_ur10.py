@@ -9,7 +9,7 @@ import pytest
 
 from bench.ur10_campaigns import halves, load_campaign
 from robocal_ros.estimation.assessment import pose_groups
-from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import Code
 from robocal_ros.identification import identify, identify_and_judge, judged
 from robocal_ros.identification.full_model import identify_full
