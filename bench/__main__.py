@@ -38,6 +38,7 @@ PARTS = {
     "closed_loop": "closed_loop.tables",
     "fault_checks": "closed_loop.checks",
     "knocks": "closed_loop.knocks",
+    "fixture": "fixture",
     "files": "files",
     "replay_speed": "replay_speed",
 }
@@ -53,6 +54,7 @@ TOGETHER = (
     "hand_eye_real",
     "hand_eye_camera",
     "hand_eye_tracker",
+    "fixture",
 )
 
 Made = tuple[Sequence[Table] | None, float]

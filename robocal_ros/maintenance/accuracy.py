@@ -77,6 +77,10 @@ class MaintenanceConfig:
     T_flange_tool: Array  # (4, 4) the taught tool
     driving: DrivingConfig  # limits, sizes and deviations; its limits hold at the station
     T_base_laser: Array | None = None  # (4, 4) of the beam station; None: no tool measurement
+    # (m, n) poses at which the fixture's features are measured, a ring as of ``poses``; None: no
+    # fixture is. Each is visited so often: between two of one place the robot repeats anew.
+    fixture_poses: Array | None = None
+    fixture_visits: int = 2
     travel_speed_m_s: float = 0.25  # of the tip on the ways between taught poses
     # (n,), or one for all: the robot is at home with all joints so near, rad (m)
     home_near: ArrayLike = float(np.radians(0.5))

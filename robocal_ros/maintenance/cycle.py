@@ -11,6 +11,8 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
+from robocal_ros.maintenance.fixture_part import MEASUREMENT as FIXTURE_MEASUREMENT
+from robocal_ros.maintenance.fixture_part import FixturePart, FixtureVisits
 from robocal_ros.maintenance.mover import HOME, STATION, FaultError
 from robocal_ros.maintenance.robot_interface import (
     BeginCycle,
@@ -139,26 +141,11 @@ class ThermalPart:
             yield from cell.drive(route, worst_s)
             q = yield from cell.stand()
             cell.doing = f"measuring pose {pose} of {cell.ways.count}"
-            if not (yield from self._measured(q)):
+            if not (yield from cell.measured_at(q, cell.measured)):
                 thermal.unmeasured.add(pose)
             thermal.visited.add(pose)
             thermal.last_s = cell.now_s
         return 0
-
-    def _measured(self, q: Array) -> Script[bool]:
-        """Stand at joints (n,) until the measurements are there; False: their time is over."""
-        cell, times, count = self._cell, self._times, self._cell.config.measurements
-        from_s = cell.robot.newest_s + times.settle_s
-        until_s = cell.now_s + times.measure_s
-        cell.measured.clear()
-        while cell.now_s < until_s:
-            cell.robot.require_at(q)
-            fresh = sorted(stamp for stamp in cell.measured if stamp >= from_s)
-            enough = fresh[:count]  # more may come, faster than the stay ends
-            if len(enough) == count and cell.robot.newest_s >= enough[-1] + times.stay_s:
-                return True
-            yield
-        return False
 
     def _end(self) -> Script[DriverAnswer]:
         self._cell.doing = "thermal cycle ends"
@@ -509,6 +496,7 @@ class CycleRun:
         result: CycleResult,
         cell: CellInterface,
         thermal: ThermalCycle,
+        visits: FixtureVisits,
         decider: Decider,
         memory: Memory,
         decided: Callable[[Outcome], None],
@@ -516,7 +504,7 @@ class CycleRun:
     ) -> None:
         self.result = result
         self._cell, self._decider, self._decided, self._drift = cell, decider, decided, drift
-        self._thermal = ThermalPart(cell, thermal)
+        self._thermal, self._fixture = ThermalPart(cell, thermal), FixturePart(cell, visits)
         self._tool = ToolPart(
             cell, thermal, decider, memory, decided, self._unsure, self._drift_error
         )
@@ -558,6 +546,8 @@ class CycleRun:
         if self._cell.ways.count:
             yield from self._measure_thermal()
         yield from self._measure_tool()
+        if self._cell.fixture_ways is not None:
+            yield from self._measure_fixture()
         message, left = "; ".join(self._messages) or "nothing was due", self.result.left
         if left:
             message = f"{message}; left for the next gap: {', '.join(left)}"
@@ -610,6 +600,19 @@ class CycleRun:
             self._messages.append(longer)
         if found.fault:
             raise FaultError(Code.CONFLICT, found.fault)
+
+    def _measure_fixture(self) -> Script[None]:
+        try:
+            answer, left = yield from self._fixture.script()
+        except SilentError as error:
+            answer, left = DriverAnswer(Code.CONFLICT, str(error)), FIXTURE_MEASUREMENT
+        yield from self._cell.go_home()
+        if left:
+            self._leave(left)
+        if answer is None:
+            return
+        waits = f"; candidate {answer.candidate_id} waits for a decision"
+        self._messages.append(f"fixture: {answer.message}{waits if answer.done else ''}")
 
     def _leave(self, what: str) -> None:
         self.result = replace(self.result, left=(*self.result.left, what))

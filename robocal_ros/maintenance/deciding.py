@@ -17,6 +17,7 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
+    FIXTURE,
     REFERENCE,
     THERMAL,
     TOOL,
@@ -124,7 +125,7 @@ class Decider:
         """
         entry = self._history.get(calibration_id)
         command = Command(name, {"id": calibration_id, "by": by, "reason": why})
-        if entry.kind not in KINDS:
+        if entry.kind not in KINDS and entry.kind.split("/")[0] != FIXTURE:
             raise InputError(
                 f"calibration {calibration_id} is of kind {entry.kind}: decide elsewhere"
             )

@@ -169,10 +169,11 @@ class Mover:
     ``watch``: the readings, and how fast the controller's clock runs. ``stopping``: the stop that
     was sent last. ``place``: point, line or station at which it was last known to be.
     ``stops_within_s``: a stop that was sent is over in the readings by then, from any speed.
+    ``ways``: the ring that it is on; another one from home alone.
     """
 
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
-        self._config, self._ways = config, ways
+        self._config, self.ways = config, ways
         self._arm = ways.cell.arm
         driving = config.driving
         self.watch = RobotWatch(self._arm, driving)
@@ -256,7 +257,7 @@ class Mover:
         """
         if self.place != STATION:
             allowed = np.maximum(self._allowed(), self._config.home_near)
-            away = self._ways.beside(self.place, q)
+            away = self.ways.beside(self.place, q)
             self._require_near(away, allowed, "on its taught way")
 
     def _allowed(self) -> Array:
@@ -271,7 +272,7 @@ class Mover:
         """A route was sent."""
         self._route, self._lost = route, ""
         self.stopping.forget()
-        self.watch.follow(route.plan, self._ways.cell, now_s)
+        self.watch.follow(route.plan, self.ways.cell, now_s)
 
     def reported(self, report: MotionReport) -> None:
         """What the controller says of what it was sent last."""

@@ -15,8 +15,9 @@ from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from robocal_msgs.srv import BeginCycle, EndCycle
 from sensor_msgs.msg import JointState, PointCloud2
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
+from robocal_ros.fixture.session import POINT
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.files import StateFile
 from robocal_ros.ground.samples import (
@@ -67,7 +68,7 @@ Answered = Callable[[int, DriverAnswer], None]
 
 
 class MaintenanceDriver:
-    """Clients of ``thermal_node`` and ``tcf_node``, and of the robot's controller.
+    """Clients of the capabilities' nodes, and of the robot's controller.
 
     ``motion``: sends motions to the controller. ``answered``: takes the number of a request and
     what came of it. ``moves``: told just before a motion goes out: later, the robot would be ahead
@@ -84,6 +85,8 @@ class MaintenanceDriver:
         self._node, self._motion, self._answered, self._moves = node, motion, answered, moves
         self._begin = node.add_client(BeginCycle, "thermal_node/begin_cycle")
         self._end = node.add_client(EndCycle, "thermal_node/end_cycle")
+        self._start = node.add_client(Trigger, "fixture_node/start_trigger")
+        self._judge = node.add_client(Trigger, "fixture_node/measure_trigger")
         self._arm = node.add_client(SetBool, "tcf_node/arm")
         self._measure = ActionClient(node, MeasureTool, "tcf_node/measure")
         self._goals: dict[int, Any] = {}  # handles; None until the goal is accepted
@@ -109,6 +112,10 @@ class MaintenanceDriver:
                 self._call(self._begin, BeginCycle.Request(cycle_id=name), number, _status)
             case asked.EndCycle(cycle_id=name):
                 self._call(self._end, EndCycle.Request(cycle_id=name), number, _cycle)
+            case asked.BeginFixture():
+                self._call(self._start, Trigger.Request(), number, _triggered)
+            case asked.MeasureFixture():
+                self._call(self._judge, Trigger.Request(), number, _triggered)
             case asked.Arm():
                 self._call(self._arm, SetBool.Request(data=True), number, _done)
             case asked.Disarm():
@@ -183,6 +190,13 @@ def _code(status: int) -> Code:
 
 def _done(response: Any) -> DriverAnswer:
     return DriverAnswer(Code.ACCEPT if response.success else Code.CONFLICT, response.message)
+
+
+def _triggered(response: Any) -> DriverAnswer:
+    """Of a twin, whose message is `trigger_text`."""
+    number, name, words = response.message.split(" ", 2)
+    code = Code[name] if name in Code.__members__ else Code.BAD_INPUT
+    return DriverAnswer(code, words, int(number))
 
 
 def _status(response: Any) -> DriverAnswer:
@@ -266,6 +280,8 @@ class MaintenanceNode(RobotNode):
         self.add_input(CorrectionStatus, CORRECTION, self._take_correction, endpoints.LATCHED)
         for topic, kind in MEASUREMENTS.items():
             self.add_input(kind, topic, self._take_measurement, endpoints.STREAM)
+        if self._config.fixture_poses is not None:
+            self.add_input(PointStamped, POINT, self._take_feature, endpoints.STREAM)
         self.add_timer(TICK_S, self._tick, steady=True)
         self.add_timer(SHOW_S, self._show, steady=True)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
@@ -330,6 +346,10 @@ class MaintenanceNode(RobotNode):
     def _take_measurement(self, message: Any) -> None:
         if self._session is not None:
             self._session.measured(stamp_ns(message.header.stamp) / NS)
+
+    def _take_feature(self, message: Any) -> None:
+        if self._session is not None:
+            self._session.measured(stamp_ns(message.header.stamp) / NS, of_fixture=True)
 
     def _take_accuracy(self, message: Any) -> None:
         if self._session is not None:

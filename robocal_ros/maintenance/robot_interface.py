@@ -43,6 +43,16 @@ class EndCycle(DriverRequest):
 
 
 @dataclass(frozen=True)
+class BeginFixture(DriverRequest):
+    """Let the fixture's points count from now (`FixtureSession`, `fixture_node` ``~/start``)."""
+
+
+@dataclass(frozen=True)
+class MeasureFixture(DriverRequest):
+    """Judge them; the answer carries the candidate."""
+
+
+@dataclass(frozen=True)
 class Arm(DriverRequest):
     """Let the tool's driver move the robot (`ToolDriver.arm`, `tcf_node` ``~/arm``)."""
 
@@ -273,18 +283,23 @@ class CellInterface(Asking):
 
     ``tool``: whether the tool's driver may move the robot. ``left_home``: whether something may
     have moved the robot since the run began. ``measured``: stamps of measurements of the flange's
-    target, on the joints' clock, newest last. ``doing``: what goes on, in words. ``tool_home_s``:
-    for the way home from the beams; the longest so far where that took longer.
+    target, on the joints' clock, newest last; ``features``: of the fixture. ``doing``: what goes
+    on, in words. ``tool_home_s``: for the way home from the beams; the longest so far where that
+    took longer. ``ways``, ``fixture_ways``: the rings of the measuring poses and of the fixture's
+    (None: it is not measured); ``robot.ways``: the one that it is on.
     """
 
-    def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
+    def __init__(
+        self, config: MaintenanceConfig, ways: Ways, fixture_ways: Ways | None = None
+    ) -> None:
         super().__init__()
-        self.config, self.ways = config, ways
+        self.config, self.ways, self.fixture_ways = config, ways, fixture_ways
         self.robot = Mover(config, ways)
         self.gap = Gap(config.times.stale_s)
         self.tool = Disarming()
         self.left_home = False
         self.measured: list[float] = []
+        self.features: list[float] = []
         self.doing = ""
         self.tool_home_s = config.times.tool_home_s
         self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
@@ -307,7 +322,7 @@ class CellInterface(Asking):
     def begin(self, gap_s: float) -> None:
         """A run is to begin, with the robot at home."""
         self.gap.begin(gap_s, self.now_s)
-        self.robot.place, self.left_home = (HOME, HOME), False
+        self.robot.place, self.left_home, self.robot.ways = (HOME, HOME), False, self.ways
 
     def not_handed_over(self) -> bool:
         """Whether the robot is not at rest at home with nobody who may move it."""
@@ -430,6 +445,24 @@ class CellInterface(Asking):
             yield
         return q
 
+    def measured_at(self, q: Array, stamps: list[float]) -> Script[bool]:
+        """Stand at joints (n,) until the measurements are there; False: their time is over.
+
+        ``stamps``: `measured` or `features`.
+        """
+        times, count = self.config.times, self.config.measurements
+        from_s = self.robot.newest_s + times.settle_s
+        until_s = self.now_s + times.measure_s
+        stamps.clear()
+        while self.now_s < until_s:
+            self.robot.require_at(q)
+            fresh = sorted(stamp for stamp in stamps if stamp >= from_s)
+            enough = fresh[:count]  # more may come, faster than the stay ends
+            if len(enough) == count and self.robot.newest_s >= enough[-1] + times.stay_s:
+                return True
+            yield
+        return False
+
     def drive(self, route: Route, worst_s: float) -> Script[None]:
         """Send a route and wait until it is over; supervised by the session.
 
@@ -485,7 +518,7 @@ class CellInterface(Asking):
         if robot.exactly_home(q):
             return
         try:
-            route = self.ways.home(robot.place, q)
+            route = robot.ways.home(robot.place, q)
         except LimitError as error:
             raise FaultError(error.code, f"no way home: {error}") from error
         duration_s, left_s = self.robot.lasts_s(route.plan.duration_s), self.gap.left_s(self.now_s)

@@ -391,6 +391,15 @@ SETTINGS = (
         -1e5,
         1e5,
     ),
+    number(
+        "fixture_poses_deg",
+        NO_POSES,
+        "Poses at which fixture_node's sensor sees the fixture's features, as measuring_poses_deg; "
+        "at its default: no fixture measurement",
+        -1e5,
+        1e5,
+    ),
+    number("fixture_visits", 2, "Each of them is visited so often in a measurement", 1, 10),
     Setting(
         "laser",
         "",
@@ -492,12 +501,15 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
     laser = settings["laser"]
     taught = given_pose(settings, "taught")
     degree = float(np.radians(1.0))
+    fixture = joint_poses(arm, settings["fixture_poses_deg"], "fixture_poses_deg")
     return MaintenanceConfig(
         home=joints_of(arm, settings["home_deg"], "home_deg"),
         poses=joint_poses(arm, settings["measuring_poses_deg"], "measuring_poses_deg"),
         T_flange_tool=arm.T_flange_tool if taught is None else taught,
         driving=driving,
         T_base_laser=read_laser_for(Path(laser), arm).laser.T_base_laser if laser else None,
+        fixture_poses=fixture if len(fixture) else None,
+        fixture_visits=settings["fixture_visits"],
         travel_speed_m_s=settings["travel_speed_mm_s"] * MM,
         home_near=settings["home_near_deg"] * np.where(arm.prismatic, MM, degree),
         measurements=settings["measurements"],

@@ -29,6 +29,7 @@ from robocal_ros.maintenance.accuracy import (
 )
 from robocal_ros.maintenance.cycle import CycleRun, ThermalCycle, ThermalPart
 from robocal_ros.maintenance.deciding import Decider
+from robocal_ros.maintenance.fixture_part import FixturePart, FixtureVisits
 from robocal_ros.maintenance.mover import FaultError, Ways
 from robocal_ros.maintenance.robot_interface import (
     CellInterface,
@@ -262,10 +263,13 @@ class MaintenanceSession:
         self.config, self.ways = config, Ways(nominal, config)
         self.memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
-        self._cell = CellInterface(config, self.ways)
+        fixture = None
+        if config.fixture_poses is not None:
+            fixture = Ways(nominal, replace(config, poses=config.fixture_poses))
+        self._cell = CellInterface(config, self.ways, fixture)
         self.robot = self._cell.robot
         self._cell.doubt()  # whoever ran before may have left the tool's driver armed
-        self._book = ThermalCycle()
+        self._book, self._visits = ThermalCycle(), FixtureVisits()
         self._record = record
         self._conductor = Conductor(self._cell, self.memory, self._tell)
         self._reports = NodeReports(config)
@@ -300,10 +304,14 @@ class MaintenanceSession:
         self._second, self._cell.now_s = why, now_s
         self._conductor.give_up(why) if why else None
 
-    def measured(self, stamp_s: float) -> None:
-        """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
-        self._cell.measured.append(stamp_s)
-        del self._cell.measured[:-1000]
+    def measured(self, stamp_s: float, of_fixture: bool = False) -> None:
+        """A measurement of the flange's target, or of the fixture, has arrived.
+
+        ``stamp_s``: its stamp, on the joints' clock.
+        """
+        stamps = self._cell.features if of_fixture else self._cell.measured
+        stamps.append(stamp_s)
+        del stamps[:-1000]
 
     def drift(self, drift: Accuracy, now_s: float) -> None:
         """What the thermal part believes of the accuracy."""
@@ -347,6 +355,7 @@ class MaintenanceSession:
             memory.begin(cycle_id, wall_ns),
             cell,
             self._book,
+            self._visits,
             self._decider,
             memory,
             self._decided,
@@ -434,6 +443,8 @@ class MaintenanceSession:
         if self.config.T_base_laser is not None:
             worst_s = self._cell.tool_worst_s
             found |= {f"tool measurement ({mode})": worst_s(mode) for mode in (QUICK, FULL)}
+        if self.config.fixture_poses is not None:
+            found["the first fixture pose"] = FixturePart(self._cell, self._visits).worst_s()
         return found
 
     def result(self, cycle_id: str) -> CycleResult | None:

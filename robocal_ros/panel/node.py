@@ -10,12 +10,24 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from robocal_msgs.msg import AccuracyState, CorrectionStatus, MaintenanceStatus
+from robocal_msgs.msg import (
+    AccuracyState,
+    CalibrationQuality,
+    CorrectionStatus,
+    MaintenanceStatus,
+)
 from robocal_msgs.srv import Acknowledge, Decide
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import InputError
-from robocal_ros.panel.state import ACCURACY, CORRECTION, LONGEST_TEXT, STATUS, plain
+from robocal_ros.panel.state import (
+    ACCURACY,
+    CORRECTION,
+    FIXTURE,
+    LONGEST_TEXT,
+    STATUS,
+    plain,
+)
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import (
@@ -69,6 +81,7 @@ SOURCES: Mapping[str, tuple[type, str, Read]] = {
             "fault_code", "fault") | {"last": lambda m: plain(m.last, LAST)},
     ),
     CORRECTION: (CorrectionStatus, "joint_correction_node/status", _of("state", "reason")),
+    FIXTURE: (CalibrationQuality, FIXTURE, _of("code", "candidate_id", "reason")),
 }  # fmt: skip
 """Messages by the name of their source: type, topic, and what of them is shown."""
 

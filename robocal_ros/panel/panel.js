@@ -7,7 +7,7 @@ const RECONNECT_MS = 8000;  // a stream that is open and silent is opened anew
 const SHIFT_S = 12 * 3600;
 const BREAK_S = 150;        // a line is broken where nothing was seen for so long
 const LEVELS = ["NONE", "OK", "DUE", "DEGRADED", "EXPIRED", "FAULT"];
-const DECIDED = ["thermal", "tool"];
+const DECIDED = ["thermal", "tool", "fixture"];  // kinds; a fixture's goes on with its name
 const ICONS = {
   OK: "M12 34 26 48 52 16",
   DUE: "M32 6a26 26 0 1 0 .1 0M32 18v15l10 8",
@@ -139,7 +139,7 @@ function back() {
 }
 
 function drawCandidates() {
-  const pending = history_.results.filter((r) => r.state === "pending" && DECIDED.includes(r.kind));
+  const pending = history_.results.filter((r) => r.state === "pending" && DECIDED.includes(r.kind.split("/")[0]));
   const known = new Set(pending.map((r) => r.id));
   const others = (state?.waiting ?? []).filter((id) => !known.has(id)).map((id) => ({ id }));
   draw("candidates", [pending, others, session.users, asking], () => {
@@ -149,8 +149,13 @@ function drawCandidates() {
   });
 }
 
+function kindOf(kind) {
+  const [first, name] = kind.split("/");
+  return [words.labels[first] ?? first, name].filter(Boolean).join(" ");
+}
+
 function drawnCandidate(result) {
-  const kind = result.kind ? label(result.kind) : "";
+  const kind = result.kind ? kindOf(result.kind) : "";
   const time = result.stamp_ns ? `${day(result.stamp_ns / 1e9)} ${clock(result.stamp_ns / 1e9)}` : "";
   const rms = result.candidate_rms_mm ? ` · ${mm(result.candidate_rms_mm)}` : "";
   const mine = asking?.id === result.id;
@@ -212,7 +217,7 @@ function drawnResult(result, what) {
     (d.reason ? `: ${d.reason}` : ""));
   return make("div", { class: "item" },
     make("div", { class: "row" },
-      make("span", {}, make("strong", {}, `#${result.id} ${words.labels[result.kind] ?? result.kind} `),
+      make("span", {}, make("strong", {}, `#${result.id} ${kindOf(result.kind)} `),
         make("span", { class: `tag ${result.state}` }, label(result.state))),
       make("span", {}, `${day(result.stamp_ns / 1e9)} ${clock(result.stamp_ns / 1e9)}`)),
     make("p", { class: "soft" }, what),

@@ -17,7 +17,8 @@ from robocal_ros.panel.words import instruction_key, step_of
 Values = Mapping[str, Any]
 
 ACCURACY, STATUS, CORRECTION = "accuracy_state", "maintenance_node/status", "correction_status"
-SILENT_S: Mapping[str, float] = {ACCURACY: 3.0, STATUS: 3.0, CORRECTION: 5.0}
+FIXTURE = "fixture_node/quality"  # a verdict, said once
+SILENT_S: Mapping[str, float] = {ACCURACY: 3.0, STATUS: 3.0, CORRECTION: 5.0, FIXTURE: math.inf}
 """A source that is silent for so long says nothing any more; the PLC's bridge has the same 3 s."""
 
 SHIFT_S = 12 * 3600.0  # what the curve shows at the most
@@ -126,7 +127,9 @@ class PanelState:
         self.cycle_id = ""
         self.steps: deque[dict[str, Any]] = deque(maxlen=STEPS)
         self.gaps: deque[Values] = deque(maxlen=GAPS)
-        self.in_force: frozenset[int] = frozenset()  # calibrations, as the history says
+        # calibrations, as the history says
+        self.in_force: frozenset[int] = frozenset()
+        self.decided: frozenset[int] = frozenset()
         self.history_trouble = ""
         self._found: dict[str, Values] = {}  # of drift and tool: the last gap that measured it
 
@@ -224,6 +227,11 @@ class PanelState:
             code = code_of(gap["thermal_code"])
             if code not in WELL:
                 found.append(_task(code, "drift", gap["message"]))
+        if fixture := self.sources[FIXTURE].values:
+            code = code_of(fixture["code"])
+            new = code is Code.ACCEPT and fixture["candidate_id"] not in self.decided
+            if new or code not in WELL:
+                found.append(_task(code, "fixture", fixture["reason"]))
         return found
 
     def _corrected(self, now_s: float) -> list[Instruction]:

@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 from kr150_shift import ABOVE, CYCLE, HOME, WORK, cell_of, first_circle, went
-from measured_fixture import fixture_poses
 
 from bench.closed_loop.faults import proven, rights_by_size, shown, smallest_held
+from bench.measured_fixture import fixture_poses
 from robocal_ros.cell_sim.cell import TAUGHT
 from robocal_ros.cell_sim.faults import CONTROLLER_FAULTS, FAULTS, NEXT_MOTION, SIZES
 from robocal_ros.cell_sim.robot import Effects

@@ -8,8 +8,8 @@ import pytest
 from command import robocal_json
 from fixture_driver import fixture_bag
 from fixture_tables import MOVED_M, fixture_tables
-from measured_fixture import ARM, PLATE
 
+from bench.measured_fixture import ARM, PLATE
 from robocal_ros.cli.main import main
 from robocal_ros.fixture.files import read_fixture
 from robocal_ros.ground.errors import InputError

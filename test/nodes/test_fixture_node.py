@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from fixture_driver import mounted, visit
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
-from measured_fixture import ARM, FRAME, PLATE, MeasuredFixture
 from rclpy.qos import HistoryPolicy, QoSProfile
 from robocal_msgs.msg import CalibrationQuality
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from bench.measured_fixture import ARM, FRAME, PLATE, MeasuredFixture
 from robocal_ros.fixture.files import fixture_document
 from robocal_ros.fixture.node import FixtureNode
 from robocal_ros.fixture.session import POINT

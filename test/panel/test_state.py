@@ -18,6 +18,7 @@ from robocal_ros.panel.state import (
     BUCKET_S,
     CORRECTION,
     CORRECTIONS,
+    FIXTURE,
     GAPS,
     LONGEST_TEXT,
     POINTS,
@@ -123,7 +124,31 @@ def test_each_fault_of_the_simulator_leads_to_what_has_it(fault):
 
 
 def test_each_fault_that_must_be_told_has_its_place():
-    assert SENDS_TO.keys() == RIGHT.keys()
+    assert SENDS_TO.keys() == {*RIGHT, "fixture_moved"}
+
+
+def verdict(code, candidate_id=0):
+    """What fixture_node says once of a measurement."""
+    return {"code": int(code), "candidate_id": candidate_id, "reason": f"{code.name} in words"}
+
+
+def test_a_fixture_that_moved_is_told_until_a_person_has_decided():
+    panel = shown(**{FIXTURE: verdict(Code.ACCEPT, 9)})
+    assert not wrongly_told("fixture_moved", panel, NOW_S)
+    assert panel.tasks(NOW_S)[0].detail == "ACCEPT in words"
+    later_s = NOW_S + 1e5  # it is said once, and stays; the others go on
+    heard(panel, {ACCURACY: accuracy(), STATUS: status()}, later_s)
+    assert not wrongly_told("fixture_moved", panel, later_s)
+    panel.decided = frozenset({9})
+    assert keys(panel, later_s) == ["state/OK"]
+
+
+@pytest.mark.parametrize(
+    "code", [Code.SENSOR_OR_ROBOT_MOVED, Code.RESIDUAL_TOO_LARGE, Code.POSES_NOT_INFORMATIVE]
+)
+def test_what_is_not_the_fixture_has_words_of_its_own(code):
+    assert keys(shown(**{FIXTURE: verdict(code, 9)}))[0] == f"{code.name}/fixture"
+    assert keys(shown(**{FIXTURE: verdict(Code.NO_SIGNIFICANT_GAIN)})) == ["state/OK"]
 
 
 def test_a_bent_tool_is_told_until_a_gap_has_measured_it_or_it_is_mended():

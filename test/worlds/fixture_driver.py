@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from measured_fixture import ARM, FRAME, LIMITS, PLATE, MeasuredFixture, fixture_poses
-
+from bench.measured_fixture import ARM, FRAME, LIMITS, PLATE, MeasuredFixture, fixture_poses
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim.fixture import T_FLANGE_SENSOR

@@ -4,8 +4,8 @@
 from pathlib import Path
 
 import yaml
-from measured_fixture import ARM, PLATE, MeasuredFixture
 
+from bench.measured_fixture import ARM, PLATE, MeasuredFixture
 from robocal_ros.fixture.features import FixturePoints
 from robocal_ros.fixture.files import fixture_document
 from robocal_ros.kinematics.tables import joint_texts, write_cells

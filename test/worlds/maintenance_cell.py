@@ -52,6 +52,7 @@ def _above(height_m: float) -> np.ndarray:
 
 HOME, AT_BEAMS = _above(0.10), _above(0.004)
 POSES = HOME + np.radians([[20.0, 5, 0, 0, 0, 0], [25.0, 0, 10, 0, 5, 0], [10.0, 0, 10, 0, 0, 8]])
+FIXTURE_POSES = HOME + np.radians([[-15.0, 4, 0, 0, 0, 0], [-25.0, 0, 8, 0, 5, 0]])
 TIMES = Times(
     answer_s=0.5,
     solve_s=0.5,
@@ -135,6 +136,9 @@ class Cell:
         default_factory=lambda: DriverAnswer(Code.NO_SIGNIFICANT_GAIN, "warm")
     )
     check: DriverAnswer = field(default_factory=lambda: passed())
+    fixture: DriverAnswer = field(
+        default_factory=lambda: DriverAnswer(Code.ACCEPT, "plate moved by 0.50 mm", 9)
+    )
     full: Callable[["Cell"], DriverAnswer] = field(default=lambda cell: same_tool())
     drift: Accuracy | None = None  # told by the thermal node
     silent: bool = False  # joint states
@@ -237,6 +241,8 @@ class Cell:
         due = round(self.now_s / TICK_S) % self.measures_every == 0
         if due and self.services.get("sensor") != SILENT:
             self.session.measured(self.now_s)
+        if due and self.services.get("features") != SILENT:
+            self.session.measured(self.now_s, of_fixture=True)
         for item in [item for item in self.due if item[0] <= self.now_s]:
             self.due.remove(item)
             self.session.answered(item[1], item[2])
@@ -292,6 +298,10 @@ class Cell:
                 self._answer("thermal", request.number, self.thermal)
                 if isinstance(request, ask.BeginCycle):
                     self._answer("thermal", request.number, DriverAnswer(Code.ACCEPT))
+            case ask.BeginFixture():
+                self._answer("fixture", request.number, DriverAnswer(Code.ACCEPT))
+            case ask.MeasureFixture():
+                self._answer("fixture", request.number, self.fixture)
             case ask.Arm():
                 if self.services.get("arm", OK) in (OK, SLOW):
                     self.tool.armed = True
@@ -370,9 +380,16 @@ class Cell:
         """A way to a pose follows the taught lines, all of it."""
         if np.max(np.abs(plan.q[-1] - HOME)) < 1e-9:
             return
-        points = np.vstack([HOME, self.config.poses, HOME])
+        rings = [self.config.poses, self.config.fixture_poses]
+        lines = [
+            line
+            for poses in rings
+            if poses is not None
+            for line in pairwise(np.vstack([HOME, poses, HOME]))
+            if len(poses)
+        ]
         beside = np.full(len(plan.q), np.inf)
-        for start, end in pairwise(points):
+        for start, end in lines:
             share = np.clip((plan.q - start) @ (end - start) / np.sum((end - start) ** 2), 0.0, 1.0)
             away = np.max(np.abs(start + share[:, None] * (end - start) - plan.q), axis=1)
             beside = np.minimum(beside, away)

@@ -19,6 +19,7 @@ BEAMS = ("Look at the light beams", "Lichtschranken ansehen", "查看光束传�
 CLOCKS = ("The clocks of robot", "Die Uhren von Roboter", "时钟不一致")
 NETWORK = ("network cable", "Netzwerkkabel", "网线")
 ASTRAY = ("The robot is not where it should be", "nicht, wo er sein soll", "不在应在的位置")
+FIXTURE_MOVED = ("The fixture stands elsewhere", "Die Vorrichtung steht anders", "夹具位置变了")
 
 SENDS_TO: Mapping[Fault, tuple[str, str, str]] = {
     "collision": TOOL_BENT,
@@ -43,6 +44,7 @@ SENDS_TO: Mapping[Fault, tuple[str, str, str]] = {
     "joints_silent": NETWORK,
     "frozen_clock": NETWORK,
     "frozen_encoder": ASTRAY,
+    "fixture_moved": FIXTURE_MOVED,
 }
 
 

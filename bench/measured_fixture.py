@@ -2,7 +2,7 @@
 """A fixture measured by a sensor on the flange of a warm robot: what a session is given."""
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class MeasuredFixture:
         self.cell = kr150_cell(ARM, self.seed)
 
     def faults(self, fault: Fault | None = None, size_m: float = 0.0) -> Faults:
+        """What is wrong in it."""
         faults = Faults(seed=self.seed)
         if fault is not None:
             faults.sizes[fault] = size_m
@@ -82,9 +83,9 @@ class MeasuredFixture:
         names = tuple(PLATE.named(one, PLATE.T_base_fixture) for one in p)
         return FixturePoints(names, (FRAME,) * len(p), q, known, p)
 
-    @cached_property
-    def taught(self) -> FixtureInForce:
-        points = self.points(self.faults(), TAUGHT_VISITS, 1)
+    def taught(self, visits: int = TAUGHT_VISITS) -> FixtureInForce:
+        """In force, taught by so many visits."""
+        points = self.points(self.faults(), visits, 1)
         result = judge_fixture(PLATE, points, ARM, LIMITS, None)
         assert result.verdict.accept, result.verdict
         return result.next_in_force
@@ -96,11 +97,15 @@ class MeasuredFixture:
         warm: Warmth | None = None,
         without: tuple[str, ...] = (),
         number: int = 2,
+        visits: tuple[int, int] = (TAUGHT_VISITS, GAP_VISITS),
     ) -> FixtureResult:
-        """What is said in a gap after a fault; ``without``: what was not measured."""
-        points = self.points(self.faults(fault, size_m), GAP_VISITS, number, warm)
+        """What is said in a gap after a fault; ``without``: what was not measured.
+
+        ``visits``: of each pose when it was taught, and in the gap.
+        """
+        points = self.points(self.faults(fault, size_m), visits[1], number, warm)
         seen = points.take(np.array([name not in without for name in points.name]))
-        return judge_fixture(PLATE, seen, ARM, LIMITS, self.taught)
+        return judge_fixture(PLATE, seen, ARM, LIMITS, self.taught(visits[0]))
 
     def worst_m(self, result: FixtureResult, fault: Fault | None, size_m: float) -> float:
         """Largest error of a feature's place by the new frame, against the truth."""

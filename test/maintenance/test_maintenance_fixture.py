@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fixture as the last step of a maintenance run: its ring of ways, its gaps, its node."""
+
+import numpy as np
+import pytest
+from maintenance_cell import (
+    FIXTURE_POSES,
+    HOME,
+    LONG_S,
+    REFUSED,
+    SILENT,
+    Cell,
+    config_of,
+    kinds,
+    opened,
+    over,
+)
+
+from robocal_ros.ground.errors import Code
+from robocal_ros.maintenance import robot_interface as ask
+
+VISITS = 2
+SHORT_S = 16.0  # for some of the poses
+WAYS = VISITS * [*FIXTURE_POSES]
+FIXTURE = {"fixture_poses": FIXTURE_POSES, "fixture_visits": VISITS}
+
+
+@pytest.fixture
+def cell(history):
+    """In an open gap, after what every start does."""
+    return opened(history, config=config_of(**FIXTURE))
+
+
+@pytest.fixture
+def lone(history):
+    """A cell in which the fixture alone is measured: neither drift nor tool."""
+    return lone_cell(history)
+
+
+def lone_cell(history, **changes):
+    poses = np.empty((0, len(HOME)))
+    cell = Cell(history, config_of(poses=poses, T_base_laser=None, **FIXTURE, **changes))
+    cell.open_gap()
+    return cell
+
+
+def ends(cell):
+    return np.array([r.plan.q[-1] for r in cell.log if isinstance(r, ask.Move)])
+
+
+def fixture_log(cell):
+    """What was asked from the fixture's step on."""
+    return kinds(cell)[kinds(cell).index("BeginFixture") :]
+
+
+def test_it_comes_after_drift_and_tool_each_pose_as_often_as_set(cell):
+    result = cell.ran("c1")
+    assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
+    assert kinds(cell).index("BeginFixture") > kinds(cell).index("Measure")
+    moves = len(WAYS) + 1
+    assert fixture_log(cell) == ["BeginFixture", *["Move"] * moves, "MeasureFixture"]
+    np.testing.assert_allclose(ends(cell)[-moves:], [*WAYS, HOME], atol=1e-9)
+    said = "fixture: plate moved by 0.50 mm; candidate 9 waits for a decision"
+    assert said in result.message
+    assert not result.accepted
+    over(cell)
+
+
+def test_what_does_not_fit_goes_on_in_the_next_gap_and_is_asked_for_once(lone):
+    seen, result = [], None
+    while result is None or not result.complete:
+        result = lone.ran(f"c{len(seen)}", SHORT_S)
+        assert result.code is Code.ACCEPT, result.message
+        seen += result.left
+        over(lone)
+        assert len(seen) < len(WAYS)
+    assert seen, "all of it fitted one gap"
+    assert kinds(lone).count("BeginFixture") == 1
+    assert kinds(lone).count("MeasureFixture") == 1
+    at = [q for q in ends(lone) if min(np.max(np.abs(FIXTURE_POSES - q), axis=1)) < 1e-9]
+    np.testing.assert_allclose(at, WAYS, atol=1e-9)
+
+
+def test_one_that_waited_too_long_begins_anew(history):
+    cell = lone_cell(history, resume_within_s=30.0)
+    assert not cell.ran("first", SHORT_S).complete
+    cell.pass_time(40.0)
+    cell.log.clear()
+    assert cell.ran("later").complete
+    np.testing.assert_allclose(ends(cell), [*WAYS, HOME], atol=1e-9)
+    assert kinds(cell).count("BeginFixture") == 1
+
+
+@pytest.mark.parametrize("how", [SILENT, REFUSED])
+def test_a_node_that_does_not_answer_leaves_it_with_the_robot_at_home(cell, how):
+    cell.services["fixture"] = how
+    result = cell.ran("c1")
+    assert (result.code, result.complete) == (Code.ACCEPT, False), result.message
+    assert "fixture measurement" in result.left
+    assert cell.at_home()
+    assert fixture_log(cell) == ["BeginFixture"]  # and nothing was driven for it
+    over(cell)
+
+
+def test_poses_at_which_the_sensor_finds_nothing_are_named(cell):
+    cell.services["features"] = SILENT
+    result = cell.ran("c1")
+    assert not result.complete
+    assert result.left == (
+        f"fixture measurement at {len(WAYS)} poses, where the sensor found nothing",
+    )
+
+
+def test_one_that_is_not_taught_is_left_with_what_to_do(cell):
+    cell.fixture = ask.DriverAnswer(Code.CONFLICT, "plate was not taught yet: teach it first")
+    result = cell.ran("c1")
+    assert result.left == ("fixture measurement",)
+    assert "teach it first" in result.message
+    assert "waits" not in result.message
+
+
+def under_way(cell):
+    """Until the robot is away from home, on the fixture's ring."""
+    cell.run("c1", LONG_S)
+    while "BeginFixture" not in kinds(cell) or kinds(cell)[-1] != "Move":
+        cell.step()
+    cell.pass_time(1.0)
+    assert not cell.at_home()
+
+
+def test_a_gap_that_closes_at_the_fixture_stops_the_robot(cell):
+    under_way(cell)
+    cell.is_open = False
+    cell.finish()
+    over(cell, fault=True)
+    assert not cell.at_home()
+    assert "Stop" in fixture_log(cell)
+
+
+def test_a_cancelled_run_comes_home_by_the_ring_it_is_on(cell):
+    under_way(cell)
+    cell.session.cancel("by hand")
+    assert cell.finish().code is Code.CONFLICT
+    over(cell)
+    np.testing.assert_allclose(cell.q, HOME, atol=1e-6)
+    cell.log.clear()
+    assert cell.ran("c2").complete, "the next run begins on the ring of the measuring poses"
