@@ -29,6 +29,7 @@ RULES = {
     "services": {"reply", "request"},
     "actions": {"execute", "call"},
 }
+SEES_DEG = [4.97, -74.1, 98.61, 2.92, 79.56, 41.63]  # the plate, from one of the cell's poses
 PEOPLE = {"observer", "operator", "engineer"}
 CONTROLLER = "/joint_trajectory_controller"
 ACTION = f"{CONTROLLER}/follow_joint_trajectory"
@@ -117,7 +118,7 @@ def test_it_allows_what_the_node_has_and_no_more(graph: Any, tmp_path: Path) -> 
         "thermal_node": {"arrangement": "flange-sensor"},  # which has all of the other's topics
         "tcf_node": laser | moves,
         "joint_correction_node": moves,
-        "maintenance_node": laser | moves,
+        "maintenance_node": laser | moves | {"fixture_poses_deg": SEES_DEG},
         "cell_sim_node": {"profile": True, "fixture": True, "run_program": True},
         "plc_bridge_node": plc | {"host": "127.0.0.1", "beams": ["x"]},
         "panel_node": {"page_port": free_port()},
