@@ -529,7 +529,7 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
     ),
     "correct-program": CliCommand(
         "cli.programs:correct_program",
-        "correct the points of a program (KRL, RAPID, FANUC .ls, URScript) for the robot as it is",
+        "correct the points of a program (KRL, RAPID, .ls, URScript, AS) for the robot as it is",
     ),
     "frame-shift": CliCommand(
         "cli.programs:frame_shift",

@@ -187,7 +187,7 @@ def add_correct_program(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EXAMPLE
     parser.add_argument(
-        "program", type=Path, metavar="FILE", help="program: .src, .dat, .mod, .ls, .script …"
+        "program", type=Path, metavar="FILE", help="program: .src, .dat, .mod, .ls, .script, .as …"
     )
     add_model_options(parser)
     parser.add_argument(

@@ -24,6 +24,7 @@ from robocal_ros.ground.frames import Array, Document
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.programs.conventions import numbers_of, pose_of
 from robocal_ros.programs.fanuc import FanucDialect
+from robocal_ros.programs.kawasaki import KawasakiDialect
 from robocal_ros.programs.krl import KrlDialect
 from robocal_ros.programs.points import (
     Dialect,
@@ -38,7 +39,13 @@ from robocal_ros.programs.postures import chosen_posture, is_singular, reach, st
 from robocal_ros.programs.rapid import RapidDialect
 from robocal_ros.programs.urscript import UrScriptDialect
 
-DIALECTS: tuple[Dialect, ...] = (KrlDialect(), RapidDialect(), FanucDialect(), UrScriptDialect())
+DIALECTS: tuple[Dialect, ...] = (
+    KrlDialect(),
+    RapidDialect(),
+    FanucDialect(),
+    UrScriptDialect(),
+    KawasakiDialect(),
+)
 # Below this nothing is to be corrected: no format has as many digits.
 LEAST_M, LEAST_RAD = 1e-7, 1e-7
 

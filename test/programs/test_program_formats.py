@@ -70,11 +70,11 @@ def test_every_point_is_found_where_it_is_written(maker):
     found = dialect.read(program.text)
     poses = [point for point in found.points if not point.joints]
     given = [point for point in found.points if point.joints]
-    assert (len(poses), len(given)) == (len(POINTS), len(JOINTS))
+    assert (len(poses), len(given)) == (len(POINTS), len(program.joints))
     assert not any(point.problem for point in found.points)
-    for point, q in zip(given, JOINTS, strict=True):
+    for point, q in zip(given, program.joints, strict=True):
         shown = dialect.to_arm(np.array(point.numbers) * point.joint_unit)
-        digits = {"kuka": 1e-8, "abb": 1e-4, "fanuc": 2e-5, "ur": 1e-6}[maker]
+        digits = {"kuka": 1e-8, "abb": 1e-4, "fanuc": 2e-5, "ur": 1e-6, "kawasaki": 1e-4}[maker]
         np.testing.assert_allclose(shown, q, atol=digits)
     lines = program.text.split("\n")
     for point in found.points:
@@ -391,3 +391,69 @@ def test_text_that_somebody_has_spoiled_harms_nothing(maker, data):
     assert all(text[part.start : part.end] == part.text for part in parts)
     assert all(np.all(np.isfinite(point.numbers)) for point in fine)
     assert spliced(text, [(part, part.text) for part in set(parts)]) == text
+
+
+AS = """.NETCONF 192.168.0.2,"c",255.255.255.0
+.PROGRAM main() ;LMOVE a
+  TOOL gun
+  LMOVE a
+  BASE TRANS(0,0,100)
+  JAPPRO b, 50
+  TOOL hand[.n]
+  LMOVE c
+  LMOVE fix+d
+  FOR .i = 1 TO 2
+    LMOVE row[.i]
+  END
+  JMOVE #e
+  HERE f
+  LMOVE f
+  ABOVE
+  LMOVE g
+  TOOL NULL
+  LMOVE g
+  LMOVE there
+.END
+.TRANS
+a 1 2 3 0 0 0
+b 1 2 3 0 0 0
+c 1 2 3 0 0 0
+d 1 2 3 0 0 0
+f 1 2 3 0 0 0
+g 1 2 3 0 0 0
+gun 0 0 250 0 0 0
+lone 1 2 3 0 0 0
+row[1] 1 2 3 0 0 0
+short 1 2 3
+.END
+.JOINTS
+#e 1 2 3 4 5 6 812.5
+.END
+"""
+
+
+def test_as_programs_and_their_locations():
+    found = dialect_of(".as").read(AS)
+    words = {point.name: point for point in found.points}
+    assert list(words) == ["a", "b", "c", "f", "g", "row[1]", "#e"]
+    assert (words["a"].tool, words["a"].frame) == ("TOOL of line 3", None)
+    assert (words["b"].tool, words["b"].frame) == ("TOOL of line 3", "BASE of line 5")
+    np.testing.assert_allclose(found.frames["TOOL of line 3"][:3, 3], [0.0, 0.0, 0.25])
+    np.testing.assert_allclose(found.frames["BASE of line 5"][:3, 3], [0.0, 0.0, 0.1])
+    assert words["c"].tool == "TOOL of line 7"  # reckoned, so unknown: not the one before
+    assert "TOOL of line 7" not in found.frames
+    assert "reckons with it in line 14" in words["f"].problem
+    assert "different" in words["g"].problem
+    assert "reckons with it in line 11" in words["row[1]"].problem
+    assert len(words["#e"].fields) == 6  # what is behind them is an external axis
+    assert found.computed == ((9, "fix+d"), (11, "row[.i]"), (20, "there"))
+    assert "ABOVE" in found.notes[0]
+
+
+def test_a_file_of_locations_alone_has_them_all():
+    found = dialect_of(".lc").read(AS[AS.index(".TRANS") :])
+    assert [point.name for point in found.points] == [
+        "a", "b", "c", "d", "f", "g", "gun", "lone", "row[1]", "short", "#e",
+    ]  # fmt: skip
+    assert "3 numbers" in found.points[-2].problem
+    assert {point.tool for point in found.points} == {None}

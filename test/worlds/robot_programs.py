@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs of four makers for one robot, written by code of its own, and the robot that runs them.
+"""Programs of five makers for one robot, written by code of its own, and the robot that runs them.
 
 What a maker writes of joints and frames is stated here once more, along scipy's conventions, so
 that a reader that has it wrong does not agree with itself.
@@ -205,6 +205,41 @@ def urscript(points: np.ndarray, joints: np.ndarray) -> str:
     return "\n".join([*lines, "end", ""])
 
 
+def kawasaki(points: np.ndarray, joints: np.ndarray) -> str:
+    """As SAVE writes it: a step of the pendant, motions by name, then where the names are.
+
+    A pose says no posture: each is reached from joints beside it.
+    """
+    shown = ",".join(f"{v:.5g}" for v in np.degrees(joints[0]))
+    lines = [
+        '.PROGRAM weld()@26/11/26 18:00 #7; Naht "s1"',
+        f"  TOOL {_oat(TOOL_TURN, TOOL_MM)}",
+        "  BASE fix ; LMOVE s2 is none",
+        '  PRINT "LMOVE s3"',
+        f"  JOINT SPEED9 ACCU1 TIMER0 TOOL1 WORK0 CLAMP1 (OFF,0,0,O) OX= WX= #[{shown}] ;",
+        "  SPEED 200 MM/S ALWAYS",
+    ]
+    for i in range(1, len(points) + 1):
+        lines += [f"  JMOVE #v[{i}]", f"  {'LAPPRO' if i == 1 else 'LMOVE'} s{i}{',50' * (i == 1)}"]
+    lines += [f"  JMOVE #home{i}" for i in range(2, len(joints) + 1)]
+    lines += ["  POINT up = SHIFT(fix BY 0,0,50)", "  LMOVE up", ".END", ".TRANS"]
+    six = lambda values: " ".join(f"{v:.6f}" for v in values)  # noqa: E731
+    for i, q in enumerate(points, start=1):
+        T = relative(q)
+        oat = Rotation.from_matrix(T[:3, :3]).as_euler("ZYZ", degrees=True)
+        lines.append(f"s{i} {six([*T[:3, 3] * 1e3, *oat])}")
+    lines.append(f"fix {six([*FRAME_MM, *FRAME_TURN.as_euler('ZYZ', degrees=True)])}")
+    lines += [".END", ".JOINTS"]
+    lines += [f"#v[{i}] {six(np.degrees(q + 0.01))}" for i, q in enumerate(points, start=1)]
+    lines += [f"#home{i} {six(np.degrees(q))}" for i, q in enumerate(joints, start=1) if i > 1]
+    return "\r\n".join([*lines, ".END", ".REALS", "s1 = 5", ".END", ""])
+
+
+def _oat(turn: Rotation, place_mm: np.ndarray) -> str:
+    cells = [*place_mm, *turn.as_euler("ZYZ", degrees=True)]
+    return f"TRANS({','.join(f'{v:.9f}' for v in cells)})"
+
+
 # ---- a controller of our own: reads the texts along another way ---------------------------------
 
 
@@ -241,6 +276,17 @@ def poses_in(maker: str, text: str) -> tuple[list[np.ndarray], list[np.ndarray]]
             else:
                 j = np.radians([float(x) for x in re.findall(r"J\d=\s*(-?[\d.]+)", block)])
                 joints.append(j + np.array([0.0, 0.0, j[1], 0.0, 0.0, 0.0]))
+    if maker == "kawasaki":
+        rows = re.findall(r"^(#?[sv]\[?\d+\]?|#home\d+) (-?\d+\.[^\r\n]*)", text, re.MULTILINE)
+        for name, cells in [
+            ("#", c.replace(",", " ")) for c in re.findall(r"#\[(.*)\]", text)
+        ] + rows:
+            v = [float(x) for x in cells.split()]
+            if name.startswith("#"):
+                joints.append(np.radians(v))
+            else:
+                turn = Rotation.from_euler("ZYZ", v[3:], degrees=True)
+                found.append(pose(turn, np.array(v[:3])))
     base = np.eye(4) if maker == "ur" else T_BASE_FRAME
     return [base @ T @ np.linalg.inv(T_FLANGE_TOOL) for T in found], joints
 
@@ -253,17 +299,20 @@ class WrittenProgram:
     suffix: str
     frames: dict[str, np.ndarray]
     decimals: tuple[int, int, int]  # of a length (mm; UR m), of the orientation, of a joint
+    joints: np.ndarray  # (k, n) of the points that are given by joints, in the order of the text
 
 
 def programs(points: np.ndarray, joints: np.ndarray) -> dict[str, WrittenProgram]:
     """By maker. What the makers' files do not hold themselves is in ``frames``."""
     kuka = {"TOOL_DATA[3]": T_FLANGE_TOOL, "BASE_DATA[5]": T_BASE_FRAME}
     tp = {"UT4": T_FLANGE_TOOL, "UF2": T_BASE_FRAME}
+    beside = np.vstack([joints[:1], points + 0.01, joints[1:]])
     return {
-        "kuka": WrittenProgram(krl(points, joints), ".dat", kuka, (4, 6, 6)),
-        "abb": WrittenProgram(rapid(points, joints), ".mod", {}, (4, 8, 6)),
-        "fanuc": WrittenProgram(fanuc(points, joints), ".ls", tp, (3, 3, 3)),
-        "ur": WrittenProgram(urscript(points, joints), ".script", {}, (7, 8, 8)),
+        "kuka": WrittenProgram(krl(points, joints), ".dat", kuka, (4, 6, 6), joints),
+        "abb": WrittenProgram(rapid(points, joints), ".mod", {}, (4, 8, 6), joints),
+        "fanuc": WrittenProgram(fanuc(points, joints), ".ls", tp, (3, 3, 3), joints),
+        "ur": WrittenProgram(urscript(points, joints), ".script", {}, (7, 8, 8), joints),
+        "kawasaki": WrittenProgram(kawasaki(points, joints), ".as", {}, (6, 6, 5), beside),
     }
 
 

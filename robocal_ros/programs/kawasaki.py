@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kawasaki AS programs and locations as SAVE writes them (.as, .pg, .lc): mm and degrees.
+
+    .PROGRAM weld()
+      TOOL gun
+      JMOVE #safe
+      LMOVE seam[1]
+      JOINT SPEED9 ACCU1 TIMER0 TOOL1 WORK0 CLAMP1 (OFF,0,0,O) OX= WX= #[36.46,37.629,-50.962,…] ;
+    .END
+    .TRANS
+    seam[1] 495.507904 -83.463379 192.623932 -35.992920 112.299080 -179.965958
+    .END
+    .JOINTS
+    #safe -39.931789 28.146606 -88.212029 1.514356 -58.995213 -3.377170
+    .END
+
+A location is a point where a motion goes to it alone, by its name. One from which the program makes
+others stays as it is: a corrected one would correct them too, not as they need it. Sources are in
+docs/programs.md.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from robocal_ros.ground.frames import Array
+from robocal_ros.programs.conventions import pose_of
+from robocal_ros.programs.points import (
+    NUMBER,
+    Decimals,
+    Dialect,
+    Field,
+    Program,
+    ProgramPoint,
+    arguments,
+    line_of,
+    masked,
+    require_numbers,
+)
+
+AXES = 6  # numbers behind them are of external axes
+NULL = "NULL"
+
+_HEADER = re.compile(r"^\.([A-Z][A-Z0-9_]*)\b(?!\s*[=\[])[^\r\n]*", re.M)
+_NAME = r"#?\.?[A-Za-z][\w.]*(?:\[[^\]\r\n]*\])*"
+_LOCATION = re.compile(
+    rf"^[ \t]*(#?[A-Za-z][\w.]*(?:\[[\d,]*\])*)((?:[ \t]+{NUMBER})+)[ \t]*\r?$", re.M
+)
+_STEP = re.compile(
+    r"^[ \t]*(?:\d+[ \t]+)?(?:JOINT|LINEAR|FLIN|CIR1|CIR2)\b[^\r\n]*?#\[([^\]\r\n]*)\]", re.M
+)
+_MOTION = re.compile(
+    r"\b(?:J|L|X|H|FL|C1|C2)MOVE\b[ \t]*([^\r\n]*)|\b(?:J|L)APPRO\b[ \t]*([^\r\n]*)", re.I
+)
+_SET = re.compile(r"^[ \t]*(BASE|TOOL)[ \t]+([^\r\n]+)", re.M | re.I)
+_TRANS = re.compile(r"TRANS[ \t]*\(", re.I)
+_POINT = re.compile(rf"^[ \t]*POINT[ \t]+({_NAME})[ \t]*=[ \t]*([^\r\n]*)", re.M | re.I)
+_TOKEN = re.compile(_NAME)
+_POSTURE = re.compile(r"^[ \t]*(LEFTY|RIGHTY|ABOVE|BELOW|UWRIST|DWRIST)\b", re.M | re.I)
+
+
+@dataclass
+class _Use:
+    """Of a location: the motions that go to it alone, with the frames there, and what else."""
+
+    goals: list[int] = field(default_factory=list)
+    moved: bool = False  # a motion goes to it, or may: by an index that is reckoned
+    frames: set[tuple[str | None, str | None]] = field(default_factory=set)
+    other: int | None = None  # where the program does something else with it
+
+
+class KawasakiDialect(Dialect):
+    """Kawasaki: nothing in a point says the posture; the arm stays in the one that it has."""
+
+    maker, suffixes = "kawasaki", (".as", ".pg", ".lc")
+    decimals = Decimals(length=4, turn=5, joint=5)
+
+    def read(self, text: str) -> Program:
+        """Locations that motions go to, and taught steps; of a file without programs all."""
+        clean = masked(text, ";")
+        headers = [*_HEADER.finditer(clean)]
+        ends = [*(found.start() for found in headers[1:]), len(clean)]
+        sections = [(found[1], found.end(), end) for found, end in zip(headers, ends, strict=True)]
+        programs = [(start, end) for name, start, end in sections if name == "PROGRAM"]
+        located = [
+            found
+            for name, start, end in sections
+            if name in ("TRANS", "JOINTS")
+            for found in _LOCATION.finditer(clean, start, end)
+        ]
+        values = {found[1].lower(): found for found in located}
+        frames: dict[str, Array] = {NULL: np.eye(4)}
+        uses: dict[str, _Use] = {}
+        points: list[ProgramPoint] = []
+        computed: list[tuple[int, str]] = []
+        for start, end in programs:
+            computed += _used(text, clean, (start, end), values, frames, uses)
+            points += _steps(text, clean, start, end)
+        for found in located:
+            use = uses.get(found[1].lower())
+            if programs and (use is None or not use.moved):
+                continue
+            points.append(_location(text, found, use))
+        notes = tuple(
+            f"line {line_of(text, found.start())}: {found[1]} is not followed: of a point's "
+            "postures the one nearest to the point before is taken"
+            for found in _POSTURE.finditer(clean)
+        )
+        points.sort(key=lambda point: point.fields[0].start)
+        made = tuple((line_of(text, at), words) for at, words in sorted(computed))
+        return Program(text, tuple(points), frames, made, notes)
+
+
+def _used(
+    text: str,
+    clean: str,
+    span: tuple[int, int],
+    values: Mapping[str, "re.Match[str]"],
+    frames: dict[str, Array],
+    uses: dict[str, _Use],
+) -> list[tuple[int, str]]:
+    """Note what one program does with each location; the places where it makes points itself."""
+    computed = []
+    goals: dict[int, str] = {}
+    for found in _MOTION.finditer(clean, *span):
+        group = 1 if found[1] is not None else 2
+        target = arguments(clean, found.start(group), found.end(group))[0]
+        name = target.text.strip()
+        if not name:
+            continue
+        if not _TOKEN.fullmatch(name):
+            computed.append((target.start, name))
+        elif name.lower() in values:
+            goals[target.start] = name.lower()
+            use = uses.setdefault(name.lower(), _Use())
+            use.goals.append(target.start)
+            use.moved = True
+            use.frames.add(_frames_at(text, clean, span[0], target.start, values, frames))
+        else:  # a variable index, or a location that another file has
+            computed.append((target.start, name))
+            _note_array(name, target.start, values, uses, moved=True)
+    for found in _POINT.finditer(clean, *span):
+        computed.append((found.start(1), f"POINT {found[1]} = {found[2].strip()}"))
+    for token in _TOKEN.finditer(clean, *span):
+        name = token[0].lower()
+        if name in values and token.start() not in goals:
+            use = uses.setdefault(name, _Use())
+            use.other = token.start() if use.other is None else use.other
+        elif "[" in name and name not in values and token.start() not in goals:
+            _note_array(name, token.start(), values, uses)
+    return computed
+
+
+def _note_array(
+    name: str,
+    at: int,
+    values: Mapping[str, object],
+    uses: dict[str, _Use],
+    moved: bool = False,
+) -> None:
+    """An index that is reckoned may mean each location of its array."""
+    first = name.lower().split("[")[0]
+    for one in values:
+        if one.split("[")[0] == first and "[" in one:
+            use = uses.setdefault(one, _Use())
+            use.other = at if use.other is None else use.other
+            use.moved |= moved
+
+
+def _frames_at(
+    text: str,
+    clean: str,
+    start: int,
+    at: int,
+    values: Mapping[str, "re.Match[str]"],
+    frames: dict[str, Array],
+) -> tuple[str | None, str | None]:
+    """Names of tool and base that the program has set above; None: it has not."""
+    found: dict[str, str] = {}
+    for setting in _SET.finditer(clean, start, at):
+        kind, word = setting[1].upper(), setting[2].strip()
+        name = f"{kind} of line {line_of(text, setting.start())}"
+        if word.upper() == NULL:
+            name = NULL
+        elif (T := _constant(clean, setting.start(2), setting.end(2), values)) is not None:
+            frames[name] = T
+        found[kind] = name
+    return found.get("TOOL"), found.get("BASE")
+
+
+def _constant(
+    clean: str, start: int, end: int, values: Mapping[str, "re.Match[str]"]
+) -> Array | None:
+    """A transformation that is written out, or the location of that name; None: reckoned."""
+    word = clean[start:end].strip()
+    located = values.get(word.lower())
+    if located is not None and not word.startswith("#"):
+        numbers = [part.value for part in _numbers(located)[:AXES]]
+        return pose_of("kawasaki", numbers) if len(numbers) == AXES else None
+    begins = _TRANS.match(word)
+    if begins is None or not word.endswith(")"):
+        return None
+    parts = [part.text for part in arguments(word, begins.end(), len(word) - 1)]
+    try:
+        given = [float(part or 0.0) for part in parts]
+    except ValueError:
+        return None
+    return (
+        pose_of("kawasaki", [*given, *[0.0] * (AXES - len(given))]) if len(given) <= AXES else None
+    )
+
+
+def _numbers(found: "re.Match[str]") -> list[Field]:
+    return [Field(found.start(2) + one.start(), one[0]) for one in re.finditer(r"\S+", found[2])]
+
+
+def _location(text: str, found: "re.Match[str]", use: _Use | None) -> ProgramPoint:
+    """A row of .TRANS or .JOINTS."""
+    fields, joints = _numbers(found), found[1].startswith("#")
+    own, rest = tuple(fields[:AXES]), fields[AXES:]
+    external = {} if joints else {i: part for i, part in enumerate(rest, start=1)}
+    line = line_of(text, found.start(1))
+    point = ProgramPoint(found[1], line, own, joints, external=external, order=found.start(1))
+    if len(own) < AXES:
+        return replace(point, problem=f"has {len(own)} numbers in place of {AXES}")
+    if use is None:
+        return point
+    if use.other is not None:
+        words = f"the program reckons with it in line {line_of(text, use.other)}"
+        return replace(point, problem=words)
+    point = replace(point, order=min(use.goals))
+    if joints:
+        return point
+    if len(use.frames) > 1:
+        return replace(point, problem="motions with different tools or bases go to it")
+    tool, base = next(iter(use.frames))
+    return replace(point, tool=tool, frame=base)
+
+
+def _steps(text: str, clean: str, start: int, end: int) -> list[ProgramPoint]:
+    """Steps that were taught on the pendant, by joints."""
+    points = []
+    for found in _STEP.finditer(clean, start, end):
+        fields = arguments(clean, found.start(1), found.end(1))
+        line = line_of(text, found.start(1))
+        problem = require_numbers(fields)
+        if not problem and len(fields) < AXES:
+            problem = f"has {len(fields)} numbers in place of {AXES}"
+        point = ProgramPoint(
+            f"step in line {line}", line, tuple(fields[:AXES]), True, problem=problem
+        )
+        points.append(replace(point, order=found.start(1)))
+    return points
