@@ -29,6 +29,7 @@ OUT, KEPT = ROOT / "out" / "soak", ROOT / "docs" / "figures"
 
 ROBOTS = 4  # nodes that one round of the test of kills kills
 MOST_GROWTH_MB = 10.0
+HOSTILE = 2000  # requests
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,7 @@ def endurance(amount: Amount) -> Table:
         lambda: not _pytest("test/nodes/soak_stalls.py"))  # fmt: skip
     add("real measurements through live nodes and their replay, bit for bit", 2,
         lambda: not _pytest("test/nodes/test_real_replay.py", ROBOCAL_SERIES="B D"))  # fmt: skip
-    add("hostile requests to the PLC's server", 1000,
-        lambda: not _pytest("test/plc/test_server.py", ROBOCAL_PLC_REQUESTS="1000"))  # fmt: skip
+    add("hostile requests to a live bridge and a live page", HOSTILE, lambda: not _hostile())
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test", "--ignore=test/nodes")
@@ -99,6 +99,12 @@ def endurance(amount: Amount) -> Table:
         lambda: sum(not _pytest(*properties, f"--hypothesis-seed={seed}")
                     for seed in range(amount.seeds)))  # fmt: skip
     return table
+
+
+def _hostile() -> bool:
+    from bench.soak_hostile import soak
+
+    return soak(HOSTILE).met
 
 
 def _history_kills(count: int) -> int:

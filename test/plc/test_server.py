@@ -4,20 +4,18 @@
 import asyncio
 import contextlib
 import gc
-import os
 import random
 import socket
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 from asyncua import ua
 
+from bench.hostile import ON_A_SESSION, good_heartbeat
 from bench.live.opc_ua import NAMESPACE, PlcClient, free_port, security_folder
 from robocal_ros.adapter.inputs import InputTiming
 from robocal_ros.ground.errors import Code
@@ -25,7 +23,6 @@ from robocal_ros.plc import access, cell
 from robocal_ros.plc import server as plc_server
 from robocal_ros.plc.cell import EdgeWritten, MethodCalled
 from robocal_ros.plc.inputs import Heartbeat
-from robocal_ros.plc.model import METHODS
 from robocal_ros.plc.server import (
     MOST_CALLS,
     MOST_STRANGERS,
@@ -35,9 +32,8 @@ from robocal_ros.plc.server import (
     ServerThread,
 )
 
-REQUESTS = int(os.environ.get("ROBOCAL_PLC_REQUESTS", "300"))
+REQUESTS = 300  # more of them, of strangers too, against a live cell: `bench.soak_hostile`
 UP_S, QUICK_S = 30.0, 5.0
-TYPES = ("Boolean", "Double", "String", "DateTime", "Int32", "UInt32", "Float", "ByteString")
 NUMBERS = {"Code": {code.name: int(code) for code in Code}}
 OTHERS = ("AccuracyLevel", "MaintenanceState", "ToolState", "ToolAnswer")
 
@@ -83,136 +79,14 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     assert not made.thread._thread.is_alive()
 
 
-def wrong_variant(rng: random.Random, right: str) -> ua.Variant:
-    kind = rng.choice([name for name in TYPES if name != right])
-    values: dict[str, Any] = {
-        "Boolean": True,
-        "Double": rng.choice([0.0, float("nan"), float("inf"), 1e300]),
-        "String": "x" * rng.choice([0, 1, 5000]),
-        "DateTime": datetime.now(UTC),
-        "Int32": rng.randint(-(2**31), 2**31 - 1),
-        "UInt32": rng.randint(0, 2**32 - 1),
-        "Float": 1.5,
-        "ByteString": bytes(rng.randrange(2000)),
-    }
-    value, variant = values[kind], ua.VariantType[kind]
-    if rng.random() < 0.3:
-        return ua.Variant([value] * rng.randrange(20), variant, is_array=True)
-    return ua.Variant(value, variant)
-
-
-def a_write(rng: random.Random, served: Served) -> ua.WriteValue:
-    """Something that must not be taken: a wrong type, node, attribute, status or range."""
-    index = served.plc.index
-    node, right = rng.choice(
-        [("Cell.Gap.Heartbeat", "UInt32"), ("Cell.Beams.x.Blocked", "Boolean"),
-         ("Cell.Beams.x.Time", "DateTime"), ("Cell.Gap.Beat", ""), ("Cell.Accuracy.State", ""),
-         ("Cell.Nowhere", ""), ("Cell.Methods.Run", ""), ("Code", "")]
-    )  # fmt: skip
-    item = ua.WriteValue(NodeId=ua.NodeId(node, index), AttributeId=ua.AttributeIds.Value)
-    item.Value = ua.DataValue(wrong_variant(rng, right))
-    how = rng.randrange(5)
-    if how == 1:
-        item.AttributeId = rng.choice([ua.AttributeIds.BrowseName, ua.AttributeIds.AccessLevel])
-    elif how == 2:
-        item.IndexRange = "0:1"
-    elif how == 3 and right == "UInt32":
-        good = ua.Variant(7, ua.VariantType.UInt32)
-        item.Value = ua.DataValue(good, StatusCode=ua.StatusCode(ua.StatusCodes.BadNoData))
-    elif how == 4:
-        item.NodeId = ua.NodeId(rng.choice([2253, 2256, 11715, 85, 99999]))
-    return item
-
-
-async def bad_writes(rng: random.Random, served: Served) -> None:
-    parameters = ua.WriteParameters()
-    parameters.NodesToWrite = [a_write(rng, served) for _ in range(rng.randint(1, 5))]
-    for status in await served.plc.client.uaclient.write(parameters):
-        assert not status.is_good()
-
-
-async def bad_calls(rng: random.Random, served: Served) -> None:
-    method = rng.choice(METHODS)
-    index = served.plc.index
-    inputs = [wrong_variant(rng, item.variant_type.name) for item in method.inputs]
-    request = ua.CallMethodRequest(
-        ua.NodeId("Cell.Methods", index), ua.NodeId(f"Cell.Methods.{method.name}", index), inputs
-    )
-    how = rng.randrange(4)
-    if how == 0 or not inputs:
-        request.InputArguments = [*inputs, wrong_variant(rng, "")]
-    elif how == 1:
-        request.InputArguments = inputs[:-1]
-    elif how == 2:
-        request.ObjectId = ua.NodeId(rng.choice(["Cell", "Cell.Gap", "Cell.Nowhere"]), index)
-    for result in await served.plc.client.uaclient.call([request]):
-        assert not result.StatusCode.is_good()
-
-
-async def bad_services(rng: random.Random, served: Served) -> None:
-    """Services that this server has not, and requests of many items."""
-    client = served.plc.client.uaclient
-    cell = ua.NodeId("Cell", served.plc.index)
-    node = ua.ReadValueId(NodeId=cell, AttributeId=ua.AttributeIds.BrowseName)
-
-    async def add() -> None:
-        item = ua.AddNodesItem(ParentNodeId=cell, BrowseName=ua.QualifiedName("evil"))
-        (result,) = await client.add_nodes([item])
-        result.StatusCode.check()
-
-    browse = ua.BrowseDescription(NodeId=cell)
-    call = ua.CallMethodRequest(cell, cell, [])
-    services: list[Callable[[], Any]] = [
-        add,
-        lambda: client.delete_nodes(ua.DeleteNodesParameters([ua.DeleteNodesItem(cell)])),
-        lambda: client.register_server(ua.RegisteredServer(ServerUri="urn:evil")),
-        lambda: client.history_read(ua.HistoryReadParameters()),
-        lambda: client.read(ua.ReadParameters(NodesToRead=[node] * 501)),
-        lambda: client.browse(ua.BrowseParameters(NodesToBrowse=[browse] * 101)),
-        lambda: client.call([]),
-        lambda: client.call([call] * 11),
-    ]
-    with pytest.raises((ua.UaError, TimeoutError)):
-        await rng.choice(services)()
-
-
-async def bad_bytes(rng: random.Random, served: Served) -> None:
-    """No OPC UA at all, or a header of gigabytes."""
-    hello = b"HELF" + struct.pack("<IIIIIIi", 32, 0, 2**32 - 1, 2**32 - 1, 0, 0, -1)
-    words = rng.choice(
-        [rng.randbytes(rng.randrange(1, 3000)), b"GET / HTTP/1.1\r\n\r\n", hello,
-         b"HELF" + struct.pack("<I", 2**32 - 1) + bytes(70_000),
-         b"OPNF" + struct.pack("<II", 5000, 0) + rng.randbytes(5000), b"HELF\0\0\0\0"]
-    )  # fmt: skip
-    with contextlib.suppress(ConnectionError, TimeoutError):
-        reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
-        writer.write(words)
-        await asyncio.wait_for(writer.drain(), 2.0)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(reader.read(100), 0.02)
-        writer.close()
-
-
-async def latched(rng: random.Random, served: Served) -> None:
-    """A heartbeat with a time from long before: the newest of this session is of the year 2100."""
-    value = ua.Variant(rng.randrange(1, 2**32), ua.VariantType.UInt32)
-    at = datetime.fromtimestamp(rng.randrange(2**31), UTC)
-    with pytest.raises(ua.UaStatusCodeError):
-        await served.plc.write("Gap.Heartbeat", value, at)
-
-
-HOSTILE = (bad_writes, bad_calls, bad_services, bad_bytes, latched)
-
-
 def test_hostile_requests_change_nothing_and_end_nothing(served: Served) -> None:
     rng, plc = random.Random(20), served.plc
-    newest = datetime(2100, 1, 1, tzinfo=UTC)
-    plc.do(plc.write("Gap.Heartbeat", ua.Variant(0, ua.VariantType.UInt32), newest))
+    plc.do(good_heartbeat(plc))
     served.handed.clear()
     nodes = len(served.thread.cell.model._server.iserver.aspace.keys())
+    attacks = [*ON_A_SESSION.values()]
     for number in range(REQUESTS):
-        hostile = HOSTILE[number % len(HOSTILE)]
-        plc.do(hostile(rng, served))
+        plc.do(attacks[number % len(attacks)](rng, plc))
         if number % 25 == 0:
             served.works()
     served.works()
