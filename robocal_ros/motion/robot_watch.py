@@ -55,12 +55,16 @@ class SpeedScaling:
         return None
 
 
-# Two clocks run apart by less: ntpd slews by 500 ppm, crystals err by 100. chronyd slews by up to
-# 83 333 (maxslewrate of chrony.conf): what it takes back makes messages late, and is told of.
+# Two clocks run apart by less: ntpd slews by 500 ppm, crystals err by 100.
 DRIFT = 6e-4
 USUAL_S = 0.01  # what is no later: stamps and messages scatter by as much
 BEHIND_S = 0.03  # after later ones more wait: they are taken before anything is made of them
 LATE_S, LATELY_S = 0.1, 5.0  # later ones are told of, for so long
+# chronyd slews by up to 83 333 ppm (maxslewrate of chrony.conf): what it takes back makes messages
+# late. Lateness that grew no faster, also over the longest time without a message that is bridged,
+# and then was the same for `STEADY_S`, with hardly a message left out, is of a clock.
+SLEW, BRIDGED_S, STEADY_S = 0.0834, 0.25, 5.0
+LEFT_OUT, APART = 0.005, 1.75  # share of intervals that are so much longer than the mean
 
 
 class Lateness:
@@ -68,7 +72,9 @@ class Lateness:
 
     Later than the quickest one: what the clocks differ by is in all of them alike. They are as late
     as that clock has them which has them least, so that setting one of the receiver's makes nothing
-    late. A source's clock that is set back begins anew.
+    late. A source's clock that is set back begins anew; one that is taken back bit by bit makes
+    late while it is, and for `STEADY_S` more. A queue grows by stalls, or drains, or is full and
+    leaves messages out.
 
     ``late_s``: the last message; 0 where that is usual, or it has no stamp.
     """
@@ -77,27 +83,63 @@ class Lateness:
         self._what = what
         self.late_s = 0.0
         self._stamp_s = self._taken_s = -math.inf
-        self._least_s: tuple[float, ...] = ()
+        self._least_s: list[float] = []
         self._worst_s, self._worst_at_s = 0.0, -math.inf
+        # what of it came no faster than a clock is slewed, seen when; since when that is the same,
+        # by the clock and the stamps, how much it was, messages since, those after one left out
+        self._slewed_s, self._slewed_at_s = 0.0, -math.inf
+        self._steady = (-math.inf, 0.0, 0.0)
+        self._count = self._left_out = 0
 
     def take(self, stamp_s: float, now_s: float, *ages_s: float) -> float:
         """Take a message that comes now, of these ages by other clocks; how late it is."""
         self.late_s = 0.0
         if not stamp_s:
             return 0.0
-        offsets = (now_s - stamp_s, *ages_s)
-        if stamp_s < self._stamp_s or len(offsets) != len(self._least_s):
-            self._least_s = offsets
+        offsets, least, late_s = [now_s - stamp_s, *ages_s], self._least_s, math.inf
+        if stamp_s < self._stamp_s or len(offsets) != len(least):
+            least = self._least_s = list(offsets)
+            self._slewed_s, self._taken_s = 0.0, now_s
+            self._steady_from(now_s, stamp_s)
         drift_s = DRIFT * max(now_s - self._taken_s, 0.0)
-        least = tuple(map(min, offsets, [each + drift_s for each in self._least_s]))
-        self._stamp_s, self._taken_s, self._least_s = stamp_s, now_s, least
-        late_s = min(map(float.__sub__, offsets, least))
+        for i, offset in enumerate(offsets):
+            least[i] = min(offset, least[i] + drift_s)
+            late_s = min(late_s, offset - least[i])
+        self._slewed_s -= drift_s
+        late_s -= self._made_up(late_s, stamp_s, now_s)
+        self._stamp_s, self._taken_s = stamp_s, now_s
         self.late_s = late_s if late_s > USUAL_S else 0.0
         if self.late_s > LATE_S:
             lately = now_s - self._worst_at_s <= LATELY_S
             self._worst_s = max(self.late_s, self._worst_s * lately)
             self._worst_at_s = now_s
         return self.late_s
+
+    def _steady_from(self, now_s: float, stamp_s: float) -> None:
+        self._steady = now_s, stamp_s, self._slewed_s
+        self._count = self._left_out = 0
+
+    def _made_up(self, late_s: float, stamp_s: float, now_s: float) -> float:
+        """What of the lateness of a message is a clock's, and counts no more from now on."""
+        grown_s = SLEW * min(max(now_s - self._slewed_at_s, 0.0), BRIDGED_S)
+        if late_s > self._slewed_s + grown_s + USUAL_S:
+            return 0.0
+        self._slewed_s, self._slewed_at_s = min(late_s, self._slewed_s + grown_s), now_s
+        since_s, first_s, then_s = self._steady
+        self._count += 1
+        if abs(self._slewed_s - then_s) > USUAL_S:
+            self._steady_from(now_s, stamp_s)
+        elif (stamp_s - self._stamp_s) * self._count > APART * (stamp_s - first_s):
+            self._left_out += 1
+        if now_s - since_s < STEADY_S:
+            return 0.0
+        made_up_s = self._slewed_s if self._left_out <= LEFT_OUT * self._count else 0.0
+        if made_up_s <= USUAL_S:
+            made_up_s = 0.0
+        self._slewed_s -= made_up_s
+        self._least_s = [each + made_up_s for each in self._least_s]
+        self._steady_from(now_s, stamp_s)
+        return made_up_s
 
     def words(self, now_s: float) -> str:
         """That messages are late, and what to do; empty where none were lately."""
@@ -107,8 +149,8 @@ class Lateness:
             f"{self._what} come up to {self._worst_s * 1e3:.0f} ms late, so that nobody knows "
             "where the robot is now: this computer or its network has too much to do; give this "
             "node a core of its own, end other processes, or let the controller publish less "
-            "often. Has the robot's computer set its clock back bit by bit (chronyd)? Then "
-            "configure this node anew"
+            "often. Where the robot's computer takes its clock back bit by bit (chronyd) this ends "
+            f"{STEADY_S:g} s after that"
         )
 
 
