@@ -272,10 +272,10 @@ class ToolPart:
         return answer.candidate_id if answer.done else 0
 
     def _ask_mandrel(self, cycle_id: str, candidate: int) -> Script[bool]:
-        """Whose is a change in doubt, the tool's or the station's? Whether a mandrel has told it.
+        """Whose is a change in doubt, the tool's or the station's? Whether that is settled.
 
         Where the station has moved the candidate is rejected. Where it stands the tool is measured
-        once more, and judged with that.
+        once more, and judged with that; unless a person has decided meanwhile.
         """
         cell, outcome = self._cell, self.outcome
         if cell.config.driving.mandrel is None or not self._decider.in_doubt(candidate):
@@ -288,6 +288,9 @@ class ToolPart:
             return self._decider.decide(REJECT, candidate, BY, told.message, self.wall_ns)
 
         yield  # what was kept just before may have taken its time
+        if words := self._decider.decided(candidate):
+            outcome.candidate_id, outcome.note = candidate, words
+            return True
         self._decided((yield from patiently(cell, reject)))
         if not told.done:
             outcome.candidate_id = candidate

@@ -112,6 +112,11 @@ class Decider:
         """Whether nothing proves that a tool candidate is the tool's change, not the station's."""
         return self._history.model(calibration_id).get("cause") != "tool"
 
+    def decided(self, calibration_id: int) -> str:
+        """What became of a candidate; empty while it waits."""
+        state = self._history.get(calibration_id).state
+        return "" if state is CalibrationState.PENDING else f"it is {state.value}"
+
     def accepted_here(self, calibration_id: int) -> bool:
         """Whether it is in force since it was accepted without a person."""
         entry = self._history.get(calibration_id)
@@ -233,9 +238,9 @@ class Decider:
         bounds = self._config.bounds
         if not bounds.automatic:
             return "auto_accept is off"
+        if words := self.decided(calibration_id):
+            return words
         entry = self._history.get(calibration_id)
-        if entry.state is not CalibrationState.PENDING:
-            return f"it is {entry.state.value}"
         if entry.kind != THERMAL:
             return self._outdated(entry) or self._tool_withheld(calibration_id)
         allowed_m, shift_m = bounds.thermal_m, self.thermal_shift_m(calibration_id)

@@ -412,9 +412,13 @@ MANDREL = frames.transform(ACROSS, 0.17 * ACROSS[:, 2] + [0.0, 0.0, 0.02])
 SMALL_BEND = bent(TAUGHT, [3e-4, 0.0, 0.0], [0.0, 3e-3, 0.0])  # its tilt drowns in the noise
 
 
+@pytest.mark.parametrize("rejected", [False, True])
 @pytest.mark.parametrize("knocked", [True, False])
-def test_a_mandrel_settles_in_the_cycle_what_has_changed(tmp_path, knocked):
-    """A shift of 0.3 mm of the station or of the tool, which the tool's own run cannot tell."""
+def test_a_mandrel_settles_in_the_cycle_what_has_changed(tmp_path, knocked, rejected):
+    """A shift of 0.3 mm of the station or of the tool, which the tool's own run cannot tell.
+
+    Finding: what a person rejected while the mandrel ran was measured anew.
+    """
     bounds = AcceptBounds(automatic=True, tool_m=0.01, tool_rad=0.1)
     with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
         slow = Times(full_s=60.0, tool_home_s=30.0)  # 50 mm/s, and the flange turns by 85 deg
@@ -438,8 +442,22 @@ def test_a_mandrel_settles_in_the_cycle_what_has_changed(tmp_path, knocked):
             cell.cell.station = replace(station, beams=(x, y))
         else:
             cell.tool = RoundTool.cylinder(SMALL_BEND, 0.0025)
-        result = cell.maintain("c1", 1.5 * GAP_S)
-        if knocked:
+        session, rejections = cell.maintenance, []
+
+        def reject() -> None:
+            waiting = history.pending(TOOL, 1)
+            if rejected and waiting and "witness" in session.status(cell.now_s).doing:
+                rejections.append(waiting[0].id)
+                session.decide(REJECT, waiting[0].id, "a person", "", cell.wall_ns)
+
+        result = cell.maintain("c1", 1.5 * GAP_S, reject)
+        if rejected:
+            entries = [entry for entry in history.list() if entry.kind == TOOL]
+            assert [entry.id for entry in entries] == rejections
+            assert entries[0].decisions[-1].by == "a person"
+            assert result.accepted == ()
+            assert (result.tool_code is Code.STATION_MOVED) is knocked
+        elif knocked:
             assert result.tool_code is Code.STATION_MOVED, result.message
             assert result.accepted == ()
             assert not history.pending(TOOL, 1)

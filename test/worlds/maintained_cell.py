@@ -4,6 +4,7 @@
 What the maintenance asks is carried out by calling the sessions themselves, as a bench does.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -160,11 +161,18 @@ class MaintainedCell(Robot):
         self.run(0.5)
         assert self.last_thermal.done, self.last_thermal.message
 
-    def maintain(self, cycle_id: str, gap_s: float) -> Any:
-        """A whole cycle; its result."""
+    def maintain(
+        self, cycle_id: str, gap_s: float, meanwhile: Callable[[], None] = lambda: None
+    ) -> Any:
+        """A whole cycle, with what is done at each step of it; its result."""
+
+        def over() -> bool:
+            meanwhile()
+            return self.maintenance.running is None
+
         begun_s = self.now_s
         self.maintenance.run(cycle_id, gap_s, self.now_s, self.wall_ns)
-        self.run(gap_s, until=lambda: self.maintenance.running is None)
+        self.run(gap_s, until=over)
         assert self.now_s <= begun_s + gap_s
         assert np.max(np.abs(self.q - HOME)) < 1e-3
         assert not self.driver.armed
