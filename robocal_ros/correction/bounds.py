@@ -321,6 +321,7 @@ class DesiredOffset:
         self._span = np.array([reference.lower, reference.upper], dtype=np.float64)
         bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
         self._bounds = np.array(bounds, dtype=np.float64)
+        self._nothing = np.zeros(reference.n)
         self._tcp = np.array([config.thermal.tcp_m, config.thermal.tcp_rad])
 
     def want(self, actual: SerialArm, on: bool) -> None:
@@ -337,7 +338,7 @@ class DesiredOffset:
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
         self.made = False
-        self.figures[[SHIFT, LARGEST, REMAINING]] = 0.0
+        self.figures[SHIFT : REMAINING + 1] = 0.0
         if self.stage is None:
             return np.zeros_like(q), None
         result = self.stage.correct(q)
@@ -367,7 +368,8 @@ class DesiredOffset:
         self,
         q: Array,
         velocity: Array,
-        times: tuple[float, float],
+        elapsed: float,
+        longest: float,
         limiter: OffsetLimiter,
         active: Array,
         speeds: Array,
@@ -379,14 +381,18 @@ class DesiredOffset:
         stage, memory, limits, span = self.stage, limiter.memory, limiter.limits, self._span
         if stage is not None and self._config.policy is Policy.REFUSE:
             share = step_out(
-                q, velocity, *times, memory, limits, active, speeds, span, self._bounds, self._tcp,
-                stage.largest, stage.free_axis, stage.works, stage.reports, self.figures,
+                q, velocity, elapsed, longest, memory, limits, active, speeds, span, self._bounds,
+                self._tcp, stage.largest, stage.free_axis, stage.works, stage.reports, self.figures,
             )  # fmt: skip
             if share != NOT_WITHIN:
                 self.made = True
                 return share
-        desired = self.at(q[None])[0][0]
-        share = put_out(memory, q, desired, *times, limits, active, speeds[0], span)
+        if stage is None:
+            self.made, desired = False, self._nothing
+            self.figures[SHIFT : REMAINING + 1] = 0.0
+        else:
+            desired = self.at(q[None])[0][0]
+        share = put_out(memory, q, desired, elapsed, longest, limits, active, speeds[0], span)
         if isinstance(stage, ClampedCorrection) and self.made and not limiter.withheld.any():
             memory[VELOCITY] = stage.velocity_one(memory[TAUGHT], velocity, memory[OUT])
         else:

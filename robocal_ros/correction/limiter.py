@@ -329,6 +329,8 @@ class OffsetLimiter:
     Attributes
     ----------
     memory : (19, n) its rows are those named above.
+    state : (5, n) of it: offset, its rate, the desired offset, its rate and the share of it aimed
+        at.
     limits : (4, n).
     """
 
@@ -339,11 +341,7 @@ class OffsetLimiter:
         self.memory = np.zeros((MEMORY, n))
         self.memory[SHARE] = 1.0
         self.memory[[TAUGHT, OUT]] = np.nan
-
-    @property
-    def state(self) -> Array:
-        """(5, n) offset, its rate, the desired offset, its rate and the share of it aimed at."""
-        return self.memory[: len(STATE)]
+        self.state = self.memory[: len(STATE)]
 
     def begin(self, index: NDArray[np.int64], offset: Array, desired: Array) -> None:
         """Joints ``index`` (k,) stand with an offset (k,), at rest."""

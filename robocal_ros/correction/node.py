@@ -299,14 +299,18 @@ class JointCorrectionNode(RobotNode):
         return response
 
     def _listen(
-        self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None], profile: Any
+        self,
+        topic: str,
+        read: Callable[[Any], Any],
+        act: Callable[[Any, float], None],
+        profile: Any,
     ) -> None:
         """Act on an input; refuse what a correction node publishes itself, and several sources.
 
         In shadow mode a message goes out as it came before anything else is done with it.
+        ``act`` is given the message, and when it was taken.
         """
-        guard = self._sources[topic]
-        senders = self._senders.get(topic)
+        guard, senders = self._sources[topic], self._senders.get(topic)
 
         def receive(came: Any) -> None:
             message, now = read(came), time.monotonic()
@@ -314,10 +318,9 @@ class JointCorrectionNode(RobotNode):
                 self._refuse_message(topic, Reason.OWN_OUTPUT, guard.fault, now)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
-            rivals = senders.hear(topic, now) if senders else ""
-            if rivals:
+            if senders and (rivals := senders.hear(topic, now)):
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
-            act(message)
+            act(message, now)
 
         opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
         if senders:
@@ -330,8 +333,7 @@ class JointCorrectionNode(RobotNode):
             self._arm_tail()
         self._session.refuse(reason, detail)
 
-    def _on_target(self, topic: str, message: JointMessage | ArrayMessage) -> None:
-        now = time.monotonic()
+    def _on_target(self, topic: str, message: JointMessage | ArrayMessage, now: float) -> None:
         self._stream = topic
         try:
             command = message.command()
@@ -343,13 +345,13 @@ class JointCorrectionNode(RobotNode):
             self._arm_tail()
         self._tell_offset(JointOffset.STREAM, now)
 
-    def _on_states(self, message: JointMessage) -> None:
-        command, now = self._session.counted(message.command), time.monotonic()
+    def _on_states(self, message: JointMessage, now: float) -> None:
+        session = self._session
+        command = session.counted(message.command)
         self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
-        taught = self._session.reading(command, now, age)
-        self._put_out(STATES, message, command, taught)
-        if self._session.lateness(command.names).late_s > BEHIND_S:
+        self._put_out(STATES, message, command, session.reading(command, now, age))
+        if session.late_s > BEHIND_S:
             self._catch_up()
 
     def _catch_up(self) -> None:
@@ -359,13 +361,13 @@ class JointCorrectionNode(RobotNode):
             STATES, pick=lambda came: {joint_names(one): one for one in came}.values()
         )
 
-    def _on_path(self, message: PathMessage) -> None:
+    def _on_path(self, message: PathMessage, now: float) -> None:
         if not message.points:  # what its sender means: a controller drops it and drives on
             words = (
                 f"{TRAJECTORY} has no points, which stops no robot: a controller drops it and "
                 "drives on; the robot is slowed down in its place"
             )
-            if self._log_limit.allows(TRAJECTORY, words, time.monotonic()):
+            if self._log_limit.allows(TRAJECTORY, words, now):
                 self.get_logger().error(words)
             if not self._shadow:
                 self._stop(f"{TRAJECTORY} without points")
@@ -515,10 +517,13 @@ class JointCorrectionNode(RobotNode):
 
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
-        if self._session.stream.has_tail and not self._shadow:
+        stream, timer = self._session.stream, self._tail_timer
+        if stream.has_tail and not self._shadow:
             self._emit_tail()
-            self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
-            self._tail_timer.reset()
+            period_ns = round(self._tail_period_s() * 1e9)
+            if abs(period_ns - timer.timer_period_ns) > 0.1 * timer.timer_period_ns:
+                timer.timer_period_ns = period_ns
+            timer.reset()
 
     def _tail_period_s(self) -> float:
         period = self._session.stream.period_s

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the robot was read, where its controller is, and what was put out last."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -78,7 +79,6 @@ class RobotState:
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
         self._doubtful = np.minimum(self._turns, self._tenfold)
-        self._endless = np.full(arm.n, np.finfo(np.float64).max)
         self._continuous = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
         changes = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
         self._turned = 0.5 * VELOCITY_S * changes + near / LEAST_TRACK_S
@@ -126,16 +126,20 @@ class RobotState:
         if np.any(np.all(size > self._tenfold[index], axis=1)):
             raise RefusedError(Reason.DEGREES, "all joints are beyond ten times their limits")
 
-    def require_velocities(self, names: tuple[str, ...], index: Index, velocity: Array) -> None:
-        """Refuse velocities (k,) that are not finite, or of another number."""
-        if len(velocity) != len(index):
+    def require_target(self, command: JointCommand, index: Index) -> None:
+        """As `require_positions`, and velocities that are not finite, or of another number."""
+        names, velocity = command.names, command.velocity
+        self.require_positions(names, index, command.position[None])
+        if velocity is None:
+            return
+        if len(velocity) != len(names):
             detail = f"{len(names)} names but {len(velocity)} velocities"
             raise RefusedError(Reason.WRONG_SIZE, detail)
-        if not ordinary(plain(velocity), self._endless, index):
+        if not math.isfinite(sum(velocity.tolist())):
             require_finite(names, velocity[None])
 
     def complete(self, index: Index, position: Array, taught: Array, now_s: float) -> Array:
-        """All joints (m, n) of a command (m, k); those that it leaves out stay where they are.
+        """All joints (..., n) of a command (..., k); those that it leaves out stay where they are.
 
         ``taught`` (n,): un-corrected readings. Raises `RefusedError` where one that is left out
         was never read, or not lately.
@@ -150,8 +154,8 @@ class RobotState:
             if absent:
                 raise RefusedError(Reason.MISSING_JOINT, ", ".join(absent))
             self.require_fresh(rest, now_s)
-            q = np.tile(taught, (len(position), 1))
-        q[:, index] = position
+            q = np.broadcast_to(taught, (*position.shape[:-1], self.count)).copy()
+        q[..., index] = position
         return q
 
     def find(self, state: JointCommand) -> tuple[Index, Index]:
@@ -198,7 +202,7 @@ class RobotState:
         while len(self._track) > 1 and self._track[1][0] <= at_s - RESPONSE_S:
             self._track.popleft()
         self._track.append((at_s, self.measured.copy()))
-        if blind or not (np.abs(self.measured - self._place) < self._near).all():
+        if blind or not ordinary(self.measured - self._place, self._near, self._all):
             self._place, self._place_s = self.measured.copy(), at_s
 
     def controller(
@@ -288,7 +292,7 @@ class RobotState:
     @property
     def heard_s(self) -> float:
         """Of when the oldest joint's reading is."""
-        return float(self._heard_s.min())
+        return min(self._heard_s.tolist())
 
     def blind(self, now_s: float) -> bool:
         """Whether a joint has not come for longer than the age limit."""
@@ -397,21 +401,13 @@ class Output:
         self._fastest = config.velocity_limits
         # the offsets of a stream, and of the begin of what comes next
         self.limiter = OffsetLimiter(arm.prismatic, config.turning, config.sliding)
+        # (n,) the last target, as it was followed, and what went out for it; NaN before any
+        self.taught, self.out = self.limiter.memory[TAUGHT], self.limiter.memory[OUT]
         self.stage: StagedCorrection | None = None  # of the last target
         self.out_s = -np.inf  # when
         self.path: SentPath | None = None  # put out since; None after a target
         self.mismatch = ""  # why nothing goes out until it is acknowledged
         self._track: deque[tuple[float, Array]] = deque()  # where the controller was sent lately
-
-    @property
-    def taught(self) -> Array:
-        """(n,) the last target, as it was followed; NaN before any."""
-        return self.limiter.memory[TAUGHT]
-
-    @property
-    def out(self) -> Array:
-        """(n,) what went out for it."""
-        return self.limiter.memory[OUT]
 
     def correction(self, now_s: float) -> tuple[StagedCorrection | None, Array]:
         """The correction in what is put out now, and what the limiter adds to it (n,)."""
@@ -419,11 +415,13 @@ class Output:
             return self.path.stage, self.path.withheld(now_s)
         return self.stage, self.limiter.withheld
 
-    def uncorrected(self, corrected: Array, now_s: float) -> Array:
-        """Taught joints (n,) of corrected ones; of readings in part as they are."""
-        stage, withheld = self.correction(now_s)
+    def uncorrected(
+        self, corrected: Array, correction: tuple[StagedCorrection | None, Array]
+    ) -> Array:
+        """Taught joints (n,) of corrected ones, by what `correction` gives; in part as they are."""
+        stage, withheld = correction
         bare = corrected - withheld
-        if stage is None or not np.isfinite(bare).all():
+        if stage is None or not math.isfinite(sum(bare.tolist())):
             return bare
         return stage.uncorrect_one(bare)
 
@@ -488,7 +486,8 @@ class Output:
         place, exact = self.place(index, q[index], now_s)
         here = self._state.measured.copy()
         here[index] = place
-        known = np.vstack([begins, here - self.uncorrected(here, now_s)])  # as readings are told
+        told = here - self.uncorrected(here, self.correction(now_s))  # as readings are
+        known = np.vstack([begins, told])
         offset, beside = self._taken_up(index, place - q[index], known, exact=exact)
         if np.any(beside > 1.0):
             j = int(np.argmax(beside))
@@ -535,7 +534,7 @@ class Output:
         if exact and self.path is not None and self.path.live(now_s):
             taught = place - self.path.offset(now_s)[0]
         else:  # with the offset that readings are told with
-            taught = self.uncorrected(place, now_s)
+            taught = self.uncorrected(place, self.correction(now_s))
         return taught, place - taught
 
     def refuse(self, detail: str) -> RefusedError:

@@ -8,6 +8,7 @@ A refusal ends a stream that runs: the robot is slowed down (`tail`).
 """
 
 import contextlib
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -105,6 +106,7 @@ class CorrectionSession:
         # of each kind and source: the last stamp, ns, and when it came
         self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
         self._lateness: dict[tuple[str, ...], Lateness] = {}
+        self.late_s = 0.0  # of the last readings, see `Lateness`
         self._refused: Counter[Reason] = Counter()
         self._last_refusal = ""
         self._overtaken = 0
@@ -213,10 +215,8 @@ class CorrectionSession:
             self._require_order("target", command, (), now_s)
             self._require_released()
             index = self.robot.index(command.names)
-            self.robot.require_positions(command.names, index, command.position[None])
-            if command.velocity is not None:
-                self.robot.require_velocities(command.names, index, command.velocity)
-            q = self.robot.complete(index, command.position[None], self._taught, now_s)[0]
+            self.robot.require_target(command, index)
+            q = self.robot.complete(index, command.position, self._taught, now_s)
             if self._config.shadow:
                 self._shadow(q[None])
                 corrected = command
@@ -320,10 +320,9 @@ class CorrectionSession:
         velocities of which one is not finite are none.
         """
         try:
-            stamp_s = state.stamp_ns * 1e-9
-            late_s = self.lateness(state.names).take(stamp_s, now_s, age_s)
             self._require_order("reading", state, state.names, now_s)
             index, column = self.robot.find(state)
+            late_s = self._late_by(state, now_s, age_s)
             velocity = state.velocity
             if velocity is not None:
                 whole = len(velocity) == len(state.names)
@@ -336,11 +335,14 @@ class CorrectionSession:
         self._taught[:] = q
         return JointCommand(state.names, position, velocity, state.stamp_ns, TAUGHT)
 
-    def lateness(self, names: tuple[str, ...]) -> Lateness:
-        """Of readings of these joints; many drivers share one."""
-        if names not in self._lateness and len(self._lateness) >= MOST_SOURCES:
-            names = ()
-        return self._lateness.setdefault(names, Lateness("joint states"))
+    def _late_by(self, state: JointCommand, now_s: float, age_s: float) -> float:
+        """How late readings come; many drivers share one measure."""
+        of = self._lateness.get(state.names)
+        if of is None:
+            names = state.names if len(self._lateness) < MOST_SOURCES else ()
+            of = self._lateness.setdefault(names, Lateness("joint states"))
+        self.late_s = of.take(state.stamp_ns * 1e-9, now_s, age_s)
+        return self.late_s
 
     def late(self, now_s: float) -> str:
         """That readings come late, in words; empty where they do not."""
@@ -366,14 +368,15 @@ class CorrectionSession:
         measured, velocity = self.robot.measured.copy(), state.velocity
         measured[index] = state.position[column]
         if velocity is not None and not (
-            len(velocity) == len(state.names) and np.isfinite(velocity).all()
+            len(velocity) == len(state.names) and math.isfinite(sum(velocity.tolist()))
         ):
             velocity = None  # a driver that has none says NaN, or gives fewer
         if self._config.shadow:
             return measured, state.position, velocity
-        taught, position = self.output.uncorrected(measured, now_s), state.position.copy()
+        stage, withheld = self.output.correction(now_s)
+        taught = self.output.uncorrected(measured, (stage, withheld))
+        position = state.position.copy()
         position[column] = taught[index]
-        stage, _ = self.output.correction(now_s)
         if velocity is not None and stage is not None and len(column):
             speed, velocity = np.zeros(self._reference.n), velocity.copy()
             speed[index] = velocity[column]
@@ -422,8 +425,8 @@ class CorrectionSession:
             offset, withheld = output.out - output.taught, output.limiter.withheld
             offset = np.where(np.isfinite(offset), offset, 0.0)
         else:
-            offset = measured - output.uncorrected(measured, now_s)
-            withheld = output.correction(now_s)[1]
+            stage, withheld = output.correction(now_s)
+            offset = measured - output.uncorrected(measured, (stage, withheld))
         tool = self._gate.tools.in_use if self._enabled else None
         return Offset(
             names=self._reference.joint_names,
@@ -537,7 +540,7 @@ def load_kernels(arm: SerialArm) -> None:
     q, zeros, ones = np.zeros((2, n)), np.zeros(n), np.ones(n)
     arm.fk(q)
     desired, offsets = DesiredOffset(arm, config), Output(arm, config, RobotState(arm, 0.0, ones))
-    given = zeros, zeros, (0.004, 0.004), offsets.limiter, ones, np.ones((2, n))
+    given = zeros, zeros, 0.004, 0.004, offsets.limiter, ones, np.ones((2, n))
     desired.put_out(*given)
     desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)
     desired.put_out(*given)

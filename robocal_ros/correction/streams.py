@@ -150,14 +150,14 @@ class TargetStream:
         pause = now_s - self._came_s
         if self.phase is StreamPhase.RUNNING and pause > self._gap_s():
             self._look_after_pause(q, pause, now_s)
-        if self.phase is StreamPhase.IDLE:
+        if begins := self.phase is StreamPhase.IDLE:
             self._active[:] = 0.0
             self._intervals.clear()
             self._way.clear()
             self._sent.clear()
             self.period_s, self._step_period_s, self._beat_s = np.nan, LONGEST_STEP_S, now_s
         self._note_interval(now_s)
-        if index is not self._index or self.phase is StreamPhase.IDLE:
+        if begins or index is not self._index:
             new = index[self._active[index] == 0.0]
             if len(new):
                 self._begin(new, q, now_s)
@@ -166,7 +166,8 @@ class TargetStream:
             self._index = index
         self._goal = q
         self._note(self._way, q, now_s, SPEED_S)
-        self._velocity[:] = 0.0
+        if command.velocity is None or len(index) < len(q):
+            self._velocity[:] = 0.0
         if command.velocity is not None:
             self._velocity[index] = command.velocity
         self._output.path = None
@@ -214,25 +215,28 @@ class TargetStream:
 
     def _advance(self, now_s: float) -> None:
         """Put out what came in last, or as much of the way there as the speeds allow."""
-        output = self._output
-        self.come_to_rest(now_s)
+        output, period_s = self._output, self._step_period_s
         elapsed = longest = max(now_s - output.out_s, 0.0)
+        before, held_up = output.out.copy(), self._held_up
         if self._holds(elapsed):  # a robot that stands makes no longer step
-            longest = min(elapsed, self._step_period_s)
-        before, window = output.out.copy(), max(SENT_S, SENT_PERIODS * self._step_period_s)
-        if longest < elapsed:  # the time in which the robot stood is no part of its motion
-            self._sent.clear()
-        self._note(self._sent, before, now_s - longest, window)
-        self._held_up = longest < elapsed or (self._held_up and self.lag_s > 0.0)
-        self._speeds[0] = self._fastest
+            output.limiter.state[OFFSET_RATE] = 0.0
+            longest, self._held_up = period_s, True
+            self._sent.clear()  # the time in which it stood is no part of its motion
+        elif self.lag_s == 0.0:
+            self._held_up = False
+        self._note(self._sent, before, now_s - longest, max(SENT_S, SENT_PERIODS * period_s))
         if self._held_up:
             late = self.lag_s >= LATE * CATCH_UP_S
             self._speeds[0] = self._pace() if late else self._catching_up(elapsed, longest)
-        q, fraction, given = self._goal, 1.0, (output.limiter, self._active, self._speeds)
+        elif held_up:
+            self._speeds[0] = self._fastest
+        q, fraction, limiter = self._goal, 1.0, output.limiter
         for _ in range(TRIES):
-            share = self._desired.put_out(q, self._velocity, (elapsed, longest), *given)
+            share = self._desired.put_out(
+                q, self._velocity, elapsed, longest, limiter, self._active, self._speeds
+            )
             if share < 0.0:
-                require_limits(output.limiter.memory[-1:], self._arm)
+                require_limits(limiter.memory[-1:], self._arm)
             if share <= 1.0 + ROUNDING:
                 break
             if fraction == 1.0:
@@ -241,7 +245,7 @@ class TargetStream:
             way = (self._goal - output.taught) * self._active
             q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
         else:
-            output.limiter.state[OFFSET_RATE] = 0.0
+            limiter.state[OFFSET_RATE] = 0.0
         self._before, self._step_s, output.out_s = before, longest, now_s
         output.stage = self._desired.stage if self._desired.made else None
         self.lag_s = 0.0
@@ -337,7 +341,7 @@ class TargetStream:
         if self.lag_s > 0.0 and self._step_s > 0.0:
             velocity = (output.out - self._before)[index] / self._step_s
         else:
-            velocity = output.limiter.memory[VELOCITY, index]
+            velocity = output.limiter.memory[VELOCITY][index]
             if not self._desired.figures[TOO_FAST]:
                 return velocity
         names = [self._arm.joint_names[i] for i in index]

@@ -131,7 +131,7 @@ def streamed(taught: SerialArm, actual: SerialArm, q: np.ndarray) -> np.ndarray:
     limiter.memory[TAUGHT], limiter.memory[OUT] = q[0], q[0] + begin
     offsets, given = [begin], (limiter, np.ones(6), np.full((2, 6), 10.0))
     for at in q[1:]:
-        assert 0.0 <= desired.put_out(at.copy(), np.zeros(6), (DT, DT), *given) <= 1.0
+        assert 0.0 <= desired.put_out(at.copy(), np.zeros(6), DT, DT, *given) <= 1.0
         offsets.append(limiter.memory[OUT] - at)
     return np.array(offsets)
 

@@ -105,6 +105,22 @@ def test_a_driver_whose_clock_is_ahead_starves_no_other() -> None:
     refused(Reason.TIME_BACKWARDS, session.reading, early, robot.now)
 
 
+def test_a_reading_that_was_overtaken_tells_nothing_of_how_late_others_are() -> None:
+    """Finding: those after it, of a robot that was heard 0.15 s late, counted as of now."""
+    session, stall_s, began_s = Robot().session, 0.15, 10.0
+
+    def read(at_s: float, now_s: float) -> float:
+        session.reading(JointCommand(NAMES, HOME, None, round(at_s * SECOND)), now_s, now_s - at_s)
+        return session.late_s
+
+    for count in range(200):
+        at_s = began_s + count * DT
+        late_s = read(at_s, at_s + stall_s * (count > 100))
+    assert late_s == pytest.approx(stall_s, abs=1e-3)
+    refused(Reason.TIME_BACKWARDS, read, at_s - 0.05, at_s + stall_s + DT)
+    assert read(at_s + 2.0 * DT, at_s + 2.0 * DT + stall_s) == pytest.approx(stall_s, abs=1e-3)
+
+
 def test_any_number_of_drivers_takes_no_more_room() -> None:
     robot = Robot()
     for i in range(5000):
