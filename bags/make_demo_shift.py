@@ -4,7 +4,8 @@
 A KR 150 works for three hours with a break. Cold, it shows its sphere to the sensor in twelve
 poses; then, every twelve minutes, in eight of them. The bag holds what a cell would record:
 
-- ``joint_states``: 50 Hz from 0.6 s before to 0.2 s after each measurement, one reading in ten
+- ``joint_states``: 50 Hz from 0.6 s before to 0.2 s after each measurement; before that 10 Hz, from
+  a little before the robot arrives, to show from which side each joint came; one reading in ten
   seconds in between (to keep the file small; a cell records them all);
 - ``measured_point``: sphere centre in the frame ``sensor``, target ``ball``;
 - ``motor_temperatures``: one per joint and minute, named by ``frame_id``;
@@ -44,7 +45,7 @@ AMBIENT_C = 22.0
 PHASES = ((1.6, 1.0), (0.4, 0.0), (1.0, 0.7))  # hours and level: work, break, lighter work
 DUTY = np.array([0.5, 1.0, 1.0, 0.8, 0.6, 0.6])
 PERIOD_S = 720.0
-READING_S = 0.02
+AROUND_S = np.concatenate([np.arange(-1.2, -0.6, 0.1), np.arange(-0.6, 0.2, 0.02)])
 SPARSE_S = 10.0
 MICROMETRE = 1e-6
 
@@ -94,8 +95,7 @@ def header(time_s: float, frame: str = "") -> dict[str, Any]:
 def reading_times(cell: DemoCell) -> Array:
     """When the joints are recorded: densely around the visits, sparsely between them."""
     shift = cell.shift
-    around = np.arange(-0.6, 0.2, READING_S)
-    dense = np.concatenate([visit.time_s + around for visit in shift.visits])
+    dense = np.concatenate([visit.time_s + AROUND_S for visit in shift.visits])
     sparse = np.arange(0.0, shift.path.depart[-1], SPARSE_S) + 0.007
     apart = np.abs(sparse[:, None] - [visit.time_s for visit in shift.visits]).min(axis=1) > 2.0
     times = np.sort(np.concatenate([dense, sparse[apart]]))

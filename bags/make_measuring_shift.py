@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from make_demo_shift import ROBOT, SPARSE_S, Record, header, stamp
+from make_demo_shift import AROUND_S, ROBOT, SPARSE_S, Record, header, stamp
 from make_thermal_shift import DUTY, SEED
 from numpy.typing import NDArray
 from session_events import EventLog
@@ -135,8 +135,7 @@ def build() -> tuple[Shift, list[str], int]:
 
 def records(shift: Shift, names: list[str], points: int, rng: np.random.Generator) -> list[Record]:
     """All that was recorded, in order of time."""
-    around = np.arange(-0.5, 0.2, 0.02)
-    times = np.concatenate([visit.time_s + around for visit in shift.visits])
+    times = np.concatenate([visit.time_s + AROUND_S for visit in shift.visits])
     sparse = np.arange(0.0, shift.path.depart[-1], SPARSE_S) + 0.007
     apart = np.abs(sparse[:, None] - [v.time_s for v in shift.visits]).min(axis=1) > 2.0
     times = np.sort(np.concatenate([times, sparse[apart]]))

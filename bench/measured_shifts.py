@@ -26,6 +26,8 @@ SERVO_RAD = 2e-5  # a pose is reached this well; the encoders show where it real
 MOVE_S = 5.0  # from pose to pose, in a cycle and in production
 SETTLE_S = 1.0  # from arrival to measurement
 REST_S = 1.4  # at a measuring pose
+# A measuring pose is always reached from the same side of each joint, so that backlash cancels.
+APPROACH_RAD, APPROACH_S = float(np.radians(2.0)), 1.0
 
 
 def level_at(phases: Sequence[tuple[float, float]], time_s: float) -> float:
@@ -115,13 +117,13 @@ class _Course:
         self.q: list[Array] = [plan.check[0]]
         self.log: list[tuple[float, Array]] = [(0.0, self.warmth.motor)]
 
-    def move(self, q: Array, rest_s: float, level: float) -> None:
+    def move(self, q: Array, rest_s: float, level: float, move_s: float = MOVE_S) -> None:
         """Go to ``q`` and rest there."""
-        self.arrive.append(self.time_s + MOVE_S)
-        self.depart.append(self.time_s + MOVE_S + rest_s)
+        self.arrive.append(self.time_s + move_s)
+        self.depart.append(self.time_s + move_s + rest_s)
         self.q.append(q)
-        self.warmth = self.warm_up.step(self.warmth, self.plan.duty * level, MOVE_S + rest_s)
-        self.time_s += MOVE_S + rest_s
+        self.warmth = self.warm_up.step(self.warmth, self.plan.duty * level, move_s + rest_s)
+        self.time_s += move_s + rest_s
         self.log.append((self.time_s, self.warmth.motor))
 
 
@@ -141,9 +143,11 @@ def simulate(
         for pose in poses:
             exact = pose + SERVO_RAD * rng.standard_normal(pose.shape)
             reading = np.round(exact / COUNT_RAD) * COUNT_RAD
-            way, gears = reading - course.q[-1], robot.backlash
-            course.move(reading, REST_S, level)
-            behind = None if gears is None else gears.behind(way)
+            before = reading - APPROACH_RAD
+            course.move(before, 0.0, level, MOVE_S - APPROACH_S)
+            course.move(reading, REST_S, level, APPROACH_S)
+            gears = robot.backlash
+            behind = None if gears is None else gears.behind(reading - before)
             flange = robot.flange(reading, course.warmth, rng, behind)[0]
             at = course.time_s - REST_S + SETTLE_S
             rise = float(course.warmth.link[-1])

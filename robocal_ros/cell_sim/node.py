@@ -134,7 +134,7 @@ SETTINGS = (
         0,
         100_000,
     ),
-    Setting("gears", False, "The robot's gears err as real ones do, and have backlash"),
+    Setting("gears", True, "The robot's gears err as real ones do, and have backlash"),
     Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
     Setting("profile", False, "A line laser on the flange of the kr150"),
     Setting("fixture", False, "A fixture of the kr150, and a sensor on the flange that finds it"),

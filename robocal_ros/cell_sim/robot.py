@@ -76,8 +76,7 @@ class Effects:
 
     The estimators model ``static`` and ``drift``, and know the size of ``noise``. Those of a
     drift know nothing of ``compliance``, ``eccentricity``, ``gears``, ``stem`` and
-    ``sensor_warm_up``, and are to recognise ``outliers``. ``gears`` are asked for: without them
-    stand the figures of docs/simulation.md but where it says so.
+    ``sensor_warm_up``, and are to recognise ``outliers``.
     """
 
     static: bool = True
@@ -88,12 +87,12 @@ class Effects:
     stem: bool = True
     sensor_warm_up: bool = True
     outliers: bool = True
-    gears: bool = False
+    gears: bool = True
 
     @classmethod
     def none(cls) -> "Effects":
         """The nominal robot and a perfect sensor."""
-        return cls(*[False] * 8)
+        return cls(*[False] * 9)
 
     @classmethod
     def modelled(cls) -> "Effects":

@@ -152,10 +152,12 @@ def test_the_ball_is_measured_at_each_pose_of_the_cycle():
     came = went(cell, CYCLE, rest_s=1.0)
     assert len(came.shots) == len(CYCLE)
     sensor = cell.plan.sphere.sensor
-    for shot, pose in zip(came.shots, CYCLE, strict=True):
+    before = np.vstack([HOME, CYCLE[:-1]])
+    for shot, pose, last in zip(came.shots, CYCLE, before, strict=True):
         standing = np.max(np.abs(came.qd[np.abs(came.time_s - shot.time_s) < 0.3]))
         assert standing == 0.0
-        T = sensor.T_sensor_base @ cell.plan.robot.flange(pose, Warmth.cold(6))[0]
+        behind = cell.plan.robot.backlash.behind(pose - last)[None]
+        T = sensor.T_sensor_base @ cell.plan.robot.flange(pose, Warmth.cold(6), behind=behind)[0]
         centre = T[:3, :3] @ sensor.ball + T[:3, 3]
         # Its sensor and stem warm up within this minute; the readings are in counts of 1e-6 rad.
         assert shot.centre == pytest.approx(centre, abs=1e-5)

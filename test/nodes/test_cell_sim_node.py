@@ -34,7 +34,7 @@ HOME = np.radians(DEFAULTS["q_start_deg"])
 T_BASE_LASER = laser_pose(DEFAULTS)
 EXACT = {
     "repeatability_mm": 0.0, "edge_noise_mm": 0.0, "input_jitter_ms": 0.0, "ripple": 0.0,
-    "lag_ms": 0.0,
+    "lag_ms": 0.0, "gears": False,
 }  # fmt: skip
 FIRST = ARM.joint_names[0]
 

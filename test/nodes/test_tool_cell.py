@@ -48,6 +48,7 @@ class Cell:
         self.graph, csv = graph, folder / "beams.csv"
         bend = ", ".join(map(str, BEND_MM))
         simulated = {"laser_csv": str(csv), "tool_bend_mm": f"[{bend}]", "seed": 7} | faults
+        simulated["gears"] = "false"  # their model is not in force: no covariance holds them
         simulated["run_program"] = str(motion == "program").lower()
         remap = {
             "next_step": "/tcf_node/next_step",
