@@ -23,16 +23,15 @@ from bench.hand_eye_sets import (
     turned_tsai,
 )
 from bench.tables import Goal, Table
+from robocal_ros.hand_eye.boards import boards_of_corners, see_boards
 from robocal_ros.hand_eye.camera import distances, pair_streams, rms
 from robocal_ros.hand_eye.camera_data import (
     CLOSED_FORMS,
     HAND_EYE,
     PosePairs,
-    boards_of_corners,
     closed_form,
     closed_form_of_all,
     pairs_at,
-    see_boards,
 )
 from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs, linearised
 

@@ -510,15 +510,25 @@ class TrueLens:
         stretch = 1.0 + self.k1 * r2 + self.k2 * r2**2
         return np.column_stack([self.fx * u * stretch + self.cx, self.fy * v * stretch + self.cy])
 
-    def image(self, view: TruePose, columns: int, rows: int, square_m: float) -> NDArray[np.uint8]:
-        """The board of so many inner corners, on white paper a square wider, as a grey image."""
+    def plane(self, view: TruePose) -> tuple[Array, Array]:
+        """X and y, m, where the ray of every sample of an image meets a board's plane."""
         ideal_x, ideal_y = _rays(self)
         R, t = view.R.as_matrix().reshape(3, 3), view.t.ravel()
         # the ray d hits the board where its normal says so
         normal = R[:, 2]
         depth = (normal @ t) / (normal[0] * ideal_x + normal[1] * ideal_y + normal[2])
         away = np.stack([ideal_x * depth - t[0], ideal_y * depth - t[1], depth - t[2]], axis=-1)
-        across, down = away @ R[:, 0] / square_m, away @ R[:, 1] / square_m
+        return away @ R[:, 0], away @ R[:, 1]
+
+    def taken(self, shade: Array) -> Array:
+        """Grey values (h, w) of pixels from those of their samples."""
+        return np.asarray(
+            shade.reshape(self.height, _SAMPLES, self.width, _SAMPLES).mean(axis=(1, 3))
+        )
+
+    def image(self, view: TruePose, columns: int, rows: int, square_m: float) -> NDArray[np.uint8]:
+        """The board of so many inner corners, on white paper a square wider, as a grey image."""
+        across, down = (side / square_m for side in self.plane(view))
         inside = (np.abs(across - (columns - 1) / 2) < (columns + 1) / 2) & (
             np.abs(down - (rows - 1) / 2) < (rows + 1) / 2
         )
@@ -527,8 +537,7 @@ class TrueLens:
         )
         black = inside & ((np.floor(across) + np.floor(down)) % 2 == 0)
         shade = np.where(black, _BLACK, np.where(paper, _WHITE, _BEHIND))
-        shade = shade.reshape(self.height, _SAMPLES, self.width, _SAMPLES).mean(axis=(1, 3))
-        return np.asarray(np.round(shade), dtype=np.uint8)
+        return np.asarray(np.round(self.taken(shade)), dtype=np.uint8)
 
 
 @cache

@@ -16,14 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from bench.ur10_campaigns import data_folder
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye.boards import Chessboard, Image, decode_image
 from robocal_ros.hand_eye.camera_data import (
-    Chessboard,
-    Image,
     Placement,
     PosePairs,
     PoseStream,
     closed_form,
-    decode_image,
     stream_of,
 )
 from robocal_ros.hand_eye.files import write_pose_table

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The adapter node: inputs and scanners as drivers publish them in, beam events and profiles out.
+"""The adapter node: what drivers and detectors publish in; beam events, profiles, poses out.
 
 docs/adapter_node.md.
 """
@@ -7,6 +7,7 @@ docs/adapter_node.md.
 from functools import partial
 from typing import Any
 
+from geometry_msgs.msg import Point, Pose, PoseStamped
 from robocal_msgs.msg import BeamEvent
 from sensor_msgs.msg import LaserScan, PointCloud2
 from std_msgs.msg import Bool
@@ -30,9 +31,9 @@ from robocal_ros.ros.conversions import header, profile_cloud, time_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health
 from robocal_ros.ros.parameters import Setting, number
 
-NONE, CLOUD, SCAN = "none", "cloud", "scan"
+NONE, CLOUD, SCAN, TF = "none", "cloud", "scan", "tf"
 TOPICS = {UR_IO: "io_states", GPIO: "gpio_states"}
-EVENTS, PROFILE = "beam_events", "profile"
+EVENTS, PROFILE, TARGET_POSE = "beam_events", "profile", "target_pose"
 LATE_PERIODS = 10.0  # a driver that is silent for so many has stopped
 
 SETTINGS = (
@@ -85,6 +86,12 @@ SETTINGS = (
         1000.0,
     ),
     Setting("profile_frame", "", "frame_id of profile; empty: that of a cloud; a scan needs one"),
+    Setting(
+        "target_frame",
+        "",
+        "Frame of a tag that a detector puts onto tf, such as tag36h11:0: its poses become "
+        "target_pose; empty: none",
+    ),
 )
 
 
@@ -108,8 +115,18 @@ def io_type(kind: str) -> Any:
         ) from error
 
 
+def tf_type() -> Any:
+    """The message of ``/tf``. Raises `InputError` when its package is not installed."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError as error:
+        words = "target_frame: tf2_msgs is missing: apt install ros-jazzy-tf2-msgs, and source it"
+        raise InputError(words) from error
+    return TFMessage
+
+
 class AdapterNode(HouseNode):
-    """Makes `BeamEvent`s and profiles of what drivers publish."""
+    """Makes `BeamEvent`s, profiles and poses of targets of what others publish."""
 
     NAME = "adapter_node"
     SETTINGS = SETTINGS
@@ -118,13 +135,16 @@ class AdapterNode(HouseNode):
         """Open what is listened to; raise where the inputs do not fit the beams."""
         settings = self.settings
         kind, looks = settings["input"], settings["profile_input"]
-        if kind == looks == NONE:
-            raise InputError("input and profile_input are both none: there is nothing to adapt")
+        if kind == looks == NONE and not settings["target_frame"]:
+            raise InputError(
+                "input and profile_input are none, target_frame is empty: there is nothing to adapt"
+            )
         if looks == SCAN and not settings["profile_frame"]:
             raise InputError("profile_frame is empty: name the frame of the profiles of a scan")
         self._levels: dict[str, BeamLevel] = {}
         self._topics: dict[str, tuple[str, type]] = {}
-        self._edges = self._profiles = 0
+        self._edges = self._profiles = self._poses = 0
+        self._cameras: dict[str, int] = {}  # and the stamp of the newest pose in each
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         if kind != NONE:
             self._open_beams(kind)
@@ -133,9 +153,13 @@ class AdapterNode(HouseNode):
             taken = LaserScan if looks == SCAN else PointCloud2
             act = self._take_scan if looks == SCAN else self._take_cloud
             self._listen(taken, looks, act, endpoints.SENSOR)
+        if settings["target_frame"]:
+            self._target = self.add_output(PoseStamped, TARGET_POSE, endpoints.SENSOR)
+            self.add_input(tf_type(), "/tf", self._take_tf, endpoints.STREAM)
 
     def activate(self) -> None:
-        """What the levels were before is not known."""
+        """What the levels were before is not known, nor who saw the tag."""
+        self._cameras = {}
         timing = InputTiming(
             *(self.settings[f"{name}_ms"] * 1e-3 for name in ("latency", "jitter", "period"))
         )
@@ -205,6 +229,21 @@ class AdapterNode(HouseNode):
         self._profiles += 1
         self._profile.publish(message)
 
+    def _take_tf(self, message: Any) -> None:
+        """The tag's transforms of all on tf, each once: some publishers repeat what they told."""
+        for found in message.transforms:
+            if found.child_frame_id != self.settings["target_frame"]:
+                continue
+            camera, at_ns = found.header.frame_id, stamp_ns(found.header.stamp)
+            if self._cameras.get(camera) == at_ns:
+                continue
+            self._cameras[camera] = at_ns
+            self._poses += 1
+            t = found.transform.translation
+            place = Point(x=t.x, y=t.y, z=t.z)
+            pose = Pose(position=place, orientation=found.transform.rotation)
+            self._target.publish(PoseStamped(header=found.header, pose=pose))
+
     def health(self) -> Health:
         """Tell the latencies, which are so in each recording, the levels, and what is not heard."""
         settings, health = self.settings, Health()
@@ -220,6 +259,15 @@ class AdapterNode(HouseNode):
                 "profile latency subtracted ms": settings["profile_latency_ms"],
                 "profiles": self._profiles,
             }
+        if tag := settings["target_frame"]:
+            health.values |= {"target poses": self._poses, "cameras": ", ".join(self._cameras)}
+            if not self._cameras:
+                health.worsen(
+                    WARN, f"no {tag} on /tf yet: does its detector see it, and publish it?"
+                )
+            elif len(self._cameras) > 1:
+                told = ", ".join(sorted(self._cameras))
+                health.worsen(WARN, f"{tag} is told in frames {told}: hand_eye_node takes one")
         silent_s = LATE_PERIODS * settings["period_ms"] * 1e-3
         for beam, level in self._levels.items():
             words = {None: "unknown", True: "interrupted", False: "free"}[level.blocked]

@@ -348,7 +348,8 @@ def write_data_set(
 def _shot(topic: str, header: Document, values: Sequence[Sequence[float]]) -> Document:
     """Message of a profile, point, pose or image (rows: its width and height, each corner)."""
     if topic == IMAGE:
-        layout = [("size and corners", len(values), 2 * len(values)), ("x, y", 2, 2)]
+        wide = len(values[0])  # of a ChArUco board with the number of each corner
+        layout = [("size and corners", len(values), wide * len(values)), ("x, y", wide, wide)]
         dim = [{"label": label, "size": n, "stride": stride} for label, n, stride in layout]
         return {"layout": {"dim": dim, "data_offset": 0}, "data": np.ravel(values)}
     if topic == PROFILE:
@@ -405,9 +406,10 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
 
 
 def _values(recorded: BagMessage) -> Array:
-    """Points (n, 2) of a cloud; point (1, 3); pose (1, 7); size and corners (1 + n, 2), image."""
+    """Points (n, 2) of a cloud; point (1, 3); pose (1, 7); size and corners of an image."""
     if recorded.topic == IMAGE:
-        return np.asarray(recorded.message.data, dtype=np.float64).reshape(-1, 2)
+        wide = recorded.message.layout.dim[1].size
+        return np.asarray(recorded.message.data, dtype=np.float64).reshape(-1, wide)
     if recorded.topic == PROFILE:
         return cloud_points(recorded.message)[:, [0, 2]]
     if recorded.topic == TRACKER_POINT:

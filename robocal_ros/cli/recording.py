@@ -39,7 +39,7 @@ from robocal_ros.ground.samples import (
     TEMPERATURES,
     stamp_ns,
 )
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, SHOTS, TARGET_POSE, TRACKER_POINT
+from robocal_ros.hand_eye.data import COMPRESSED, IMAGE, PROFILE, SHOTS, TARGET_POSE, TRACKER_POINT
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import robot_folders
 from robocal_ros.session.events import Command
@@ -65,6 +65,7 @@ TYPES = {  # of the messages that an input is read from, where others may look l
     PROFILE: ("sensor_msgs/msg/PointCloud2",),
     TARGET_POSE: ("geometry_msgs/msg/PoseStamped",),
     IMAGE: ("sensor_msgs/msg/Image",),
+    COMPRESSED: ("sensor_msgs/msg/CompressedImage",),
     TRACKER_POINT: _POINTS,
     POINT: ("geometry_msgs/msg/PointStamped",),
     EVENTS: ("robocal_msgs/msg/SessionEvent",),
@@ -110,7 +111,8 @@ class BagOverview:
 
         Raises `InputError` when the bag lacks an input that the session had.
         """
-        lacking = needed_inputs(self.configured, self.commands) - set(self.inputs.values())
+        held = {kind.split("/")[0] for kind in self.inputs.values()}  # image/compressed: an image
+        lacking = needed_inputs(self.configured, self.commands) - held
         if not lacking:
             return
         recorded = {} if self.configured is None else self.configured.arguments.get("topics", {})

@@ -25,6 +25,15 @@ from robocal_ros.estimation.assessment import verdict_document
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import transform_document
+from robocal_ros.hand_eye.boards import (
+    Chessboard,
+    Intrinsics,
+    SeenBoards,
+    board_pairs,
+    intrinsics_document,
+    read_intrinsics,
+    see_boards,
+)
 from robocal_ros.hand_eye.camera import (
     METHODS,
     CameraSettings,
@@ -32,17 +41,7 @@ from robocal_ros.hand_eye.camera import (
     calibrate_camera,
     calibrate_streams,
 )
-from robocal_ros.hand_eye.camera_data import (
-    Chessboard,
-    Intrinsics,
-    PosePairs,
-    SeenBoards,
-    board_pairs,
-    intrinsics_document,
-    read_intrinsics,
-    see_boards,
-    stream_of,
-)
+from robocal_ros.hand_eye.camera_data import PosePairs, stream_of
 from robocal_ros.hand_eye.camera_fit import GivenNoise
 from robocal_ros.hand_eye.cli import (
     LIMIT_MM,
@@ -84,7 +83,13 @@ from robocal_ros.hand_eye.planning import (
 )
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise, hand_eye_document
-from robocal_ros.hand_eye.targets import FARTHEST_MM, TrackerTarget, read_tracker_target
+from robocal_ros.hand_eye.targets import (
+    FARTHEST_MM,
+    BoardTarget,
+    TrackerTarget,
+    read_target,
+    read_tracker_target,
+)
 from robocal_ros.hand_eye.tracker import LIMIT_M, solve_tracker
 from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise
 from robocal_ros.kinematics import SerialArm
@@ -110,9 +115,7 @@ def _tables(
 
 
 def _from_images(args: argparse.Namespace, settings: CameraSettings) -> HandEyeResult:
-    columns, rows = args.board
-    board = Chessboard(columns, rows, args.square_mm * 1e-3)
-    intrinsics = None if args.intrinsics is None else read_intrinsics(args.intrinsics)
+    board, intrinsics = _described(args)
     used, judges = _tables(args, "image")
     pairs, seen = _pairs_of_images(used, args, board, intrinsics)
     check = None
@@ -126,6 +129,25 @@ def _from_images(args: argparse.Namespace, settings: CameraSettings) -> HandEyeR
         rejected=seen.rejected,
         more={"intrinsics": intrinsics_document(seen, intrinsics is None)},
     )
+
+
+def _described(args: argparse.Namespace) -> tuple[Chessboard, Intrinsics | None]:
+    """The board and what is known of the camera, from the options or a target file."""
+    intrinsics = None if args.intrinsics is None else read_intrinsics(args.intrinsics)
+    if isinstance(args.board, tuple):
+        if args.square_mm is None:
+            raise InputError("give --square-mm, the side of a square of the board")
+        columns, rows = args.board
+        return Chessboard(columns, rows, args.square_mm * 1e-3), intrinsics
+    if args.square_mm is not None:
+        raise InputError("--square-mm belongs to --board 9x6: a file tells the size itself")
+    target = read_target(args.board)
+    if not isinstance(target, BoardTarget):
+        raise InputError("describes no board", file=str(args.board))
+    if target.camera_info and intrinsics is None:
+        words = "takes the intrinsics from a topic: give them as --intrinsics"
+        raise InputError(words, file=str(args.board))
+    return target.board, intrinsics or target.intrinsics
 
 
 def _pairs_of_images(
@@ -210,7 +232,12 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--profiles", "--images", type=Path, metavar="DIR", help="folder of the images"
     )
-    parser.add_argument("--board", type=_board, metavar="9x6", help="inner corners of the board")
+    parser.add_argument(
+        "--board",
+        type=_board,
+        metavar="9x6",
+        help="inner corners of the board, or a file that describes it (also of a ChArUco board)",
+    )
     parser.add_argument("--square-mm", type=positive, metavar="S", help="side of a square")
     parser.add_argument(
         "--intrinsics",
@@ -253,7 +280,7 @@ def run_camera(args: argparse.Namespace) -> CliResult:
                     "one of both"
                 )
         result = _from_poses(args, settings)
-    elif args.profiles is None or args.board is None or args.square_mm is None:
+    elif args.profiles is None or args.board is None:
         raise InputError(
             "give --profiles, --board and --square-mm for images, or --measured for board poses"
         )
@@ -262,10 +289,12 @@ def run_camera(args: argparse.Namespace) -> CliResult:
     return CliResult(hand_eye_document(result), _show_camera)
 
 
-def _board(value: str) -> tuple[int, int]:
-    """Type of inner corners along both sides, such as 9x6."""
+def _board(value: str) -> tuple[int, int] | Path:
+    """Type of inner corners along both sides, such as 9x6, or of a file."""
     sides = value.lower().split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        if Path(value).suffix:
+            return Path(value)
         raise argparse.ArgumentTypeError(f"'{value}' is not columns and rows such as 9x6")
     return int(sides[0]), int(sides[1])
 

@@ -21,13 +21,13 @@ from robocal_ros.ground.samples import (
     JointStream,
     NotStillError,
     StandstillRule,
-    image_array,
     joint_sample,
     point_sample,
     pose_sample,
     stamp_ns,
 )
-from robocal_ros.hand_eye.camera_data import Mount, find_corners
+from robocal_ros.hand_eye.boards import find_corners, message_image
+from robocal_ros.hand_eye.camera_data import Mount
 from robocal_ros.hand_eye.profiles import DEFAULT, SensorDescription, cloud_profile, profile_of
 from robocal_ros.hand_eye.targets import ROLES, BoardTarget, target_of
 from robocal_ros.history.history_records import Head
@@ -38,7 +38,8 @@ from robocal_ros.session.events import GAP_NS, Command, Ignored
 
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
 TRACKER_POINT = "tracker_point"
-SHOTS = (PROFILE, TARGET_POSE, IMAGE, TRACKER_POINT)
+COMPRESSED = "image/compressed"  # the input ``image`` in another encoding
+SHOTS = (PROFILE, TARGET_POSE, IMAGE, COMPRESSED, TRACKER_POINT)
 MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
 AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 FARTHEST_TRACKED_M = 100.0  # the longest trackers measure 80 m
@@ -46,9 +47,10 @@ FARTHEST_TRACKED_M = 100.0  # the longest trackers measure 80 m
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One profile (``PointCloud2``), target pose (``PoseStamped``), image (``Image``) or point.
+    """One profile (``PointCloud2``), target pose (``PoseStamped``), image or point.
 
-    A point (``PointStamped``) is the reflector of a laser tracker.
+    An image is an ``Image`` or a ``CompressedImage``; a point (``PointStamped``) is the reflector
+    of a laser tracker.
 
     ``sensor``: how a line laser tells its profiles.
     """
@@ -81,6 +83,7 @@ class Shot:
 
 def shot_of(topic: str, message: Any, sensor: SensorDescription = DEFAULT) -> Shot:
     """A shot from the message of an input; its content is not looked at."""
+    topic = IMAGE if topic == COMPRESSED else topic
     return Shot(topic, stamp_ns(message.header.stamp), message.header.frame_id, message, sensor)
 
 
@@ -100,7 +103,7 @@ def _tracked(message: Any) -> Array:
 
 _READERS: Mapping[str, Callable[[Any], NDArray[Any]]] = {
     TARGET_POSE: _pose,
-    IMAGE: image_array,
+    IMAGE: message_image,
     TRACKER_POINT: _tracked,
 }
 
@@ -445,13 +448,11 @@ class DataSet:
 
     def _require_image(self, values: Array) -> None:
         """Refuse corners of another board, or of an image of another size."""
-        count = int(self.target["columns"]) * int(self.target["rows"])
-        if len(values) != 1 + count:
-            raise InputError(f"{len(values) - 1} corners where the board has {count}")
+        board_of(self.target).board.seen(values[1:])
         first = next(iter(self.samples.values()), None)
-        expected = self.target.get("size") or (values if first is None else first.values)[0]
-        if not np.array_equal(values[0], expected):
-            found, wanted = ("{:.0f}x{:.0f} px".format(*size) for size in (values[0], expected))
+        expected = self.target.get("size") or (values if first is None else first.values)[0, :2]
+        if not np.array_equal(values[0, :2], expected):
+            found, wanted = ("{:.0f}x{:.0f} px".format(*size[:2]) for size in (values[0], expected))
             raise InputError(
                 f"the image has {found} where {wanted} are expected, as the intrinsics or the "
                 "samples before have it: keep the camera at one resolution"
@@ -559,7 +560,7 @@ def _sample_of(
     if topic == PROFILE:
         profile_of(values, f"of sample {handle}")
     elif topic == IMAGE:
-        values = values.reshape(-1, 2)
+        values = values if values.ndim == 2 else values.reshape(-1, 2)
     elif topic == TRACKER_POINT:
         values = values.reshape(1, 3)
     elif values.shape != (1, 7) or abs(float(np.linalg.norm(values[0, 3:])) - 1.0) > UNIT:
@@ -573,6 +574,8 @@ def _sample_of(
 def seen_corners(target: Mapping[str, Any], shot: Shot) -> Array:
     """Width and height of an image, then the corners of the board in it: (1 + n, 2), px.
 
+    Of a ChArUco board (1 + k, 3), with the number of each corner that is seen.
+
     Raises `InputError` when the image does not show the board.
     """
     board = board_of(target).board
@@ -580,10 +583,12 @@ def seen_corners(target: Mapping[str, Any], shot: Shot) -> Array:
     corners = find_corners(image, board)
     if corners is None:
         raise InputError(
-            f"no board of {board.columns}x{board.rows} inner corners in the image of "
-            f"{shot.stamp_ns} ns: look for light, focus, and that all of the board is in sight"
+            f"no {board} in the image of {shot.stamp_ns} ns: look for light, focus, and that "
+            f"{'enough' if board.markers else 'all'} of the board is in sight"
         )
-    return np.vstack([image.shape[::-1], corners])
+    width_height = np.zeros((1, corners.shape[1]))
+    width_height[0, :2] = image.shape[::-1]
+    return np.vstack([width_height, corners])
 
 
 def board_of(target: Mapping[str, Any]) -> BoardTarget:

@@ -22,7 +22,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted, read_bytes
 from robocal_ros.ground.frames import Array, fixed, urdf_joint, urdf_origin
-from robocal_ros.hand_eye.camera_data import Image, decode_image
+from robocal_ros.hand_eye.boards import Image, decode_image
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.profiles import (
     CLOUDS,

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PointStamped, PoseStamped
-from sensor_msgs.msg import Image, JointState, PointCloud2
+from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.samples import JOINTS, Silence
 from robocal_ros.hand_eye.data import (
+    COMPRESSED,
     FEATURES,
     IMAGE,
     MOUNTS,
@@ -27,7 +28,12 @@ from robocal_ros.hand_eye.data import (
 )
 from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, sensor_of
 from robocal_ros.hand_eye.result import METHODS
-from robocal_ros.hand_eye.services import HandEyeFiles, HandEyeOutputs, HandEyeServices
+from robocal_ros.hand_eye.services import (
+    CameraTopic,
+    HandEyeFiles,
+    HandEyeOutputs,
+    HandEyeServices,
+)
 from robocal_ros.hand_eye.session import (
     HandEyeConfig,
     HandEyeSession,
@@ -58,6 +64,7 @@ INPUTS = {
     PROFILE: (PointCloud2, endpoints.SENSOR),
     TARGET_POSE: (PoseStamped, endpoints.SENSOR),
     IMAGE: (Image, endpoints.SENSOR),
+    COMPRESSED: (CompressedImage, endpoints.SENSOR),
     TRACKER_POINT: (PointStamped, endpoints.SENSOR),
 }
 
@@ -213,7 +220,8 @@ class HandEyeNode(SessionNode[HandEyeSession]):
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
         ask, session = self._desk.ask, self._running
         self._files = HandEyeFiles(self, ask, session, history)
-        HandEyeServices(self, settings, ask, self._files, session, history)
+        self._camera = CameraTopic(self)
+        HandEyeServices(self, settings, ask, self._files, session, history, self._camera)
         DecisionServices(self.add_service, self._ask_decision, history, self._kind)
         self.add_timer(WATCH_S, self._watch, steady=True)
 
@@ -361,6 +369,8 @@ class HandEyeNode(SessionNode[HandEyeSession]):
             health.worsen(ERROR, taken)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
+        if data is not None and (told := self._camera.doubt(data.target)):
+            health.worsen(WARN, told)
 
 
 def main() -> None:

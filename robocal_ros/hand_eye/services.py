@@ -21,12 +21,14 @@ from robocal_msgs.srv import (
     RemoveHandEye,
     StartHandEye,
 )
+from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.files import made_folder_beside
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import joint_sample
+from robocal_ros.hand_eye.boards import Intrinsics, pixels_apart, told_intrinsics
 from robocal_ros.hand_eye.data import (
     IN_HAND,
     MOST_POINTS,
@@ -40,7 +42,14 @@ from robocal_ros.hand_eye.data import (
 )
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.session import HandEyeSession, sample_poses, solved
-from robocal_ros.hand_eye.targets import KIND_OF, read_target, target_document
+from robocal_ros.hand_eye.targets import (
+    CAMERA_INFO,
+    KIND_OF,
+    BoardTarget,
+    read_target,
+    target_document,
+    target_of,
+)
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
 from robocal_ros.history.history_records import Head, hand_eye_kind
@@ -59,6 +68,7 @@ Ask = Callable[[Command], Awaitable[Outcome]]
 
 KEPT, SUFFIX = "hand_eye", ".mcap"
 RUNS, LONGEST_RUNS_S = 5, 3.0  # of a calibration whose time is taken
+MOST_APART_PX = 1.0  # two calibrations of one camera agree to some tenths where boards were
 ROUGH = "rough"  # the parameters that say about where the sensor sits
 
 TARGETS = dict(enumerate(TOPIC_OF, 1))  # by the constants of HandEyeStatus
@@ -347,12 +357,69 @@ def start_arguments(
     }
 
 
+class CameraTopic:
+    """What ``camera_info`` tells, beside the intrinsics of the open data set.
+
+    A session knows them from the command that begins a set: a replay does not need the topic.
+    """
+
+    def __init__(self, node: EndpointNode) -> None:
+        self._message: Any = None
+        node.add_input(CameraInfo, CAMERA_INFO, self._take, endpoints.SENSOR)
+
+    def _take(self, message: Any) -> None:
+        self._message = message
+
+    def _told(self, target: BoardTarget) -> Intrinsics:
+        if self._message is None:
+            raise InputError(
+                "no camera_info has come yet, and the target file takes the intrinsics from it: "
+                "does the camera publish it, in this namespace?"
+            )
+        return told_intrinsics(self._message, target.rectified)
+
+    def given(self, document: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A target's document with the camera of the topic, where its file takes that.
+
+        Raises `InputError` when nothing has come, or it tells no camera that is known.
+        """
+        target = target_of(document)
+        if not isinstance(target, BoardTarget) or not target.camera_info:
+            return document
+        return target_document("camera", target.with_intrinsics(self._told(target)))
+
+    def require_same(self, document: Mapping[str, Any]) -> None:
+        """Raise `InputError` when the camera is not any more what the open set took it for."""
+        if fault := self._apart(document, taken=True):
+            raise InputError(f"{fault}: was it set anew? Start a new data set")
+
+    def doubt(self, document: Mapping[str, Any]) -> str:
+        """What is to be told of intrinsics from a file; empty: nothing."""
+        return self._apart(document, taken=False)
+
+    def _apart(self, document: Mapping[str, Any], taken: bool) -> str:
+        target = target_of(document) if "columns" in document else None
+        if not isinstance(target, BoardTarget) or target.intrinsics is None:
+            return ""
+        if self._message is None or bool(target.camera_info) != taken:
+            return ""
+        try:
+            apart_px = pixels_apart(target.intrinsics, self._told(target))
+        except InputError as error:
+            return str(error) if taken else ""  # a camera that is not calibrated tells no other one
+        if apart_px <= (0.0 if taken else MOST_APART_PX):
+            return ""
+        how = f"by up to {apart_px:.1f} px" if np.isfinite(apart_px) else "in the size of images"
+        return f"camera_info differs from the intrinsics of the data set {how}"
+
+
 class HandEyeServices:
     """Data set, captures, calibration, with their Trigger twins.
 
     ``ask``: gives a command to the session and awaits its outcome.
     ``files``: asks where data sets begin or are calibrated.
     ``session``: the one that runs; raises while the node is inactive.
+    ``camera``: what the camera tells of itself.
     """
 
     def __init__(
@@ -363,9 +430,11 @@ class HandEyeServices:
         files: HandEyeFiles,
         session: Callable[[], HandEyeSession],
         history: CalibrationHistory,
+        camera: CameraTopic,
     ) -> None:
         self._node, self._settings, self._ask = node, settings, ask
         self._files, self._session, self._history = files, session, history
+        self._camera = camera
         add = node.add_service
         add(StartHandEye, "~/start", self._start)
         add(Trigger, "~/start_trigger", self._start_twin)
@@ -384,12 +453,16 @@ class HandEyeServices:
     async def _start(self, request: Any, response: Any) -> Any:
         kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
         given = kind, request.target_file, request.feature, request.method, mount
-        arguments = start_arguments(self._settings, *given)
+        arguments = self._begun(*given)
         return answer(response, await self._files.begin(Command(START, arguments)))
+
+    def _begun(self, *given: str) -> dict[str, Any]:
+        arguments = start_arguments(self._settings, *given)
+        return arguments | {"target": self._camera.given(arguments["target"])}
 
     async def _start_twin(self, request: Any, response: Any) -> Any:
         try:
-            arguments = start_arguments(self._settings)
+            arguments = self._begun()
         except RobocalError as error:
             response.message = trigger_text(0, error.code, str(error))
             return response
@@ -398,6 +471,8 @@ class HandEyeServices:
     async def _capture_now(self, arguments: Mapping[str, Any]) -> Outcome:
         """A capture takes nothing that was received before its call."""
         self._node.take_waiting()
+        if (data := self._session().data) is not None:
+            self._camera.require_same(data.target)
         return await self._ask(Command(CAPTURE, arguments))
 
     async def _capture(self, request: Any, response: Any) -> Any:

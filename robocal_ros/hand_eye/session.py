@@ -28,6 +28,7 @@ from robocal_ros.ground.samples import (
     joint_sample,
 )
 from robocal_ros.hand_eye.data import (
+    COMPRESSED,
     FEATURES,
     IMAGE,
     MOST_CAPTURES,
@@ -259,13 +260,9 @@ def _solved_camera(
     data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
 ) -> HandEyeResult:
     """From the corners of a board in images, or from poses of the target."""
+    from robocal_ros.hand_eye.boards import board_pairs, boards_of_corners, intrinsics_document
     from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
-    from robocal_ros.hand_eye.camera_data import (
-        PosePairs,
-        board_pairs,
-        boards_of_corners,
-        intrinsics_document,
-    )
+    from robocal_ros.hand_eye.camera_data import PosePairs
     from robocal_ros.hand_eye.camera_fit import GivenNoise
 
     names = tuple(str(sample.handle) for sample in samples)
@@ -277,8 +274,8 @@ def _solved_camera(
         pairs = PosePairs(T_base_flange, T_camera_board, names, data.mount)
         return calibrate_camera(pairs, settings)
     target = board_of(data.target)
-    corners = np.array([sample.values[1:] for sample in samples])
-    width, height = samples[0].values[0]
+    corners = [sample.values[1:] for sample in samples]
+    width, height = samples[0].values[0, :2]
     size = int(width), int(height)
     boards = boards_of_corners(names, corners, target.board, size, target.intrinsics)
     return calibrate_camera(
@@ -601,6 +598,7 @@ class HandEyeSession(SessionBase):
 
 def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> None:
     """Give a message to the session; one that cannot be used is counted with its reason."""
+    kind = IMAGE if kind == COMPRESSED else kind
     try:
         if kind == JOINTS:
             session.add(joint_sample(message))

@@ -15,7 +15,14 @@ import numpy as np
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.hand_eye.camera_data import FEWEST_CORNERS, Chessboard, Intrinsics, read_intrinsics
+from robocal_ros.hand_eye.boards import (
+    DICTIONARIES,
+    FEWEST_CORNERS,
+    Chessboard,
+    Intrinsics,
+    Markers,
+    read_intrinsics,
+)
 from robocal_ros.kinematics.robots import Fields, read_fields, read_pose
 
 
@@ -43,7 +50,7 @@ FirstStep = Literal["lowest", "highest"]
 
 MACHINING_M = 1e-4 / 3.0  # one sigma of a target that is machined to 0.1 mm
 NEAR, FAR = "near", "far"
-KINDS = ("sphere", "step", "line", "board", "tracker")
+KINDS = ("sphere", "step", "line", "board", "charuco", "tracker")
 CORNERS: dict[str, CornerKind] = {"convex": "convex", "concave": "concave", "both": "both"}
 FIRST: dict[str, FirstStep] = {"lowest": "lowest", "highest": "highest"}
 SMALLEST_MM, LARGEST_MM = 1.0, 1000.0  # of a sphere's radius
@@ -52,6 +59,7 @@ FARTHEST_REFLECTOR_MM = 1e3  # of the reflector from the flange's origin
 ROUNDING = 1e-3  # of the axes of a frame, from unit vectors at right angles
 MOST_STEPS = 100
 MOST_CORNERS = 100  # along a side of a board
+CAMERA_INFO = "camera_info"  # in the place of a file of intrinsics: the topic
 
 
 @dataclass(frozen=True)
@@ -101,8 +109,10 @@ class BoardTarget:
     """A chessboard that a camera sees, and what is known of this camera.
 
     ``columns``, ``rows``, ``square_m``: see `Chessboard`.
-    ``matrix``, ``distortion``, ``size``: see `Intrinsics`; all three, or None: found from the
-    images.
+    ``matrix``, ``distortion``, ``size``, ``model``: see `Intrinsics`; of the first three all, or
+    None: found from the images.
+    ``dictionary``, ``marker_m``, ``legacy``: of a ChArUco board, see `Markers`; empty: none.
+    ``camera_info``: the camera is what the topic tells, of rectified images where ``rectified``.
     """
 
     columns: int
@@ -111,11 +121,20 @@ class BoardTarget:
     matrix: Array | None = None
     distortion: Array | None = None
     size: Array | None = None
+    model: str = "plumb_bob"
+    dictionary: str = ""
+    marker_m: float = 0.0
+    legacy: bool = False
+    camera_info: bool = False
+    rectified: bool = False
 
     @property
     def board(self) -> Chessboard:
-        """The chessboard alone. Raises `InputError` when it has too few corners."""
-        return Chessboard(self.columns, self.rows, self.square_m)
+        """The board alone. Raises `InputError` when no board is like that."""
+        markers = None
+        if self.dictionary:
+            markers = Markers(self.dictionary, self.marker_m, bool(self.legacy))
+        return Chessboard(self.columns, self.rows, self.square_m, markers)
 
     @property
     def intrinsics(self) -> Intrinsics | None:
@@ -123,7 +142,14 @@ class BoardTarget:
         if self.matrix is None or self.distortion is None or self.size is None:
             return None
         width, height = self.size
-        return Intrinsics(self.matrix, self.distortion, (int(width), int(height)))
+        return Intrinsics(self.matrix, self.distortion, (int(width), int(height)), model=self.model)
+
+    def with_intrinsics(self, camera: Intrinsics) -> "BoardTarget":
+        """The same board before a known camera."""
+        size = np.array(camera.size, dtype=np.float64)
+        return replace(
+            self, matrix=camera.matrix, distortion=camera.distortion, size=size, model=camera.model
+        )
 
 
 @dataclass(frozen=True)
@@ -210,7 +236,10 @@ def target_of(document: Mapping[str, Any]) -> Target | None:
         target = TYPE_OF[document["kind"]](**values)
         for field in fields(target):
             value = getattr(target, field.name)
-            if value is not None or field.default is not None:
+            if isinstance(field.default, str):
+                if not isinstance(value, str):
+                    raise ValueError(f"{field.name} is {value}")
+            elif value is not None or field.default is not None:
                 _require_numbers(field.name, value)
         return target
     except (KeyError, TypeError, ValueError) as error:
@@ -253,8 +282,8 @@ def read_target(path: Path) -> Target:
     if kind == "sphere":
         top.only("kind", "radius_mm")
         return SphereTarget(_radius(top, "radius_mm"))
-    if kind == "board":
-        return _board(top, path.parent)
+    if kind in ("board", "charuco"):
+        return _board(top, path.parent, kind == "charuco")
     if kind == "step":
         return _step(top)
     if kind == "tracker":
@@ -276,15 +305,45 @@ def _radius(top: Fields, key: str) -> float:
     return radius_mm * 1e-3
 
 
-def _board(top: Fields, folder: Path) -> BoardTarget:
-    top.only("kind", "columns", "rows", "square_mm", "intrinsics")
-    columns, rows = (top.whole(key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows"))
-    square_m = top.positive("square_mm") * 1e-3
-    if "intrinsics" not in top.values:
-        return BoardTarget(columns, rows, square_m)
-    camera = read_intrinsics(folder / top.text("intrinsics"))
-    size = np.array(camera.size, dtype=np.float64)
-    return BoardTarget(columns, rows, square_m, camera.matrix, camera.distortion, size)
+def _board(top: Fields, folder: Path, marked: bool) -> BoardTarget:
+    camera = ("intrinsics", "rectified")
+    if marked:
+        top.only("kind", "squares", "square_mm", "marker_mm", "dictionary", "legacy", *camera)
+        sides = dict(zip("xy", top.numbers("squares", 2), strict=True))
+        squares = Fields(sides, top.file, "squares")
+        columns, rows = (squares.whole(side, FEWEST_CORNERS + 1, MOST_CORNERS) - 1 for side in "xy")
+        board = BoardTarget(
+            columns,
+            rows,
+            top.positive("square_mm") * 1e-3,
+            dictionary=top.choice("dictionary", DICTIONARIES),
+            marker_m=top.positive("marker_mm") * 1e-3,
+            legacy=_yes(top, "legacy"),
+        )
+    else:
+        top.only("kind", "columns", "rows", "square_mm", *camera)
+        columns, rows = (
+            top.whole(key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows")
+        )
+        board = BoardTarget(columns, rows, top.positive("square_mm") * 1e-3)
+    try:
+        _ = board.board
+    except InputError as error:
+        top.fail(f"describes no board: {error}")
+    rectified = _yes(top, "rectified")
+    given = top.text("intrinsics") if "intrinsics" in top.values else ""
+    if given == CAMERA_INFO:
+        return replace(board, camera_info=True, rectified=rectified)
+    if rectified:
+        top.fail(f"belongs to 'intrinsics: {CAMERA_INFO}'", "rectified")
+    return board.with_intrinsics(read_intrinsics(folder / given)) if given else board
+
+
+def _yes(top: Fields, key: str) -> bool:
+    value = top.values.get(key, False)
+    if not isinstance(value, bool):
+        top.fail("must be true or false", key)
+    return value
 
 
 def _step(top: Fields) -> StepTarget:

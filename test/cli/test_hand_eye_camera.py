@@ -186,7 +186,7 @@ def test_tables_of_different_length_are_refused(robocal, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("plumb_bob", "equidistant", "distortion_model is 'equidistant'"),
+        ("plumb_bob", "fov", "distortion_model is 'fov'"),
         ("image_width", "width", "'width' is not a known key"),
         ("image_width: 640\n", "", "image_width is missing"),
         ("640", "640.7", "image_width is 640.7; it must be a whole number"),

@@ -10,16 +10,16 @@ from scipy.stats import chi2
 
 from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
-from robocal_ros.hand_eye.camera_data import (
+from robocal_ros.hand_eye.boards import (
     Chessboard,
     Intrinsics,
-    PosePairs,
     boards_of_corners,
     decode_image,
     find_corners,
     see_boards,
 )
+from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
 
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from board_driver import LENS, board_file, board_set, image
 from command import robocal_json
-from hand_eye_driver import TYPE, Recorded
-from hand_eye_live import NAME, LiveSensor
+from hand_eye_live import NAME, LiveSensor, recorded
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import HandEyeFile
 
-from robocal_ros.bags.bags import BagWriter, read_bag
+from robocal_ros.bags.bags import read_bag
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros.session_node import EVENTS
@@ -68,8 +67,7 @@ def test_a_camera_is_calibrated_from_images_and_replayed_to_the_last_bit(
     assert (again.sensor, again.covariance) == (result.sensor, result.covariance)
     commands = 1 + 2 * (1 + COUNT) + 1 + 1 + 1
     graph.spin_until(lambda: len(live) >= commands + 2, "all events, with the configuration")
-    bag = tmp_path / "live.mcap"
-    _record(bag, camera.sent, live)
+    bag = recorded(tmp_path, camera.sent, live)
     document = robocal_json("replay.hand_eye.json", "replay", bag)
     assert document["differs"] == []
     first, second = document["calibrations"]
@@ -79,16 +77,6 @@ def test_a_camera_is_calibrated_from_images_and_replayed_to_the_last_bit(
         c for c in document["commands"] if c["command"] == "sample" and c["code"] != "ACCEPT"
     ]
     assert [c["code"] for c in failures] == ["BAD_INPUT"]
-
-
-def _record(path: Path, sent: list[Recorded], live: list[SessionEvent]) -> None:
-    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
-        now_ns = 0
-        for message in sent:
-            now_ns = max(now_ns, message.stamp_ns)
-            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
-        for event in live:
-            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
 
 
 def test_images_that_are_not_read_are_named(graph: Any, camera: LiveSensor) -> None:

@@ -123,7 +123,8 @@ def test_it_allows_what_the_node_has_and_no_more(graph: Any, tmp_path: Path) -> 
         "plc_bridge_node": plc | {"host": "127.0.0.1", "beams": ["x"]},
         "panel_node": {"page_port": free_port()},
         "fixture_node": {"fixture_file": str(tmp_path / "plate.yaml")},
-        "adapter_node": {"input": "bool", "profile_input": "scan", "profile_frame": "scanner"},
+        "adapter_node": {"input": "bool", "profile_input": "scan", "profile_frame": "scanner"}
+        | {"target_frame": "tag36h11:0"},
     }
     robot = {"robot": "kr150_r3100"}
     nodes, ever = {}, {}

@@ -6,7 +6,8 @@ from scipy.stats import chi2
 
 from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.camera_data import Chessboard, PosePairs
+from robocal_ros.hand_eye.boards import Chessboard
+from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import GivenNoise
 
 MOUNTS = ("in-hand", "to-hand")

@@ -16,7 +16,7 @@ from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
+from robocal_ros.hand_eye.data import COMPRESSED, IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
 from robocal_ros.hand_eye.profiles import SensorDescription
 from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.targets import SphereTarget, target_document
@@ -37,6 +37,7 @@ TYPE = {
     PROFILE: "sensor_msgs/msg/PointCloud2",
     TARGET_POSE: "geometry_msgs/msg/PoseStamped",
     IMAGE: "sensor_msgs/msg/Image",
+    COMPRESSED: "sensor_msgs/msg/CompressedImage",
     TRACKER_POINT: "geometry_msgs/msg/PointStamped",
 }
 SPHERE = {

@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PointStamped, PoseStamped
-from hand_eye_driver import FRAME, LASER, RADIUS_M, Recorded, Robot, sphere_shots_of
+from hand_eye_driver import FRAME, LASER, RADIUS_M, TYPE, Recorded, Robot, sphere_shots_of
 from rclpy.qos import HistoryPolicy, QoSProfile
-from robocal_msgs.msg import HandEyeSample, HandEyeStatus
+from robocal_msgs.msg import HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import CalibrateHandEye, CaptureHandEye, StartHandEye
-from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
+from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2, PointField
 
 from bench.hand_eye_files import write_target
+from robocal_ros.bags.bags import BagWriter
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
+from robocal_ros.hand_eye.data import COMPRESSED, IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.ros import endpoints
@@ -23,7 +24,7 @@ from robocal_ros.ros import endpoints
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
 TYPES = {
     JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped, IMAGE: Image,
-    TRACKER_POINT: PointStamped,
+    TRACKER_POINT: PointStamped, COMPRESSED: CompressedImage,
 }  # fmt: skip
 NAME = "/hand_eye_node"
 SHOTS = list(sphere_shots_of(14))
@@ -47,6 +48,18 @@ def settings_of(folder: Path, **parameters: Any) -> dict[str, Any]:
     write_target(file, SphereTarget(RADIUS_M))
     told = {"serial": "K7", "sensor_frame": FRAME, "target_file": str(file)}
     return told | {"z_grows": LASER.z_grows} | parameters
+
+
+def recorded(folder: Path, sent: list[Recorded], live: list[SessionEvent]) -> Path:
+    """A recording of what was published, and of the session's events."""
+    path, now_ns = folder / "live.mcap", 0
+    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
+        for message in sent:
+            now_ns = max(now_ns, message.stamp_ns)
+            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
+        for event in live:
+            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
+    return path
 
 
 class LiveSensor:
