@@ -13,11 +13,8 @@ from bench import ur10_campaigns
 pytestmark = pytest.mark.data
 
 ROBOCAL, SCRIPT = ".venv/bin/robocal ", ".venv/bin/python bench/ur10_campaigns.py "
-STEP = re.compile(  # commands, and their output
-    r"```bash\n(.*?)```\n\n((?:    [^\n]*\n)*)", re.DOTALL
-)
-    r"```bash\n(.*?)```\n\n((?:    [^\n]*\n)*)", re.DOTALL
-)  # commands, and their output
+# Commands, and what they print.
+STEP = re.compile(r"```bash\n(.*?)```\n\n((?:    [^\n]*\n)*)", re.DOTALL)
 
 
 def steps(section: str) -> list[tuple[list[str], list[str]]]:
