@@ -68,6 +68,7 @@ class Demo:
         tell("the programme, corrected for drift and tool")
         plc.produce()
         self._judged("after gap 2: tool measured")
+        story.called_s = plc.called_s()
         if self._page:
             story.page = self._shown()
             tell(f"the page says {story.page['headline']}: {self._page}")

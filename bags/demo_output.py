@@ -30,12 +30,14 @@ class Story:
     moments: list[Moment] = field(default_factory=list)
     gaps: list[Gap] = field(default_factory=list)
     page: dict[str, Any] | None = None  # what panel_node shows at the end
+    called_s: list[float] = field(default_factory=list)  # of the PLC's calls
 
     def document(self) -> dict[str, object]:
         """Plain values."""
         moments = [asdict(moment) for moment in self.moments]
         gaps = [_gap(gap) for gap in self.gaps]
-        return {"simulated": True, "moments": moments, "gaps": gaps, "page": self.page}
+        told = {"page": self.page, "called_s": self.called_s}
+        return {"simulated": True, "moments": moments, "gaps": gaps, **told}
 
 
 def _gap(gap: Gap) -> dict[str, object]:

@@ -65,6 +65,9 @@ class Line(Protocol):
     def acknowledge(self) -> Answer:
         """End a fault, as a person does."""
 
+    def called_s(self) -> list[float]:
+        """How long each call took to its answer, s."""
+
     def close(self) -> None:
         """End the heartbeat."""
 
@@ -75,6 +78,7 @@ class RosLine:
     def __init__(self, controller: CellController) -> None:
         self._controller = controller
         self.is_open, self._beats = False, True
+        self._called_s: list[float] = []
         self._gap = controller.publisher(GapOpen, "gap_open")
         self._accuracy: deque[AccuracyState] = deque(maxlen=1)
         controller.listen(AccuracyState, "accuracy_state", self._accuracy, endpoints.LATCHED)
@@ -102,15 +106,21 @@ class RosLine:
 
     def run(self, cycle_id: str, gap_s: float) -> Answer:
         """Call for a cycle."""
-        name = "/maintenance_node/run"
-        asked = {"cycle_id": cycle_id, "gap_s": gap_s}
-        found = self._controller.call(RunMaintenanceCycle, name, **asked)
-        return Answer(found.success, found.status, found.message)
+        return self._call(RunMaintenanceCycle, "run", cycle_id=cycle_id, gap_s=gap_s)
 
     def acknowledge(self) -> Answer:
         """End a fault, as a person does."""
-        found = self._controller.call(Acknowledge, "/maintenance_node/acknowledge", by="demo")
+        return self._call(Acknowledge, "acknowledge", by="demo")
+
+    def _call(self, kind: type, name: str, **fields: object) -> Answer:
+        begin_s = time.monotonic()
+        found = self._controller.call(kind, f"/maintenance_node/{name}", **fields)
+        self._called_s.append(time.monotonic() - begin_s)
         return Answer(found.success, found.status, found.message)
+
+    def called_s(self) -> list[float]:
+        """How long each call took to its answer, s."""
+        return self._called_s
 
     def close(self) -> None:
         """End the heartbeat."""
@@ -205,6 +215,10 @@ class OpcUaLine:
             return Answer(*self._ask(panel, "call", "Acknowledge"))
         finally:
             panel.close()
+
+    def called_s(self) -> list[float]:
+        """How long each call of the PLC took to its answer, s."""
+        return list(self._ask(self._plc, "called_s"))
 
     def close(self) -> None:
         """End the heartbeat."""

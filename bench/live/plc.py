@@ -89,6 +89,10 @@ class Plc:
         if not answer.success:
             raise LiveError(f"the correction cannot be enabled: {answer.message}")
 
+    def called_s(self) -> list[float]:
+        """How long each of its calls took to the answer, s."""
+        return self._line.called_s()
+
     def line(self) -> tuple[str, str]:
         """What the line reads now: state, and its words."""
         read = self._line.look().accuracy

@@ -21,6 +21,7 @@ from robocal_ros.ground.errors import Code
 pytestmark = pytest.mark.cell
 
 ROOT = Path(__file__).parent.parent.parent
+ANSWERED_S = 0.5  # what a PLC waits for the answer of a call (docs/plc.md)
 LONGEST_S = 1800.0  # where nothing else runs: some 110 s
 WITHIN_MM = 0.3  # what docs/simulation.md calls recovered
 BENT_MM = 2.0
@@ -91,14 +92,15 @@ def test_the_line_reads_what_is_known(demo):
 
 
 def test_the_drives_take_all_that_they_are_sent(demo):
-    _, _, out = demo
+    _, story, out = demo
     (bag,) = sorted((out / "recordings").glob("robocal_*"))
     with BagReader(bag) as reader:
         *_, last = (json.loads(m.message.data) for m in reader.messages([TRUTH]))
     assert last["drive_faults"] == 0, last
-    assert (
-        0.9 < last["peak_speed_share"] < 1.0 + ROOM
-    )  # the programme is near what the drives reach
+    assert last["peak_speed_share"] > 0.9  # the programme is near what the drives reach
+    # A stop of a computer that is starved comes late, and steps back: judged where none is.
+    if not any(gap["broken_off"] for gap in story["gaps"]):
+        assert last["peak_speed_share"] < 1.0 + ROOM
 
 
 def test_the_recording_gives_the_live_results_again(demo):
@@ -131,6 +133,8 @@ def test_the_plc_spoke_opc_ua_alone(demo):
     runs = sum(1 + len(gap["broken_off"]) for gap in story["gaps"])
     assert log.count("plc called Run: ") >= runs
     assert log.count("ada called Acknowledge: ") >= printed.count("acknowledges the fault")
+    assert len(story["called_s"]) >= runs
+    assert max(story["called_s"]) <= ANSWERED_S
 
 
 def test_the_page_shows_what_the_line_reads(demo):
