@@ -27,7 +27,6 @@ from bench.tables import Goal, Table, about, show
 ROOT = Path(__file__).resolve().parent.parent
 OUT, KEPT = ROOT / "out" / "soak", ROOT / "docs" / "figures"
 
-ROBOTS = 4  # nodes that one round of the test of kills kills
 MOST_GROWTH_MB = 10.0
 HOSTILE = 2000  # requests
 
@@ -37,7 +36,6 @@ class Amount:
     """How much of each."""
 
     history_kills: int
-    node_kills: int
     history_runs: int
     seeds: int
     live_s: float
@@ -45,8 +43,32 @@ class Amount:
     shift_s: float
 
 
-LONG = Amount(2000, 80, 1000, 40, 3600.0, 6000, 3600.0)
-SHORT = Amount(300, 60, 50, 2, 120.0, 600, 900.0)
+LONG = Amount(2000, 1000, 40, 3600.0, 6000, 3600.0)
+SHORT = Amount(300, 50, 2, 120.0, 600, 900.0)
+
+
+# Tests whose long form is told by itself; of which the others are, each file tells.
+LONG_FORM = {"ROBOCAL_LONG": "1"}
+LONG_FORMS = (
+    ("thermal_node killed during ~/accept, kill -9", 60, "test/nodes/test_thermal_node.py"),
+    ("all nodes of a correction killed together, in each order", 6,
+     "test/nodes/test_joint_correction_restarts.py"),
+    ("the nineteen faults of a cell's tool side over DDS, each with its code", 1,
+     "test/nodes/test_fault_matrix.py"),
+    ("real measurements through live nodes and their replay, bit for bit", 2,
+     "test/nodes/test_real_replay.py"),
+)  # fmt: skip
+
+
+def _other_long_forms() -> list[tuple[str, list[str]]]:
+    """Each room of ``test/``, and its files that take more cases and draws in the long form."""
+    told = {file for *_, file in LONG_FORMS}
+    rooms: dict[str, list[str]] = {}
+    for path in sorted((ROOT / "test").glob("*/test_*.py")):
+        file = str(path.relative_to(ROOT))
+        if file not in told and "from long_form import" in path.read_text():
+            rooms.setdefault(path.parent.name, []).append(file)
+    return list(rooms.items())
 
 
 def _pytest(*words: str, **variables: str) -> bool:
@@ -73,30 +95,23 @@ def endurance(amount: Amount) -> Table:
 
     add("history killed while it accepts, kill -9", amount.history_kills,
         lambda: _history_kills(amount.history_kills))  # fmt: skip
-    rounds = -(-amount.node_kills // ROBOTS)
-    kills = ("test/nodes/test_thermal_node.py", "-k", "kill_during_accept")
-    add("thermal_node killed during ~/accept, kill -9", rounds * ROBOTS,
-        lambda: not _pytest(*kills, ROBOCAL_KILL_ROUNDS=str(rounds)))  # fmt: skip
-    restarts = "test/nodes/test_joint_correction_restarts.py"
-    add("all nodes of a correction killed together, in each order", 6,
-        lambda: not _pytest(restarts, ROBOCAL_RESTARTS="6"))  # fmt: skip
+    for what, count, file in LONG_FORMS:
+        add(what, count, lambda file=file: not _pytest(file, **LONG_FORM))
     add("whole gaps of a live cell at the limits as they are set, and its calls' times", 1,
         lambda: not _pytest("test/nodes/soak_maintenance.py"))  # fmt: skip
-    matrix = "test/nodes/test_fault_matrix.py"
-    add("the nineteen faults of a cell's tool side over DDS, each with its code", 1,
-        lambda: not _pytest(matrix, ROBOCAL_FAULTS="all"))  # fmt: skip
     add("sensor, sphere or robot knocked in a live cell, each told in the next gap", 1,
         lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
     add("a node that is stopped for 50 to 500 ms in a fast stream: largest step against direct", 1,
         lambda: not _pytest("test/nodes/soak_stalls.py"))  # fmt: skip
-    add("real measurements through live nodes and their replay, bit for bit", 2,
-        lambda: not _pytest("test/nodes/test_real_replay.py", ROBOCAL_SERIES="B D"))  # fmt: skip
     add("hostile requests to a live bridge and a live page", HOSTILE, lambda: not _hostile())
+    for room, files in _other_long_forms():
+        add(f"tests of {room} with all their cases and draws: files", len(files),
+            lambda files=files: not _pytest(*files, **LONG_FORM))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test", "--ignore=test/nodes")
     add("all property tests, each time with other examples", amount.seeds,
-        lambda: sum(not _pytest(*properties, f"--hypothesis-seed={seed}")
+        lambda: sum(not _pytest(*properties, f"--hypothesis-seed={seed}", **LONG_FORM)
                     for seed in range(amount.seeds)))  # fmt: skip
     return table
 

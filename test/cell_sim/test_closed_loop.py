@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from long_form import more
 
 from bench.closed_loop import tables
 from bench.closed_loop.judging import gaps_to_recover, harm, per_hour, refused, within_at_worst
@@ -108,7 +109,7 @@ def reference_measured_late(plant, suite):
     return plant.measure_tool(suite, REFERENCE, "one")
 
 
-@pytest.mark.parametrize("seed", [51, 65, 73])
+@pytest.mark.parametrize("seed", [51, *more(65, 73)])
 def test_a_healthy_tool_is_found_where_noisy_readings_bend_its_path(seed):
     """Joint readings whose noise lets whole steps of the search overshoot for ever."""
     nominal = load_robot("kr150_r3100")

@@ -3,8 +3,10 @@
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -59,19 +61,35 @@ def test_the_hand_eye_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.Mon
     assert printed[0].splitlines()[0] in page
 
 
+@cache
+def run_once(*words: str) -> subprocess.CompletedProcess[str]:
+    """What several pages say, of files of the repository alone."""
+    return robocal(*words)
+
+
+@pytest.fixture(scope="module")
+def demo_state(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A history that stands for the demo's."""
+    state = tmp_path_factory.mktemp("demo") / "state"
+    assert robocal("replay", str(ROOT / REPLAY[1]), *REPLAY[2:], "--state", state).returncode == 0
+    return state
+
+
 @pytest.mark.parametrize("page", PAGES)
-def test_commands_run_as_typed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_run_as_typed(
+    page: str, demo_state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("docs", "bags"):
         (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / "out").mkdir()
     monkeypatch.chdir(tmp_path)
     typed = commands(page)
     assert typed
-    if any("out/state" in words for words in typed):  # stands for the demo's history
-        assert robocal(*REPLAY, "--state", "out/state").returncode == 0
+    shutil.copytree(demo_state, "out/state")
     printed = []
     for words in typed:
-        done = robocal(*words)
+        run = robocal if any(word.startswith("out/") for word in words) else run_once
+        done = run(*words)
         assert done.returncode == 0, (words, done.stderr)
         printed.append(done.stdout)
     if page == "docs/replay.md":

@@ -240,7 +240,7 @@ CASES = {
     ),
     "hand-eye step": (
         "hand-eye.step.json",
-        ["hand-eye", "step", *STEP],
+        ["hand-eye", "step", *STEP, "--method", "classic"],  # of the best one: test_hand_eye
         ["hand-eye", "step", *STEP[2:]],
         (2, "BAD_INPUT"),
     ),

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from correction_robot import FASTEST
+from long_form import more
 
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.correction.bounds import CorrectionConfig
@@ -40,9 +41,8 @@ def program(name: str, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]
 @pytest.mark.parametrize(
     ("name", "robot", "bent_m"),
     [
-        ("golden_excerpt.mcap", "kr150_r3100", 2e-3),
-        ("tool_runs.mcap", "ur10", 0.0),
         ("tool_runs.mcap", "ur10", 2e-3),
+        *more(("golden_excerpt.mcap", "kr150_r3100", 2e-3), ("tool_runs.mcap", "ur10", 0.0)),
     ],
 )
 def test_a_recorded_program_is_corrected_throughout(name: str, robot: str, bent_m: float) -> None:

@@ -30,6 +30,7 @@ from correction_robot import (
 )
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from long_form import amount
 from scipy.interpolate import BPoly
 
 from robocal_ros.correction.bounds import CorrectionConfig
@@ -197,7 +198,7 @@ LEG = st.tuples(
 COARSE = [("tool", 50, 1.0, 0.3, True, False, 0.6), ("on", 20, 1.0, 0.3, True, False, 0.35)]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=amount(10, 25), deadline=None)
 @example([*COARSE, ("off", 30, 0.2, 0.05, True, False, 0.5)])
 @example([*COARSE[::-1], ("model", 30, 0.01, 0.05, False, False, 0.5)])
 @given(st.lists(LEG, min_size=1, max_size=6))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from long_form import more
 
 from robocal_ros.estimation.assessment import (
     FEWEST_GROUPS,
@@ -168,7 +169,7 @@ def test_limit_of_the_residual():
     assert "check the robot file" in over.reason
 
 
-@pytest.mark.parametrize("poses", [8, 30, 200])
+@pytest.mark.parametrize("poses", [8, *more(30, 200)])
 def test_chance_alone_is_accepted_as_rarely_as_promised(poses):
     """Two models that are equally good, 4000 comparisons: at most 5 %, with four sigmas."""
     rng, accepted = np.random.default_rng(poses), 0

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from long_form import more
 from profile_shapes import (
     COLUMNS,
     NOISE_M,
@@ -31,7 +32,7 @@ def square(fit, truth):
 
 @pytest.mark.parametrize("kind", ["edge", "groove"])
 @pytest.mark.parametrize("dirty", [False, True])
-@pytest.mark.parametrize("half_angle", np.radians([45.0, 70.0]))
+@pytest.mark.parametrize("half_angle", np.radians([45.0, *more(70.0)]))
 def test_the_covariance_holds_and_the_bias_is_small(kind, dirty, half_angle):
     rng = np.random.default_rng(1)
     squares, normalised = [], []

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from long_form import more
 
 PACKAGE = Path(__file__).parents[2] / "robocal_ros"
 CORE = "robocal_ros.ground.compiled"
@@ -214,7 +215,7 @@ def test_where_nothing_can_be_kept_kernels_work_and_it_is_told_once(
     assert "cannot be kept" in words
 
 
-@pytest.mark.parametrize("content", [b"", b"junk"])
+@pytest.mark.parametrize("content", [b"junk", *more(b"")])
 def test_kept_code_that_a_power_cut_left_in_pieces_is_made_again(
     tree: Path, kept: Path, content: bytes
 ) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from long_form import amount, more
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import HandEyeCell, PoseRobot
@@ -28,7 +29,7 @@ from robocal_ros.hand_eye.targets import SphereTarget
 from robocal_ros.hand_eye.tasks import SphereTask
 
 BENT_M = (3e-5, -2e-5, 4e-5)  # as real sensors: 20 to 100 um over the field
-RUNS = 6
+RUNS = amount(3, 6)
 SPHERE = SphereTarget(RADIUS_M)
 
 
@@ -75,7 +76,7 @@ def test_the_field_is_recovered_within_what_is_told_of_it(shown_by, request):
         left.append(np.mean(off**2))
         whole.append(np.mean(field**2))
         # Of k numbers with this covariance, but for the scale, which is the mount's; 1e-3 is the
-        # chance of a miss, six runs.
+        # chance of a miss, in all runs.
         sigma_m = np.sqrt(np.trace(own.covariance[:-1, :-1]))
         assert np.sqrt(left[-1]) < sigma_m * np.sqrt(chi2.ppf(1.0 - 1e-3 / RUNS, 1))
         assert own.left_out_m < own.residual_m
@@ -112,7 +113,7 @@ def test_points_land_where_they_are_and_better_than_without(runs):
     assert with_it < told * chi2.ppf(1.0 - 1e-3, RUNS) / RUNS
 
 
-@pytest.mark.parametrize("make", [sphere_set, edge_set])
+@pytest.mark.parametrize("make", [sphere_set, *more(edge_set)])
 def test_of_a_straight_sensor_nothing_is_found(make):
     """At most one in three: three degrees, each with a chance of some 0.2 %."""
     straight = bent((0.0, 0.0, 0.0))
@@ -148,7 +149,7 @@ def test_targets_together_have_one(runs, edges):
 def test_what_few_poses_of_stairs_do_not_show_of_it_is_in_the_covariance():
     """Without it the squared errors are 2.2 times what is told (60 sets); it is of 0.02 mm."""
     squared = []
-    for seed in range(10):
+    for seed in range(amount(4, 10)):
         rng = np.random.default_rng([71, seed])
         result = step_world(rng).shot(rng).solve()
         assert result.linearity is None

@@ -17,6 +17,7 @@ from hand_eye_sets import (
     sphere_task,
     stairs_target,
 )
+from long_form import more
 from scipy.optimize import minimize
 
 from bench.hand_eye_cell import SimulatedShots, TrueStairs, edge_shots, sphere_shots, step_shots
@@ -86,7 +87,7 @@ def test_expected_error_is_that_of_a_calibration_from_these_poses():
 
 
 @pytest.mark.parametrize("strays", [0, 2])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3, 4)])
 def test_a_sphere_of_unknown_place_is_where_the_poses_see_it(seed, strays):
     """Poses that saw it when they were shot see it in the plan, whatever side they pass it on."""
     rng = np.random.default_rng(100 + seed)

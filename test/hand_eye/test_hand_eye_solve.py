@@ -23,6 +23,7 @@ from hand_eye_sets import (
     stairs_target,
     step_task,
 )
+from long_form import amount, more
 
 from bench.hand_eye_cell import (
     HandEyeCell,
@@ -105,9 +106,9 @@ class TestSphere:
         assert chi_square(solve(data_of(shots)), TRUE) < FAR_OFF
 
     def test_best_beats_classic(self):
-        """In translation at least twice, over ten data sets (rms); over many see the bench."""
+        """In translation at least twice, over five data sets (rms); over many see the bench."""
         off = []
-        for seed in range(10):
+        for seed in range(amount(5, 10)):
             data = sphere_data(seed, cell=HandEyeCell(robot=PoseRobot(1e-4)))
             task = sphere_task()
             view = features(task, data).view
@@ -171,17 +172,19 @@ class TestMistakes:
         ("change", "words"),
         [
             (lambda T: np.roll(T, 1, axis=0), ("shifted by one",)),
-            (lambda T: np.roll(T, -1, axis=0), ("shifted by one",)),
             (frames.invert, ("inverted",)),
             (lambda T: _negated(T, 1), ("y of their positions", "left-handed")),
             (lambda T: _in_unit(T, 1e-3), ("1000 times larger",)),
-            (lambda T: _in_unit(T, 1e3), ("smaller",)),
+            *more(
+                (lambda T: np.roll(T, -1, axis=0), ("shifted by one",)),
+                (lambda T: _in_unit(T, 1e3), ("smaller",)),
+            ),
         ],
     )
     def test_poses(self, few, change, words):
         self.refused(replace(few, T_base_flange=change(few.T_base_flange)), *words)
 
-    @pytest.mark.parametrize("radius_m", [0.0195, 0.025])
+    @pytest.mark.parametrize("radius_m", [0.025, *more(0.0195)])
     def test_wrong_radius(self, data, radius_m):
         self.refused(data, "radius", error=RobocalError, target=SphereTarget(radius_m))
 
@@ -208,9 +211,11 @@ class TestStep:
     def shots(self, seed, count=5, **more):
         return data_of(step_shots(CELL, STAIRS, count, np.random.default_rng(seed), **more))
 
-    @pytest.mark.parametrize("aim_m", [0.0, 2e-4])
+    @pytest.mark.parametrize("aim_m", [2e-4, *more(0.0)])
     def test_recovers_the_sensor(self, aim_m):
-        for seed in range(2):  # that errors are as the covariance says: test_hand_eye_mount
+        for seed in range(
+            amount(1, 2)
+        ):  # that errors are as the covariance says: test_hand_eye_mount
             found = solve_step(self.shots(seed, 8, aim_m=aim_m))
             assert found.verdict.accept
             assert chi_square(found, TRUE) < FAR_OFF
@@ -295,7 +300,7 @@ class TestLine:
             solve_task(line_task(LINE), data, "best", SETTINGS)
 
 
-@pytest.mark.parametrize("share", [0.98, 1.02, 1.2])
+@pytest.mark.parametrize("share", [1.02, *more(0.98, 1.2)])
 def test_targets_together_find_a_wrong_radius(share):
     rng = np.random.default_rng(5)
     ball = data_of(sphere_shots(CELL, CENTRE, RADIUS_M, 12, rng))
@@ -339,11 +344,13 @@ class TestStepMistakes:
     @pytest.mark.parametrize(
         ("words", "undo"),
         [
-            ("shifted by one", lambda T: np.roll(T, 1, axis=0)),
-            ("inverted", frames.invert),
-            ("y of their positions negated", lambda T: _negated(T, 1)),
             ("mirrored as a whole: .* left-handed", lambda T: MIRROR @ T @ MIRROR),
             ("read as w, x, y, z", lambda T: _read_as_xyzw(T)),
+            *more(
+                ("shifted by one", lambda T: np.roll(T, 1, axis=0)),
+                ("inverted", frames.invert),
+                ("y of their positions negated", lambda T: _negated(T, 1)),
+            ),
         ],
     )
     def test_poses(self, shots, words, undo):
@@ -364,7 +371,7 @@ class TestStepMistakes:
         assert all("swapped" in words for words in found.rejected.values())
 
 
-@pytest.mark.parametrize("kind", ["sphere", "step", "line"])
+@pytest.mark.parametrize("kind", ["line", *more("sphere", "step")])
 def test_a_sensor_that_counts_distances_is_found_in_its_own_coordinates(kind):
     """0.2 m less the height: its frame is where the light leaves."""
     rng = np.random.default_rng(41)

@@ -9,6 +9,7 @@ from history_workers import SERIAL, proposal
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from long_form import amount
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -182,5 +183,9 @@ class History(RuleBasedStateMachine):
 
 TestHistory = History.TestCase
 TestHistory.settings = settings(
-    max_examples=60, stateful_step_count=50, deadline=None, derandomize=True, database=None
+    max_examples=amount(25, 60),
+    stateful_step_count=50,
+    deadline=None,
+    derandomize=True,
+    database=None,
 )

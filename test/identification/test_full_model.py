@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bent_robot import COMPLIANCE, LOWER, NOISE_M, UPPER, BentRobot
+from long_form import more
 from scipy.linalg import null_space
 
 from robocal_ros.estimation.estimation import chi2_quantile
@@ -202,7 +203,7 @@ def test_of_data_without_noise_rounding_is_not_learned():
     assert rms_mm(found, robot.measured(robot.poses(100))) < 1e-5
 
 
-@pytest.mark.parametrize("count", [16, 40, 200])
+@pytest.mark.parametrize("count", [16, *more(40, 200)])
 def test_a_robot_without_joint_errors_loses_nothing(count):
     ratios = []
     for seed in range(8):

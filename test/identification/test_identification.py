@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from long_form import more
 
 from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground import frames
@@ -397,7 +398,7 @@ def test_prior_never_hurts_when_it_is_right(make_cell):
 
 @pytest.mark.parametrize("poses", [False, True])
 @pytest.mark.parametrize("learned", [False, True])
-@pytest.mark.parametrize("count", [12, 16, 20])
+@pytest.mark.parametrize("count", [12, *more(16, 20)])
 def test_noise_is_found_from_few_poses_under_a_prior(make_cell, count, learned, poses):
     """What the prior holds, and what orientations alone show, takes nothing from the positions.
 
@@ -419,7 +420,7 @@ def test_noise_is_found_from_few_poses_under_a_prior(make_cell, count, learned, 
 
 
 @pytest.mark.parametrize("robust", [False, True])
-@pytest.mark.parametrize("count", [10, 12, 16])
+@pytest.mark.parametrize("count", [10, *more(12, 16)])
 def test_prior_never_hurts_when_the_noise_is_found_too(make_cell, count, robust):
     """As above, sigma not given: well under that without a prior, and as large as it says."""
     squares, predicted = np.zeros(2), 0.0

@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from long_form import amount, more
 
 from bench.ur10_campaigns import halves, load_campaign
 from robocal_ros.estimation.assessment import pose_groups
@@ -117,7 +118,7 @@ def test_full_model_from_half_of_a_campaign(halved, series):
     assert compliance[1:3] == pytest.approx([10e-6, 11.8e-6], rel=0.2)  # in all campaigns alike
 
 
-@pytest.mark.parametrize("series", LARGEST_SECOND_HALF_MEAN_MM)
+@pytest.mark.parametrize("series", ["C", *more("A")])
 def test_full_model_of_the_first_half_of_the_time(campaigns, series):
     data = campaigns[series]
     first, second = (data.take(part) for part in np.array_split(np.arange(len(data)), 2))
@@ -132,19 +133,18 @@ def test_angles_that_the_first_half_never_saw_are_told(campaigns):
     assert result.check_outside > 0.3
 
 
-def test_full_model_of_july_holds_for_months(campaigns, halved):
-    train = halved["A"][0]
-    for series, largest_mm in LARGEST_FULL_LATER_MEAN_MM.items():
-        result = identify_and_judge(
-            UR10, train, campaigns[series],
-            model="full", check_refit=("base", "tool"),
-        )  # fmt: skip
-        assert result.candidate.n == POSES[series]
-        assert result.candidate.mean_m * 1e3 <= largest_mm
-        assert result.verdict.code is Code.ACCEPT
+@pytest.mark.parametrize("series", ["C", *more("B")])
+def test_full_model_of_july_holds_for_months(campaigns, halved, series):
+    result = identify_and_judge(
+        UR10, halved["A"][0], campaigns[series],
+        model="full", check_refit=("base", "tool"),
+    )  # fmt: skip
+    assert result.candidate.n == POSES[series]
+    assert result.candidate.mean_m * 1e3 <= LARGEST_FULL_LATER_MEAN_MM[series]
+    assert result.verdict.code is Code.ACCEPT
 
 
-@pytest.mark.parametrize(("count", "gain"), [(60, 0.25), (120, 0.45), (250, 0.60)])
+@pytest.mark.parametrize(("count", "gain"), [(60, 0.25), *more((120, 0.45), (250, 0.60))])
 def test_few_poses_give_joint_functions_too(campaigns, count, gain):
     """Everything from the same poses, mean of five draws, at 1500 others."""
     data, arm = campaigns["C"], UR10
@@ -158,7 +158,7 @@ def test_few_poses_give_joint_functions_too(campaigns, count, gain):
     assert full < (1.0 - gain) * plain
 
 
-@pytest.mark.parametrize("seed", [2, 5, 1139])  # the last can be met to 0.02 mm by functions
+@pytest.mark.parametrize("seed", [1139, *more(2, 5)])  # the first can be met to 0.02 mm
 def test_two_dozen_poses_are_not_harmed(campaigns, seed):
     """Nearly one orientation and few places: what fits these poses need not hold elsewhere."""
     data, arm = campaigns["D"], UR10
@@ -200,7 +200,7 @@ def test_a_mirrored_tracker_frame_is_refused(halved):
     assert result.verdict.code is Code.RESIDUAL_TOO_LARGE
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 def test_few_poses_of_one_orientation_are_not_taken_for_outliers(halved, seed):
     """D's flange hardly turns: what is known of base and target changes much from step to step."""
     train, check = halved["D"]
@@ -214,9 +214,9 @@ def test_few_poses_of_one_orientation_are_not_taken_for_outliers(halved, seed):
 
 
 def test_the_error_stated_from_few_poses_comes_true(halved):
-    """Each draw of 60 poses tells its own scale to a fifth or so: in the mean of twelve."""
+    """Each draw of 60 poses tells its own scale to a fifth or so: in the mean of four or more."""
     ratios, inside = [], []
-    for series, seed in product(POSES, range(3)):
+    for series, seed in product(POSES, range(amount(1, 3))):
         train, check = halved[series]
         few = train.take(np.random.default_rng(seed).permutation(len(train))[:60])
         found = identify_full(UR10, few)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bent_robot import NOISE_M, BentRobot
+from long_form import more
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -67,7 +68,7 @@ def test_the_nominal_model_is_fitted_as_well_as_it_can_be():
     assert rms(found.cell, data) == pytest.approx(np.sqrt(2.0 * best.cost / 40), rel=0.01)
 
 
-@pytest.mark.parametrize("wobble_rad", [0.0005, 0.005, 0.02])
+@pytest.mark.parametrize("wobble_rad", [0.005, *more(0.0005, 0.02)])
 @pytest.mark.parametrize("sigma", [None, NOISE_M])
 def test_weak_directions_do_not_creep(wobble_rad, sigma):
     robot = BentRobot(7)

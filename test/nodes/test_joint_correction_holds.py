@@ -17,6 +17,7 @@ from joint_correction_live import HOME, NAMES, NODE, NOMINAL, Line, drifted, joi
 from jumps import no_jump
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from long_form import more
 from rclpy.context import Context
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
@@ -345,7 +346,7 @@ def test_a_second_driver_of_the_arm_is_told_and_one_of_a_gripper_is_not(line: Mo
     assert "/gripper" in told.commanders
 
 
-@pytest.mark.parametrize("lost", [0, 1, 2])
+@pytest.mark.parametrize("lost", [0, 2, *more(1)])
 def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> None:
     """Finding: the controller drops it with an error and drives on."""
     take, losses = line._plan, [lost]

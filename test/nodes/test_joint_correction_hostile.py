@@ -27,6 +27,7 @@ from joint_correction_live import (
     joints,
     model_message,
 )
+from long_form import amount, more
 from rclpy.action import ActionClient, ActionServer, GoalResponse
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -262,10 +263,12 @@ class Attacked(Line):
     [
         ("joint_targets", True, {}),
         ("joint_commands", True, {}),
-        ("joint_commands", False, {}),
-        ("joint_targets", True, {"free_axis": True}),
         ("joint_targets", True, {"shadow": True}),
-        ("joint_commands", True, {"shadow": True}),
+        *more(
+            ("joint_commands", False, {}),
+            ("joint_targets", True, {"free_axis": True}),
+            ("joint_commands", True, {"shadow": True}),
+        ),
     ],
 )
 def test_nothing_wrong_goes_out(graph: Any, stream: str, on: bool, mode: dict[str, bool]) -> None:
@@ -273,7 +276,7 @@ def test_nothing_wrong_goes_out(graph: Any, stream: str, on: bool, mode: dict[st
     line.rest()
 
     @settings(
-        max_examples=10,
+        max_examples=amount(6, 10),
         deadline=None,
         database=None,
         # the node remembers: nothing can be replayed or made smaller

@@ -6,7 +6,6 @@ what it is told; the planner waits while nothing comes back.
 """
 
 import itertools
-import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from joint_correction_live import HOME, NAMES, NODE, NOMINAL, drifted, joints
 from jumps import no_jump
+from long_form import amount
 from robocal_msgs.msg import CorrectionStatus
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
@@ -186,8 +186,7 @@ class Cell:
 
 
 NODES = ("thermal_node", "tcf_node", "joint_correction_node")
-# Of the orders of all together; the soak takes all six.
-TOGETHER = int(os.environ.get("ROBOCAL_RESTARTS", "1"))
+TOGETHER = amount(1, 6)  # of the orders of all together
 
 
 def test_no_step_whoever_is_killed(graph: Any, tmp_path: Path) -> None:

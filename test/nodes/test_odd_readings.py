@@ -9,6 +9,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
 from diagnostic_msgs.msg import DiagnosticArray
+from long_form import more
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
@@ -73,7 +74,7 @@ class Corrected:
         return int(ended.result().status)
 
 
-@pytest.mark.parametrize("missing", [1.0, -2.0])
+@pytest.mark.parametrize("missing", [1.0, *more(-2.0)])
 def test_velocities_of_another_number_than_positions_are_none(
     graph: Any, tmp_path: Path, missing: float
 ) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from action_msgs.srv import CancelGoal
 from control_msgs.msg import JointTrajectoryControllerState
+from long_form import more
 from own_motions import DEEP
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -127,7 +128,7 @@ KINDS = [
     for velocities in (False, True)
 ]
 LAGGING = pytest.param(("simulated", False, {"lag_ms": 14.0}), id="simulated-lagging")
-POSITIONS = KINDS[::2]
+POSITIONS, VELOCITIES = KINDS[::2], KINDS[1::2]
 BY_TOPIC = pytest.param(
     ("simulated", False, {}, {"follow_joint_trajectory": "/nobody"}), id="simulated-topic"
 )
@@ -141,7 +142,7 @@ LATE_S = 0.012  # of a stop beyond `REACTION_S`, which it comes with less of whe
 TRIES = 5
 
 
-@pytest.mark.parametrize("own", [*KINDS, LAGGING], indirect=True)
+@pytest.mark.parametrize("own", [*POSITIONS, LAGGING, *more(*VELOCITIES)], indirect=True)
 def test_a_stop_slows_down_evenly_and_never_goes_back(own):
     """Done anew where a busy computer had it wait on its way for as long as it may be late."""
     for _ in range(TRIES):
@@ -166,7 +167,7 @@ def test_a_stop_slows_down_evenly_and_never_goes_back(own):
     assert np.max(np.abs(harder)) < SLOW * (1.0 + LATE_S / TICK_S)
 
 
-@pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, UNTOLD], indirect=True)
+@pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, *more(UNTOLD)], indirect=True)
 def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
     for slow, how in (
         (10.0, {"lost": 1}),  # planned: 0.12 s
@@ -188,7 +189,7 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         own.arrive()
 
 
-@pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC], indirect=True)
+@pytest.mark.parametrize("own", [*POSITIONS, *more(BY_TOPIC)], indirect=True)
 def test_a_motion_follows_the_speed_scaling_and_outlasts_a_pause(own):
     controller = own.controller
     way = own.at_speed(0.1)

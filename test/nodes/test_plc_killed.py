@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole cell by OPC UA alone, whose bridge is killed while its robot stands or moves.
+"""A whole cell by OPC UA alone; its bridge is killed while its robot stands or moves.
 
 The robot stops by the gap's rules, nothing is lost, and the bridge that is started again says what
 is true.
@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 from asyncua import ua
+from long_form import more
 from maintenance_live import HOME_DEG, SERIAL, LiveCell
-from robocal_msgs.msg import MaintenanceStatus
+from robocal_msgs.msg import MaintenanceStatus, ToolFrame
 from test_maintenance_calls import proposed
 from test_plc_bridge import DISAPPEARS_S, refused
 
 from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 GAP_S = 150.0
@@ -34,6 +36,7 @@ TRUE = {
     "Maintenance.Disarmed": lambda s: s.disarmed,
     "LastCycle.CycleId": lambda s: s.last.cycle_id,
     "LastCycle.Code": lambda s: s.last.code,
+    "LastCycle.ToolCode": lambda s: s.last.tool_code,
     "LastCycle.Run": lambda s: s.last.run,
     "LastCycle.ToolId": lambda s: s.last.tool_id,
     "LastCycle.Left": lambda s: list(s.last.left),
@@ -158,7 +161,20 @@ def line(cell: KilledBridge) -> KilledBridge:
     return cell
 
 
-@pytest.mark.parametrize("is_open", [False, True], ids=["idle", "gap open"])
+def test_a_whole_gap_by_opc_ua_alone(line: KilledBridge) -> None:
+    cycle = line.begins("whole", MEASURES)
+    line.graph.spin_until(lambda: line.ended(cycle), "it ends", within_s=GAP_S)
+    success, code, words, state, result, *_ = line.call("Status", cycle)
+    assert (success, code, result) == (True, Code.ACCEPT, Code.ACCEPT), words
+    assert state == MaintenanceStatus.IDLE
+    assert line.cell.at_home()
+    line.says_the_truth()
+    tools = line.graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
+    line.graph.spin_until(lambda: tools, "the tool in force")
+    assert line.do(line.plc, line.plc.read("Tool.Name")) == tools[-1].child_frame_id != ""
+
+
+@pytest.mark.parametrize("is_open", [True, *more(False)])
 def test_killed_while_the_robot_stands_nothing_moves(line: KilledBridge, is_open: bool) -> None:
     line.plc.is_open = is_open
     if not is_open:
@@ -171,7 +187,7 @@ def test_killed_while_the_robot_stands_nothing_moves(line: KilledBridge, is_open
     assert line.call("Run", "closed", GAP_S)[:2] == [False, Code.CONFLICT]
 
 
-@pytest.mark.parametrize("motions", [ON_ITS_WAY, MEASURES], ids=["run under way", "measures"])
+@pytest.mark.parametrize("motions", [MEASURES, *more(ON_ITS_WAY)])
 def test_killed_while_the_robot_moves_it_stops_and_a_person_looks(
     line: KilledBridge, motions: int
 ) -> None:

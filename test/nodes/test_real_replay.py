@@ -2,7 +2,6 @@
 """Real measurements through the live nodes: the results of ``robocal replay``, bit for bit."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 from command import robocal
 from diagnostic_msgs.msg import DiagnosticArray
 from history_content import content
+from long_form import more
 from robocal_msgs.msg import SessionEvent
 from robocal_msgs.srv import Decide, Identify
 from std_msgs.msg import String
@@ -87,7 +87,7 @@ def with_events(bag: Path, events: list[SessionEvent], path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("series", os.environ.get("ROBOCAL_SERIES", "D").split())
+@pytest.mark.parametrize("series", ["D", *more("B")])
 def test_live_equals_replay(graph, tmp_path: Path, series: str) -> None:
     arm, data = load_robot("ur10"), ur10_campaigns.load_campaign(series)
     bag = tmp_path / f"{series}.mcap"

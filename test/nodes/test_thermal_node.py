@@ -3,7 +3,6 @@
 
 import json
 import math
-import os
 import re
 import time
 from dataclasses import replace
@@ -18,6 +17,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped
 from joint_errors import with_joint_errors
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from long_form import amount
 from rclpy.node import Node
 from robocal_msgs.msg import AccuracyState, CorrectionStatus, KinematicModel
 from robocal_msgs.srv import Decide, ListCalibrations
@@ -275,7 +275,7 @@ def propose(history: CalibrationHistory, nominal: Any, number: int) -> int:
     )
 
 
-ROUNDS, ROBOTS = int(os.environ.get("ROBOCAL_KILL_ROUNDS", "2")), 3  # more for a long run
+ROUNDS, ROBOTS = amount(2, 20), 3
 
 
 def test_a_kill_during_accept_leaves_the_old_or_the_new_state(graph, nominal):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from beam_cell import make_cell
+from long_form import amount
 
 from bench.measured_runs import TAUGHT, laser_of
 from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise
@@ -43,7 +44,9 @@ def cell():
 @pytest.fixture(scope="module")
 def runs(cell) -> list[KnownTool]:
     """Of one tool at one station."""
-    measured = [cell.full_run(TOOL, TAUGHT, np.random.default_rng(i)) for i in range(60)]
+    measured = [
+        cell.full_run(TOOL, TAUGHT, np.random.default_rng(i)) for i in range(amount(24, 60))
+    ]
     return [KnownTool.measured(run.estimate(Held())) for run in measured]
 
 
@@ -61,7 +64,7 @@ def away(found: KnownTool, other: KnownTool) -> np.ndarray:
 
 
 def test_two_runs_differ_by_what_is_their_own(runs):
-    """Chi-square of five numbers for each of 30 pairs; the laser frame is alike in both."""
+    """Chi-square of five numbers for each pair; the laser frame is alike in both."""
     squared = 0.0
     for one, other in zip(runs[::2], runs[1::2], strict=True):
         both = one.own_covariance + other.own_covariance

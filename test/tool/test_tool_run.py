@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from beam_cell import SILENT, make_cell
+from long_form import amount
 
 from bench.measured_runs import (
     BETA_RAD,
@@ -174,10 +175,10 @@ def noisy_cell(laser_sigma: float = 0.0) -> ToolCell:
 
 
 def test_errors_are_what_the_covariance_says():
-    """Chi-square of five degrees over 60 runs with noise, sampled input and drawn laser points."""
+    """Chi-square of five degrees of each run with noise, sampled input and drawn laser points."""
     squared, tips, bound = [], [], []
-    sigma = 2.2e-5
-    for seed in range(60):
+    sigma, runs = 2.2e-5, amount(25, 60)
+    for seed in range(runs):
         random, cell = rng(seed), noisy_cell()
         points = cell.laser.points
         across = np.repeat(cell.laser.normals, 2, axis=0) * random.standard_normal((4, 1))
@@ -193,17 +194,17 @@ def test_errors_are_what_the_covariance_says():
         squared.append(both @ np.linalg.solve(found.covariance, both))
         tips.append(error)
         bound.append(np.trace(found.covariance[:3, :3]))
-    assert np.sum(squared) == pytest.approx(300.0, abs=4.0 * np.sqrt(600.0))
+    assert np.sum(squared) == pytest.approx(5.0 * runs, abs=4.0 * np.sqrt(10.0 * runs))
     rms = np.sqrt(np.mean(np.sum(np.square(tips), axis=1)))
-    assert rms == pytest.approx(np.sqrt(np.mean(bound)), rel=4.0 / np.sqrt(360.0))
+    assert rms == pytest.approx(np.sqrt(np.mean(bound)), rel=4.0 / np.sqrt(6.0 * runs))
 
 
 @pytest.mark.parametrize("step_m", [1e-7, 3e-5])
 def test_edges_that_scatter_more_than_told_widen_all_that_is_told_once(step_m):
-    """Three times, over 60 runs; the scatter is found from about 20 residuals, so that a squared
+    """Three times, over the runs; the scatter is found from about 20 residuals, so that a squared
     error over its covariance is n F(n, 20), of mean n 20 / 18 for n numbers.
     """
-    runs, free, true = 60, 20, bent(TAUGHT, [0.002, -0.001, 0.001], [0.02, -0.01, 0.0])
+    runs, free, true = amount(25, 60), 20, bent(TAUGHT, [0.002, -0.001, 0.001], [0.02, -0.01, 0.0])
     squared = {"tool": 0.0, "latency": 0.0, "radius": 0.0}
     for seed in range(runs):
         cell = make_cell(exact=False, noise=TrueNoise(step_m, 6e-6))

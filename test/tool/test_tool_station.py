@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command import ROOT, robocal_json
+from long_form import amount
 from scipy.stats import chi2
 from tool_driver import NOISE, Driver, config_of, noisy_cell
 
@@ -36,7 +37,7 @@ from robocal_ros.tool.station import (
 RADIUS_M = 2.5e-3
 MANDREL = frames.transform(frames.exp_rotation([0.01, -0.02, 0.0]), [0.03, -0.02, 0.14])
 ROBOT = RobotNoise(NOISE.step_m, NOISE.edge_m)
-RUNS = 200
+RUNS = amount(60, 200)
 
 
 def knocked(cell: ToolCell, shift_m, turn_rad=(0.0, 0.0, 0.0)) -> ToolCell:
@@ -107,7 +108,7 @@ def scatter_over_told(many: list[StationShift]) -> np.ndarray:
 
 
 def test_the_sigma_told_is_the_scatter(many):
-    """Over 200 runs, in each of the six ways: within what 200 draws of chi-square allow."""
+    """Over all runs, in each of the six ways: within what so many draws of chi-square allow."""
     ratio = scatter_over_told(many)
     low, high = chi2.ppf([0.0005, 0.9995], RUNS) / RUNS
     assert np.all((ratio > low) & (ratio < high)), ratio
@@ -120,11 +121,11 @@ def test_the_sigma_told_is_the_scatter(many):
 def test_a_polled_input_leaves_the_sigma_honest():
     """Edges half a turn apart may fall on one phase of the input: they are not independent then.
 
-    Sigma within 0.8 to 1.25 of the scatter, give or take what 60 runs leave of that (3 sigma).
+    Sigma within 0.8 to 1.25 of the scatter, give or take what the runs leave of that (3 sigma).
     """
-    cell = noisy_cell()
-    ratio = np.sqrt(scatter_over_told([bends(cell, driven(cell, seed)) for seed in range(60)]))
-    slack = 3.0 / np.sqrt(2 * 60)
+    cell, runs = noisy_cell(), amount(30, 60)
+    ratio = np.sqrt(scatter_over_told([bends(cell, driven(cell, seed)) for seed in range(runs)]))
+    slack = 3.0 / np.sqrt(2 * runs)
     assert np.all((ratio > 0.8 * (1.0 - slack)) & (ratio < 1.25 * (1.0 + slack))), ratio
 
 
