@@ -14,6 +14,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.msg import JointTolerance
 from jumps import no_jump
+from long_form import more
 from trajectory_controllers import (
     CONTROLLERS,
     HOME,
@@ -108,7 +109,7 @@ def test_states_are_by_alphabet_and_have_what_the_hardware_has(start, velocities
     assert state.speed_scaling_factor == 1.0
 
 
-@pytest.mark.parametrize("rows", [1, 2, 3], ids=["lines", "cubics", "quintics"])
+@pytest.mark.parametrize("rows", [3, *more(1, 2)])  # quintics; lines and cubics
 def test_it_goes_between_points_as_the_polynomials_do(controller, rows):
     rng = np.random.default_rng(rows)
     time = np.array([0.2, 0.5, 0.6, 1.0])
@@ -340,7 +341,7 @@ def test_a_path_tolerance_refuses_a_jump(controller):
 # ---- speed scaling -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.2])
+@pytest.mark.parametrize("factor", [0.5, *more(0.2)])
 def test_a_scaled_motion_takes_longer(controller, factor):
     controller.scale(factor)
     begin_s = controller.now_s

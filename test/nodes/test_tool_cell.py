@@ -12,6 +12,7 @@ from command import robocal_json
 from geometry_msgs.msg import TransformStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from long_form import more
 from rclpy.action import ActionClient
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import ToolStep
@@ -153,7 +154,7 @@ def rest_after(joints: list[JointState]) -> float:
     return float(stamp[-1] - stamp[moving[-1] + 1])
 
 
-HOW = ("cancel", "disarm", "silent", "deactivate", "kill")  # which ends the node
+HOW = ("cancel", *more("disarm"), "silent", *more("deactivate"), "kill")  # this ends the node
 
 
 def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path) -> None:
