@@ -63,10 +63,9 @@ def offered_qos(latched: bool) -> str:
 class BagWriter:
     """Writes one ``.mcap`` file; a context manager, the file is complete when it is left.
 
-    ``path``: an existing file is replaced.
-    ``latched``: topics that are published latched (transient-local); looked up with a topic's first
-    message.
-    ``compression``, ``chunk_bytes``: of the chunks; larger ones are smaller on the disk.
+    ``path``: an existing file is replaced. ``latched``: topics that are published latched
+    (transient-local); looked up with a topic's first message. ``compression``, ``chunk_bytes``: of
+    the chunks; larger ones are smaller on the disk.
 
     Raises `InputError` when the file cannot be made.
     """
@@ -227,9 +226,8 @@ class BagRecording:
     A new file is begun when one is full. ``metadata.yaml``, which ``ros2 bag play`` looks for,
     names each file from its begin on, so that a crash hides none; its counts are of that time.
 
-    ``folder``: made where it is not there; see `recording_folders.new_folder`.
-    ``latched``: topics that are published latched; may grow.
-    ``file_bytes``: size of a file.
+    ``folder``: made where it is not there; see `recording_folders.new_folder`. ``latched``: topics
+    that are published latched; may grow. ``file_bytes``: size of a file.
 
     Raises `StorageError` when it cannot be written; what was written before stays readable.
     """
@@ -403,10 +401,9 @@ MB = 1_000_000
 class Maker:
     """A recorder, the same after a restart.
 
-    ``node``: the full name of its node.
-    ``serial``: of its robot; "" without.
-    ``place``: what tells it from others of its name where there is no serial: host and ROS domain.
-    ``run``: of this start alone; no part of who it is.
+    ``node``: the full name of its node. ``serial``: of its robot; "" without. ``place``: what tells
+    it from others of its name where there is no serial: host and ROS domain. ``run``: of this start
+    alone; no part of who it is.
     """
 
     node: str
@@ -432,11 +429,10 @@ class MarkedRecording:
 class FreedSpace:
     """What became of the attempt to make room.
 
-    ``deleted``: recordings that are gone.
-    ``left``: why something that looks like a recording was left alone, by its name.
-    ``short_bytes``: so much is missing to what shall stay free, and no deleting would bring it.
-    ``rivals``: recordings that others write who say to be the same recorder: what earlier runs made
-    may be theirs, and stays.
+    ``deleted``: recordings that are gone. ``left``: why something that looks like a recording was
+    left alone, by its name. ``short_bytes``: so much is missing to what shall stay free, and no
+    deleting would bring it. ``rivals``: recordings that others write who say to be the same
+    recorder: what earlier runs made may be theirs, and stays.
     """
 
     deleted: tuple[Path, ...]

@@ -96,9 +96,8 @@ class RecordedTopics:
     ``wanted``: topics; relative ones are in the node's namespace, ``~/`` is the node's own.
     ``take``: is given topic, type and serialized message.
 
-    ``found``: by resolved name.
-    ``latched``: those that are offered latched, by both their names; grows.
-    ``unknown``: topics whose type cannot be recorded, and why.
+    ``found``: by resolved name. ``latched``: those that are offered latched, by both their names;
+    grows. ``unknown``: topics whose type cannot be recorded, and why.
     """
 
     def __init__(

@@ -50,8 +50,7 @@ class Played:
 class ReplayTopics:
     """One reliable publisher for each topic.
 
-    ``played``: by recorded name.
-    ``skipped``: topics that are not played, and why.
+    ``played``: by recorded name. ``skipped``: topics that are not played, and why.
     ``unacknowledged``: messages that a reliable subscriber did not confirm in time.
     """
 

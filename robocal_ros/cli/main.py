@@ -253,8 +253,7 @@ class CliResult:
     """Result of a command.
 
     ``document``: what ``--json`` prints; finite numbers only. Its ``warnings``, and its ``error``
-    where there is one, are told on standard error.
-    ``render``: prints the document for people.
+    where there is one, are told on standard error. ``render``: prints the document for people.
     """
 
     document: Document

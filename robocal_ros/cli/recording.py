@@ -275,10 +275,8 @@ SERIES = {  # of a state, by what it is called here, the first that is told
 class CheckPoints:
     """Where the tool truly was at poses that were never measured, without correction.
 
-    ``q`` (m, n): joints commanded, rad.
-    ``tool`` (3,): in the flange, m.
-    ``stamp_ns`` (t,): when it was told.
-    ``position``: (t, m, 3), base, m; the first is the cold robot.
+    ``q`` (m, n): joints commanded, rad. ``tool`` (3,): in the flange, m. ``stamp_ns`` (t,): when it
+    was told. ``position``: (t, m, 3), base, m; the first is the cold robot.
     """
 
     q: Array
@@ -299,9 +297,8 @@ class CheckPoints:
 class ToldStates:
     """States of a simulated cell: 48 bytes of each, however much it tells.
 
-    ``stamp_ns`` (t,): when each was told.
-    ``series``: the `SERIES`, (t,) each; not a number where it is not told.
-    ``faults``: stamp, ns, fault and size, SI (0: it ended), as they changed.
+    ``stamp_ns`` (t,): when each was told. ``series``: the `SERIES`, (t,) each; not a number where
+    it is not told. ``faults``: stamp, ns, fault and size, SI (0: it ended), as they changed.
     ``transforms``: by their names, as they changed.
     """
 

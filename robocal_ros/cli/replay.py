@@ -202,12 +202,11 @@ class ReplayRequest:
     """What to replay and how.
 
     ``find_robot``: gives the arm for the recorded configuration (None: nothing was recorded).
-    ``robot_named``: whether the user said which robot it is.
-    ``cold``, ``warm``: windows, s from the first joint reading; without any the recorded commands.
-    ``topics``: input to topic of the bag, where given.
-    ``state``: folder of a history that is kept; None: one that is not.
-    ``accept``: with ``auto``, accept each candidate that its verdict accepts.
-    ``observe``: gets a thermal session and its samples, and hands these on.
+    ``robot_named``: whether the user said which robot it is. ``cold``, ``warm``: windows, s from
+    the first joint reading; without any the recorded commands. ``topics``: input to topic of the
+    bag, where given. ``state``: folder of a history that is kept; None: one that is not.
+    ``accept``: with ``auto``, accept each candidate that its verdict accepts. ``observe``: gets a
+    thermal session and its samples, and hands these on.
     """
 
     bag: Path
@@ -234,7 +233,16 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
         reader = opened.enter_context(open_bag(request.bag))
         recording = open_recording(reader, request.topics)
         if not given:
-            _require_commands(request, recording)
+            # Refuse a recording without commands that can be obeyed.
+            if not recording.commands:
+                configured = recording.configured
+                words = _NO_COMMANDS if configured is None else f"{recording.events}: {UNASKED}"
+                words += _WINDOWS if session_kind(configured) in ("", "thermal") else ""
+                words += "" if request.robot_named or configured is not None else _NO_ROBOT
+                raise InputError(words, file=str(request.bag))
+            if any(command.name == MAINTAIN for command, _ in recording.commands):
+                raise InputError(_NOT_REPLAYED, file=str(request.bag))
+            recording.require_inputs()
         arm = request.find_robot(recording.configured)
         state = request.state or Path(opened.enter_context(TemporaryDirectory(prefix="robocal-")))
         serial = request.bag.resolve().stem
@@ -286,19 +294,6 @@ _NOT_REPLAYED = (
     "lists each with its reason"
 )
 _GOES_ON = "{} already holds calibrations: the replay went on from there"
-
-
-def _require_commands(request: ReplayRequest, recording: BagOverview) -> None:
-    """Refuse a recording without commands that can be obeyed."""
-    if not recording.commands:
-        configured = recording.configured
-        words = _NO_COMMANDS if configured is None else f"{recording.events}: {UNASKED}"
-        words += _WINDOWS if session_kind(configured) in ("", "thermal") else ""
-        words += "" if request.robot_named or configured is not None else _NO_ROBOT
-        raise InputError(words, file=str(request.bag))
-    if any(command.name == MAINTAIN for command, _ in recording.commands):
-        raise InputError(_NOT_REPLAYED, file=str(request.bag))
-    recording.require_inputs()
 
 
 def _session(

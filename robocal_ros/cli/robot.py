@@ -407,7 +407,9 @@ def _document(links: Chain, arm: SerialArm, output: Path, T_tip_flange: Array) -
 
     Of an element of its pose, mm, or its like in rad at a metre.
     """
-    q = _poses(arm)
+    low = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(arm.upper - 1.0, -np.pi))
+    high = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(arm.lower + 1.0, np.pi))
+    q = np.random.default_rng(0).uniform(low, high, (_POSES, arm.n))
     there = np.array([links.fk(row) @ T_tip_flange for row in q])
     return {
         "robot": arm.name,
@@ -419,12 +421,6 @@ def _document(links: Chain, arm: SerialArm, output: Path, T_tip_flange: Array) -
             np.abs(there - replace(arm, functions=None).fk(q)).max() * 1e3
         ),
     }
-
-
-def _poses(arm: SerialArm) -> Array:
-    low = np.where(np.isfinite(arm.lower), arm.lower, np.minimum(arm.upper - 1.0, -np.pi))
-    high = np.where(np.isfinite(arm.upper), arm.upper, np.maximum(arm.lower + 1.0, np.pi))
-    return np.random.default_rng(0).uniform(low, high, (_POSES, arm.n))
 
 
 def _show_import(console: "Console", document: Document) -> None:

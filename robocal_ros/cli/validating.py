@@ -424,8 +424,7 @@ class ReplayedCycle:
 class ThermalHistory:
     """The history of a replayed thermal session.
 
-    ``nominal``: the arm without any calibration.
-    ``start_ns``: first joint reading.
+    ``nominal``: the arm without any calibration. ``start_ns``: first joint reading.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, start_ns: int) -> None:

@@ -37,9 +37,8 @@ class CornerRule(SurfaceRule):
     """What the corners in a profile must be like.
 
     ``count``: how many corners the profile must show, convex and concave ones; None takes what is
-    there.
-    ``classic``: the published form instead of the best one.
-    ``repair_m``: classic only: a corner farther than this from the line through its like is moved.
+    there. ``classic``: the published form instead of the best one. ``repair_m``: classic only: a
+    corner farther than this from the line through its like is moved.
     """
 
     count: int | None = None
@@ -51,14 +50,13 @@ class CornerRule(SurfaceRule):
 class CornerFit:
     """Corners in the order of the laser line.
 
-    ``points`` (k, 2): x, z in the sensor frame, m.
-    ``covariance`` (k, 2, 2): m^2; neighbours share a surface, so their errors are not independent.
-    ``repaired`` (k,): moved onto the line through the others; in the best form none is.
-    ``convex`` (k,): outer edges, nearer to the sensor than the surfaces beside them.
-    ``left_out`` (j, 2): where a surface ends without a corner that is known: its neighbour was not
-    seen, or too little of it.
-    ``noise_m``: standard deviation of a point along z, from the profile.
-    ``sides``: points (n, 2) on the two surfaces that meet at each corner, m; classic tells none.
+    ``points`` (k, 2): x, z in the sensor frame, m. ``covariance`` (k, 2, 2): m^2; neighbours share
+    a surface, so their errors are not independent. ``repaired`` (k,): moved onto the line through
+    the others; in the best form none is. ``convex`` (k,): outer edges, nearer to the sensor than
+    the surfaces beside them. ``left_out`` (j, 2): where a surface ends without a corner that is
+    known: its neighbour was not seen, or too little of it. ``noise_m``: standard deviation of a
+    point along z, from the profile. ``sides``: points (n, 2) on the two surfaces that meet at each
+    corner, m; classic tells none.
     """
 
     points: Array
@@ -202,9 +200,8 @@ class EdgeRule(SurfaceRule):
     ``kind``: "edge" is an outer edge, nearer to the sensor than the surfaces beside it; where the
     best form finds none, it is the end of a surface beyond which a farther one is seen. "groove" is
     an inner edge, the bottom of a groove or the foot of a step, farther from the sensor than the
-    surfaces beside it.
-    ``classic``: the published form instead of the best one: the largest second derivative of z over
-    x for an edge, the smallest (most negative) for a groove.
+    surfaces beside it. ``classic``: the published form instead of the best one: the largest second
+    derivative of z over x for an edge, the smallest (most negative) for a groove.
     """
 
     kind: Kind = "edge"
@@ -215,10 +212,8 @@ class EdgeRule(SurfaceRule):
 class EdgeFit:
     """A feature.
 
-    ``point`` (2,): x, z in the sensor frame, m.
-    ``covariance`` (2, 2): m^2.
-    ``sides``: points (n, 2) on the surfaces that meet there, m; none where one ends alone, and in
-    the classic form.
+    ``point`` (2,): x, z in the sensor frame, m. ``covariance`` (2, 2): m^2. ``sides``: points (n,
+    2) on the surfaces that meet there, m; none where one ends alone, and in the classic form.
     """
 
     point: Array

@@ -41,9 +41,8 @@ class Freedom:
     numbers, of those that tell the noise trace(A (W + s^2 P)^-1) (MacKay, Bayesian interpolation,
     1992: the number of well-determined parameters).
 
-    ``count``: N numbers tell the noise.
-    ``told``, ``data`` (k,): diagonals of A and W in directions in which W + unit P is one.
-    ``unit``: a variance at which data and prior weigh alike.
+    ``count``: N numbers tell the noise. ``told``, ``data`` (k,): diagonals of A and W in directions
+    in which W + unit P is one. ``unit``: a variance at which data and prior weigh alike.
     """
 
     count: int
@@ -160,10 +159,9 @@ class DescentState(Generic[S]):
 class Loss(Generic[S]):
     """Of one step of a descent.
 
-    ``prior`` (k, k): information about the unknowns.
-    ``keep`` (m,): samples in use.
-    ``scale``: standard deviation of a whitened residual.
-    ``huber`` (m,): length of each sample's residual, in scales, from which it counts linearly.
+    ``prior`` (k, k): information about the unknowns. ``keep`` (m,): samples in use. ``scale``:
+    standard deviation of a whitened residual. ``huber`` (m,): length of each sample's residual, in
+    scales, from which it counts linearly.
     """
 
     problem: Problem[S]
@@ -517,13 +515,12 @@ FREE_ATTEMPTS = 5  # in which a rejected sample may come back
 class Estimate(Generic[S]):
     """Outcome of ``solve``.
 
-    ``state``: the estimate.
-    ``covariance`` (k, k): of the increments at the estimate, in the problem's units.
-    ``scale``: standard deviation of the whitened residual: 1 where sigmas were given, unless the
-    residuals are clearly larger; then covariances are widened by it.
-    ``freedom``: how many numbers tell the scale: those of the residuals less those that the
-    unknowns take up. What the prior holds takes up none.
-    ``residual`` (m, c): whitened; ``rejected`` (m,) marks samples not used.
+    ``state``: the estimate. ``covariance`` (k, k): of the increments at the estimate, in the
+    problem's units. ``scale``: standard deviation of the whitened residual: 1 where sigmas were
+    given, unless the residuals are clearly larger; then covariances are widened by it. ``freedom``:
+    how many numbers tell the scale: those of the residuals less those that the unknowns take up.
+    What the prior holds takes up none. ``residual`` (m, c): whitened; ``rejected`` (m,) marks
+    samples not used.
     """
 
     state: S
@@ -572,13 +569,11 @@ def solve(
 
     ``prior_information`` (k, k): inverse covariance of the prior, or None (zeros) for a flat one.
     ``noise_known``: whether residuals are in units of their true sigma; otherwise a common scale is
-    estimated with them.
-    ``robust``: whether to look for outliers.
-    ``sizes`` (m,): how many of its c components each sample has, where they differ; the residuals
-    and Jacobians of the others are zero.
-    ``freedom``: how many numbers the sigmas were found from, where they come from these data: then
-    a sample must be farther off to be an outlier (F distribution).
-    ``false_rejection``: chance that clean data lose any sample.
+    estimated with them. ``robust``: whether to look for outliers. ``sizes`` (m,): how many of its c
+    components each sample has, where they differ; the residuals and Jacobians of the others are
+    zero. ``freedom``: how many numbers the sigmas were found from, where they come from these data:
+    then a sample must be farther off to be an outlier (F distribution). ``false_rejection``: chance
+    that clean data lose any sample.
 
     Raises `TooFewSamplesError`: without a prior, fewer equations than unknowns;
     `RankDeficientError` when the data, and the prior where there is one, leave a direction

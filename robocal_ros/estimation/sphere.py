@@ -62,11 +62,20 @@ _FEWEST = 8  # points that improve a start
 def find_circle(points: Array, radius: float, limit: float) -> Array | None:
     """The circle (x0, z0, r) with its near side on most points (n, 2); None if there is none.
 
-    ``points`` (n, 2): of the profile, m.
-    ``radius``: of the sphere, m; the circle's is 0.2 to 1.5 of it.
-    ``limit``: distance from the circle within which a point is near it, m.
+    ``points`` (n, 2): of the profile, m. ``radius``: of the sphere, m; the circle's is 0.2 to 1.5
+    of it. ``limit``: distance from the circle within which a point is near it, m.
     """
-    circles = _through(_triples(points, radius))
+    # Circles (c, 3) through triples (t, 3, 2); those whose near side passes through the middle.
+    triples = _triples(points, radius)
+    a, b = triples[:, 0] - triples[:, 1], triples[:, 2] - triples[:, 1]
+    area = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    # The outer points lie further from the sensor than the middle one: the surface is convex.
+    convex = area < -np.finfo(float).tiny
+    a, b, area, middle = a[convex], b[convex], area[convex], triples[convex, 1]
+    aa, bb = np.sum(a * a, axis=1), np.sum(b * b, axis=1)
+    foot = np.column_stack([b[:, 1] * aa - a[:, 1] * bb, a[:, 0] * bb - b[:, 0] * aa])
+    foot /= area[:, None]
+    circles = np.column_stack([middle + foot, np.sqrt(np.sum(foot * foot, axis=1))])
     circles = circles[
         (circles[:, 2] > SMALLEST_SHARE * radius) & (circles[:, 2] < LARGEST_SHARE * radius)
     ]
@@ -112,19 +121,6 @@ def _triples(points: Array, radius: float) -> Array:
     right = np.minimum(np.searchsorted(x, x[middle] + reach), last).ravel()
     rows = np.column_stack([left, np.tile(middle, len(_WIDTHS)), right])
     return np.asarray(smooth[rows])
-
-
-def _through(triples: Array) -> Array:
-    """Circles (c, 3) through triples (t, 3, 2); those whose near side passes through the middle."""
-    a, b = triples[:, 0] - triples[:, 1], triples[:, 2] - triples[:, 1]
-    area = 2.0 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    # The outer points lie further from the sensor than the middle one: the surface is convex.
-    convex = area < -np.finfo(float).tiny
-    a, b, area, middle = a[convex], b[convex], area[convex], triples[convex, 1]
-    aa, bb = np.sum(a * a, axis=1), np.sum(b * b, axis=1)
-    foot = np.column_stack([b[:, 1] * aa - a[:, 1] * bb, a[:, 0] * bb - b[:, 0] * aa])
-    foot /= area[:, None]
-    return np.column_stack([middle + foot, np.sqrt(np.sum(foot * foot, axis=1))])
 
 
 def _costs(circles: Array, points: Array, limit: float) -> Array:
@@ -181,12 +177,10 @@ class LargeArcError(ResidualError):
 class ArcRule:
     """What the arc of a sphere in a profile must be like.
 
-    ``radius_m``: R, of the sphere.
-    ``radius_tolerance_m``: how far the arc's radius may exceed the sphere's.
-    ``radius_sigma_m``: largest standard deviation of the arc's radius; a short arc has a larger
-    one.
-    ``noise_m``: largest standard deviation of a point along its normal.
-    ``towards``: whether z grows towards the sensor (a height), not away from it (a distance).
+    ``radius_m``: R, of the sphere. ``radius_tolerance_m``: how far the arc's radius may exceed the
+    sphere's. ``radius_sigma_m``: largest standard deviation of the arc's radius; a short arc has a
+    larger one. ``noise_m``: largest standard deviation of a point along its normal. ``towards``:
+    whether z grows towards the sensor (a height), not away from it (a distance).
     """
 
     radius_m: float
@@ -200,13 +194,12 @@ class ArcRule:
 class ArcFit:
     """A fitted arc.
 
-    ``centre`` (2,): x0, z0 of the circle, sensor frame, m.
-    ``radius_m``: r, of the circle.
-    ``covariance`` (3, 3): of (x0, z0, r) from the points' scatter and form, m^2.
-    ``noise_m``: standard deviation of a point along its normal, root mean square over the arc.
-    ``form_m``: rms of the smooth deviation from the circle where it is more than noise, else 0: of
-    the sensor's linearity, of light that enters the surface, of the surface.
-    ``used`` (n,): which points were taken for the arc's.
+    ``centre`` (2,): x0, z0 of the circle, sensor frame, m. ``radius_m``: r, of the circle.
+    ``covariance`` (3, 3): of (x0, z0, r) from the points' scatter and form, m^2. ``noise_m``:
+    standard deviation of a point along its normal, root mean square over the arc. ``form_m``: rms
+    of the smooth deviation from the circle where it is more than noise, else 0: of the sensor's
+    linearity, of light that enters the surface, of the surface. ``used`` (n,): which points were
+    taken for the arc's.
     """
 
     centre: Array
@@ -431,9 +424,8 @@ _CLOSE_M = 1e-8
 class SphereRule:
     """What a measured sphere must be like.
 
-    ``radius_m``: certified radius.
-    ``radius_tolerance_m``: how far the radius of the measured points may be off.
-    ``noise_m``: largest standard deviation of a point along its normal.
+    ``radius_m``: certified radius. ``radius_tolerance_m``: how far the radius of the measured
+    points may be off. ``noise_m``: largest standard deviation of a point along its normal.
     ``centre_sigma_m``: largest standard deviation of the centre in any direction.
     ``half_angle_rad``: smallest half angle of the cap; a smaller one turns a form error of the
     sensor into several times as much of the centre.
@@ -450,12 +442,11 @@ class SphereRule:
 class SphereFit:
     """A fitted sphere.
 
-    ``centre`` (3,): in the frame of the points, m.
-    ``covariance`` (3, 3): of the centre from the points' scatter, m^2.
-    ``noise_m``: standard deviation of a point along its normal.
-    ``radius_m``, ``radius_sigma_m``: of a fit with free radius; checks the known one.
-    ``half_angle_rad``: of the cone about the cap's middle that holds 95 % of its points.
-    ``used`` (n,): which points were taken for the sphere's.
+    ``centre`` (3,): in the frame of the points, m. ``covariance`` (3, 3): of the centre from the
+    points' scatter, m^2. ``noise_m``: standard deviation of a point along its normal. ``radius_m``,
+    ``radius_sigma_m``: of a fit with free radius; checks the known one. ``half_angle_rad``: of the
+    cone about the cap's middle that holds 95 % of its points. ``used`` (n,): which points were
+    taken for the sphere's.
     """
 
     centre: Array

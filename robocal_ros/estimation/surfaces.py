@@ -39,12 +39,10 @@ _WORST = 0.5  # share of points beside a line that is still one
 class Flank:
     """A straight piece of a profile.
 
-    ``rows`` (n,): indices of its points in the profile, ascending.
-    ``middle`` (2,): mean of its points, m.
-    ``direction`` (2,): unit vector in the order of the points.
-    ``start_m``, ``end_m``: of its points along the direction, from the middle.
-    ``noise_m``: standard deviation of a point along the normal.
-    ``spread_m2``: sum of squares of its points along the direction.
+    ``rows`` (n,): indices of its points in the profile, ascending. ``middle`` (2,): mean of its
+    points, m. ``direction`` (2,): unit vector in the order of the points. ``start_m``, ``end_m``:
+    of its points along the direction, from the middle. ``noise_m``: standard deviation of a point
+    along the normal. ``spread_m2``: sum of squares of its points along the direction.
     """
 
     rows: NDArray[np.int64]
@@ -187,10 +185,9 @@ class SurfaceRule:
 class Corner:
     """Where two neighbouring surfaces meet.
 
-    ``point`` (2,): x, z, m.
-    ``covariance`` (2, 2): m^2.
-    ``turn_rad``: from the first surface to the second; positive where the corner is convex, an
-    outer edge, nearer to the sensor than the surfaces.
+    ``point`` (2,): x, z, m. ``covariance`` (2, 2): m^2. ``turn_rad``: from the first surface to the
+    second; positive where the corner is convex, an outer edge, nearer to the sensor than the
+    surfaces.
     """
 
     point: Array

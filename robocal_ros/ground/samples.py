@@ -99,14 +99,12 @@ class TemperatureSample:
 class Measurements:
     """Joint readings paired with measured positions or poses of named targets on the flange.
 
-    ``q`` (m, n): joint readings, rad (prismatic: m).
-    ``position`` (m, 3): target position in the measuring frame, m.
-    ``target``: m names; each name is one point (or frame) fixed to the flange.
-    ``sample``: m unique ids, for naming rejected samples.
-    ``rotation`` (m, 3, 3): R_frame_target, or None when only positions were measured.
-    ``sigma`` (m,): standard deviation of each position coordinate, m, or None when unknown.
-    ``stamp_ns`` (m,): int64, or None.
-    ``side`` (m, n): which way each joint went last, see `JointStream.side`; or None.
+    ``q`` (m, n): joint readings, rad (prismatic: m). ``position`` (m, 3): target position in the
+    measuring frame, m. ``target``: m names; each name is one point (or frame) fixed to the flange.
+    ``sample``: m unique ids, for naming rejected samples. ``rotation`` (m, 3, 3): R_frame_target,
+    or None when only positions were measured. ``sigma`` (m,): standard deviation of each position
+    coordinate, m, or None when unknown. ``stamp_ns`` (m,): int64, or None. ``side`` (m, n): which
+    way each joint went last, see `JointStream.side`; or None.
     """
 
     q: Array

@@ -337,9 +337,8 @@ class CameraSettings:
     """How to calibrate.
 
     ``method``: ``best`` is maximum likelihood; the name of a closed form is the same from that
-    start; ``classic`` is the closed form that fits best, alone, without covariance.
-    ``noise``: what is known of it.
-    ``limit_m``: largest expected error where the boards were that is accepted.
+    start; ``classic`` is the closed form that fits best, alone, without covariance. ``noise``: what
+    is known of it. ``limit_m``: largest expected error where the boards were that is accepted.
     """
 
     method: str = "best"
@@ -369,9 +368,8 @@ def calibrate_camera(
 ) -> HandEyeResult:
     """Place a camera.
 
-    ``check``: what judges the result and is not used to find it.
-    ``rejected``: samples that were left out before, with the reason.
-    ``more``: further entries of the document.
+    ``check``: what judges the result and is not used to find it. ``rejected``: samples that were
+    left out before, with the reason. ``more``: further entries of the document.
 
     Raises `TooFewSamplesError` or `RankDeficientError` when the poses do not show the camera's
     place; `InputError` when the pairs hold a mistake that can be named: units, inverted, shifted;

@@ -43,11 +43,10 @@ class PosePairs:
     ``to-hand``: the camera stands still, the board is on the flange; X = T_base_camera and
     Z = T_flange_board with X T_camera_board = T_base_flange Z.
 
-    ``T_base_flange``, ``T_camera_board`` (m, 4, 4).
-    ``names`` (m,) of the samples.
-    ``covariance`` (m, 6, 6) of T_camera_board, m and rad: of its position, and of its turn, both
-    along the camera's axes; None where it is not known.
-    ``time_s`` (m,) of the samples of a stream, increasing; None of single shots.
+    ``T_base_flange``, ``T_camera_board`` (m, 4, 4). ``names`` (m,) of the samples. ``covariance``
+    (m, 6, 6) of T_camera_board, m and rad: of its position, and of its turn, both along the
+    camera's axes; None where it is not known. ``time_s`` (m,) of the samples of a stream,
+    increasing; None of single shots.
     """
 
     T_base_flange: Array

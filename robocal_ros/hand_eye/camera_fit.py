@@ -241,12 +241,11 @@ class PairNoise:
     distance and one of tilt beside that of its lateral position and of its turn about the axis.
 
     ``position_m``: of the board's position, by both sides together; where the pairs have a
-    covariance of the camera's side, by the robot alone.
-    ``turn_rad``: of the flange's orientation, which moves the board by its lever.
-    ``tilt_rad``, ``roll_rad``: of the board's turn in the camera, across its axis and about it.
-    ``depth_m``: what the position along the camera's axis errs by besides.
-    ``excess``: root of what is added to the pairs' own covariance, as a part of it. It takes the
-    place of the camera's other three, which are zero where the pairs have one.
+    covariance of the camera's side, by the robot alone. ``turn_rad``: of the flange's orientation,
+    which moves the board by its lever. ``tilt_rad``, ``roll_rad``: of the board's turn in the
+    camera, across its axis and about it. ``depth_m``: what the position along the camera's axis
+    errs by besides. ``excess``: root of what is added to the pairs' own covariance, as a part of
+    it. It takes the place of the camera's other three, which are zero where the pairs have one.
     """
 
     position_m: float

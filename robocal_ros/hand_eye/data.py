@@ -174,9 +174,8 @@ class StandingShot:
 class Standstills:
     """Pairs profiles with standstills, as a session does for a capture.
 
-    ``found``: shots in the order of the recording.
-    ``rejected``: name of each other profile, and why it is none.
-    ``ignored``: joint readings that were not used.
+    ``found``: shots in the order of the recording. ``rejected``: name of each other profile, and
+    why it is none. ``ignored``: joint readings that were not used.
     """
 
     def __init__(
@@ -347,13 +346,11 @@ class PoseModels:
 class HandEyeSample:
     """What was seen at one standstill.
 
-    ``handle``: its name.
-    ``mark``: of a step target the mark that the laser plane lies through, of a tracker's one of
-    `ROLES` or `SCAN`, of marked points the name; else empty.
-    ``stamp_ns``: of the shot.
-    ``q`` (n,) mean of the joint readings at standstill, rad (prismatic: m).
-    ``values``: see `Shot.read`; of an image `seen_corners`.
-    ``thermal``: what was in force then, so that a set of a cold robot stays one.
+    ``handle``: its name. ``mark``: of a step target the mark that the laser plane lies through, of
+    a tracker's one of `ROLES` or `SCAN`, of marked points the name; else empty. ``stamp_ns``: of
+    the shot. ``q`` (n,) mean of the joint readings at standstill, rad (prismatic: m). ``values``:
+    see `Shot.read`; of an image `seen_corners`. ``thermal``: what was in force then, so that a set
+    of a cold robot stays one.
     """
 
     handle: int

@@ -127,14 +127,12 @@ def beside_corners(sides: Iterable[Array], corners: Array) -> list[SeenLine]:
 class SensorLinearity:
     """An error of z over the field: told less true, m.
 
-    ``low``, ``high`` (2,): ends of the field in x and z that profiles showed, m.
-    ``degree``: of the polynomial; a shift and a turn are the mount's.
-    ``coefficients`` (k,), ``covariance`` (k, k): of products of Legendre's polynomials, and of the
-    scale of z, m.
-    ``rms_m``, ``max_m``: of the error at the points that showed it.
-    ``residual_m``, ``left_out_m``: rms of residuals without it, and with one that is
-    found from the other profiles.
-    ``assumed``: not seen; none is taken out, and ``covariance`` and ``rms_m`` are as makers state.
+    ``low``, ``high`` (2,): ends of the field in x and z that profiles showed, m. ``degree``: of the
+    polynomial; a shift and a turn are the mount's. ``coefficients`` (k,), ``covariance`` (k, k): of
+    products of Legendre's polynomials, and of the scale of z, m. ``rms_m``, ``max_m``: of the error
+    at the points that showed it. ``residual_m``, ``left_out_m``: rms of residuals without it, and
+    with one that is found from the other profiles. ``assumed``: not seen; none is taken out, and
+    ``covariance`` and ``rms_m`` are as makers state.
     """
 
     low: Array

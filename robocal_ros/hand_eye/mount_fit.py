@@ -105,12 +105,11 @@ def joined(words: Sequence[str]) -> str:
 class MountFit:
     """The most likely mount.
 
-    ``views``: of the sightings that were used, in the order of the problem's.
-    ``state``, ``covariance`` (k, k) of the problem's unknowns; ``scale``: how far the misfit
-    widened it.
-    ``noise``: of reported poses, given or found.
-    ``rejected``: names of sightings not used, with the reason.
-    ``doubt``: why this is no solution, or not the only one, in words; empty where it is.
+    ``views``: of the sightings that were used, in the order of the problem's. ``state``,
+    ``covariance`` (k, k) of the problem's unknowns; ``scale``: how far the misfit widened it.
+    ``noise``: of reported poses, given or found. ``rejected``: names of sightings not used, with
+    the reason. ``doubt``: why this is no solution, or not the only one, in words; empty where it
+    is.
     """
 
     views: tuple[TargetView, ...]

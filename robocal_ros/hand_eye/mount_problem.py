@@ -41,12 +41,10 @@ WIDEST = 1.0  # of them
 class Sightings:
     """Features (m) of one target.
 
-    ``names``: of the features, for reports.
-    ``shot`` (m,) index of the shot that each was seen in.
+    ``names``: of the features, for reports. ``shot`` (m,) index of the shot that each was seen in.
     ``pose`` (m,) index of the pose that it was taken from, as of `same_pose`: those with one index
-    share its error.
-    ``T_base_flange`` (m, 4, 4) reported pose of each.
-    ``value`` (m, 3), m; ``covariance``: (m, 3, 3). Empty components have value 0 and variance 1.
+    share its error. ``T_base_flange`` (m, 4, 4) reported pose of each. ``value`` (m, 3), m;
+    ``covariance``: (m, 3, 3). Empty components have value 0 and variance 1.
     """
 
     names: tuple[str, ...]
@@ -89,12 +87,11 @@ def in_plane(value: Array) -> Array:
 class Seen:
     """What a model predicts for m sightings.
 
-    ``value`` (m, 3) predicted features.
-    ``point`` (m, 3) the point of the target that is seen, sensor frame, m.
-    ``slope`` (m, 3, 3) change of the value as that point moves with the target, sensor axes.
-    ``spread`` (m, 3, k) displacement of that point, base axes, for each unknown of the target.
-    ``aim`` (m, 3, 2) change of the value with how the light was laid on the target by eye, which
-    all sightings of one pose have in common; None where nothing is laid by eye.
+    ``value`` (m, 3) predicted features. ``point`` (m, 3) the point of the target that is seen,
+    sensor frame, m. ``slope`` (m, 3, 3) change of the value as that point moves with the target,
+    sensor axes. ``spread`` (m, 3, k) displacement of that point, base axes, for each unknown of the
+    target. ``aim`` (m, 3, 2) change of the value with how the light was laid on the target by eye,
+    which all sightings of one pose have in common; None where nothing is laid by eye.
     """
 
     value: Array
@@ -262,10 +259,9 @@ class CornerModel(TargetModel):
 
     What the eye missed is a shift of the light along the edges and a turn across them.
 
-    ``corner_user`` (m, 3) mark that each sighting shows, user frame, m.
-    ``edge_user`` (3,) unit direction of the edges.
-    ``T_base_user`` (4, 4) as taught; ``information`` (6, 6) about its error (v, w), user axes, or
-    None where it is exact. Place (4, 4) = the user frame.
+    ``corner_user`` (m, 3) mark that each sighting shows, user frame, m. ``edge_user`` (3,) unit
+    direction of the edges. ``T_base_user`` (4, 4) as taught; ``information`` (6, 6) about its error
+    (v, w), user axes, or None where it is exact. Place (4, 4) = the user frame.
     """
 
     corner_user: Array
@@ -349,8 +345,7 @@ class MountState:
 class Linear:
     """All sightings (m) linearised: nothing is whitened yet.
 
-    ``residual`` (m, 3), prediction minus measurement.
-    ``jacobian`` (m, 3, k) for the unknowns.
+    ``residual`` (m, 3), prediction minus measurement. ``jacobian`` (m, 3, k) for the unknowns.
     ``common`` (m, 3, 8) for what all sightings of a pose have in common, as in `PoseNoise`.
     ``covariance`` (m, 3, 3) of the measured value.
     """

@@ -116,11 +116,10 @@ class PlanReport:
 
     ``rank``, ``unknowns``: of the problem; a direction that stays open by 2 cm is not seen, even
     where rounding or a faint effect would tell something. ``unobservable``: those of the sensor, in
-    words.
-    ``sigma`` (6,) expected, sensor axes: m, rad; ``working_error_m``: rms at the working distance.
-    ``unseen``: poses (by index) that do not see the target, with the reason.
-    ``proposed`` (n, 4, 4) flange poses to add, best first; ``proposed_error_m``: with all of them,
-    None where there is none.
+    words. ``sigma`` (6,) expected, sensor axes: m, rad; ``working_error_m``: rms at the working
+    distance. ``unseen``: poses (by index) that do not see the target, with the reason. ``proposed``
+    (n, 4, 4) flange poses to add, best first; ``proposed_error_m``: with all of them, None where
+    there is none.
     """
 
     rank: int

@@ -88,20 +88,19 @@ def profile_of(points: ArrayLike, name: str) -> Profile:
 class SensorDescription:
     """How a line laser tells its profiles; plain values, so that a recording carries them.
 
-    ``z_grows``: away from the sensor, or towards it.
-    ``x``, ``z``: columns of a table, by name or number (from 1), or fields of a cloud, along the
-    laser line and along the beam; empty: ``x_mm`` and ``z_mm`` of a table, x and z of a cloud.
-    ``unit``, ``cloud_unit``: of both in files, and in messages; a table's own columns are in mm.
-    ``x_pitch_mm``: from column to column where nothing tells x, the first at ``x_start_mm`` or, if
-    None, so that 0 is amid them; 0: x is told.
+    ``z_grows``: away from the sensor, or towards it. ``x``, ``z``: columns of a table, by name or
+    number (from 1), or fields of a cloud, along the laser line and along the beam; empty: ``x_mm``
+    and ``z_mm`` of a table, x and z of a cloud. ``unit``, ``cloud_unit``: of both in files, and in
+    messages; a table's own columns are in mm. ``x_pitch_mm``: from column to column where nothing
+    tells x, the first at ``x_start_mm`` or, if None, so that 0 is amid them; 0: x is told.
     ``lines``: whether each line of a table holds the heights of a profile, at that pitch.
     ``z_step_mm``, ``z_zero``: of a count, and which count is 0; a step of 0: z is a length.
-    ``no_return``: values of z, as they are told, that stand for none.
-    ``intensity``, ``least_intensity``: a column or field; weaker points are left out.
-    ``row``: a column or field that numbers the profiles, where there are several.
-    ``ordered``: whether points follow the sensor's columns; else they are sorted along x.
-    ``near_mm``, ``far_mm``, ``width_mm``, ``noise_mm``: of the field and of a point along the beam;
-    see `planning.SensorRange`; None where nothing is told.
+    ``no_return``: values of z, as they are told, that stand for none. ``intensity``,
+    ``least_intensity``: a column or field; weaker points are left out. ``row``: a column or field
+    that numbers the profiles, where there are several. ``ordered``: whether points follow the
+    sensor's columns; else they are sorted along x. ``near_mm``, ``far_mm``, ``width_mm``,
+    ``noise_mm``: of the field and of a point along the beam; see `planning.SensorRange`; None where
+    nothing is told.
     """
 
     z_grows: str = Z_GROWS[0]
@@ -264,7 +263,11 @@ def columns_profile(
     if "x" in columns:
         x: Array = columns["x"] * unit_m
     else:
-        place = _places(numbers)
+        # Place (n,) of each point within its profile.
+        order = np.argsort(numbers, kind="stable")
+        ordered = numbers[order]
+        place = np.empty(len(numbers), dtype=np.int64)
+        place[order] = np.arange(len(numbers)) - np.searchsorted(ordered, ordered)
         count = int(place.max()) + 1
         middle_mm = -0.5 * (count - 1) * sensor.x_pitch_mm
         start_mm = middle_mm if sensor.x_start_mm is None else sensor.x_start_mm
@@ -325,15 +328,6 @@ def _rows_of(columns: Columns, width: int, unit_m: float) -> NDArray[np.int64]:
         return one  # in no order at all
     one[np.flatnonzero(told)[1:][steps < -ANEW * np.ptp(x)]] = 1
     return np.cumsum(one)
-
-
-def _places(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Place (n,) of each point within its profile."""
-    order = np.argsort(numbers, kind="stable")
-    ordered = numbers[order]
-    place = np.empty(len(numbers), dtype=np.int64)
-    place[order] = np.arange(len(numbers)) - np.searchsorted(ordered, ordered)
-    return place
 
 
 def _wanted(sensor: SensorDescription, x: str, z: str, y: str = "") -> dict[str, str]:

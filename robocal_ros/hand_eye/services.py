@@ -80,8 +80,7 @@ MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
 class HandEyeOutputs:
     """Publishers of one sensor's results.
 
-    ``add``: creates a publisher.
-    ``robot``, ``serial``: as messages carry them.
+    ``add``: creates a publisher. ``robot``, ``serial``: as messages carry them.
 
     ``transforms``: all that were put onto tf.
     ``missing``: what cannot be published on this machine; empty when everything can.
@@ -174,9 +173,8 @@ def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStat
 class HandEyeFiles:
     """``~/load``, ``~/save`` and its Trigger twin; the data set of each calibration is kept.
 
-    ``ask``: gives a command to the session and awaits its outcome.
-    ``session``: the one that runs; raises while the node is inactive.
-    ``history``: beside its file data sets are kept.
+    ``ask``: gives a command to the session and awaits its outcome. ``session``: the one that runs;
+    raises while the node is inactive. ``history``: beside its file data sets are kept.
     """
 
     def __init__(
@@ -577,7 +575,15 @@ class HandEyeServices:
             if (number := session.in_force.calibration_id) is None:
                 raise ConflictError("no calibration is in force: name candidates")
             numbers = [number]
-        touched = _touched(request)
+        # Places (3,) in base, m, by name.
+        names, places = list(request.points), [np.array(_point(p)) for p in request.touched]
+        if len(names) != len(places) or len(set(names)) < len(names):
+            raise InputError(
+                f"points {names} and {len(places)} touched places: give one for each name"
+            )
+        if not all(np.all(np.isfinite(place)) for place in places):
+            raise InputError("touched places must be finite, m")
+        touched = dict(zip(names, places, strict=True))
         samples = data.chosen([])
         scanned, rejected = scanned_points(
             [one.mark for one in samples],
@@ -616,16 +622,6 @@ class HandEyeServices:
         own = self._history.document(number).get("linearity")
         linearity = None if own is None else SensorLinearity.of_document(own)
         return SensorMount("flange", np.array(model["T_parent_sensor"]), linearity)
-
-
-def _touched(request: Any) -> dict[str, Array]:
-    """Places (3,) in base, m, by name."""
-    names, places = list(request.points), [np.array(_point(p)) for p in request.touched]
-    if len(names) != len(places) or len(set(names)) < len(names):
-        raise InputError(f"points {names} and {len(places)} touched places: give one for each name")
-    if not all(np.all(np.isfinite(place)) for place in places):
-        raise InputError("touched places must be finite, m")
-    return dict(zip(names, places, strict=True))
 
 
 def _parts(pose: Any) -> tuple[list[float], list[float]]:

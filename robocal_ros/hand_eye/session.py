@@ -88,14 +88,12 @@ Samples = Sequence[HandEyeSample]
 class HandEyeConfig:
     """Settings of a hand-eye session; plain values, so that a recording carries them.
 
-    ``base_frame``, ``flange_frame``, ``sensor_frame``: names of the frames.
-    ``standstill``: when the robot counts as standing still about a measurement.
-    ``capture_timeout_s``: a capture without standstill or without a measurement for so long fails.
-    ``robot_sigma_m``, ``robot_sigma_rad``: error of a reported flange pose along and about each
-    axis, one sigma; None: found from the samples, but the second of a line laser as
-    `HandEyeSettings`.
-    ``limit_m``: largest expected error at the working distance that is accepted.
-    ``sensor``: how a line laser tells its profiles.
+    ``base_frame``, ``flange_frame``, ``sensor_frame``: names of the frames. ``standstill``: when
+    the robot counts as standing still about a measurement. ``capture_timeout_s``: a capture without
+    standstill or without a measurement for so long fails. ``robot_sigma_m``, ``robot_sigma_rad``:
+    error of a reported flange pose along and about each axis, one sigma; None: found from the
+    samples, but the second of a line laser as `HandEyeSettings`. ``limit_m``: largest expected
+    error at the working distance that is accepted. ``sensor``: how a line laser tells its profiles.
     ``tracker_frame``: of the points of a laser tracker; ``tracker_sigma_m``: of a coordinate of
     one; ``joint_sigma_rad``, ``joint_sigma_m``: of a joint that moves between its visits.
     """

@@ -73,13 +73,11 @@ class SphereTarget:
 class StepTarget:
     """Corners of parallel edges at known places.
 
-    ``T_base_user`` (4, 4), m; the user frame that was taught at the target.
-    ``corners``: of each mark the corners (k, 3), m, user frame, in the order in which a profile
-    that is laid through this mark shows them.
-    ``edge_user`` (3,) unit vector along the edges, user frame.
-    ``sigma_m``: machining error of each corner's coordinate, one sigma.
-    ``user_sigma_m``, ``user_sigma_rad``: error of ``T_base_user`` about each axis, one sigma; it is
-    common to all corners.
+    ``T_base_user`` (4, 4), m; the user frame that was taught at the target. ``corners``: of each
+    mark the corners (k, 3), m, user frame, in the order in which a profile that is laid through
+    this mark shows them. ``edge_user`` (3,) unit vector along the edges, user frame. ``sigma_m``:
+    machining error of each corner's coordinate, one sigma. ``user_sigma_m``, ``user_sigma_rad``:
+    error of ``T_base_user`` about each axis, one sigma; it is common to all corners.
     """
 
     T_base_user: Array
@@ -160,11 +158,10 @@ class Staircase:
     the other, y into the steps, z up. Step i = 0, 1 … has its riser at ``y = i depth``, its tread
     at ``z = (i + 1) height`` and its marks at a third (near) and two thirds (far) of its length.
 
-    ``steps``: number of treads.
-    ``length_m``, ``height_m``, ``depth_m``: of a step along x, z and y.
-    ``corners``: which of them a profile is read for. Riser and tread of one step meet in a convex
-    corner, a tread and the next riser in a concave one.
-    ``first``: the step with which a profile begins.
+    ``steps``: number of treads. ``length_m``, ``height_m``, ``depth_m``: of a step along x, z and
+    y. ``corners``: which of them a profile is read for. Riser and tread of one step meet in a
+    convex corner, a tread and the next riser in a concave one. ``first``: the step with which a
+    profile begins.
     """
 
     steps: int

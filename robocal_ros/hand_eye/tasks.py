@@ -114,9 +114,8 @@ class Read:
 class Task(ABC):
     """A kind of target.
 
-    ``read_by_poses``: whether poses tell which feature of a profile is which.
-    ``plain``: profiles are taken as they are; else the sensor's linearity is taken out of them,
-    where they show it.
+    ``read_by_poses``: whether poses tell which feature of a profile is which. ``plain``: profiles
+    are taken as they are; else the sensor's linearity is taken out of them, where they show it.
     """
 
     kind: ClassVar[TargetKind]

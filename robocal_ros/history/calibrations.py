@@ -266,10 +266,8 @@ class HistoryReader:
     Every method raises `StorageError` when the file cannot be read. Not for several threads at
     once.
 
-    ``serial``: the robot.
-    ``path``: the file.
-    ``damaged``: where a damaged predecessor was set aside at this opening, or None.
-    ``created``: whether this opening made a new, empty history.
+    ``serial``: the robot. ``path``: the file. ``damaged``: where a damaged predecessor was set
+    aside at this opening, or None. ``created``: whether this opening made a new, empty history.
     """
 
     def __init__(
@@ -303,13 +301,12 @@ class HistoryReader:
     ) -> Self:
         """Open the history of a robot.
 
-        ``serial``: robot serial; any text.
-        ``model_hash``: hash of the nominal model in use; what was made for another one is refused.
-        ``state_dir``: folder of the histories, default `state_folder()`.
-        ``create``: False refuses a robot that has no history.
-        ``busy_timeout_s``: longest wait for other processes.
-        ``sole_user``: the part that only one process may play for this robot; empty: none.
-        ``owner``: sets a damaged file aside and begins anew; others are refused.
+        ``serial``: robot serial; any text. ``model_hash``: hash of the nominal model in use; what
+        was made for another one is refused. ``state_dir``: folder of the histories, default
+        `state_folder()`. ``create``: False refuses a robot that has no history. ``busy_timeout_s``:
+        longest wait for other processes. ``sole_user``: the part that only one process may play for
+        this robot; empty: none. ``owner``: sets a damaged file aside and begins anew; others are
+        refused.
 
         Raises `InputError`: bad serial, or no history and ``create`` is False; `WrongRobotError`:
         the file belongs to another serial; `StorageError`: the file cannot be opened, was made by a

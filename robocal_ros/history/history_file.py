@@ -243,10 +243,9 @@ Verify = Callable[[sqlite3.Connection], None]
 class HistoryFile:
     """One open history file. Use `open_file`.
 
-    ``path``: the file.
-    ``connection``: autocommit SQLite connection.
-    ``damaged``: where a damaged predecessor was set aside at this opening, or None.
-    ``created``: whether this opening made a new, empty history.
+    ``path``: the file. ``connection``: autocommit SQLite connection. ``damaged``: where a damaged
+    predecessor was set aside at this opening, or None. ``created``: whether this opening made a
+    new, empty history.
     """
 
     def __init__(self, path: Path, serial: str, timeout_s: float, *, owner: bool) -> None:

@@ -86,14 +86,11 @@ class Candidate:
     """What is known of a calibration without opening its contents.
 
     ``kind``: which model it changes, e.g. ``thermal``; each kind has its own revisions.
-    ``model_hash``: hash of the nominal model that it corrects.
-    ``based_on``: revision in force when it was solved (0 = nominal).
-    ``cycle_id``: measurement cycle that gave the data.
-    ``stamp_ns``: time of the data.
-    ``created_ns``: wall clock when it was proposed.
-    ``software``, ``method``: version and estimator that made it.
-    ``code``, ``reason``: the verdict.
-    ``candidate_rms_mm``: held-out rms error of the proposed model, None when not judged.
+    ``model_hash``: hash of the nominal model that it corrects. ``based_on``: revision in force when
+    it was solved (0 = nominal). ``cycle_id``: measurement cycle that gave the data. ``stamp_ns``:
+    time of the data. ``created_ns``: wall clock when it was proposed. ``software``, ``method``:
+    version and estimator that made it. ``code``, ``reason``: the verdict. ``candidate_rms_mm``:
+    held-out rms error of the proposed model, None when not judged.
     """
 
     kind: str = THERMAL
@@ -338,16 +335,13 @@ NOMINAL, CALIBRATED = "nominal", "calibrated"
 class CorrectionRecord:
     """What the joint correction did from an instant on.
 
-    ``wall_ns``: when this began.
-    ``software``: version of this software.
-    ``model_hash``: of the nominal model.
-    ``enabled``: whether the correction was asked for.
-    ``shadow``: whether it was only shown.
-    ``model_revision``, ``tool_revision``: in force for it; 0 for none, and for the taught tool.
-    ``reference``: NOMINAL or CALIBRATED: which model the program was made with, as it was chosen.
-    ``reference_source``: where that came from: a robot type, or the path of a robot file.
-    ``reference_name``, ``reference_hash``: of that model.
-    ``taught_tool``: the tool that the program was made with: x, y, z in m, qx, qy, qz, qw.
+    ``wall_ns``: when this began. ``software``: version of this software. ``model_hash``: of the
+    nominal model. ``enabled``: whether the correction was asked for. ``shadow``: whether it was
+    only shown. ``model_revision``, ``tool_revision``: in force for it; 0 for none, and for the
+    taught tool. ``reference``: NOMINAL or CALIBRATED: which model the program was made with, as it
+    was chosen. ``reference_source``: where that came from: a robot type, or the path of a robot
+    file. ``reference_name``, ``reference_hash``: of that model. ``taught_tool``: the tool that the
+    program was made with: x, y, z in m, qx, qy, qz, qw.
     """
 
     wall_ns: int

@@ -153,14 +153,12 @@ class SerialArm:
     free between nearly parallel axes and d elsewhere. With beta = 0 it is distal
     Denavit-Hartenberg.
 
-    ``mdh`` (n, 5): columns d, theta, a, alpha, beta in m and rad.
-    ``sign`` (n,): +1 or -1, the controller's direction of counting.
-    ``prismatic`` (n,): bool.
-    ``lower``, ``upper`` (n,): limits of q in rad or m; infinite where unknown.
-    ``T_base_root`` (4, 4): pose of the first joint's frame in the robot's base.
-    ``T_flange_tool`` (4, 4): tool mounted on the flange.
-    ``functions``: what each joint turns besides what is read; None: nothing.
-    ``load``: what gravity pulls at; None: not known.
+    ``mdh`` (n, 5): columns d, theta, a, alpha, beta in m and rad. ``sign`` (n,): +1 or -1, the
+    controller's direction of counting. ``prismatic`` (n,): bool. ``lower``, ``upper`` (n,): limits
+    of q in rad or m; infinite where unknown. ``T_base_root`` (4, 4): pose of the first joint's
+    frame in the robot's base. ``T_flange_tool`` (4, 4): tool mounted on the flange. ``functions``:
+    what each joint turns besides what is read; None: nothing. ``load``: what gravity pulls at;
+    None: not known.
     """
 
     name: str
@@ -524,10 +522,9 @@ def follow(
 ) -> JointDerivatives:
     """Joints that carry a point of the flange along a path.
 
-    ``T_base_point`` (m, 4, 4): poses of the flange, but with the point as their origin.
-    ``twist``, ``twist_rate`` (m, 6): velocity [v; w] of the point, base, and its derivative.
-    ``q_near`` (n,): joints from which the first pose is sought.
-    ``p_flange`` (3,): the point, m.
+    ``T_base_point`` (m, 4, 4): poses of the flange, but with the point as their origin. ``twist``,
+    ``twist_rate`` (m, 6): velocity [v; w] of the point, base, and its derivative. ``q_near`` (n,):
+    joints from which the first pose is sought. ``p_flange`` (3,): the point, m.
 
     Raises `LimitError` where a joint limit is passed, a singularity is near
     (`SMALLEST_SINGULAR_VALUE`), a pose is out of reach, or a joint would have to move by more than
@@ -558,7 +555,15 @@ def follow(
         path.qdd,
     )
     if arm.functions is not None:
-        path = _as_read(arm, JointDerivatives(*(x[:reached] for x in (path.q, path.qd, path.qdd))))
+        # What the arm reads while a rigid one would read `turned`.
+        turned = JointDerivatives(*(x[:reached] for x in (path.q, path.qd, path.qdd)))
+        q = arm.read(turned.q)
+        S = arm.turned_jacobian(q)
+        qd = np.linalg.solve(S, turned.qd[..., None])
+        step = _AHEAD_S * qd[..., 0]
+        change = (arm.turned_jacobian(q + step) - arm.turned_jacobian(q - step)) / (2.0 * _AHEAD_S)
+        qdd = np.linalg.solve(S, turned.qdd[..., None] - change @ qd)
+        path = JointDerivatives(q, np.asarray(qd[..., 0]), np.asarray(qdd[..., 0]))
     require_within_limits(arm, path.q[:reached])
     require_regular(arm, path.q[:reached])
     if outcome != newton.REACHED:
@@ -569,17 +574,6 @@ def follow(
 
 # Where rounding and what the spline's third derivative leaves weigh alike.
 _AHEAD_S = 1e-5
-
-
-def _as_read(arm: SerialArm, turned: JointDerivatives) -> JointDerivatives:
-    """What the arm reads while a rigid one would read ``turned``."""
-    q = arm.read(turned.q)
-    S = arm.turned_jacobian(q)
-    qd = np.linalg.solve(S, turned.qd[..., None])
-    step = _AHEAD_S * qd[..., 0]
-    change = (arm.turned_jacobian(q + step) - arm.turned_jacobian(q - step)) / (2.0 * _AHEAD_S)
-    qdd = np.linalg.solve(S, turned.qdd[..., None] - change @ qd)
-    return JointDerivatives(q, np.asarray(qd[..., 0]), np.asarray(qdd[..., 0]))
 
 
 def require_within_limits(arm: SerialArm, q: Array) -> None:

@@ -29,11 +29,10 @@ class IdentifiedFrom:
     numbers and more, and its correlations count; these are few.
 
     ``q`` (m, n), ``target`` (m,), ``weight`` (m,): readings of the poses that were used, rad
-    (prismatic: m), which target, and how many poses each stands for.
-    ``p_flange`` (t, 3): the targets, m.
-    ``lever``: length by which a measured turn counted, m; 0: positions alone.
-    ``noise``: of a coordinate, m.
-    ``parameter_sigma`` (k,), ``base_sigma``, ``target_sigma``: of the arm's free parameters, base
+    (prismatic: m), which target, and how many poses each stands for. ``p_flange`` (t, 3): the
+    targets, m. ``lever``: length by which a measured turn counted, m; 0: positions alone.
+    ``noise``: of a coordinate, m. ``parameter_sigma`` (k,), ``base_sigma``, ``target_sigma``: of
+    the arm's free parameters, base
         and targets' places before the data, m and rad; 0: held, from 1 on: nothing was known.
     ``length``, ``amplitude`` (n,): of the functions' prior, rad (prismatic: m); 0: no function.
 
@@ -151,11 +150,9 @@ class JointFunctions:
 class ArmLoad:
     """What gravity pulls at.
 
-    ``mass`` (n,): of the links, kg.
-    ``centre`` (n, 3): of mass, m, each in the frame behind its joint (of the last: the flange).
-    ``payload_mass``: kg.
-    ``payload_centre`` (3,): m, in the flange.
-    ``gravity`` (3,): m/s², in the base.
+    ``mass`` (n,): of the links, kg. ``centre`` (n, 3): of mass, m, each in the frame behind its
+    joint (of the last: the flange). ``payload_mass``: kg. ``payload_centre`` (3,): m, in the
+    flange. ``gravity`` (3,): m/s², in the base.
 
     Raises `ValueError` for shapes that do not fit, numbers that are not finite, or a mass below
     zero.

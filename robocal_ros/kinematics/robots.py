@@ -335,7 +335,13 @@ def save_robot(
             xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
             document[key] = {"xyz_mm": xyz, "quat_xyzw": frames.quat_xyzw(T).tolist()}
     if arm.load is not None:
-        document["load"] = _load_document(arm.load)
+        document["load"] = {
+            "masses_kg": arm.load.mass.tolist(),
+            "centres_mm": [[_shown(x, MM) for x in row] for row in arm.load.centre.tolist()],
+            "payload_kg": arm.load.payload_mass,
+            "payload_centre_mm": [_shown(x, MM) for x in arm.load.payload_centre.tolist()],
+            "gravity_m_s2": arm.load.gravity.tolist(),
+        }
     if arm.functions is not None:
         document["functions"] = _functions_document(arm, arm.functions)
         if arm.functions.identified_from is not None:
@@ -433,16 +439,6 @@ def _load(fields: Fields, n: int) -> ArmLoad:
         )
     except ValueError as error:
         fields.fail(f"cannot be: {error}")
-
-
-def _load_document(load: ArmLoad) -> dict[str, Any]:
-    return {
-        "masses_kg": load.mass.tolist(),
-        "centres_mm": [[_shown(x, MM) for x in row] for row in load.centre.tolist()],
-        "payload_kg": load.payload_mass,
-        "payload_centre_mm": [_shown(x, MM) for x in load.payload_centre.tolist()],
-        "gravity_m_s2": load.gravity.tolist(),
-    }
 
 
 def _functions(top: Fields, joints: Sequence["_Joint"]) -> JointFunctions:

@@ -57,11 +57,10 @@ GREEK = {"theta": "\u03b8", "alpha": "\u03b1", "beta": "\u03b2"}
 class ShiftErrors:
     """True errors of a simulated tool at check poses over a shift, against the cold robot.
 
-    ``hours`` (c,) time of each cycle since the start of the shift.
-    ``accepted``: of each cycle: whether its model came into force.
-    ``before``, ``after`` (c, m, 3) error at the check poses after each cycle, m, without and with
-    correction.
-    ``held`` (c, m, 3) with the correction that was in force just before the cycle: at its oldest.
+    ``hours`` (c,) time of each cycle since the start of the shift. ``accepted``: of each cycle:
+    whether its model came into force. ``before``, ``after`` (c, m, 3) error at the check poses
+    after each cycle, m, without and with correction. ``held`` (c, m, 3) with the correction that
+    was in force just before the cycle: at its oldest.
     """
 
     hours: Array
@@ -270,16 +269,13 @@ LEAST_MM = 0.01  # shown
 class CellCourse:
     """True errors at the working poses over time; not a number where they are not told.
 
-    ``topic``: on which the truth was told.
-    ``hours`` (t,) since the recording began.
+    ``topic``: on which the truth was told. ``hours`` (t,) since the recording began.
     ``without_mm``, ``with_mm`` (t,) rms without correction, and of what was commanded; at the same
-    poses, where some were visited.
-    ``p95_mm`` (t,) 95 % of the poses are better, of what was commanded.
-    ``lambda_without``, ``lambda_with`` (t,) share of directions within `TOLERANCE_MM`.
-    ``bound_mm`` (t,) what the line was told: 95 % of the errors are below.
-    ``tolerance_mm``: error that the process allows; None where the line was told nothing.
-    ``faults``: each with ``hours``, ``fault``, ``size`` (SI; 0: it ended) and ``told``, the size in
-    words.
+    poses, where some were visited. ``p95_mm`` (t,) 95 % of the poses are better, of what was
+    commanded. ``lambda_without``, ``lambda_with`` (t,) share of directions within `TOLERANCE_MM`.
+    ``bound_mm`` (t,) what the line was told: 95 % of the errors are below. ``tolerance_mm``: error
+    that the process allows; None where the line was told nothing. ``faults``: each with ``hours``,
+    ``fault``, ``size`` (SI; 0: it ended) and ``told``, the size in words.
     """
 
     topic: str

@@ -79,22 +79,21 @@ class Setting:
             ]
             raise InputError(f"{self.name} = {value!r} is not {'a list, each ' * many}{wanted}")
         for item in typed if isinstance(typed, list) else [typed]:
-            self._check_item(item)
+            if isinstance(item, float) and not math.isfinite(item):
+                raise InputError(f"{self.name} = {item} is not finite")
+            if isinstance(item, str):
+                if self.choices and item not in self.choices:
+                    raise InputError(
+                        f"{self.name} = '{item}' is not one of {', '.join(self.choices)}"
+                    )
+            elif (self.low is not None and item < self.low) or (
+                self.high is not None and item > self.high
+            ):
+                raise InputError(f"{self.name} = {item:g} is out of bounds: {self.bounds}")
         fault = self.check(typed) if self.check else None
         if fault:
             raise InputError(f"{self.name} = {value!r}: {fault}")
         return typed
-
-    def _check_item(self, item: bool | int | float | str) -> None:
-        if isinstance(item, float) and not math.isfinite(item):
-            raise InputError(f"{self.name} = {item} is not finite")
-        if isinstance(item, str):
-            if self.choices and item not in self.choices:
-                raise InputError(f"{self.name} = '{item}' is not one of {', '.join(self.choices)}")
-        elif (self.low is not None and item < self.low) or (
-            self.high is not None and item > self.high
-        ):
-            raise InputError(f"{self.name} = {item:g} is out of bounds: {self.bounds}")
 
     @property
     def bounds(self) -> str:

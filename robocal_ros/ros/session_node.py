@@ -242,8 +242,7 @@ class CommandQueue:
     """Between the callers of a node and its session.
 
     ``timeout_s``: a command waits at most so long for its samples. ``show``: takes each outcome,
-    also of what was decided outside.
-    ``session``: None while the node is inactive.
+    also of what was decided outside. ``session``: None while the node is inactive.
     """
 
     def __init__(

@@ -337,9 +337,8 @@ def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:
 class HistoryFollower:
     """Heads of a history as of the last look; a subclass reads those that it is about.
 
-    ``kind``: whose decisions are told.
-    ``head``: of that kind. ``fault``: why the history could not be read at the last look; empty
-    when it could.
+    ``kind``: whose decisions are told. ``head``: of that kind. ``fault``: why the history could not
+    be read at the last look; empty when it could.
     """
 
     def __init__(self, history: CalibrationHistory, kind: str) -> None:

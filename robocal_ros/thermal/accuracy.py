@@ -409,8 +409,7 @@ class Work:
 class ToolError:
     """Expected error of the tool at all poses of the work, m.
 
-    ``rms_m``: root mean square length.
-    ``bound_m``: 95 % of the errors are shorter.
+    ``rms_m``: root mean square length. ``bound_m``: 95 % of the errors are shorter.
     """
 
     rms_m: float
@@ -432,8 +431,7 @@ class ToolError:
 class AccuracyForecast:
     """Expected error of a model in force, from what the tracker knows.
 
-    ``in_force``: an arm of the cold model's type.
-    ``work``: where the error is asked for.
+    ``in_force``: an arm of the cold model's type. ``work``: where the error is asked for.
     """
 
     def __init__(self, tracker: DriftTracker, in_force: SerialArm, work: Work) -> None:

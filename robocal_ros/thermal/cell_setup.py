@@ -54,12 +54,11 @@ NAMES = (
 class SensorCalibration:
     """A placed sensor.
 
-    ``T_sensor_base`` (4, 4): the robot's base in the sensor's frame.
-    ``sphere_in_flange`` (3,): centre of the sphere in the flange frame, m.
-    ``covariance``: (9, 9), SI, of ``NAMES``: shift of the base and turn about it (sensor axes), and
-    the sphere (flange axes); None for the classic method, which has no noise model.
-    ``residual`` (m, 3): predicted minus measured centre, sensor axes, m.
-    ``left_out`` (m,): distance at each pose of a calibration from the others, m.
+    ``T_sensor_base`` (4, 4): the robot's base in the sensor's frame. ``sphere_in_flange`` (3,):
+    centre of the sphere in the flange frame, m. ``covariance``: (9, 9), SI, of ``NAMES``: shift of
+    the base and turn about it (sensor axes), and the sphere (flange axes); None for the classic
+    method, which has no noise model. ``residual`` (m, 3): predicted minus measured centre, sensor
+    axes, m. ``left_out`` (m,): distance at each pose of a calibration from the others, m.
     ``rejected``: names of the samples that do not fit the others.
     """
 
@@ -308,11 +307,10 @@ class SensorField:
 class PosePlan:
     """Chosen poses in the order of the shortest way.
 
-    ``q`` (m, n): joints.
-    ``chosen`` (m,): their places among the candidates.
-    ``predicted_rms_m``: error of the tool at the working poses after one cycle of them.
-    ``random_rms_m``: the same of as many candidates drawn at random, median of 50 draws.
-    ``before_rms_m``: the same of the prior, without any cycle.
+    ``q`` (m, n): joints. ``chosen`` (m,): their places among the candidates. ``predicted_rms_m``:
+    error of the tool at the working poses after one cycle of them. ``random_rms_m``: the same of as
+    many candidates drawn at random, median of 50 draws. ``before_rms_m``: the same of the prior,
+    without any cycle.
     """
 
     q: Array
@@ -349,18 +347,13 @@ def candidate_poses(
     )
 
 
-def _limits(arm: SerialArm) -> tuple[Array, Array]:
+def _reached(cell: CellModel, goals: Array, rng: np.random.Generator) -> Array:
+    """Joints that bring the target to goals (m, 3), from random starts; those that arrive."""
+    arm, target = cell.arm, np.zeros(len(goals), dtype=np.int64)
     margin = np.where(arm.prismatic, 0.1 * MARGIN_RAD, MARGIN_RAD)
     span = np.where(arm.prismatic, 0.5, np.pi)
     lower = np.where(np.isfinite(arm.lower), arm.lower + margin, -span)
     upper = np.where(np.isfinite(arm.upper), arm.upper - margin, span)
-    return lower, upper
-
-
-def _reached(cell: CellModel, goals: Array, rng: np.random.Generator) -> Array:
-    """Joints that bring the target to goals (m, 3), from random starts; those that arrive."""
-    arm, target = cell.arm, np.zeros(len(goals), dtype=np.int64)
-    lower, upper = _limits(arm)
     q = rng.uniform(lower, upper, (len(goals), arm.n))
     lever = cell.T_flange_target[0, :3, 3]
     for _ in range(_STEPS):

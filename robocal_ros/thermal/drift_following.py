@@ -52,23 +52,18 @@ class ThermalConfig:
     """Settings of a thermal session.
 
     ``arrangement``: a fixed sensor sees targets on the flange, or a sensor on the flange spheres
-    that are fixed in the cell.
-    ``method``: estimator where a command names none.
-    ``prior``: ``default``, or ``learned`` from the shifts in the history.
-    ``sigma_m``: standard deviation of one measured coordinate in one visit of a pose.
-    ``drift_parameters``: what ``lsq`` solves of a drift; empty: all, which takes many poses.
-    ``hold_out``, ``seed``: share of the poses kept to judge a calibration without reference.
-    ``cycle_timeout_s``: a cycle ends when nothing was measured for so long.
-    ``tolerance_m``, ``expires_after_s``: error that the process allows, and age at which a
-    measurement says nothing any more.
-    ``work_poses``, ``tip_m``: where accuracy is judged: joints of the working poses, rad
-    (prismatic: m), and the tool's tip on the flange; empty: throughout the joint limits, and the
-    target.
-    ``lateness_s``: a command waits for joint readings this much newer, so that measurements under
-    way still count.
-    ``measuring_frame``: frame of the measurements; empty: that of the first one used.
-    ``target``: name of the target where the measurement's frame_id gives none.
-    ``sphere``: what a sphere in a cloud must be like.
+    that are fixed in the cell. ``method``: estimator where a command names none. ``prior``:
+    ``default``, or ``learned`` from the shifts in the history. ``sigma_m``: standard deviation of
+    one measured coordinate in one visit of a pose. ``drift_parameters``: what ``lsq`` solves of a
+    drift; empty: all, which takes many poses. ``hold_out``, ``seed``: share of the poses kept to
+    judge a calibration without reference. ``cycle_timeout_s``: a cycle ends when nothing was
+    measured for so long. ``tolerance_m``, ``expires_after_s``: error that the process allows, and
+    age at which a measurement says nothing any more. ``work_poses``, ``tip_m``: where accuracy is
+    judged: joints of the working poses, rad (prismatic: m), and the tool's tip on the flange;
+    empty: throughout the joint limits, and the target. ``lateness_s``: a command waits for joint
+    readings this much newer, so that measurements under way still count. ``measuring_frame``: frame
+    of the measurements; empty: that of the first one used. ``target``: name of the target where the
+    measurement's frame_id gives none. ``sphere``: what a sphere in a cloud must be like.
     """
 
     method: Method = "map"
@@ -100,14 +95,12 @@ class ThermalConfig:
 class FollowerState:
     """Where a follower stands.
 
-    ``tracker``: state of the tracker; its time counts from the cold visit.
-    ``heat``: motor temperatures as last read, where they are in use.
-    ``anchor_ns``: stamp that the tracker's time is at; that of the last cycle until the clock
-    jumps.
-    ``stamp_ns``: of the last cycle that was taken, of the cold visit before the first.
-    ``cycles``: kept since the cold visit, refused ones among them.
-    ``moved``, ``moved_s``: why the last cycle was refused, empty where it was not; and the
-    tracker's time of the first of those that were refused in a row.
+    ``tracker``: state of the tracker; its time counts from the cold visit. ``heat``: motor
+    temperatures as last read, where they are in use. ``anchor_ns``: stamp that the tracker's time
+    is at; that of the last cycle until the clock jumps. ``stamp_ns``: of the last cycle that was
+    taken, of the cold visit before the first. ``cycles``: kept since the cold visit, refused ones
+    among them. ``moved``, ``moved_s``: why the last cycle was refused, empty where it was not; and
+    the tracker's time of the first of those that were refused in a row.
     """
 
     tracker: DriftState
@@ -230,8 +223,7 @@ class DriftFollower:
     """Takes cycles in the order in which they are kept.
 
     ``expected``: how the robot is expected to drift; with temperatures where the reference has
-    them.
-    ``work``: where the forecast is asked for.
+    them. ``work``: where the forecast is asked for.
     """
 
     def __init__(self, reference: ColdReference, expected: LearnedProcess, work: Work) -> None:

@@ -58,8 +58,7 @@ _SMALLEST_SPREAD = 1e-6
 class MeasuringRobot:
     """An arm with a sensor, and the spheres that it sees.
 
-    ``T_flange_sensor`` (4, 4).
-    ``spheres``, ``centres``: names and (s, 3) centres in base, m.
+    ``T_flange_sensor`` (4, 4). ``spheres``, ``centres``: names and (s, 3) centres in base, m.
     """
 
     arm: SerialArm

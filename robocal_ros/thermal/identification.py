@@ -49,9 +49,8 @@ def drift_prior(arm: SerialArm) -> Array:
 def learned_prior(default: Array, drifts: Array, covariances: Array) -> Array:
     """Covariance (k, k) of the drift from identified ones.
 
-    ``default`` (k, k): prior to start from.
-    ``drifts``, ``covariances`` (n, k): identified drifts against the cold reference and their (n,
-    k, k) covariances.
+    ``default`` (k, k): prior to start from. ``drifts``, ``covariances`` (n, k): identified drifts
+    against the cold reference and their (n, k, k) covariances.
 
     One expectation-maximisation step of a zero-mean Gaussian's covariance with the default as
     its inverse-Wishart prior: the second moment of each drift is its square plus its covariance,
@@ -69,8 +68,7 @@ _VISIBLE = 1e-6  # share of an undetermined direction that counts as being in it
 class SubsetDrift:
     """Drift of p chosen parameters in t cycles.
 
-    ``chosen`` (p,): columns of the parameters.
-    ``drift`` (t, p): since the cold visit, SI.
+    ``chosen`` (p,): columns of the parameters. ``drift`` (t, p): since the cold visit, SI.
     ``basis`` (3m, p): orthonormal, of the displacements that the chosen parameters can cause.
     ``inverse`` (p, p): from coordinates in that basis to parameters.
     """
@@ -96,10 +94,9 @@ def subset_drift(
 ) -> SubsetDrift:
     """Solve Y = A X for some columns of A by singular values (thesis eq. 3-8 to 3-10).
 
-    ``displacement`` (t, 3m): of the spots since the cold visit, m, measuring axes.
-    ``rows`` (3m, k): the same by each parameter, measuring axes.
-    ``chosen``: columns that may drift; the others are held.
-    ``names`` (k,): of all parameters.
+    ``displacement`` (t, 3m): of the spots since the cold visit, m, measuring axes. ``rows`` (3m,
+    k): the same by each parameter, measuring axes. ``chosen``: columns that may drift; the others
+    are held. ``names`` (k,): of all parameters.
 
     Raises `TooFewSamplesError` with fewer equations than chosen parameters; `RankDeficientError`
     when the poses do not tell the chosen parameters apart.
@@ -199,14 +196,12 @@ class CycleDrift:
     """A drift identified from one cycle.
 
     ``drift``, ``covariance``: (k,) of the free parameters since the cold visit, and (k, k), SI.
-    ``prior_covariance`` (k, k): of the drift before the cycle; None where there was none.
-    ``arm``: the cold arm with the drift added.
-    ``warm``: the visits, those of one pose averaged; m of them.
+    ``prior_covariance`` (k, k): of the drift before the cycle; None where there was none. ``arm``:
+    the cold arm with the drift added. ``warm``: the visits, those of one pose averaged; m of them.
     ``left_out`` (m, 3): displacement at each sample less what all other samples say of it, m.
-    ``left_out_sigma`` (m,): rms length of the same that the covariances predict, m.
-    ``rejected`` (m,): samples that the others contradict.
-    ``noise_m``: rms standard deviation of a coordinate of the visits.
-    ``seen``, ``unobservable``: what the data alone determine, and what not, in words.
+    ``left_out_sigma`` (m,): rms length of the same that the covariances predict, m. ``rejected``
+    (m,): samples that the others contradict. ``noise_m``: rms standard deviation of a coordinate of
+    the visits. ``seen``, ``unobservable``: what the data alone determine, and what not, in words.
     """
 
     drift: Array

@@ -122,9 +122,8 @@ class ObservationDesk:
 
     ``frame``: the measuring frame; None until the first observation that is used gives it.
     ``newest_ns``: newest stamp of each topic, of a measurement once its joints are complete: one
-    stamped in the future says nothing about how far its topic has come.
-    ``used_ns``: observations up to this stamp were used.
-    ``jumps``: how often the clock jumped back.
+    stamped in the future says nothing about how far its topic has come. ``used_ns``: observations
+    up to this stamp were used. ``jumps``: how often the clock jumped back.
     """
 
     joint_names: tuple[str, ...]

@@ -34,14 +34,11 @@ CONTRADICTION = 8.0  # median distances from the spot's median; noise alone stay
 class ColdSpots:
     """Each pose and target of a cold visit once.
 
-    ``cell``: the cold model with base and targets.
-    ``q`` (s, n): mean joints.
-    ``target`` (s,): index into the cell's targets.
-    ``error`` (s, 3): mean of predicted minus measured position, m; the arm's static errors.
-    ``visits`` (s,): how many cold measurements went into it.
-    ``first`` (s,): the first of them.
-    ``rejected``: names of cold measurements that other visits of the same spot contradict.
-    ``on_flange``: whether the sensor is on the flange: see `SpheresInCell`.
+    ``cell``: the cold model with base and targets. ``q`` (s, n): mean joints. ``target`` (s,):
+    index into the cell's targets. ``error`` (s, 3): mean of predicted minus measured position, m;
+    the arm's static errors. ``visits`` (s,): how many cold measurements went into it. ``first``
+    (s,): the first of them. ``rejected``: names of cold measurements that other visits of the same
+    spot contradict. ``on_flange``: whether the sensor is on the flange: see `SpheresInCell`.
     ``side`` (s, n): which way each joint went last, mean of the visits; None: not known.
     """
 
@@ -202,10 +199,8 @@ class SpheresInCell:
     for each pose and sphere: while the arm is cold it comes to the sphere's centre, and where it
     comes to later tells the drift, as of a sphere on the flange. The measuring frame is the base.
 
-    ``T_flange_sensor`` (4, 4).
-    ``sphere``, ``centre``: of each target of the cell, its name, and (t, 3) in base, m.
-    ``q`` (t, n): joints of the cold visits.
-    ``frame``: the sensor's.
+    ``T_flange_sensor`` (4, 4). ``sphere``, ``centre``: of each target of the cell, its name, and
+    (t, 3) in base, m. ``q`` (t, n): joints of the cold visits. ``frame``: the sensor's.
     """
 
     T_flange_sensor: Array
@@ -258,13 +253,11 @@ class SpheresInCell:
 class ColdReference:
     """Cold visit of the measuring poses.
 
-    ``cell``: the cold model with base and targets as fitted to the cold visit.
-    ``data``: the cold measurements.
-    ``rejected``: names of those that did not fit the others.
-    ``temperature`` (n,): of the motors, degrees Celsius; None where they were not read.
-    ``fixed`` (n, 3): centres of a sphere fixed in the cell, measured at the same visit, m; n may be
-    0.
-    ``spheres``: of a measuring robot, whose ``data`` are placed; None of a fixed sensor.
+    ``cell``: the cold model with base and targets as fitted to the cold visit. ``data``: the cold
+    measurements. ``rejected``: names of those that did not fit the others. ``temperature`` (n,): of
+    the motors, degrees Celsius; None where they were not read. ``fixed`` (n, 3): centres of a
+    sphere fixed in the cell, measured at the same visit, m; n may be 0. ``spheres``: of a measuring
+    robot, whose ``data`` are placed; None of a fixed sensor.
     """
 
     cell: CellModel
@@ -538,8 +531,7 @@ def drift_share(
     """Tell how much of the drift from ``visit``'s arm to ``warm`` a visit shows.
 
     ``reference``: the one in force, for the static errors at its poses; other poses tell nothing.
-    ``visit``: the new visit, placed with the cold arm.
-    ``warm``: the arm with the drift.
+    ``visit``: the new visit, placed with the cold arm. ``warm``: the arm with the drift.
     ``sigma_m``: standard deviation of one coordinate of one visit.
     """
     spots, cold = reference.spots, visit.cell.arm

@@ -23,11 +23,9 @@ FEWEST_KNOWN = 21  # as many as the test of stationarity needs
 class DriftHistory:
     """Displacements since the cold visit in t cycles, in order of time.
 
-    ``names`` (k,): parameters.
-    ``displacement``, ``rows``: (t, 3m) at the spots, m, and (3m, k) the same by each parameter, in
-    measuring axes. They identify.
-    ``check``, ``check_rows``: (t, 3c) and (3c, k) at the check points, in axes of their own if need
-    be. They judge.
+    ``names`` (k,): parameters. ``displacement``, ``rows``: (t, 3m) at the spots, m, and (3m, k) the
+    same by each parameter, in measuring axes. They identify. ``check``, ``check_rows``: (t, 3c) and
+    (3c, k) at the check points, in axes of their own if need be. They judge.
     """
 
     names: tuple[str, ...]
@@ -115,10 +113,9 @@ FEWEST = 3 * LAGS
 class Stationarity:
     """Tests of k series, each against white noise about a level.
 
-    ``autocorrelation`` (LAGS, k): at lags 1 ... LAGS.
-    ``bound``: half width of the interval that holds 95 % of a white series' autocorrelations.
-    ``outside`` (k,): how many lags lie outside it; ``allowed`` of them is what chance allows.
-    ``p_value`` (k,): of Ljung and Box's test.
+    ``autocorrelation`` (LAGS, k): at lags 1 ... LAGS. ``bound``: half width of the interval that
+    holds 95 % of a white series' autocorrelations. ``outside`` (k,): how many lags lie outside it;
+    ``allowed`` of them is what chance allows. ``p_value`` (k,): of Ljung and Box's test.
     """
 
     autocorrelation: Array
@@ -194,13 +191,11 @@ UNDETERMINED = -1.0  # orders a set that the poses do not determine below any sh
 class Round:
     """One round: the parameters left at its beginning.
 
-    ``names``: the parameters left.
-    ``share``: lambda with these identified; None where the poses do not determine them.
-    ``undetermined``: the directions that the poses leave open, in words.
-    ``stationary``: the set S, in the order of ``names``.
-    ``candidates``: those of which one is removed: S; all, if S is empty; where a direction is open
-    those in it, because their series mean nothing.
-    ``removed``: the one that is; None in the last round.
+    ``names``: the parameters left. ``share``: lambda with these identified; None where the poses do
+    not determine them. ``undetermined``: the directions that the poses leave open, in words.
+    ``stationary``: the set S, in the order of ``names``. ``candidates``: those of which one is
+    removed: S; all, if S is empty; where a direction is open those in it, because their series mean
+    nothing. ``removed``: the one that is; None in the last round.
     """
 
     names: tuple[str, ...]

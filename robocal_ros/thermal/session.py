@@ -82,10 +82,8 @@ class ThermalSession(SessionBase):
     Without a cold reference, ``identify`` calibrates base, targets and model from all poses and
     judges on held-out ones; with one, it identifies the drift since then.
 
-    ``current``: what is in force.
-    ``temperatures``: of the motors.
-    ``cycle``: the measuring cycle that is open.
-    ``windows``: which measurements belong to a cycle.
+    ``current``: what is in force. ``temperatures``: of the motors. ``cycle``: the measuring cycle
+    that is open. ``windows``: which measurements belong to a cycle.
     """
 
     def __init__(

@@ -87,9 +87,8 @@ SWING_TIME_S = 3600.0
 class Heat:
     """Motor temperatures above those at the cold visit, K: as last read, and lagged.
 
-    ``time_s``: of the last reading.
-    ``motor``, ``lagged``: (n,).
-    ``lag_s``: time constant of the lag.
+    ``time_s``: of the last reading. ``motor``, ``lagged``: (n,). ``lag_s``: time constant of the
+    lag.
     """
 
     time_s: float
@@ -196,15 +195,13 @@ class DriftState:
 class Innovation:
     """What a cycle brought against what was expected.
 
-    ``time_s``: at which the expectation was.
-    ``squared``, ``freedom``: normalised square of the innovation, and its degrees of freedom.
-    ``limit``: the square above which a cycle is not applied.
-    ``applied``: whether it was.
-    ``kept`` (m,): samples that agree with the others.
+    ``time_s``: at which the expectation was. ``squared``, ``freedom``: normalised square of the
+    innovation, and its degrees of freedom. ``limit``: the square above which a cycle is not
+    applied. ``applied``: whether it was. ``kept`` (m,): samples that agree with the others.
     ``deviation``, ``covariance``: (3m,) measured less expected displacement, m, and (3m, 3m) what
-    the tracker expected of it.
-    ``log_likelihood``: of all samples; those that do not fit lie anywhere within a millimetre.
-    ``whitened`` (freedom,): the innovation in units of its own spread: standard normal.
+    the tracker expected of it. ``log_likelihood``: of all samples; those that do not fit lie
+    anywhere within a millimetre. ``whitened`` (freedom,): the innovation in units of its own
+    spread: standard normal.
     """
 
     time_s: float
@@ -425,10 +422,9 @@ class DriftTracker:
 class TrackedCycle:
     """A cycle that the tracker took or refused.
 
-    ``found``: the drift after the cycle; before it where the cycle was refused.
-    ``judged``: figures and verdict; each pose is forecast from all earlier cycles and the other
-    poses.
-    ``innovation``: what the cycle brought against what was expected.
+    ``found``: the drift after the cycle; before it where the cycle was refused. ``judged``: figures
+    and verdict; each pose is forecast from all earlier cycles and the other poses. ``innovation``:
+    what the cycle brought against what was expected.
     """
 
     found: CycleDrift

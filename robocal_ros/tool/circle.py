@@ -37,10 +37,9 @@ SAME_TURN_RAD = 1e-3  # orientations that differ by less are one: a robot repeat
 class CircleMotion:
     """The commanded circle.
 
-    ``radius_m``, ``period_s``: of the flange's circle.
-    ``start_rad``: where the flange stands at time 0, counter-clockwise from the laser's x.
-    ``direction``: +1 counter-clockwise seen from above, -1 clockwise.
-    ``beam_angle_rad``: beta, from the x- to the y-beam.
+    ``radius_m``, ``period_s``: of the flange's circle. ``start_rad``: where the flange stands at
+    time 0, counter-clockwise from the laser's x. ``direction``: +1 counter-clockwise seen from
+    above, -1 clockwise. ``beam_angle_rad``: beta, from the x- to the y-beam.
     """
 
     radius_m: float
@@ -81,10 +80,9 @@ class CircleMotion:
 class CircleEdges:
     """Edges of one circle with what each one means.
 
-    ``beam`` (m,): 0 for the x-beam, 1 for the y-beam.
-    ``rising`` (m,): +1 where the distance from the beam grows, -1 where it falls.
-    ``side`` (m,): +1 where the tool's axis is at +rho then, -1 at -rho.
-    ``time_s``, ``sigma_s``: (m,).
+    ``beam`` (m,): 0 for the x-beam, 1 for the y-beam. ``rising`` (m,): +1 where the distance from
+    the beam grows, -1 where it falls. ``side`` (m,): +1 where the tool's axis is at +rho then, -1
+    at -rho. ``time_s``, ``sigma_s``: (m,).
     """
 
     beam: NDArray[np.int64]
@@ -191,12 +189,10 @@ class CircleFit:
     """The tool's axis on one circle.
 
     ``centre`` (2,): place of the tool's axis in the beam plane, laser frame, when the flange is at
-    the circle's centre, m.
-    ``covariance`` (2, 2): of it, m^2; None for the classic method, which has no noise model.
-    ``d``, ``rho``: (2,) distances from the x- and the y-beam, and the tool's radius seen by each,
-    m; the classic method does not see the radius (None).
-    ``latency_s``, ``period_s``: as estimated, or as given.
-    ``misfit_m``: rms of the residuals along the circle, m.
+    the circle's centre, m. ``covariance`` (2, 2): of it, m^2; None for the classic method, which
+    has no noise model. ``d``, ``rho``: (2,) distances from the x- and the y-beam, and the tool's
+    radius seen by each, m; the classic method does not see the radius (None). ``latency_s``,
+    ``period_s``: as estimated, or as given. ``misfit_m``: rms of the residuals along the circle, m.
     """
 
     method: CircleMethod

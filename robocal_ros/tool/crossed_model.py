@@ -52,8 +52,7 @@ EXACT_M = 1e-9  # prior of what is taken as exact, against edges of micrometres
 class RobotNoise:
     """How well the robot repeats, m, one standard deviation of each axis.
 
-    ``step_m``: common to a circle or a plunge.
-    ``edge_m``: further at each edge.
+    ``step_m``: common to a circle or a plunge. ``edge_m``: further at each edge.
     """
 
     step_m: float = 3e-5
@@ -75,11 +74,10 @@ class ToolState:
     """Unknowns of a run.
 
     ``tip`` (3,): in the flange frame, m; ``axis`` (3,) unit vector from flange to tip there.
-    ``latency_s``: of the edges behind the robot's readings.
-    ``depth``: of an edge behind the mean of break and restore, m: the receiver's hysteresis.
-    ``radius`` (circles, 2): of the tool as each circle and beam sees it, m.
-    ``shift`` (steps, 3): of the flange in each step, base, m.
-    ``bend`` (4, 2): of the laser's points A ... D, horizontally across the beam and upwards, m.
+    ``latency_s``: of the edges behind the robot's readings. ``depth``: of an edge behind the mean
+    of break and restore, m: the receiver's hysteresis. ``radius`` (circles, 2): of the tool as each
+    circle and beam sees it, m. ``shift`` (steps, 3): of the flange in each step, base, m. ``bend``
+    (4, 2): of the laser's points A ... D, horizontally across the beam and upwards, m.
     """
 
     tip: Array
@@ -331,15 +329,13 @@ class ToolEstimate:
     ``T_flange_tool`` (4, 4): z along the axis from flange to tip, turned about it as it was taught.
     ``covariance`` (5, 5): of the tip (flange axes, m^2) and of the axis' direction along the tool's
     own x and y (rad^2); ``own_covariance`` (5, 5) its part that is this run's alone, without the
-    laser frame's, which all runs at a station have in common.
-    ``latency_s``, ``latency_sigma_s``: of the edges behind the robot's readings.
-    ``radius`` (circles, 2): of the tool as each circle and beam sees it, m.
-    ``misfit_m``: rms of the edges' residuals, m.
-    ``shift_m``: largest shift of a step against the others, m.
-    ``turn_rad``, ``turn_sigma_rad``: of both beams about the laser's z since they were placed; None
-    of a run with something held. Taken out where the edges are not explained without.
-    ``estimate``: with the covariance that all sigmas here are of: wider where the given noise does
-    not explain edges, shifts or what was held.
+    laser frame's, which all runs at a station have in common. ``latency_s``, ``latency_sigma_s``:
+    of the edges behind the robot's readings. ``radius`` (circles, 2): of the tool as each circle
+    and beam sees it, m. ``misfit_m``: rms of the edges' residuals, m. ``shift_m``: largest shift of
+    a step against the others, m. ``turn_rad``, ``turn_sigma_rad``: of both beams about the laser's
+    z since they were placed; None of a run with something held. Taken out where the edges are not
+    explained without. ``estimate``: with the covariance that all sigmas here are of: wider where
+    the given noise does not explain edges, shifts or what was held.
     """
 
     T_flange_tool: Array

@@ -219,10 +219,8 @@ class ToolDriver:
     ``closed``: why nothing may move at a time, empty: it may; asked before anything begins.
     ``hard_stop``: stops a robot that does not obey, by other means; takes why.
 
-    ``robot``: where it is, and how fast its controller's clock runs.
-    ``phase``: what the robot does now.
-    ``armed``: whether motions may be sent.
-    ``told``: why it disarmed itself last.
+    ``robot``: where it is, and how fast its controller's clock runs. ``phase``: what the robot does
+    now. ``armed``: whether motions may be sent. ``told``: why it disarmed itself last.
     """
 
     def __init__(

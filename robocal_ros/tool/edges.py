@@ -227,9 +227,8 @@ class StepWatch:
     or leaves, or when edges are missing and it has left or rested for long. The last step of a
     run is over with its last edge.
 
-    ``up`` (3,): the laser's z, base.
-    ``beams``: those that the step breaks.
-    ``first_edge_s``: time of the first edge; None before.
+    ``up`` (3,): the laser's z, base. ``beams``: those that the step breaks. ``first_edge_s``: time
+    of the first edge; None before.
     """
 
     kind: StepKind

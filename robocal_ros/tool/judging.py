@@ -55,10 +55,9 @@ class BendRule:
 class Witness:
     """What a change of the measured tool says of its cause.
 
-    ``tip_m``: how far the tip seems to have moved.
-    ``tilt_rad``, ``tilt_sigma_rad``: of the axis, and its standard deviation in one direction.
-    ``lever_m``: that explains shift and tilt best. It and the sigma are None where no noise is
-    known.
+    ``tip_m``: how far the tip seems to have moved. ``tilt_rad``, ``tilt_sigma_rad``: of the axis,
+    and its standard deviation in one direction. ``lever_m``: that explains shift and tilt best. It
+    and the sigma are None where no noise is known.
     """
 
     cause: Cause
@@ -85,9 +84,8 @@ def bend_or_station(change: Array, covariance: Array, rule: BendRule, small_m: f
     """Tell a bend from a knocked station by the tilt that belongs to a shift.
 
     ``change`` (5,): of the tip along the tool's x, y, z, m, and of its axis along x and y, rad.
-    ``covariance`` (5, 5): of it.
-    ``small_m``: what the tip's change is since a tool whose cause was known; up to `SMALL_M` the
-    tool may have it without proof: more harm it cannot do.
+    ``covariance`` (5, 5): of it. ``small_m``: what the tip's change is since a tool whose cause was
+    known; up to `SMALL_M` the tool may have it without proof: more harm it cannot do.
 
     Notes
     -----

@@ -165,9 +165,8 @@ REQUIRED = ("station", "points_mm", "sigma_mm", "reach_mm", "robot", "model_hash
 class LaserFile:
     """Beams in a robot's base, and whose they are.
 
-    ``station``: name of the beams' station, as its edges carry it.
-    ``robot``, ``model_hash``: the nominal model whose flange poses placed the beams.
-    ``serial``: of the robot, where it is known.
+    ``station``: name of the beams' station, as its edges carry it. ``robot``, ``model_hash``: the
+    nominal model whose flange poses placed the beams. ``serial``: of the robot, where it is known.
     """
 
     laser: LaserFrame
@@ -247,9 +246,8 @@ class JointPath:
     Raises `TooFewSamplesError` or `InputError`: fewer than four readings; stamps that do not
     increase.
 
-    ``arm``: the model in force, so that the thermal drift is in the poses.
-    ``time_s`` (n,): stamps of the readings, in increasing order.
-    ``q`` (n, joints): readings, rad (prismatic: m).
+    ``arm``: the model in force, so that the thermal drift is in the poses. ``time_s`` (n,): stamps
+    of the readings, in increasing order. ``q`` (n, joints): readings, rad (prismatic: m).
     ``longest_gap_s``: longest pause between two readings around an edge.
     """
 

@@ -54,10 +54,9 @@ START_RAD = float(np.pi / 4.0)  # in mid-quadrant: no circle begins on a beam
 class MeasuringMotion:
     """Sizes and speeds of the steps, m and m/s.
 
-    ``radius_m``, ``speed_m_s``: of the circles.
-    ``height_m``: between the circles; the longer, the better the axis.
-    ``above_tip_m``: where the lower circles meet the tool.
-    ``plunge_depth_m``, ``plunge_speed_m_s``: of the plunges, half of the depth below the beams.
+    ``radius_m``, ``speed_m_s``: of the circles. ``height_m``: between the circles; the longer, the
+    better the axis. ``above_tip_m``: where the lower circles meet the tool. ``plunge_depth_m``,
+    ``plunge_speed_m_s``: of the plunges, half of the depth below the beams.
     """
 
     radius_m: float = 0.012
@@ -82,12 +81,10 @@ class MeasuringMotion:
 class PlannedStep:
     """A circle or a plunge to be driven; the flange's orientation is held.
 
-    ``number``, ``of``: place in the run, from 1.
-    ``T_base_flange`` (4, 4): at the circle's centre, or where the plunge begins and ends.
-    ``R_base_laser`` (3, 3): the circle lies in its x-y plane; the plunge goes along -z and back.
-    ``radius_m``, ``speed_m_s``: of a circle; ``direction`` +1 counter-clockwise about the laser's
-    z.
-    ``depth_m``: of a plunge; its speed is ``speed_m_s``.
+    ``number``, ``of``: place in the run, from 1. ``T_base_flange`` (4, 4): at the circle's centre,
+    or where the plunge begins and ends. ``R_base_laser`` (3, 3): the circle lies in its x-y plane;
+    the plunge goes along -z and back. ``radius_m``, ``speed_m_s``: of a circle; ``direction`` +1
+    counter-clockwise about the laser's z. ``depth_m``: of a plunge; its speed is ``speed_m_s``.
     ``beams``: those that the step breaks.
     """
 
@@ -193,9 +190,8 @@ class ClockError(RobocalError):
 class TraitLimits:
     """Changes against the healthy tool's run that are no fault yet; 0: any.
 
-    ``radius_m``: of the tool as a beam sees it.
-    ``latency_s``: of the edges behind the joint readings.
-    ``lost``: share of the joint readings.
+    ``radius_m``: of the tool as a beam sees it. ``latency_s``: of the edges behind the joint
+    readings. ``lost``: share of the joint readings.
     """
 
     radius_m: float = 5e-5
@@ -208,10 +204,9 @@ class RunTraits:
     """Traits of a run.
 
     ``radius_m``: by circle, of the tool as the x- and the y-beam see it; ``radius_sigma_m`` of
-    each.
-    ``latency_s``, ``latency_sigma_s``: of the edges behind the joint readings.
-    ``rate_hz``: of the joint readings.
-    ``turn_rad``, ``turn_sigma_rad``: of the beams, as of a `ToolEstimate`; older runs have none.
+    each. ``latency_s``, ``latency_sigma_s``: of the edges behind the joint readings. ``rate_hz``:
+    of the joint readings. ``turn_rad``, ``turn_sigma_rad``: of the beams, as of a `ToolEstimate`;
+    older runs have none.
     """
 
     radius_m: Mapping[str, tuple[float, float]]
@@ -335,16 +330,13 @@ Rows = tuple[tuple[float, ...], ...]
 class ToolConfig:
     """Settings of a tool session; plain values, so that a recording carries them.
 
-    ``points_m``: four points (A, B on the x-beam, C, D on the y-beam), base.
-    ``laser_sigma_m``, ``reach_m``: see `LaserFrame`.
-    ``taught``: rows of T_flange_tool (4, 4) as taught.
-    ``station``: frame_id of the beams' edges; empty: any.
-    ``beams``: names of the x- and the y-beam in the edges.
-    ``mandrel``: rows of T_flange_mandrel (4, 4), z along its axis to its end; None: there is none.
-    ``mandrel_radius_m``: as certified, where it places the beams.
-    ``taper``: growth of the tool's radius per length above the tip.
-    ``spin_rad``: turn of the flange about the laser's z while it measures.
-    ``step_timeout_s``: a step without any edge for so long ends the run.
+    ``points_m``: four points (A, B on the x-beam, C, D on the y-beam), base. ``laser_sigma_m``,
+    ``reach_m``: see `LaserFrame`. ``taught``: rows of T_flange_tool (4, 4) as taught. ``station``:
+    frame_id of the beams' edges; empty: any. ``beams``: names of the x- and the y-beam in the
+    edges. ``mandrel``: rows of T_flange_mandrel (4, 4), z along its axis to its end; None: there is
+    none. ``mandrel_radius_m``: as certified, where it places the beams. ``taper``: growth of the
+    tool's radius per length above the tip. ``spin_rad``: turn of the flange about the laser's z
+    while it measures. ``step_timeout_s``: a step without any edge for so long ends the run.
     """
 
     points_m: Rows
@@ -432,11 +424,10 @@ BEFORE_NS = AFTER_NS = 1_000_000_000  # joint readings kept about the edges of a
 class ToolRun:
     """A run as it grows.
 
-    ``number``: of the run in its session, from 1; ``mode`` as it was asked for.
-    ``arm``, ``thermal_revision``: the model in force when it began.
-    ``begun_ns``: origin of its times.
-    ``from_ns``: the step that is awaited counts from here.
-    ``healthy``: traits of the healthy tool's run, which this one must share; None: none are known.
+    ``number``: of the run in its session, from 1; ``mode`` as it was asked for. ``arm``,
+    ``thermal_revision``: the model in force when it began. ``begun_ns``: origin of its times.
+    ``from_ns``: the step that is awaited counts from here. ``healthy``: traits of the healthy
+    tool's run, which this one must share; None: none are known.
     """
 
     number: int

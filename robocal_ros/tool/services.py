@@ -242,8 +242,7 @@ UNHEARD = "gap_open is not listened to: gap_stale_s is 0"
 class TcfMotion:
     """``~/arm``, the robot's controller, and ``gap_open`` where it is listened to.
 
-    ``arm``, ``serial``: the robot.
-    ``ask``: gives a command to the session.
+    ``arm``, ``serial``: the robot. ``ask``: gives a command to the session.
     """
 
     def __init__(

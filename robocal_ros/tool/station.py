@@ -42,9 +42,8 @@ H_M = 1e-7
 class StationMeasurement:
     """Beams as a run found them.
 
-    ``laser``: with the reach of each beam.
-    ``covariance`` (8, 8): of A ... D, each across its beam and upwards, m^2.
-    ``misfit_m``: rms of the edges, m.
+    ``laser``: with the reach of each beam. ``covariance`` (8, 8): of A ... D, each across its beam
+    and upwards, m^2. ``misfit_m``: rms of the edges, m.
     """
 
     laser: LaserFrame

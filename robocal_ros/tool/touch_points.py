@@ -64,10 +64,9 @@ class _TouchProblem:
 class TouchFit:
     """A touched tool.
 
-    ``tip`` (3,): flange frame, m; ``covariance`` (3, 3), m^2.
-    ``point`` (3,): the touched point, base, m.
-    ``rotation``: R_flange_tool (3, 3) of seven points; None of four.
-    ``residual`` (m, 3): of the touches, base, m.
+    ``tip`` (3,): flange frame, m; ``covariance`` (3, 3), m^2. ``point`` (3,): the touched point,
+    base, m. ``rotation``: R_flange_tool (3, 3) of seven points; None of four. ``residual`` (m, 3):
+    of the touches, base, m.
     """
 
     tip: Array
@@ -219,12 +218,10 @@ def parallel_tip(
     Raises `ResidualError` when the re-sweep shows a tool that still leans; `RankDeficientError`
     when both sweeps have one orientation.
 
-    ``x_beam_m``: place of both beams along x_b, m.
-    ``T_straight``: two flange rotations (3, 3) with the axis down, one turned by 90 deg about z.
-    ``x_straight``: flange x_b at break and restore, of the upper and the lower beam, at each of
-    them.
-    ``z_first_break_m``: flange height at the first break of the upper beam, driving down: the tip
-    is D = z - h_up below the flange (eq. 4-7).
+    ``x_beam_m``: place of both beams along x_b, m. ``T_straight``: two flange rotations (3, 3) with
+    the axis down, one turned by 90 deg about z. ``x_straight``: flange x_b at break and restore, of
+    the upper and the lower beam, at each of them. ``z_first_break_m``: flange height at the first
+    break of the upper beam, driving down: the tip is D = z - h_up below the flange (eq. 4-7).
     """
     rows, right = [np.array([0.0, 0.0, 1.0])], [beams.up_m - z_first_break_m]
     frame = T_straight[0]
