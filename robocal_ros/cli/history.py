@@ -186,7 +186,6 @@ def _target(value: str) -> int | None:
 
 
 def add_history(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``history``."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="action")
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
@@ -249,7 +248,6 @@ def add_history(parser: argparse.ArgumentParser) -> None:
 
 
 def run_history(args: argparse.Namespace) -> CliResult:
-    """Do ``history``. Raises `RobocalError` for what a user can mend."""
     folder = state_folder() if args.state is None else args.state.absolute()
     serial = args.robot_serial
     if serial is None:

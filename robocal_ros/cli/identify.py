@@ -191,7 +191,6 @@ _HOLD_OUT = 0.5
 
 
 def add_identify(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``identify``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--data",
@@ -265,7 +264,6 @@ def _add_judging(parser: argparse.ArgumentParser) -> None:
 
 
 def run_identify(args: argparse.Namespace) -> CliResult:
-    """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
     if args.plan is not None:
         return _planned(args)
@@ -490,7 +488,6 @@ Point = tuple[float, ...]
 
 
 def add_iso9283(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``iso9283``."""
     parser.add_argument(
         "--data",
         required=True,
@@ -511,7 +508,6 @@ def add_iso9283(parser: argparse.ArgumentParser) -> None:
 
 
 def run_iso9283(args: argparse.Namespace) -> CliResult:
-    """Do ``iso9283``. Raises `RobocalError` for what a user can mend."""
     table = read_positions(args.data)
     commanded = _by_target(args.commanded, list(table), str(args.data))
     targets: Document = {}

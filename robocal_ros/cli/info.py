@@ -22,7 +22,6 @@ SQLITE = b"SQLite format 3\0"
 
 
 def add_info(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``info``."""
     parser.add_argument("file", type=Path, metavar="FILE", help="file, or folder of a bag")
 
 

@@ -183,7 +183,6 @@ def model_history(args: argparse.Namespace, nominal: SerialArm) -> CalibrationHi
 
 
 def add_correct_program(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``correct-program``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EXAMPLE
     parser.add_argument(
@@ -255,7 +254,6 @@ def _add_bounds(parser: argparse.ArgumentParser) -> None:
 
 
 def run_correct_program(args: argparse.Namespace) -> CliResult:
-    """Do ``correct-program``. Raises `RobocalError` for what a user can mend."""
     if args.output is not None and args.output.exists():
         raise InputError("is there already: name another file", file=str(args.output))
     models, warnings = given_models(args)
@@ -340,7 +338,6 @@ _TURNED_MM = 1e3 * LEVER_M
 
 
 def add_frame_shift(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``frame-shift``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _SHIFT_EXAMPLE
     add_model_options(parser)
@@ -394,7 +391,6 @@ def add_frame_shift(parser: argparse.ArgumentParser) -> None:
 
 
 def run_frame_shift(args: argparse.Namespace) -> CliResult:
-    """Do ``frame-shift``. Raises `RobocalError` for what a user can mend."""
     if args.output is not None and args.output.exists():
         raise InputError("is there already: name another file", file=str(args.output))
     models, warnings = given_models(args)

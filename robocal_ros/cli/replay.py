@@ -460,7 +460,6 @@ _SHOW_EVERY = 100
 
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``replay``."""
     parser.add_argument(
         "bag", type=Path, metavar="BAG", help=".mcap, .db3 or .bag (ROS 1) file, or folder of a bag"
     )
@@ -504,7 +503,6 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 
 
 def run_replay(args: argparse.Namespace) -> CliResult:
-    """Do ``replay``. Raises `RobocalError` for what a user can mend."""
     if args.auto and (args.cold or args.warm):
         raise InputError("--auto finds the cycles itself: leave out --cold and --warm")
     if args.cold and not args.warm:

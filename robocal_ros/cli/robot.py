@@ -52,7 +52,6 @@ _MOST_DEG = 1e6
 
 
 def add_fk(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``fk``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     joints = parser.add_mutually_exclusive_group(required=True)
     joints.add_argument("--joints-deg", metavar="Q1,Q2,…", help="joints in degrees")
@@ -65,7 +64,6 @@ def add_fk(parser: argparse.ArgumentParser) -> None:
 
 
 def run_fk(args: argparse.Namespace) -> CliResult:
-    """Do ``fk``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
     q = np.array(_given_joints(args, arm))
@@ -151,7 +149,6 @@ _ROWS_PER_KNOT = 4  # of a table: a cubic is drawn well by them
 
 
 def add_joint_functions(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``joint-functions``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument("--output", type=Path, metavar="T.csv", help="table to write")
     parser.add_argument(
@@ -163,7 +160,6 @@ def add_joint_functions(parser: argparse.ArgumentParser) -> None:
 
 
 def run_joint_functions(args: argparse.Namespace) -> CliResult:
-    """Do ``joint-functions``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
     functions = arm.functions
@@ -269,7 +265,6 @@ _MDH = ("d_mm", "theta_deg", "a_mm", "alpha_deg", "beta_deg")
 
 
 def add_import_ur(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``import-ur``."""
     parser.add_argument(
         "--calibration",
         required=True,
@@ -291,7 +286,6 @@ def add_import_ur(parser: argparse.ArgumentParser) -> None:
 
 
 def run_import_ur(args: argparse.Namespace) -> CliResult:
-    """Do ``import-ur``. Raises `RobocalError` for what a user can mend."""
     name = args.name or args.output.stem
     settings = [
         parse_settings(read_text(path, "configuration"), str(path))
@@ -373,7 +367,6 @@ def _read_chain(path: Path, base: str, tip: str) -> Chain:
 
 
 def add_import_urdf(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``import-urdf``."""
     parser.add_argument(
         "urdf", type=Path, metavar="FILE", help="URDF (xacro expanded), or a kinematics.yaml"
     )
@@ -385,7 +378,6 @@ def add_import_urdf(parser: argparse.ArgumentParser) -> None:
 
 
 def run_import_urdf(args: argparse.Namespace) -> CliResult:
-    """Do ``import-urdf``. Raises `RobocalError` for what a user can mend."""
     links = _read_chain(args.urdf, args.base, args.tip)
     description = arm_of(links, args.name)
     arm = description.arm
@@ -435,7 +427,6 @@ def _show_import(console: "Console", document: Document) -> None:
 
 
 def add_export_urdf(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``export-urdf``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--into",
@@ -451,7 +442,6 @@ def add_export_urdf(parser: argparse.ArgumentParser) -> None:
 
 
 def run_export_urdf(args: argparse.Namespace) -> CliResult:
-    """Do ``export-urdf``. Raises `RobocalError` for what a user can mend."""
     described, warnings = describe_robot(args.robot)
     arm = described.arm
     if args.output.exists():

@@ -245,7 +245,6 @@ LIBRARIES = ("numpy", "scipy", "numba", "rosbags", "mcap")
 
 
 def add_validate(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``validate``."""
     parser.add_argument(
         "bags",
         type=Path,
@@ -279,7 +278,6 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
 
 
 def run_validate(args: argparse.Namespace) -> CliResult:
-    """Do ``validate``. Raises `RobocalError` for what a user can mend."""
     workers = min(args.jobs or len(os.sched_getaffinity(0)), len(args.bags))
     if workers > 1 and args.scheduler is None:
         warm_up()

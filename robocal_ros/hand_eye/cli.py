@@ -507,7 +507,6 @@ run_sphere, run_step, run_line = (partial(run_target, kind) for kind in KINDS)
 
 
 def add_joint(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``joint``."""
     for kind in KINDS:
         without = "; without target.yaml the line is found too" if kind == "line" else ""
         parser.add_argument(
@@ -530,7 +529,6 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
 
 
 def run_joint(args: argparse.Namespace) -> CliResult:
-    """Do ``joint``. Raises `RobocalError` for what a user can mend."""
     arm, settings = arm_of(args), settings_of(args)
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}
     if len(folders) < 2:
@@ -555,7 +553,6 @@ def run_joint(args: argparse.Namespace) -> CliResult:
 
 
 def add_verify(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``verify``."""
     parser.add_argument(
         "--result",
         required=True,
@@ -580,7 +577,6 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
 
 
 def run_verify(args: argparse.Namespace) -> CliResult:
-    """Do ``verify``. Raises `RobocalError` for what a user can mend."""
     if args.target_kind == POINT:
         return _run_touch_test(args)
     if len(args.result) > 1 or args.touched is not None:

@@ -221,7 +221,6 @@ CAMERA_WHERE = "where the boards were"  # the expected error holds
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``camera``."""
     parser.add_argument(
         "--poses",
         required=True,
@@ -270,7 +269,6 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
 
 
 def run_camera(args: argparse.Namespace) -> CliResult:
-    """Do ``camera``. Raises `RobocalError` for what a user can mend."""
     settings = CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
     if args.measured is not None:
         for option in ("profiles", "board", "square_mm", "intrinsics"):
@@ -323,7 +321,6 @@ TRACKER_WHERE = "at the working distance"  # the expected error holds
 
 
 def add_tracker(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``tracker``."""
     parser.add_argument("--robot", required=True, metavar="NAME", help=ROBOT_HELP)
     parser.add_argument(
         "--poses",
@@ -363,7 +360,6 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
 
 
 def run_tracker(args: argparse.Namespace) -> CliResult:
-    """Do ``tracker``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     if args.target is None:
         target = TrackerTarget(args.radius_mm * 1e-3, args.radius_mm * 1e-3)
@@ -430,7 +426,6 @@ ROBOT_SIGMA_MM = 0.05
 
 
 def add_export(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``export``."""
     parser.add_argument(
         "--result", required=True, type=Path, metavar="FILE", help="JSON that was printed before"
     )
@@ -447,7 +442,6 @@ def add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def run_export(args: argparse.Namespace) -> CliResult:
-    """Do ``export``. Raises `RobocalError` for what a user can mend."""
     mount = read_mount(args.result, accepted=True)
     T, parent = mount.T_parent_sensor, args.parent or PARENTS[mount.parent]
     document: Document = {
@@ -461,7 +455,6 @@ def run_export(args: argparse.Namespace) -> CliResult:
 
 
 def add_check_plan(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``check-plan``."""
     add_target_kind(parser)
     parser.add_argument(
         "--poses",
@@ -500,7 +493,6 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
 
 
 def run_check_plan(args: argparse.Namespace) -> CliResult:
-    """Do ``check-plan``. Raises `RobocalError` for what a user can mend."""
     settings = settings_of(args)
     told = {f"{name}_mm": getattr(args, f"{name}_mm") for name in SENSOR}
     told = {name: value for name, value in told.items() if value is not None}

@@ -75,7 +75,6 @@ if TYPE_CHECKING:
 
 
 def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``calibrate-sensor``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--data", required=True, type=Path, metavar="CSV", help="joints and measured sphere centres"
@@ -92,7 +91,6 @@ def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:
 
 
 def run_calibrate_sensor(args: argparse.Namespace) -> CliResult:
-    """Do ``calibrate-sensor``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
     data = read_measurements(args.data, arm)
@@ -131,7 +129,6 @@ _FIXED_ONLY = ("sensor", "cold", "warm", "prior", "parameters")
 
 
 def add_identify(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``identify``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--arrangement",
@@ -167,7 +164,6 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
 
 
 def run_identify(args: argparse.Namespace) -> CliResult:
-    """Do ``identify``. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
@@ -204,7 +200,6 @@ def _require_sense(args: argparse.Namespace) -> None:
 
 
 def add_learn_prior(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``learn-prior``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--sensor", required=True, type=Path, metavar="S.yaml", help="from calibrate-sensor"
@@ -226,7 +221,6 @@ def add_learn_prior(parser: argparse.ArgumentParser) -> None:
 
 
 def run_learn_prior(args: argparse.Namespace) -> CliResult:
-    """Do ``learn-prior``. Raises `RobocalError` for what a user can mend."""
     if len(args.cold) != len(args.warm):
         raise InputError(
             f"{len(args.cold)} --cold and {len(args.warm)} --warm: give one of each for each shift"
@@ -356,7 +350,6 @@ def _field(value: str) -> tuple[float, ...]:
 
 
 def add_plan_poses(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``plan-poses``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--sensor", required=True, type=Path, metavar="S.yaml", help="from calibrate-sensor"
@@ -391,7 +384,6 @@ def add_plan_poses(parser: argparse.ArgumentParser) -> None:
 
 
 def run_plan_poses(args: argparse.Namespace) -> CliResult:
-    """Do ``plan-poses``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
     sensor = read_sensor(args.sensor, arm)
@@ -454,7 +446,6 @@ THRESHOLD_MM = 0.1
 
 
 def add_screen(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``screen``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     for name, metavar, words in (
         ("sensor", "S.yaml", "from calibrate-sensor"),
@@ -493,7 +484,6 @@ def add_screen(parser: argparse.ArgumentParser) -> None:
 
 
 def run_screen(args: argparse.Namespace) -> CliResult:
-    """Do ``screen``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
     if args.wanted > len(arm.parameters):
@@ -573,7 +563,6 @@ POINT = "geometry_msgs/msg/PointStamped"
 
 
 def add_correct_points(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``correct-points``."""
     add_given_model(parser)
     parser.add_argument(
         "--mount",
@@ -595,7 +584,6 @@ def add_correct_points(parser: argparse.ArgumentParser) -> None:
 
 
 def run_correct_points(args: argparse.Namespace) -> CliResult:
-    """Do ``correct-points``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     arm, mount = given_model(args, robot.arm), _mount(args, robot.arm)
     lost: list[str] = []

@@ -64,7 +64,6 @@ if TYPE_CHECKING:
 
 
 def add_beams(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``beams``."""
     parser.add_argument(
         "--data",
         required=True,
@@ -94,7 +93,6 @@ def add_beams(parser: argparse.ArgumentParser) -> None:
 
 
 def run_beams(args: argparse.Namespace) -> CliResult:
-    """Do ``beams``. Raises `RobocalError` for what a user can mend."""
     # Refuse a file without its robot or station, and options that only the file needs.
     for option in ("robot", "station", "sigma_mm"):
         given, name = getattr(args, option) is not None, f"--{option.replace('_', '-')}"
@@ -240,7 +238,6 @@ OF_RUN = ("joints", "robot", "laser", "tool", "xyz_mm", "rpy_deg")
 
 
 def add_crossed(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``crossed``."""
     parser.add_argument(
         "--events",
         required=True,
@@ -275,7 +272,6 @@ def add_crossed(parser: argparse.ArgumentParser) -> None:
 
 
 def run_crossed(args: argparse.Namespace) -> CliResult:
-    """Do ``crossed``. Raises `RobocalError` for what a user can mend."""
     if not isfinite(args.sample_period_s) or args.sample_period_s < 0.0:
         raise InputError("--sample-period-s must be a finite number, not below 0")
     rule = InputRule(JITTER_S, args.sample_period_s)
@@ -331,7 +327,6 @@ POINT_METHODS = ("four", "seven")
 
 
 def add_points(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``points``."""
     parser.add_argument("--method", choices=POINT_METHODS, default=POINT_METHODS[0])
     parser.add_argument(
         "--data",
@@ -346,7 +341,6 @@ def add_points(parser: argparse.ArgumentParser) -> None:
 
 
 def run_points(args: argparse.Namespace) -> CliResult:
-    """Do ``points``. Raises `RobocalError` for what a user can mend."""
     fit = {"four": fit_four, "seven": fit_seven}[args.method]
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
     document: Document = {"method": args.method}
@@ -355,7 +349,6 @@ def run_points(args: argparse.Namespace) -> CliResult:
 
 
 def add_parallel(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``parallel``."""
     parser.add_argument(
         "--data",
         required=True,
@@ -381,7 +374,6 @@ def add_parallel(parser: argparse.ArgumentParser) -> None:
 
 
 def run_parallel(args: argparse.Namespace) -> CliResult:
-    """Do ``parallel``. Raises `RobocalError` for what a user can mend."""
     if not all(map(isfinite, (args.up_mm, args.down_mm, args.x_mm or 0.0))):
         raise InputError("--up-mm, --down-mm and --x-mm must be finite numbers")
     beams = ParallelBeams(args.up_mm * 1e-3, args.down_mm * 1e-3)
@@ -401,7 +393,6 @@ FORMATS = ("urdf", "kuka", "abb", "fanuc", "ur", "kawasaki")
 
 
 def add_export(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``export``."""
     add_frame_options(parser, "--xyz-mm", "--rpy-deg")
     parser.add_argument("--format", required=True, choices=FORMATS)
     parser.add_argument(
@@ -416,7 +407,6 @@ def add_export(parser: argparse.ArgumentParser) -> None:
 
 
 def run_export(args: argparse.Namespace) -> CliResult:
-    """Do ``export``. Raises `RobocalError` for what a user can mend."""
     T_flange_tool = given_frame(args)
     if T_flange_tool is None:
         raise InputError("give the tool: --tool, or --xyz-mm and --rpy-deg")
@@ -440,7 +430,6 @@ MOST_LISTED = 1_000_000  # all that a history holds
 
 
 def add_station(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``station``."""
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
     parser.add_argument(
         "--robot-serial", required=True, type=text, metavar="S", help="whose history is read"
@@ -457,7 +446,6 @@ def add_station(parser: argparse.ArgumentParser) -> None:
 
 
 def run_station(args: argparse.Namespace) -> CliResult:
-    """Do ``station``. Raises `RobocalError` for what a user can mend."""
     robot, warnings = describe_robot(args.robot)
     with model_history(args, robot.arm) as history:
         entries = [e for e in reversed(history.list(MOST_LISTED)) if e.kind == LASER_FRAME]
