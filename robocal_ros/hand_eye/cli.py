@@ -53,12 +53,9 @@ from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, Profile, SensorDescr
 from robocal_ros.hand_eye.result import (
     METHODS,
     HandEyeSettings,
-    TouchTest,
     by_shot,
-    compared,
     hand_eye_document,
     shots_of,
-    touch_test,
 )
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
@@ -72,6 +69,7 @@ from robocal_ros.hand_eye.targets import (
     read_target,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData
+from robocal_ros.hand_eye.touch_test import TouchTest, compared, touch_test
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot, read_fields
 from robocal_ros.session.events import session_kind

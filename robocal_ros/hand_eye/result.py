@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a hand-eye calibration, whatever the target, and whether it is good, in mm.
-
-The touch test is the sources' evaluation (sphere and step targets, section on experiments):
-accuracy is the distance of scanned points from touched ones, stability three times the standard
-deviation of one point scanned from several poses, along the worst axis of the base.
-"""
+"""The outcome of a hand-eye calibration, whatever the target, and whether it is good, in mm."""
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -14,19 +9,14 @@ from typing import Literal
 import numpy as np
 
 from robocal_ros.estimation.assessment import (
-    ErrorSummary,
     Verdict,
-    errors_document,
     summarise,
     verdict_document,
 )
-from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import Code
 from robocal_ros.ground.frames import Array, Document, transform_document
-from robocal_ros.hand_eye.files import ScannedPoints, SensorMount
 from robocal_ros.hand_eye.linearity import SensorLinearity
-from robocal_ros.hand_eye.profiles import Profile
 
 Method = Literal["best", "classic"]
 TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
@@ -281,168 +271,3 @@ def shots_of(names: Iterable[str]) -> set[str]:
 
 def _without_corner(text: str) -> str:
     return re.sub(r"/corner \d+\b", "", text)
-
-
-FEWEST_SCANS = 3  # of a point, for a standard deviation
-
-
-@dataclass(frozen=True, eq=False)
-class TouchTest:
-    """What scanned points say of a mount.
-
-    ``points``: names, p of them; ``place`` (p, 3): mean of each, base, m; ``count`` (p,).
-    ``three_sigma_m`` (p,): along the worst axis; not a number of fewer than three scans.
-    ``distance_m`` (m,): of each scan of a touched point from there; empty where none was touched.
-    ``off_m``: by name, of the mean of a touched point from there.
-    """
-
-    points: tuple[str, ...]
-    place: Array
-    count: tuple[int, ...]
-    three_sigma_m: Array
-    distance_m: Array
-    off_m: Mapping[str, float]
-    verdict: Verdict
-
-    @property
-    def accuracy(self) -> ErrorSummary | None:
-        """Of all scans of touched points."""
-        return summarise(self.distance_m) if len(self.distance_m) else None
-
-    @property
-    def stability_m(self) -> float | None:
-        """Largest of the three sigmas; None where no point was scanned often enough."""
-        known = self.three_sigma_m[np.isfinite(self.three_sigma_m)]
-        return float(known.max()) if len(known) else None
-
-    def document(self) -> Document:
-        """In the units people read."""
-        sigma = [1e3 * s if np.isfinite(s) else None for s in self.three_sigma_m.tolist()]
-        rows = zip(self.points, self.count, self.place.tolist(), sigma, strict=True)
-        stability_m, accuracy = self.stability_m, self.accuracy
-        return {
-            "points": [
-                {
-                    "point": name,
-                    "scans": count,
-                    "xyz_mm": [1e3 * x for x in place],
-                    "three_sigma_mm": three,
-                    "off_mm": 1e3 * self.off_m[name] if name in self.off_m else None,
-                }
-                for name, count, place, three in rows
-            ],
-            "accuracy_mm": None if accuracy is None else errors_document(accuracy),
-            "three_sigma_mm": None if stability_m is None else 1e3 * stability_m,
-        }
-
-
-def scanned_points(
-    points: Sequence[str], profiles: Sequence[Profile], T_base_flange: Array, rule: EdgeRule
-) -> tuple[ScannedPoints, dict[str, str]]:
-    """Marked points of an edge or groove where the laser line crosses it, one in each profile.
-
-    ``points`` (m,): their names; ``T_base_flange`` (m, 4, 4). Beside them why a profile, by its
-    name, shows none.
-
-    Raises `TooFewSamplesError` when none shows one.
-    """
-    kept, seen = list[int](), list[Array]()
-    rejected: dict[str, str] = {}
-    for i, profile in enumerate(profiles):
-        try:
-            seen.append(fit_edge(profile.points, rule).point)
-            kept.append(i)
-        except RobocalError as error:
-            rejected[profile.name] = str(error)
-    if not kept:
-        why = "; ".join(f"{name}: {reason}" for name, reason in list(rejected.items())[:1])
-        raise TooFewSamplesError(f"no profile shows a marked point: {why or 'none was captured'}")
-    return ScannedPoints(
-        tuple(points[i] for i in kept), np.array(seen), T_base_flange[kept]
-    ), rejected
-
-
-def touch_test(
-    mount: SensorMount, scanned: ScannedPoints, touched: Mapping[str, Array], limit_m: float
-) -> TouchTest:
-    """Judge a mount by scanned points; ``touched``: places (3,) in base, m, of some or none.
-
-    Raises `InputError` for a touched point that was not scanned.
-    """
-    if missing := [name for name in touched if name not in scanned.point]:
-        raise InputError(
-            f"point '{missing[0]}' was touched but not scanned; scanned are "
-            f"{', '.join(dict.fromkeys(scanned.point))}"
-        )
-    seen = scanned.points
-    if mount.linearity is not None:
-        seen = mount.linearity.corrected(seen)
-    p_sensor = np.column_stack([seen[:, 0], np.zeros(len(seen)), seen[:, 1]])
-    p_base = frames.apply(scanned.T_base_flange @ mount.T_parent_sensor, p_sensor)
-    names = tuple(dict.fromkeys(scanned.point))
-    own = [np.array([name == one for one in scanned.point]) for name in names]
-    place = np.array([p_base[rows].mean(axis=0) for rows in own])
-    three = np.array(
-        [
-            3.0 * float(p_base[rows].std(axis=0, ddof=1).max())
-            if rows.sum() >= FEWEST_SCANS
-            else np.nan
-            for rows in own
-        ]
-    )
-    known = [i for i, name in enumerate(scanned.point) if name in touched]
-    truth = np.array([touched[scanned.point[i]] for i in known]).reshape(-1, 3)
-    distance = np.linalg.norm(p_base[known] - truth, axis=1)
-    off = {n: float(np.linalg.norm(place[names.index(n)] - p)) for n, p in touched.items()}
-    verdict = _verdict(distance, three, limit_m)
-    return TouchTest(names, place, tuple(int(r.sum()) for r in own), three, distance, off, verdict)
-
-
-def _verdict(distance: Array, three_sigma: Array, limit_m: float) -> Verdict:
-    known = three_sigma[np.isfinite(three_sigma)]
-    words = []
-    if len(known):
-        words.append(f"three sigma of one point {1e3 * known.max():.3f} mm at most")
-    if not len(distance):
-        if not len(known):
-            return Verdict(
-                Code.TOO_FEW_SAMPLES,
-                f"no point was touched, and none scanned from {FEWEST_SCANS} poses or more",
-            )
-        words.append("no point was touched, so what all scans share does not show")
-        worst_m = float(known.max())
-    else:
-        found = summarise(distance)
-        words.insert(0, f"scanned points are off by {1e3 * found.mean_m:.3f} mm on average")
-        worst_m = found.rms_m
-    if worst_m > limit_m:
-        words.append(f"allowed are {1e3 * limit_m:g} mm: the mount is not this one")
-        return Verdict(Code.RESIDUAL_TOO_LARGE, "; ".join(words))
-    return Verdict(Code.ACCEPT, "; ".join(words))
-
-
-def compared(found: Mapping[str, TouchTest]) -> Verdict:
-    """Of several places, by name, all judged by the same points: ACCEPT where each of them passed.
-
-    Else the code of the first that did not. The best is the one whose scans are nearest to what was
-    touched; where nothing was, the steadiest.
-    """
-    if len(found) == 1:
-        return next(iter(found.values())).verdict
-    passed = [name for name, test in found.items() if test.verdict.accept]
-    words = f"{len(passed)} of {len(found)} pass"
-    figures = {
-        name: test.accuracy.rms_m if test.accuracy else test.stability_m
-        for name, test in found.items()
-    }
-    known = {name: value for name, value in figures.items() if value is not None}
-    if known:
-        best = min(known, key=lambda name: known[name])
-        what = "off" if found[best].accuracy else "three sigma"
-        words += f"; best is {best}: {what} {1e3 * known[best]:.3f} mm"
-        words += " rms" if found[best].accuracy else ""
-    failed = next((test for name, test in found.items() if name not in passed), None)
-    if failed is None:
-        return Verdict(Code.ACCEPT, words)
-    others_named = ", ".join(name for name in found if name not in passed)
-    return Verdict(failed.verdict.code, f"{words}; not {others_named}: {failed.verdict.reason}")

@@ -562,7 +562,7 @@ class HandEyeServices:
     def _verify(self, request: Any, response: Any) -> Any:
         """The touch test of what is in force, or of candidates side by side."""
         from robocal_ros.estimation.edge import EdgeRule
-        from robocal_ros.hand_eye.result import compared, scanned_points, touch_test
+        from robocal_ros.hand_eye.touch_test import compared, scanned_points, touch_test
 
         session, limit_m = self._session(), self._session().config.limit_m
         data, numbers = session.data, list(request.candidates)

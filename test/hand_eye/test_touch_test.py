@@ -13,7 +13,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.hand_eye.files import ScannedPoints, SensorMount
-from robocal_ros.hand_eye.result import touch_test
+from robocal_ros.hand_eye.touch_test import touch_test
 
 TRUE = frames.transform(frames.exp_rotation([2.5, -0.3, 0.4]), [0.04, -0.06, 0.11])
 POINTS = {"a": np.array([0.6, 0.1, 0.2]), "b": np.array([0.7, -0.2, 0.25])}

@@ -12,8 +12,9 @@ from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.files import SensorMount
 from robocal_ros.hand_eye.profiles import Profile
-from robocal_ros.hand_eye.result import increment, scanned_points, touch_test
+from robocal_ros.hand_eye.result import increment
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession, sample_poses
+from robocal_ros.hand_eye.touch_test import scanned_points, touch_test
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
 
