@@ -108,6 +108,7 @@ class Shown:
 
 
 STATUS, ACCURACY, TOOL = "maintenance_node/status", "accuracy_state", "tcf_node/tool"
+FIXTURE = "fixture_node/quality"
 SILENT_S = 3.0  # maintenance_node says its status at 5 Hz, the accuracy at 1 Hz
 
 SHOWN = (
@@ -194,6 +195,16 @@ SHOWN = (
             Item("YMm", "Double", lambda m: MM * m.tool.translation.y, "In the flange, mm"),
             Item("ZMm", "Double", lambda m: MM * m.tool.translation.z, "In the flange, mm"),
             Item("QuaternionXyzw", "Double[]", lambda m: _xyzw(m.tool.rotation), "x, y, z, w"),
+        ),
+    ),
+    Shown(
+        "Fixture",
+        FIXTURE,
+        "What its last measurement said",
+        (
+            Item("Code", CODE, "code", "ACCEPT: it has moved, or was taught"),
+            Item("Id", "UInt32", "candidate_id", "Its new frame, to be decided; 0: none"),
+            Item("Reason", "String", "reason", "In words, with what moved by how much"),
         ),
     ),
 )

@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from robocal_msgs.action import MeasureTool
-from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus, ToolFrame
+from robocal_msgs.msg import (
+    AccuracyState,
+    BeamEvent,
+    CalibrationQuality,
+    GapOpen,
+    MaintenanceStatus,
+    ToolFrame,
+)
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
 
@@ -48,6 +55,7 @@ MESSAGES: Mapping[str, Any] = {
     "accuracy_state": AccuracyState,
     "maintenance_node/status": MaintenanceStatus,
     "tcf_node/tool": ToolFrame,
+    "fixture_node/quality": CalibrationQuality,
 }
 
 

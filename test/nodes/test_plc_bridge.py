@@ -23,7 +23,14 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from pymodbus.client import ModbusTcpClient
-from robocal_msgs.msg import AccuracyState, BeamEvent, GapOpen, MaintenanceStatus, ToolFrame
+from robocal_msgs.msg import (
+    AccuracyState,
+    BeamEvent,
+    CalibrationQuality,
+    GapOpen,
+    MaintenanceStatus,
+    ToolFrame,
+)
 from std_srvs.srv import Trigger
 from test_maintenance_calls import Plc, candidates, process
 
@@ -57,6 +64,10 @@ class Line:
         frame = ToolFrame(child_frame_id="tcp", revision=3, state=ToolFrame.ACCEPTED)
         frame.tool.translation.z = 0.1505
         self.tool.publish(frame)
+        quality = "fixture_node/quality"
+        self.fixture = graph.probe.create_publisher(CalibrationQuality, quality, endpoints.LATCHED)
+        reason = "plate moved by 0.51 mm"
+        self.fixture.publish(CalibrationQuality(code=1, candidate_id=9, reason=reason))
         self.bridge = self.start()
         self.plc = self.connected()
         self.plc.start(self.plc.program())
@@ -153,6 +164,8 @@ def test_what_is_shown_is_what_the_nodes_say(line):
     assert abs(shown.SourceTimestamp.timestamp() - stamp) < 5.0
     tool = [line.read(f"Tool.{name}") for name in ("Name", "Revision", "State", "ZMm")]
     assert tool == ["tcp", 3, ToolFrame.ACCEPTED, pytest.approx(150.5)]
+    fixture = [line.read(f"Fixture.{name}") for name in ("Code", "Id", "Reason")]
+    assert fixture == [Code.ACCEPT, 9, "plate moved by 0.51 mm"]
 
 
 def test_codes_are_an_enumeration_of_the_same_table(line):
