@@ -40,6 +40,7 @@ STEP_BEGINS = "step_begins"
 TOOL_STEP = "tool_step"
 BREAK_OFF = "break_off"
 TOUCH, SOLVE_TOUCHES, CLEAR_TOUCHES = "touch", "solve_touches", "clear_touches"
+SWEEP, SOLVE_SWEEPS, CLEAR_SWEEPS = "sweep", "solve_sweeps", "clear_sweeps"
 LEFT_PLAN = "left_plan"  # argument of it: the robot was stopped because it left its plan
 START = "start"
 CAPTURE = "capture"

@@ -17,9 +17,23 @@ from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 
-Beam = Literal["x", "y"]
-BEAMS: tuple[Beam, Beam] = ("x", "y")
+Beam = Literal["x", "y", "up", "down"]
+BEAMS: tuple[Beam, Beam] = ("x", "y")  # crossed
+PARALLEL: tuple[Beam, Beam] = ("up", "down")
 MOST_BOUNCES = 5  # edges of one burst; more is no contact that settles
+
+
+@dataclass(frozen=True)
+class ParallelStation:
+    """Two parallel beams along the base's y: their heights and their place along its x, m.
+
+    ``names``: of the upper and the lower beam in the edges.
+    """
+
+    up_m: float
+    down_m: float
+    x_m: float
+    names: tuple[str, str] = ("up", "down")
 
 
 class BeamError(RobocalError):
@@ -79,7 +93,7 @@ def debounced(edges: Sequence[BeamEdge], debounce_s: float) -> list[BeamEdge]:
     Raises `BeamError` when a burst leaves the beam as it was (a double edge), or does not settle.
     """
     kept: list[BeamEdge] = []
-    for beam in BEAMS:
+    for beam in (*BEAMS, *PARALLEL):
         own = sorted((e for e in edges if e.beam == beam), key=lambda e: e.time_s)
         first = 0
         for i in range(1, len(own) + 1):
@@ -147,14 +161,15 @@ class EdgeSample:
         return BeamEdge(self.beam, self.blocked, time_s, self.sigma_s or sigma_s)
 
 
-def edge_sample(message: Any, names: tuple[str, str]) -> EdgeSample:
-    """Build a sample from a ``robocal_msgs/BeamEvent``; ``names`` of the x- and the y-beam.
+def edge_sample(message: Any, names: Mapping[str, Beam]) -> EdgeSample:
+    """Build a sample from a ``robocal_msgs/BeamEvent``; ``names``: which beam has which.
 
     Raises `InputError` when the beam is unknown, the edge is neither break nor restore, or the
     stamp's sigma is negative or not finite.
     """
     if message.beam not in names:
-        raise InputError(f"beam '{message.beam}' is neither '{names[0]}' (x) nor '{names[1]}' (y)")
+        known = ", ".join(f"'{name}' ({beam})" for name, beam in names.items())
+        raise InputError(f"beam '{message.beam}' is none of {known}")
     if message.edge not in (BREAK, RESTORE):
         raise InputError(f"edge {message.edge} is neither {BREAK} (break) nor {RESTORE} (restore)")
     sigma_s = float(message.stamp_sigma_s)
@@ -163,8 +178,8 @@ def edge_sample(message: Any, names: tuple[str, str]) -> EdgeSample:
     at_ns = stamp_ns(message.header.stamp)
     if at_ns <= 0:
         raise InputError("no time stamp: edges are stamped where they happen")
-    beam = BEAMS[names.index(message.beam)]
-    return EdgeSample(at_ns, message.header.frame_id, beam, message.edge == BREAK, sigma_s)
+    beam, blocked = names[message.beam], message.edge == BREAK
+    return EdgeSample(at_ns, message.header.frame_id, beam, blocked, sigma_s)
 
 
 EDGES = "beam_events"
@@ -205,7 +220,8 @@ class EdgeLog:
             if from_ns < sample.stamp_ns <= marks.get(f"{EDGES}/{sample.beam}", -1)
         ]
         self._edges = [sample for sample in self._edges if sample not in found]
-        return sorted(found, key=lambda sample: (sample.stamp_ns, BEAMS.index(sample.beam)))
+        order = (*BEAMS, *PARALLEL)
+        return sorted(found, key=lambda sample: (sample.stamp_ns, order.index(sample.beam)))
 
     def clear(self) -> None:
         """Forget all."""

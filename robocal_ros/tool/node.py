@@ -42,9 +42,12 @@ from robocal_ros.ros.session_node import (
 )
 from robocal_ros.session.events import (
     BREAK_OFF,
+    CLEAR_SWEEPS,
     CLEAR_TOUCHES,
     MEASURE_TOOL,
+    SOLVE_SWEEPS,
     SOLVE_TOUCHES,
+    SWEEP,
     TOOL_STEP,
     TOUCH,
     Command,
@@ -52,7 +55,7 @@ from robocal_ros.session.events import (
 )
 from robocal_ros.tool.crossed_model import RobotNoise
 from robocal_ros.tool.driving import load_measuring
-from robocal_ros.tool.edges import EDGES, InputRule
+from robocal_ros.tool.edges import EDGES, InputRule, ParallelStation
 from robocal_ros.tool.judging import CheckRule, ToolLimits
 from robocal_ros.tool.laser_frame import LaserFrame, read_laser_for
 from robocal_ros.tool.run import MeasuringMotion, PlannedStep, ToolConfig, TraitLimits, rows_of
@@ -66,8 +69,11 @@ from robocal_ros.tool.session import (
     configuration,
     take_tool_message,
 )
+from robocal_ros.tool.touch_points import ParallelBeams
 
 PROGRAM, TRAJECTORY = "program", "trajectory"
+BY_TOUCHES = (TOUCH, SOLVE_TOUCHES, CLEAR_TOUCHES)
+BY_SWEEPS = (SWEEP, SOLVE_SWEEPS, CLEAR_SWEEPS)
 
 
 SETTINGS = (
@@ -78,9 +84,20 @@ SETTINGS = (
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",
         "Its orientation: z from flange to tip",
     ),
-    Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
+    Setting(
+        "laser",
+        "",
+        "Laser file of the station of crossed beams, as 'robocal tool beams' writes it; empty: "
+        "there are parallel ones alone",
+    ),
     Setting("tool_frame", "tool", "Name of the tool frame, a child of the flange's"),
     Setting("beams", ["x", "y"], "Names of the x- and the y-beam in beam_events"),
+    Setting(
+        "parallel_beams", ["up", "down"], "Names of the upper and the lower of two parallel beams"
+    ),
+    number("parallel_up_mm", 0.0, "Height of the upper one, base; 0 as the other: none", -5e3, 5e3),
+    number("parallel_down_mm", 0.0, "Height of the lower one", -5e3, 5e3),
+    number("parallel_x_mm", 0.0, "Place of both along the base's x", -5e3, 5e3),
     Setting(
         "motion",
         PROGRAM,
@@ -170,16 +187,37 @@ def taught_tool(settings: Mapping[str, Any], nominal: SerialArm) -> NDArray[np.f
     return nominal.T_flange_tool if given is None else given
 
 
+def parallel_station(settings: Mapping[str, Any]) -> ParallelStation | None:
+    """Two parallel beams; None where both heights are 0.
+
+    Raises `InputError` when they are not named as two beams; `RankDeficientError` when they are too
+    near each other.
+    """
+    up, down, x = (1e-3 * settings[f"parallel_{key}_mm"] for key in ("up", "down", "x"))
+    names = tuple(settings["parallel_beams"])
+    if up == down == 0.0:
+        return None
+    if len({*names, *settings["beams"]}) != 4:
+        raise InputError(f"beams {settings['beams']} and parallel_beams {names}: two names each")
+    ParallelBeams(up, down)  # refuses them where they are too near each other
+    return ParallelStation(up, down, x, (names[0], names[1]))
+
+
 def session_config(
-    settings: Mapping[str, Any], laser: LaserFrame, station: str, taught: NDArray[np.float64]
+    settings: Mapping[str, Any],
+    laser: LaserFrame | None,
+    station: str,
+    taught: NDArray[np.float64],
 ) -> ToolConfig:
-    """Settings of the session, in SI."""
+    """Settings of the session, in SI; ``laser`` None: there are parallel beams alone."""
+    reach = np.zeros(2) if laser is None else laser.reach
     return ToolConfig(
-        points_m=rows_of(laser.points),
+        points_m=() if laser is None else rows_of(laser.points),
+        parallel=parallel_station(settings),
         taught=rows_of(taught),
         mandrel=None if (T := given_pose(settings, "mandrel")) is None else rows_of(T),
-        laser_sigma_m=laser.sigma_m,
-        reach_m=(float(laser.reach[0]), float(laser.reach[1])),
+        laser_sigma_m=0.0 if laser is None else laser.sigma_m,
+        reach_m=(float(reach[0]), float(reach[1])),
         station=station,
         beams=tuple(settings["beams"]),
         mandrel_radius_m=settings["mandrel_radius_mm"] * 1e-3,
@@ -225,7 +263,7 @@ class TcfServices:
         add(Trigger, "~/quick_check_trigger", self._starter(QUICK))
         add(Trigger, "~/measure_reference_trigger", self._starter(REFERENCE))
         add(Trigger, "~/laser_frame_trigger", self._starter(LASER))
-        for name in (TOUCH, SOLVE_TOUCHES, CLEAR_TOUCHES):
+        for name in (*BY_TOUCHES, *BY_SWEEPS):
             add(Trigger, f"~/{name}_trigger", twin(ask, name, {}))
         add(Trigger, "~/cancel_trigger", self._cancel_twin)
         add(Trigger, "~/result_trigger", self._result)
@@ -352,12 +390,15 @@ class TcfNode(SessionNode[ToolSession]):
         """Read robot and laser, open the history, then the topics, services and the action."""
         super().configure()
         settings = self.settings
-        if not settings["laser"]:
+        if not settings["laser"] and parallel_station(settings) is None:
             raise InputError("laser is empty: name the file that 'robocal tool beams' wrote")
-        placed = read_laser_for(Path(settings["laser"]), self._nominal)
+        laser, station = None, ""
+        if settings["laser"]:
+            placed = read_laser_for(Path(settings["laser"]), self._nominal)
+            laser, station = placed.laser, placed.station
         taught = taught_tool(settings, self._nominal)
         load_measuring(self._nominal)
-        self._config = session_config(settings, placed.laser, placed.station, taught)
+        self._config = session_config(settings, laser, station, taught)
         history = self.open_session()
         frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
         self._outputs = TcfOutputs(
@@ -476,7 +517,7 @@ class TcfNode(SessionNode[ToolSession]):
             self._show_result(outcome)
             if not self.run_end.done():
                 self.run_end.set_result(outcome)
-        elif name == SOLVE_TOUCHES:
+        elif name in (SOLVE_TOUCHES, SOLVE_SWEEPS):
             self._show_result(outcome)
 
     def _show_result(self, outcome: Outcome) -> None:

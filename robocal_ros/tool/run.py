@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    RobocalError,
+    TooFewSamplesError,
+)
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.tool.crossed_model import (
@@ -24,10 +30,12 @@ from robocal_ros.tool.crossed_model import (
 )
 from robocal_ros.tool.edges import (
     BEAMS,
+    PARALLEL,
     Beam,
     BeamError,
     EdgeSample,
     InputRule,
+    ParallelStation,
     StepKind,
     StepWatch,
     debounced,
@@ -330,13 +338,14 @@ Rows = tuple[tuple[float, ...], ...]
 class ToolConfig:
     """Settings of a tool session; plain values, so that a recording carries them.
 
-    ``points_m``: four points (A, B on the x-beam, C, D on the y-beam), base. ``laser_sigma_m``,
-    ``reach_m``: see `LaserFrame`. ``taught``: rows of T_flange_tool (4, 4) as taught. ``station``:
-    frame_id of the beams' edges; empty: any. ``beams``: names of the x- and the y-beam in the
-    edges. ``mandrel``: rows of T_flange_mandrel (4, 4), z along its axis to its end; None: there is
-    none. ``mandrel_radius_m``: as certified, where it places the beams. ``taper``: growth of the
-    tool's radius per length above the tip. ``spin_rad``: turn of the flange about the laser's z
-    while it measures. ``step_timeout_s``: a step without any edge for so long ends the run.
+    ``points_m``: four points (A, B on the x-beam, C, D on the y-beam), base; empty: no such beams.
+    ``laser_sigma_m``, ``reach_m``: see `LaserFrame`. ``taught``: rows of T_flange_tool (4, 4) as
+    taught. ``station``: frame_id of the beams' edges; empty: any. ``beams``: names of the x- and
+    the y-beam in the edges. ``parallel``: two parallel beams, where there are any. ``mandrel``:
+    rows of T_flange_mandrel (4, 4), z along its axis to its end; None: there is none.
+    ``mandrel_radius_m``: as certified, where it places the beams. ``taper``: growth of the tool's
+    radius per length above the tip. ``spin_rad``: turn of the flange about the laser's z while it
+    measures. ``step_timeout_s``: a step without any edge for so long ends the run.
     """
 
     points_m: Rows
@@ -347,6 +356,7 @@ class ToolConfig:
     reach_m: tuple[float, float] = (0.0, 0.0)
     station: str = ""
     beams: tuple[str, str] = ("x", "y")
+    parallel: ParallelStation | None = None
     taper: float = 0.0
     spin_rad: float = 0.0
     step_timeout_s: float = 30.0
@@ -359,8 +369,18 @@ class ToolConfig:
 
     @property
     def laser(self) -> LaserFrame:
-        """The beams."""
+        """The crossed beams. Raises `ConflictError` where there are none."""
+        if not self.points_m:
+            raise ConflictError("there are no crossed beams: name their laser file ('laser')")
         return LaserFrame(np.array(self.points_m), self.laser_sigma_m, np.array(self.reach_m))
+
+    @property
+    def beam_names(self) -> dict[str, Beam]:
+        """Which beam has which name in the edges."""
+        crossed = dict(zip(self.beams, BEAMS, strict=True)) if self.points_m else {}
+        if self.parallel is None:
+            return crossed
+        return crossed | dict(zip(self.parallel.names, PARALLEL, strict=True))
 
     @property
     def T_flange_taught(self) -> Array:
@@ -398,6 +418,8 @@ class ToolConfig:
             }
             if values.get("mandrel") is not None:  # older ones have none
                 rows["mandrel"] = tuple(map(tuple, values.pop("mandrel")))
+            if (known := values.get("parallel")) is not None:
+                values["parallel"] = ParallelStation(**(known | {"names": tuple(known["names"])}))
             pairs: dict[str, Any] = {key: tuple(values.pop(key)) for key in ("reach_m", "beams")}
             made: dict[str, Any] = {key: part(**values.pop(key)) for key, part in parts.items()}
             return cls(**rows, **pairs, **made, **values)

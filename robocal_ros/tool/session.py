@@ -4,6 +4,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ from robocal_ros.tool.edges import (
     AHEAD_NS,
     EDGES,
     MOST_EDGES,
+    PARALLEL,
     BeamError,
     EdgeLog,
     EdgeSample,
@@ -83,7 +85,8 @@ from robocal_ros.tool.station import (
     station_shift,
     station_verdict,
 )
-from robocal_ros.tool.touch_points import TouchedTip, TouchLog
+from robocal_ros.tool.sweeps import SweepLog
+from robocal_ros.tool.touch_points import HandMeasured, TouchLog
 
 
 class ToolInForce(HistoryFollower):
@@ -293,12 +296,14 @@ class ToolResults:
         by, reason = str(command.arguments.get("by", "")), verdict.reason
         self._history.accept(kept, by=by, reason=reason, expected_head=None, wall_ns=wall_ns)
 
-    def touched(self, tip: TouchedTip, command: Command, wall_ns: int) -> Outcome:
-        """Propose a tip that was found by touches."""
-        verdict, document, model = tip.verdict, tip.document, tip.found.document()
-        kept = self._keep(TOOL, tip, command, wall_ns, verdict, document, model, method="touches")
+    def by_hand(self, tool: HandMeasured, command: Command, wall_ns: int) -> Outcome:
+        """Propose a tool that was found by touches or sweeps."""
+        verdict, document, model = tool.verdict, tool.document, tool.found.document()
+        kept = self._keep(
+            TOOL, tool, command, wall_ns, verdict, document, model, method=tool.method
+        )
         outcome = Outcome(command, verdict.code, verdict.reason, document, kept)
-        return replace(outcome, samples=len(tip.q))
+        return replace(outcome, samples=tool.samples)
 
     def _laser(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         """Where the mandrel finds the beams, against the first time."""
@@ -413,7 +418,7 @@ class ToolResults:
     def _keep(
         self,
         kind: str,
-        run: ToolRun | TouchedTip,
+        run: ToolRun | HandMeasured,
         command: Command,
         wall_ns: int,
         verdict: Verdict,
@@ -463,9 +468,8 @@ class ToolSession(SessionBase):
         self.current = ToolInForce(history, nominal, config)
         super().__init__(nominal, history, TOOL, self.current)
         self._results = ToolResults(nominal, history, config, software, self.current)
-        self._laser = config.laser
         self._edges = EdgeLog()
-        self._touches = TouchLog(config)
+        self._touches, self._sweeps = TouchLog(config), SweepLog(config)
         self._runs = 0
         self._strays = 0  # edges of the run that came with a stamp far from the joints'
         self._over: Command | None = None
@@ -487,6 +491,7 @@ class ToolSession(SessionBase):
         jumped, run, newest = self._take_joints(sample), self.run, self.newest_joints_ns
         if jumped:
             self._edges.clear()
+            self._sweeps.jumped()
             self._end_early("the clock jumped back", Code.CLOCK_WRONG)
         elif run is not None and self._over is None and newest > run.from_ns:
             _, q = self.stream.window(newest, newest)
@@ -513,6 +518,10 @@ class ToolSession(SessionBase):
             self._over = Command(events.BREAK_OFF, arguments, self.newest_joints_ns)
 
     def _add_edge(self, sample: EdgeSample) -> None:
+        if sample.beam in PARALLEL:
+            self._sweeps.add_edge(sample, self.newest_ns, self.newest_joints_ns)
+            self.received[EDGES] += 1
+            return
         if self.config.station and sample.station != self.config.station:
             words = (
                 f"edge of station '{sample.station}', the laser frame is of "
@@ -546,25 +555,25 @@ class ToolSession(SessionBase):
         return self._results.of_cycle(mode, cycle_id) is not None
 
     def _handlers(self) -> Mapping[str, Handler]:
+        now = self.current
         return {
             events.MEASURE_TOOL: self._measure,
             events.STEP_BEGINS: self._step_begins,
             events.TOOL_STEP: self._take_step,
             events.BREAK_OFF: self._break_off,
-            events.TOUCH: self._touch,
-            events.SOLVE_TOUCHES: self._solve_touches,
-            events.CLEAR_TOUCHES: lambda command, wall_ns: self._touches.clear(command),
+            events.TOUCH: lambda command, _: self._touches.add(command, self.stream),
+            events.SOLVE_TOUCHES: partial(self._solve, self._touches),
+            events.CLEAR_TOUCHES: lambda command, _: self._touches.clear(command),
+            events.SWEEP: lambda command, _: self._sweeps.add(command, self.stream, now.arm),
+            events.SOLVE_SWEEPS: partial(self._solve, self._sweeps),
+            events.CLEAR_SWEEPS: lambda command, _: self._sweeps.clear(command),
         }
 
-    def _touch(self, command: Command, wall_ns: int) -> Outcome:
-        stamp_ns = (command.marks or {}).get(JOINTS, 0)
-        return self._touches.add(command, self.stream, stamp_ns)
-
-    def _solve_touches(self, command: Command, wall_ns: int) -> Outcome:
+    def _solve(self, log: TouchLog | SweepLog, command: Command, wall_ns: int) -> Outcome:
         now = self.current
-        tip = self._touches.solve(now.arm, now.tool, now.thermal.revision)
-        outcome = self._results.touched(tip, command, wall_ns)
-        self._touches.clear(command)
+        tool = log.solve(now.arm, now.tool, now.thermal.revision)
+        outcome = self._results.by_hand(tool, command, wall_ns)
+        log.clear(command)
         return outcome
 
     def _measure(self, command: Command, wall_ns: int) -> Outcome:
@@ -583,7 +592,7 @@ class ToolSession(SessionBase):
         quick = mode == QUICK
         tool = self._results.expected().T_flange_tool if quick else self._results.taught(mode)
         steps: Mode = "quick" if quick else "laser" if mode == LASER else "full"
-        plan = MeasuringPlan(steps, self._laser, tool, config.motion, config.spin_rad)
+        plan = MeasuringPlan(steps, config.laser, tool, config.motion, config.spin_rad)
         self._runs += 1
         begun_ns = command.stamp_ns or 0
         arm, revision = current.arm, current.thermal.revision
@@ -676,6 +685,6 @@ def take_tool_message(session: ToolSession, kind: str, message: Any) -> None:
         if kind == JOINTS:
             session.add(joint_sample(message))
         elif kind == EDGES:
-            session.add(edge_sample(message, session.config.beams))
+            session.add(edge_sample(message, session.config.beam_names))
     except RobocalError as error:
         session.refuse(kind, error)

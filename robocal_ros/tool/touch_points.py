@@ -8,10 +8,10 @@ in the flange frame is ``(-(x_up - x_down), x'_up - x'_down, h_up - h_down)`` (t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.estimation.estimation import Estimate, Problem, observability, solve
@@ -24,7 +24,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.ground.samples import JointStream, StandstillRule
+from robocal_ros.ground.samples import JOINTS, JointStream, StandstillRule
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.judging import KnownTool, change_between
@@ -337,19 +337,24 @@ SAME_RAD = float(np.radians(2.0))  # a touch from the same posture says nothing 
 
 
 @dataclass(frozen=True, eq=False)
-class TouchedTip:
-    """A tip from touches at joints ``q`` (k, n), judged; kept as a run of the beams is."""
+class HandMeasured:
+    """A tool from motions that the robot's own program made, judged; kept as a run is.
 
-    q: Array
+    ``samples``: how many touches, or edges; ``inputs``: what it was found from.
+    """
+
+    method: str
+    samples: int
     found: KnownTool
     verdict: Verdict
     document: Document
     thermal_revision: int
+    inputs: Mapping[str, NDArray[Any]]
     cycle_id: str = ""
 
-    def arrays(self) -> dict[str, Array]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
         """What it was found from."""
-        return {"q": self.q}
+        return dict(self.inputs)
 
 
 class TouchLog:
@@ -359,11 +364,12 @@ class TouchLog:
         self._config = config
         self._touches: list[Array] = []
 
-    def add(self, command: Command, stream: JointStream, stamp_ns: int) -> Outcome:
+    def add(self, command: Command, stream: JointStream) -> Outcome:
         """Take a touch; one from a posture that was touched from already takes its place.
 
         Raises `NotStillError` while the robot moves; `TooFewSamplesError` without joint readings.
         """
+        stamp_ns = (command.marks or {}).get(JOINTS, 0)
         q = stream.resting(stamp_ns, STANDS) if stamp_ns else None
         if q is None:
             raise TooFewSamplesError("no joint states received: does the robot's driver publish?")
@@ -377,7 +383,7 @@ class TouchLog:
         count, self._touches = len(self._touches), []
         return Outcome(command, Code.ACCEPT, f"{count} touches are forgotten")
 
-    def solve(self, arm: SerialArm, in_force: KnownTool, thermal_revision: int) -> TouchedTip:
+    def solve(self, arm: SerialArm, in_force: KnownTool, thermal_revision: int) -> HandMeasured:
         """Find the tip with the model ``arm``, and judge it; the orientation stays."""
         q = np.array(self._touches).reshape(-1, arm.n)
         fit = fit_four(arm.fk(q))
@@ -386,7 +392,8 @@ class TouchLog:
         if in_force.covariance is not None:
             covariance[3:, 3:] = in_force.covariance[3:, 3:]
         covariance[:3, :3] = fit.covariance
-        verdict = self._verdict(fit, T)
+        sigma_m = float(np.sqrt(np.max(np.diag(fit.covariance))))
+        verdict = judge_tip(fit.verdict, sigma_m, T, self._config, "touch from more sides")
         document: Document = {
             "method": "touches",
             "touches": len(q),
@@ -396,17 +403,20 @@ class TouchLog:
             "misfit_mm": 1e3 * fit.rms_m,
             "verdict": verdict_document(verdict),
         }
-        return TouchedTip(q, KnownTool(T, covariance), verdict, document, thermal_revision)
+        found = KnownTool(T, covariance)
+        return HandMeasured("touches", len(q), found, verdict, document, thermal_revision, {"q": q})
 
-    def _verdict(self, fit: TouchFit, T_flange_tool: Array) -> Verdict:
-        """The touches' own, then how well the tip is known and how far it is from the taught."""
-        limits, verdict = self._config.limits, fit.verdict
-        sigma_m = float(np.sqrt(np.max(np.diag(fit.covariance))))
-        away = change_between(self._config.T_flange_taught, T_flange_tool)
-        if verdict.accept and sigma_m > limits.sigma_m:
-            words = f"{verdict.reason}; the tip is known to {1e3 * sigma_m:.3f} mm only"
-            return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}: touch from more sides")
-        if verdict.accept and away.tip_m > limits.change_m:
-            words = f"{verdict.reason}; the tip is {1e3 * away.tip_m:.2f} mm from the taught one"
-            return Verdict(Code.LIMIT_EXCEEDED, f"{words} (allowed {1e3 * limits.change_m:g} mm)")
-        return verdict
+
+def judge_tip(
+    verdict: Verdict, sigma_m: float, T_flange_tool: Array, config: ToolConfig, mend: str
+) -> Verdict:
+    """A fit's own verdict, then how well the tip is known and how far it is from the taught."""
+    limits = config.limits
+    away = change_between(config.T_flange_taught, T_flange_tool)
+    if verdict.accept and sigma_m > limits.sigma_m:
+        words = f"{verdict.reason}; the tip is known to {1e3 * sigma_m:.3f} mm only: {mend}"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    if verdict.accept and away.tip_m > limits.change_m:
+        words = f"{verdict.reason}; the tip is {1e3 * away.tip_m:.2f} mm from the taught one"
+        return Verdict(Code.LIMIT_EXCEEDED, f"{words} (allowed {1e3 * limits.change_m:g} mm)")
+    return verdict
