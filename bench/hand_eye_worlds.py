@@ -136,10 +136,7 @@ def step_set(
 ) -> Calibration:
     """Stairs; what is known of their corners is off by ``machining_m`` throughout."""
     shots = step_shots(cell, STAIRS, poses, rng, aim_m=aim_m)
-    corners = {
-        mark: points + machining_m * rng.standard_normal(points.shape)
-        for mark, points in STAIRCASE.marked_corners().items()
-    }
+    corners = told_corners(rng, machining_m)
     T = known_to(cell.robot) @ T_BASE_USER
     told = (TAUGHT_M, TAUGHT_RAD) if isinstance(cell.robot, ArmRobot) else (0.0, 0.0)
     target = StepTarget(
@@ -267,10 +264,19 @@ def line_world(rng: np.random.Generator, known: bool, poses: int = 15) -> World:
     return _world(LINE if known else None, place, scene, shots, PoseRobot())
 
 
-def step_world(rng: np.random.Generator, poses: int = 5) -> World:
-    """Stairs that were measured."""
+def told_corners(rng: np.random.Generator, sigma_m: float) -> dict[str, Array]:
+    """What is known of the stairs' corners: off by so much, the same in all shots."""
+    return {
+        mark: points + sigma_m * rng.standard_normal(points.shape)
+        for mark, points in STAIRCASE.marked_corners().items()
+    }
+
+
+def step_world(rng: np.random.Generator, poses: int = 5, gauged_m: float = GAUGED_M) -> World:
+    """Stairs that were measured, to ``gauged_m``."""
     shots = step_shots(CELL, STAIRS, poses, rng, aim_m=AIM_M)
-    target = StepTarget(T_BASE_USER, STAIRCASE.marked_corners(), STAIRCASE.edge_user, GAUGED_M)
+    corners = told_corners(rng, gauged_m)
+    target = StepTarget(T_BASE_USER, corners, STAIRCASE.edge_user, gauged_m)
     return _world(target, T_BASE_USER, Scene((STAIRS.body,)), shots, PoseRobot(), AIM_M)
 
 

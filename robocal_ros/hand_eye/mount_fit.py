@@ -216,14 +216,23 @@ def _settle(
     return estimate, estimate.rejected[problem.sample], noise, settled
 
 
+def robot_numbers(problem: MountProblem) -> int:
+    """How many numbers tell the robot's noise: at most six of a pose, less the unknowns."""
+    told = min(POSE_NUMBERS * len(_poses(problem)), int(problem.sizes.sum()))
+    return told - len(problem.names)
+
+
 def noise_numbers(problem: MountProblem) -> int:
-    """How many numbers tell the noise: at most six of a pose, less the unknowns.
+    """How many numbers tell each noise.
 
     Where light is laid by eye, two of a pose tell how well; three unknowns look the same.
     """
-    poses = len(np.unique(np.concatenate([view.sightings.pose for view in problem.views])))
-    told = min(POSE_NUMBERS * poses, int(problem.sizes.sum())) - len(problem.names)
-    return min(told, 2 * poses - 3 + LEAST_AIM) if problem.aimed else told
+    told = robot_numbers(problem)
+    return min(told, 2 * len(_poses(problem)) - 3 + LEAST_AIM) if problem.aimed else told
+
+
+def _poses(problem: MountProblem) -> NDArray[np.int64]:
+    return np.unique(np.concatenate([view.sightings.pose for view in problem.views]))
 
 
 def _solved(

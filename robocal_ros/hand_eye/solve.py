@@ -32,6 +32,7 @@ from robocal_ros.hand_eye.mount_fit import (
     noise_numbers,
     require_radius,
     require_seen,
+    robot_numbers,
     solved_again,
     swapped,
     undone,
@@ -187,7 +188,7 @@ def _bent(
     slope = P.T @ r - moved.T @ (J.T @ r + prior @ problem.deviation(fit.state))
     step = -spread @ (spread.T @ slope)
     told = float(np.sum(seen) - np.sum((known_before @ spread) * spread))
-    numbers = max(noise_numbers(problem), 1)
+    numbers = max(robot_numbers(problem), 1)
     wider = numbers / max(numbers - told, 1.0)
     return np.asarray(step), np.asarray((moved @ spread) @ (moved @ spread).T), wider
 
