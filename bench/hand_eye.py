@@ -59,7 +59,7 @@ CONDITIONS = (
     "Simulated, whole profiles, new poses in each run: tilted up to 25 deg, a sensor of 190 to 210 "
     "mm that errs as real ones do (0.015 mm of scatter, a field bent by 0.02 to 0.05 mm, wrong "
     "points at ends, outliers, rounded tops), poses off by 0.12 mm along and 0.1 mrad about each "
-    "axis (not told), light laid on the stairs' marks to 0.2 mm"
+    "axis (not told), light laid on the stairs' marks to 0.2 mm, stairs gauged to 0.005 mm"
 )
 
 
