@@ -43,7 +43,7 @@ QUARTER = frames.exp_rotation([0.0, 0.0, 0.5 * np.pi])
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class RecordedSweep:
     """Edges of one sweep, and the joints q (n, joints) around them at ``time_s`` (n,)."""
 
     name: str
@@ -71,7 +71,7 @@ class SweepLog:
     def __init__(self, config: ToolConfig) -> None:
         self._config = config
         self._edges = EdgeLog()
-        self._sweeps: list[Sweep] = []
+        self._sweeps: list[RecordedSweep] = []
         self._from_ns = 0
 
     def add_edge(self, sample: EdgeSample, newest_ns: dict[str, int], joints_ns: int) -> None:
@@ -101,7 +101,7 @@ class SweepLog:
         _require_passes(name, edges)
         stamps, q = stream.window(origin_ns - BEFORE_NS, samples[-1].stamp_ns + AFTER_NS)
         time_s = 1e-9 * (stamps - origin_ns).astype(np.float64)
-        sweep = Sweep(name, edges, time_s, q)
+        sweep = RecordedSweep(name, edges, time_s, q)
         seen = sweep.seen(arm, self._config.noise)  # refuses what has no readings around it
         self._sweeps.append(sweep)
         words = f"sweep {name} ({len(self._sweeps)} of {len(SWEEPS)}) is taken: {len(edges)} edges"
@@ -127,34 +127,22 @@ class SweepLog:
 
         Raises `RobocalError` when the sweeps cannot answer.
         """
-        station, config = self._config.parallel, self._config
-        if station is None or len(self._sweeps) < len(SWEEPS):
+        config = self._config
+        if len(self._sweeps) < len(SWEEPS):
             missing = ", ".join(SWEEPS[len(self._sweeps) :])
             raise TooFewSamplesError(f"sweeps {missing} are missing: take them first")
-        seen = {
-            (sweep.name, beam): one
-            for sweep in self._sweeps
-            for beam, one in sweep.seen(arm, config.noise).items()
-        }
-
-        def found(edges: Mapping[tuple[str, Height], Array]) -> tuple[Array, Array]:
-            fit = fit_parallel(ParallelBeams(station.up_m, station.down_m), station.x_m, edges)
-            if fit.tip is None:
-                raise TooFewSamplesError("the sweeps of the upright tool are missing")
-            return fit.axis, fit.tip
-
+        seen = self._seen(arm)
         edges = {key: T for key, (T, _) in seen.items()}
-        axis, tip = found(edges)
-        columns = []
-        sides = across(axis).T  # (2, 3)
-        for keys, way, share_m in _errors(seen, config.noise):
+        axis, tip = self._fit(edges)
+        columns, sides = [], across(axis).T
+        for keys, way, sigma in _errors(seen, config.noise):
             moved = dict(edges)
             for key, rows in keys.items():
                 moved[key] = moved[key].copy()
                 moved[key][rows, way, 3] += STEP_M
-            other_axis, other_tip = found(moved)
+            other_axis, other_tip = self._fit(moved)
             by = np.concatenate([other_tip - tip, sides @ (other_axis - axis)]) / STEP_M
-            columns.append(share_m * by)
+            columns.append(sigma * by)
         T = frames.transform(retaught(in_force.T_flange_tool[:3, :3], axis), tip)
         own = np.array(columns).T
         turn = np.eye(5)  # the axis' part is told along the tool's own x and y
@@ -165,11 +153,6 @@ class SweepLog:
         verdict = judge_tip(
             Verdict(Code.ACCEPT, words), float(sigma_m.max()), T, config, "sweep more often"
         )
-        change = change_between(config.T_flange_taught, T)
-        if verdict.accept and change.axis_rad > config.limits.tilt_rad:
-            off = f"the axis is {np.degrees(change.axis_rad):.2f} deg from the taught one"
-            allowed = f"(allowed {np.degrees(config.limits.tilt_rad):g} deg)"
-            verdict = Verdict(Code.LIMIT_EXCEEDED, f"{off} {allowed}")
         leans = [np.diff([edges[name, beam][:, 0, 3].mean() for beam in HEIGHTS]) for name in AGAIN]
         count = sum(len(sweep.edges) for sweep in self._sweeps)
         document: Document = {
@@ -188,17 +171,25 @@ class SweepLog:
             "parallel beams", count, known, verdict, document, thermal_revision, self._arrays()
         )
 
-    def _upright(self, arm: SerialArm) -> str:
-        """In words how the flange stands for the next two sweeps."""
+    def _seen(self, arm: SerialArm) -> dict[tuple[str, Height], tuple[Array, Array]]:
+        """By sweep and beam what `RecordedSweep.seen` gives."""
+        return {
+            (sweep.name, beam): one
+            for sweep in self._sweeps
+            for beam, one in sweep.seen(arm, self._config.noise).items()
+        }
+
+    def _fit(self, edges: Mapping[tuple[str, Height], Array]) -> tuple[Array, Array]:
+        """Axis and tip (3,), zero as long as the sweeps of the upright tool are missing."""
         station = self._config.parallel
         if station is None:
-            return ""
-        edges = {
-            (sweep.name, beam): T
-            for sweep in self._sweeps
-            for beam, (T, _) in sweep.seen(arm, self._config.noise).items()
-        }
-        axis = fit_parallel(ParallelBeams(station.up_m, station.down_m), station.x_m, edges).axis
+            raise ConflictError("there are no parallel beams")
+        fit = fit_parallel(ParallelBeams(station.up_m, station.down_m), station.x_m, edges)
+        return fit.axis, np.zeros(3) if fit.tip is None else fit.tip
+
+    def _upright(self, arm: SerialArm) -> str:
+        """In words how the flange stands for the next two sweeps."""
+        axis, _ = self._fit({key: T for key, (T, _) in self._seen(arm).items()})
         straight = R_BASE_FLANGE[FIRST[0]]
         upright = minimal_rotation(straight @ axis, [0.0, 0.0, -1.0]) @ straight
         told = []

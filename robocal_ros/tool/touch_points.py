@@ -419,4 +419,8 @@ def judge_tip(
     if verdict.accept and away.tip_m > limits.change_m:
         words = f"{verdict.reason}; the tip is {1e3 * away.tip_m:.2f} mm from the taught one"
         return Verdict(Code.LIMIT_EXCEEDED, f"{words} (allowed {1e3 * limits.change_m:g} mm)")
+    if verdict.accept and away.axis_rad > limits.tilt_rad:
+        words = f"{verdict.reason}; the axis is {np.degrees(away.axis_rad):.2f} deg from the"
+        allowed = f"taught one (allowed {np.degrees(limits.tilt_rad):g} deg)"
+        return Verdict(Code.LIMIT_EXCEEDED, f"{words} {allowed}")
     return verdict
