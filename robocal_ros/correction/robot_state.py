@@ -62,7 +62,7 @@ class RobotState:
     ``measured``, ``velocity`` (n,): last readings, NaN before the first, and where there is none.
     ``scaling``: how fast the controller's clock runs, 0 to 1; 1 where nobody says. ``held_s``: when
     one that pauses was last seen to give up a motion. ``told``: joints and unscaled velocities (n,)
-    where it is by its own words as they came, whatever its clock says; None: not known.
+    where it is by its own words, whatever its clock says, and of when these are; None: not known.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class RobotState:
         self._reference, self._reference_s = np.full(arm.n, np.nan), np.full(arm.n, -np.inf)
         self._reference_rate = np.zeros(arm.n)
         self.scaling, self.held_s = 1.0, -np.inf
-        self.told: Callable[[float], tuple[Array, Array] | None] = lambda now_s: None
+        self.told: Callable[[float], tuple[Array, Array, float] | None] = lambda now_s: None
 
     def index(self, names: tuple[str, ...]) -> Index:
         """Numbers (k,) of the arm's joints; raises `RefusedError` for a name that is no such."""
@@ -348,7 +348,7 @@ class RobotState:
         if told is None:
             return None
         reach = LAG_S * (np.abs(told[1]) + np.abs(here[1])) + self._near
-        return told if np.all(np.abs(told[0] - here[0]) < reach) else None
+        return told[:2] if np.all(np.abs(told[0] - here[0]) < reach) else None
 
     def speed(self, now_s: float) -> float:
         """Of the fastest joint, unscaled; of one that pauses as read; NaN where it is not known."""
@@ -361,12 +361,13 @@ class RobotState:
         return float(np.max(np.abs(here[1]))) / (max(self.scaling, 0.1) if self.scaling else 1.0)
 
     def seen_s(self, now_s: float) -> float:
-        """What the robot is sent shows so late: readings that come seldom tell an older speed."""
+        """What the robot is sent shows so late: what comes seldom or late tells an older speed."""
         if self.blind(now_s):
             return np.inf
         times, _ = self._recent()
-        span_s = float(times[-1] - times[0])
-        return LAG_S + now_s - float(times[-1]) + max(0.5 * (span_s - VELOCITY_S), 0.0)
+        span_s, told = float(times[-1] - times[0]), self.told(now_s)
+        read_s = float(times[-1]) - max(0.5 * (span_s - VELOCITY_S), 0.0)
+        return LAG_S + now_s - (read_s if told is None else min(read_s, told[2]))
 
     def at_rest(self, now_s: float) -> bool:
         """Whether all joints were read lately, and by these have not moved for `STANDS_S`."""

@@ -120,13 +120,16 @@ class StatedController:
 
     def reference(
         self, names: Sequence[str], now_s: float, scaling: float | None
-    ) -> tuple[Array, Array] | None:
-        """Joints and unscaled velocities (k,) where the controller is now; None: not known."""
+    ) -> tuple[Array, Array, float] | None:
+        """Joints and unscaled velocities (k,) where the controller is now, as of when it is known.
+
+        None: not known.
+        """
         if (found := self._find(names, now_s)) is None:
             return None
         _, q, qd = found
         gone_s = (now_s - self._heard_s) * (1.0 if scaling is None else scaling)
-        return q + qd * gone_s, qd
+        return q + qd * gone_s, qd, self._heard_s
 
     def _find(self, names: Sequence[str], now_s: float) -> tuple[int, Array, Array] | None:
         if self._stated is None or now_s - self._heard_s > STATED_S:

@@ -484,7 +484,7 @@ class RobotWatch:
     def seen_s(self, now_s: float) -> float:
         """What the robot is sent shows so late."""
         if self.reference(now_s) is not None:
-            return SEEN_S[True] + self.silent_s
+            return SEEN_S[True] + max(self.silent_s, now_s - self._reference_s)
         return SEEN_S[False] + max(self.silent_s, now_s - self._heard_s)
 
     def to_stop(self, now_s: float) -> tuple[Array, Array]:

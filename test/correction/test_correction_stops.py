@@ -299,7 +299,7 @@ def test_a_controller_that_runs_slowly_is_waited_for(scaling):
 def test_a_lost_stop_is_sent_again_to_a_controller_that_tells_its_unscaled_speed(scaling):
     """Finding: slower readings than the plan's speeds looked like a robot that obeys."""
     robot = SimulatedController(losses=1, scaling=scaling)
-    robot.state.told = lambda now: (robot.q.copy(), robot.qd.copy())
+    robot.state.told = lambda now: (robot.q.copy(), robot.qd.copy(), now)
     robot.run(0.3)
     robot.looks()
     took_s = robot.stops()
@@ -315,6 +315,25 @@ def test_readings_that_come_seldom_show_a_stop_late(period_s, reports, losses):
     """Finding: a robot that obeyed was stopped anew from old speeds, or held to stand in motion."""
     robot = SimulatedController(losses, reports, period_s=period_s)
     robot.run(1.0)
+    robot.stops()
+    assert not robot.qd.any()
+    assert robot.stop.sent == losses + 1
+    assert not robot.stop.failed
+
+
+@pytest.mark.parametrize("losses", [0, 1])
+def test_a_controller_whose_words_come_late_shows_a_stop_late(losses):
+    """Finding: by what it said before the stop it seemed to drive on, and was sent another one."""
+    robot, cycles = SimulatedController(losses), 12
+
+    def told(now_s):
+        """Where it would go on to from what it said 48 ms ago."""
+        before, q = robot.out[-cycles - 2 : -cycles]
+        qd, at_s = (q - before) / CYCLE_S, robot.now_s - cycles * CYCLE_S
+        return q + qd * (now_s - at_s), qd, at_s
+
+    robot.state.told = told
+    robot.run(0.3)
     robot.stops()
     assert not robot.qd.any()
     assert robot.stop.sent == losses + 1
@@ -536,7 +555,7 @@ def test_a_stop_keeps_to_the_joints_speeds_and_limits():
 def test_a_stop_begins_where_the_controller_is_while_the_robot_follows_it():
     robot = SimulatedController()
     told = [HOME, SPEED]
-    robot.state.told = lambda now: tuple(told)
+    robot.state.told = lambda now: (*told, now)
     robot.run(0.3)
     told[0] = robot.q + 0.014 * SPEED  # by which drives lag
     robot.begins()

@@ -134,6 +134,46 @@ def test_a_robot_stands_by_readings_from_after_its_stop_alone(late_s: float) -> 
     assert last_s == pytest.approx(times[250] + late_s + STANDS_S, abs=0.005)
 
 
+@given(
+    late_s=st.floats(0.0, 0.15),
+    behind_s=st.floats(0.0, 0.09),
+    period_s=st.sampled_from([0.004, 0.02]),
+    slow=st.floats(1.0, 10.0),
+)
+def test_a_stop_that_is_obeyed_is_sent_once_however_late_that_is_heard(
+    late_s: float, behind_s: float, period_s: float, slow: float
+) -> None:
+    """Finding: by a reference of before the stop it seemed to drive on: it was sent four times."""
+    began_s, reacts_s, lags_s = 1.0, 0.01, 0.014
+    limits = replace(LIMITS, stop_deceleration=np.full(6, slow))
+    watch, stopping = RobotWatch(ARM, DRIVING), WatchedStop(ARM, limits)
+    speed = 0.5 * FASTEST
+    begin = HOME + speed * (began_s + reacts_s)
+    plan = stop(ARM, limits, begin, speed)
+
+    def sent(at_s: float) -> tuple[np.ndarray, np.ndarray]:
+        since_s = at_s - began_s - reacts_s
+        if since_s < 0.0:
+            return begin + speed * since_s, speed
+        place, velocity = plan.at(since_s)
+        return place, velocity
+
+    told_s = 0.0
+    for now_s in np.arange(0.1, began_s + plan.duration_s + 0.8, 0.004).tolist():
+        read_s = now_s - late_s
+        watch.reading(read_s, sent(read_s - lags_s)[0], read_s)
+        watch.silence.look(now_s)
+        if now_s - told_s >= period_s:
+            watch.controller(*sent(now_s - behind_s), now_s - behind_s)
+            told_s = now_s
+        if now_s >= began_s and not stopping.sent:
+            stopping.begin(sent(now_s), now_s)
+        stopping.look(watch, now_s)
+    assert stopping.sent == 1
+    assert stopping.failed == ""
+    assert not stopping.under_way
+
+
 # ---- how late messages come ---------------------------------------------------------------------
 
 

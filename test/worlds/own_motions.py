@@ -29,7 +29,7 @@ from robocal_ros.motion.driver import (
     goal_tolerances,
 )
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.robot_watch import MotionReport
+from robocal_ros.motion.robot_watch import BEHIND_S, MotionReport
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import NS
@@ -117,10 +117,12 @@ class OwnMotions(HouseNode):
         self.reports.publish(String(data=json.dumps(report)))
 
     def _take_joints(self, message: Any) -> None:
-        self.motion.hear(message)
+        late_s = self.motion.hear(message)
         sample = joint_sample(message)
         q = sample.position[sample.order(ARM.joint_names)]
-        self.mover.reading(sample.stamp_ns / NS, q, self._steady.now_s())
+        self.mover.reading(sample.stamp_ns / NS, q, self._steady.now_s() - late_s)
+        if late_s > BEHIND_S:  # as maintenance_node
+            self.take_waiting("joint_states")
 
     def _take_order(self, message: Any) -> None:
         self._order = json.loads(message.data)
