@@ -612,10 +612,6 @@ class ToolGate:
         if self.refused is not None:
             self.take(self.refused, again=True)
 
-    def adopt(self) -> None:
-        """Use the tool that waits, if there is one."""
-        self.in_use, self.waiting = self.waiting or self.in_use, None
-
     def _require_small(self, T_flange_tool: Array) -> None:
         taught, bound = self._taught, self._config.tool
         shift = float(np.linalg.norm(T_flange_tool[:3, 3] - taught[:3, 3]))

@@ -414,18 +414,15 @@ class PathMessage:
         rows = dict(enumerate((command.position, command.velocity, command.acceleration)))
         given = {field: values for field, values in rows.items() if values is not None}
         if (_string_size(command.mark) - _string_size(self._frame_id)) % 8:
-            return self._changed_message(command.mark, given)  # its numbers would not be aligned
-        doubles = self._doubles.copy()
+            message = read_message(self._came, JointTrajectory)  # its numbers would not be aligned
+            message.header.frame_id = command.mark
+            for field, values in given.items():
+                for point, row in zip(message.points, values, strict=True):
+                    setattr(point, POINT_FIELDS[field], doubles(row))
+            return message
+        written = self._doubles.copy()
         for field, values in given.items():
-            scatter_rows(np.ascontiguousarray(values), self._places[:, field], doubles)
-        body, stamp = doubles.tobytes(), FRAME - STAMP
+            scatter_rows(np.ascontiguousarray(values), self._places[:, field], written)
+        body, stamp = written.tobytes(), FRAME - STAMP
         rest = body[stamp + _string_size(self._frame_id) : self._size]
         return HEAD + body[:stamp] + _string_bytes(command.mark) + rest
-
-    def _changed_message(self, mark: str, given: dict[int, Array]) -> Any:
-        message = read_message(self._came, JointTrajectory)
-        message.header.frame_id = mark
-        for field, values in given.items():
-            for point, row in zip(message.points, values, strict=True):
-                setattr(point, POINT_FIELDS[field], doubles(row))
-        return message

@@ -264,18 +264,15 @@ class RobotState:
                 detail = f"the stamp of {self.names[i]} is over {AHEAD_S:g} s ahead of the clock"
             raise RefusedError(Reason.STALE_JOINTS, detail)
 
-    def require_track(self, now_s: float) -> None:
-        """Refuse while it cannot be told whether the robot stands, as it is read for too short."""
-        read_s = now_s - self._track[0][0] if self._track else 0.0
-        if read_s < RESPONSE_S - TRACK_S:
-            detail = f"read for {read_s:.3f} s, {RESPONSE_S:g} s tell whether the robot stands"
-            raise RefusedError(Reason.STALE_JOINTS, detail)
+    def tracked_s(self, now_s: float) -> float:
+        """For how long readings are known, up to the response time."""
+        return now_s - self._track[0][0] if self._track else 0.0
 
     def stands(self, index: Index, now_s: float) -> bool:
         """Whether these joints were read, and moved by less than ``near`` for the response time."""
         track = self._track
         fresh = np.all(now_s - self._read_s[index] <= self._age_limit_s)
-        if not track or track[0][0] > now_s - RESPONSE_S + TRACK_S or not fresh:
+        if self.tracked_s(now_s) < RESPONSE_S - TRACK_S or not fresh:
             return False
         here, places = self.measured[index], np.array([q for _, q in track])
         moved = self.unwrapped(index, places[:, index], here) - here
@@ -459,7 +456,9 @@ class Output:
                 return sent, True
         if stands:
             return state.unwrapped(index, measured, q), False
-        state.require_track(now_s)
+        if (read_s := state.tracked_s(now_s)) < RESPONSE_S - TRACK_S:
+            detail = f"read for {read_s:.3f} s, {RESPONSE_S:g} s tell whether the robot stands"
+            raise RefusedError(Reason.STALE_JOINTS, detail)
         raise self.refuse("the robot moves, and where its controller is is not known")
 
     def note_place(self, now_s: float) -> None:

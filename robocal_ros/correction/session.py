@@ -195,7 +195,8 @@ class CorrectionSession:
             self._adopt_tool()
 
     def _adopt_tool(self) -> None:
-        self._gate.tools.adopt()
+        tools = self._gate.tools
+        tools.in_use, tools.waiting = tools.waiting or tools.in_use, None
         self._want()
 
     def _places(self) -> Array:
@@ -271,17 +272,14 @@ class CorrectionSession:
         self._interrupted = path, self.stream.phase
         self.stream.phase = StreamPhase.IDLE
         self._goal[:] = q[-1]
-        self._note_withheld(path.known[WITHHELD], q)
-        return corrected
-
-    def _note_withheld(self, withheld: Array, q: Array) -> None:
-        """Of a path (r, n) to taught joints (m, n); what comes before the first leads there."""
-        memory, size = self.output.limiter.memory, np.abs(withheld)
+        withheld, memory = path.known[WITHHELD], self.output.limiter.memory
+        size = np.abs(withheld)
         np.maximum(memory[MOST], size.max(axis=0), out=memory[MOST])
         worst = int(np.argmax(size.sum(axis=1)))
-        if size[worst].sum() > np.abs(memory[WORST]).sum():
+        if size[worst].sum() > np.abs(memory[WORST]).sum():  # a row before the points leads there
             memory[WORST] = withheld[worst]
             memory[WORST_OUT] = q[max(worst - (len(withheld) - len(q)), 0)]
+        return corrected
 
     def reject(self, path: SentPath) -> None:
         """The controller did not take a trajectory: what it took the place of goes on there."""

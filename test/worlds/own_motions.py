@@ -127,6 +127,7 @@ class OwnMotions(HouseNode):
     def _take_order(self, message: Any) -> None:
         self._order = json.loads(message.data)
         if "stop" in self._order:
+            self._going = False
             self._stop("ordered")
         else:  # once it rests
             self._going, self.mover = True, self._mover(self._order.get("slow", 10.0))
