@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from long_form import more
 
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing, MotionCell, ToolBody, joint_way
@@ -323,7 +324,7 @@ def test_a_stop_of_a_motion_that_began_late_hurries_no_joint(
     assert -lag_s - 0.01 < ahead_s < 0.8 * LEAD_S
 
 
-@pytest.mark.parametrize("stall_s", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("stall_s", [0.4, *more(0.05, 0.2)])
 def test_readings_that_waited_for_a_busy_node_are_no_robot_beside_its_path(stall_s: float) -> None:
     """They come at once; the first is looked at, and then the last: the robot went on meanwhile."""
     plan = joint_way(CELL, HOME, HOME + WAY)
