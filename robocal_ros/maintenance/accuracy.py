@@ -54,6 +54,7 @@ class Times:
     # check_s, full_s: a quick check and a full measurement of the tool, from home to its end
     check_s: float = 15.0
     full_s: float = 30.0
+    laser_frame_s: float = 90.0  # the beams found with the mandrel, the same
     # kept free for the way home from the beams; a longer one counts once it was driven
     tool_home_s: float = 10.0
     reserve_s: float = 1.0  # kept free before the end of a gap
@@ -93,6 +94,9 @@ class MaintenanceConfig:
     # and never
     check_every_s: float = 0.0
     full_every_s: float = 0.0
+    laser_frame_every_s: float = (
+        0.0  # the beams' own place is found again, with a mandrel; 0: never
+    )
     # tool_due_s, tool_expires_s: age of a tool check at which it is due, and says nothing any more
     tool_due_s: float = 2.0 * 3600.0
     tool_expires_s: float = 8.0 * 3600.0
@@ -177,6 +181,7 @@ class ToolRecord:
     # wall_ns, full_ns: of its last result, and of the last full one; 0: none
     wall_ns: int = 0
     full_ns: int = 0
+    laser_ns: int = 0  # when the beams were found last, or were not found
     # drift_rms_m, drift_bound_m: error of the thermal model through which a tool was last measured
     drift_rms_m: float = 0.0
     drift_bound_m: float = 0.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.frames import Array
-from robocal_ros.history.history_records import THERMAL, TOOL
+from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
 from robocal_ros.maintenance.fixture_part import MEASUREMENT as FIXTURE_MEASUREMENT
@@ -26,7 +26,7 @@ from robocal_ros.session.events import LEAVE, REJECT, ROLLBACK, Command, Outcome
 from robocal_ros.thermal.accuracy import Accuracy, AccuracyLevel, ToolError
 from robocal_ros.thermal.reference import SAME_VISIT_RAD
 from robocal_ros.tool.driving import STANDS_S
-from robocal_ros.tool.session import FULL, QUICK, WITNESS
+from robocal_ros.tool.session import FULL, LASER, QUICK, WITNESS
 
 NS = 1_000_000_000
 NODE = "thermal node"
@@ -41,6 +41,7 @@ FAILED = (  # without a result they say that something is wrong with the tool, o
     Code.LIMIT_EXCEEDED,
 )
 MEASURED_ANEW = ("recalibrate", "cannot tell")  # answers of a check
+OF_STATION = (WITNESS, LASER)  # tell nothing of the tool
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 LATE = "its check does not fit this gap any more, and it is accepted in a gap where that fits"
 UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
@@ -182,6 +183,7 @@ class ToolOutcome:
     accepted: bool = False  # without a person, and it stayed
     fault: str = ""  # why an accepted tool that failed its check is still in force; empty: none is
     mandrel: str = ""  # what it said, but for a station that has moved
+    station: str = ""  # where the beams were found, the same
     note: str = ""  # why not, or what a person must know
     left: str = ""  # what did not fit
 
@@ -201,7 +203,7 @@ class ToolOutcome:
     def messages(self) -> list[str]:
         """What was found first, what came last, and what else there is to say; each once."""
         found = [each.message for each in (self.first, self.last) if each]
-        found += [self.mandrel, self.note]
+        found += [self.mandrel, self.station, self.note]
         found = list(dict.fromkeys(filter(None, found)))
         return [text for text in found if not any(text in o for o in found if o is not text)]
 
@@ -317,6 +319,22 @@ class ToolPart:
     def _age_s(self, wall_ns: int) -> float:
         return (self.wall_ns - wall_ns) / NS
 
+    def find_beams(self, cycle_id: str) -> Script[None]:
+        """Find the beams again where that is due and fits: how their station drifts.
+
+        The first time is a person's, while the station stands right.
+        """
+        cell, outcome, every_s = self._cell, self.outcome, self._cell.config.laser_frame_every_s
+        if every_s <= 0.0 or cell.config.driving.mandrel is None or outcome.left or outcome.fault:
+            return
+        recent = 0.0 <= self._age_s(self._memory.tool.laser_ns) < every_s
+        if (
+            not recent
+            and self._decider.revision(LASER_FRAME)
+            and cell.fits(cell.tool_worst_s(LASER))
+        ):
+            yield from self._measured(LASER, f"{cycle_id}/laser frame")
+
     def _check(self, name: str, *, goes_on: bool = False) -> Script[bool]:
         """A quick check; whether it gave an answer."""
         answer = yield from self._measured(QUICK, name, goes_on=goes_on)
@@ -335,7 +353,7 @@ class ToolPart:
         Raises `FaultError` when the robot was stopped because it left its plan, or as
         `CellInterface` does.
         """
-        cell, times, outcome = self._cell, self._cell.config.times, self.outcome
+        cell, outcome = self._cell, self.outcome
         yield  # what was kept just before may have taken its time: the gap is looked at again
         if cell.tool.absent:
             outcome.left = f"tool measurement ({mode})"
@@ -350,8 +368,7 @@ class ToolPart:
         try:
             answer = yield from cell.arm()
             if answer.done:
-                limit_s = times.check_s if mode == QUICK else times.full_s
-                answer = yield from cell.measure(mode, cycle_id, limit_s)
+                answer = yield from cell.measure(mode, cycle_id, cell.run_s(mode))
         except SilentError as error:
             answer = DriverAnswer(Code.CONFLICT, str(error))
         before = self._memory.tool
@@ -368,8 +385,13 @@ class ToolPart:
     def _learn(self, mode: str, answer: DriverAnswer) -> None:
         """Remember it at once: the run may be broken off on the way home."""
         outcome, memory = self.outcome, self._memory
-        if mode == WITNESS and answer.code is not Code.STATION_MOVED:
-            outcome.mandrel = f"mandrel: {answer.message}"
+        if mode == LASER and (answer.has_result or answer.code in FAILED):
+            memory.note_tool(laser_ns=self.wall_ns)  # what came of it; all else is tried again
+        if mode in OF_STATION and answer.code is not Code.STATION_MOVED:
+            if mode == WITNESS:
+                outcome.mandrel = f"mandrel: {answer.message}"
+            else:
+                outcome.station = f"beam station: {answer.message}"
             return
         outcome.take(answer)
         about = {"revision": self._revision, "thermal_id": self._through, "words": answer.message}
@@ -404,10 +426,10 @@ class ToolPart:
         """The answer, where it is of the tool in force; kept while nothing moves."""
         outcome = self.outcome
         current = self._revision == self._decider.revision(TOOL)
-        if answer.has_result and not current and mode != WITNESS:
+        if answer.has_result and not current and mode not in OF_STATION:
             self._memory.tool, outcome.fault = before, ""
         self._memory.save()
-        if mode == WITNESS or (answer.has_result and current):
+        if mode in OF_STATION or (answer.has_result and current):
             return answer
         outcome.left = f"tool measurement ({mode})"
         outcome.note = f"{outcome.left}: {answer.message}"
@@ -595,6 +617,7 @@ class CycleRun:
         if self._cell.robot.place == STATION:  # a measurement did not fit any more after a check
             yield
             yield from self._cell.go_home()
+        yield from self._tool.find_beams(self.result.cycle_id)
         found = self._tool.outcome
         if found.left:
             self._leave(found.left)

@@ -18,7 +18,7 @@ from robocal_ros.maintenance.mover import HOME, STATION, FaultError, Mover, Rout
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import Gap
 from robocal_ros.tool.driving import SETTLED_S, STANDS_S
-from robocal_ros.tool.session import QUICK
+from robocal_ros.tool.session import LASER, QUICK
 
 
 @dataclass(frozen=True)
@@ -312,12 +312,16 @@ class CellInterface(Asking):
         lasts_s = self.robot.lasts_s(worst_s)
         return lasts_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
 
+    def run_s(self, mode: str) -> float:
+        """How long a tool measurement may take at the most."""
+        times = self.config.times
+        return {QUICK: times.check_s, LASER: times.laser_frame_s}.get(mode, times.full_s)
+
     def tool_worst_s(self, mode: str) -> float:
         """A tool measurement, from home or the station, and home: all that may go wrong in it."""
         times = self.config.times
-        limit_s = times.check_s if mode == QUICK else times.full_s
         # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
-        return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + self.tool_home_s
+        return self.run_s(mode) + 3.0 * times.answer_s + 4.0 * times.rest_s + self.tool_home_s
 
     def begin(self, gap_s: float) -> None:
         """A run is to begin, with the robot at home."""

@@ -39,7 +39,7 @@ from robocal_ros.maintenance.robot_interface import (
 )
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.thermal.accuracy import Accuracy
-from robocal_ros.tool.session import FULL, QUICK
+from robocal_ros.tool.session import FULL, LASER, QUICK
 
 ENDED, FAULT = "maintenance_ended", "fault"
 UNSAVED_S = 2.0  # a fault is written by then, whatever the robot may be doing
@@ -442,7 +442,8 @@ class MaintenanceSession:
         found = {"the first measuring pose": thermal.worst_s()} if self.ways.count else {}
         if self.config.T_base_laser is not None:
             worst_s = self._cell.tool_worst_s
-            found |= {f"tool measurement ({mode})": worst_s(mode) for mode in (QUICK, FULL)}
+            modes = (QUICK, FULL, *([LASER] if self.config.laser_frame_every_s > 0.0 else []))
+            found |= {f"tool measurement ({mode})": worst_s(mode) for mode in modes}
         if self.config.fixture_poses is not None:
             found["the first fixture pose"] = FixturePart(self._cell, self._visits).worst_s()
         return found

@@ -18,7 +18,7 @@ from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import THERMAL, TOOL, Proposal
+from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL, Proposal
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.accuracy import AcceptBounds, Times
 from robocal_ros.maintenance.mover import STATION
@@ -411,6 +411,53 @@ def test_a_calibration_of_another_kind_is_decided_elsewhere(history):
 ACROSS = frames.exp_rotation(np.radians([-85.0, 0.0, 0.0]))
 MANDREL = frames.transform(ACROSS, 0.17 * ACROSS[:, 2] + [0.0, 0.0, 0.02])
 SMALL_BEND = bent(TAUGHT, [3e-4, 0.0, 0.0], [0.0, 3e-3, 0.0])  # its tilt drowns in the noise
+
+
+def test_the_beams_are_found_again_in_gaps_and_a_knock_is_told(tmp_path):
+    """Due, not due, and due after a knock of the station by 0.3 mm; by the run's own motions."""
+    slow = Times(laser_frame_s=150.0, tool_home_s=30.0)
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        cell = MaintainedCell(
+            history,
+            TAUGHT,
+            mandrel=MANDREL,
+            poses=POSES[:0],
+            times=slow,
+            check_every_s=1e6,
+            laser_frame_every_s=3600.0,
+        )
+        gap_s = 2.0 * GAP_S
+        cell.run(0.5)
+        early = cell.maintain("early", gap_s)
+        assert (early.code, early.tool_answer) == (Code.ACCEPT, "pass"), early.message
+        assert not history.head(LASER_FRAME).revision  # the first time is a person's
+        cell.driver.arm(cell.now_s)
+        cell.measure("laser")
+        cell.run(150.0, until=cell.at_rest)
+        cell.run(0.5)
+        assert cell.outcomes[-1].status is Code.ACCEPT, cell.outcomes[-1].message
+        home = cell.maintenance.ways.home(STATION, cell.q).plan
+        cell.send(home)
+        cell.run(home.duration_s + 1.0)
+        due = cell.maintain("due", gap_s)
+        assert (due.code, due.complete) == (Code.ACCEPT, True), due.message
+        assert "beam station: " in due.message
+        assert history.head(LASER_FRAME).revision == 2
+        again = cell.maintain("again", gap_s)
+        assert again.message == "nothing was due"
+        cell.maintenance.memory.note_tool(laser_ns=1)  # long ago
+        short = cell.maintain("short", 60.0)
+        assert short.message == "nothing was due"  # with time only
+        side = 3e-4 * cell.cell.laser.T_base_laser[:3, 0]
+        x, y = (replace(b, start=b.start + side, end=b.end + side) for b in cell.cell.station.beams)
+        cell.cell.station = replace(cell.cell.station, beams=(x, y))
+        moved = cell.maintain("moved", gap_s)
+        assert moved.tool_code is Code.STATION_MOVED, moved.message
+        found = next(e for e in history.list(10) if e.kind == LASER_FRAME)
+        shift_mm = history.document(found.id)["change"]["tip_mm"]
+        sigma_mm = history.document(found.id)["sigma_mm"][0]
+        assert abs(shift_mm - 0.3) < 3.3 * sigma_mm  # one in a thousand
+        assert cell.maintenance.memory.tool.answer == "failed"  # checks of before hold no more
 
 
 @pytest.mark.parametrize("rejected", [False, True])

@@ -19,6 +19,7 @@ from robocal_ros.tool.run import rows_of
 from robocal_ros.tool.session import ToolSession
 
 PERIOD_S = 0.008
+MANDREL_RADIUS_M = 0.004
 STALE_S = 0.5  # of the heartbeat
 LAG_S = 0.02  # of the controller behind its trajectory
 AHEAD_S = 0.2
@@ -48,13 +49,15 @@ class Robot:
     def __init__(self, history, tool=TRUTH, mandrel=None, **changes):
         self.cell = noisy_cell()
         arm = self.true = self.cell.arm
-        known = {} if mandrel is None else {"mandrel": rows_of(mandrel)}
+        known = {}
+        if mandrel is not None:
+            known = {"mandrel": rows_of(mandrel), "mandrel_radius_m": MANDREL_RADIUS_M}
         self.session = ToolSession(arm, history, config_of(self.cell, **known), "test")
         config = DrivingConfig(HOUSING, 0.1, 0.008, 0.05, **changes)
         self.mandrel = None
         if mandrel is not None:
             config = replace(config, mandrel=ToolBody(mandrel, 0.08, 0.008, 0.05, "mandrel"))
-            self.mandrel = RoundTool.cylinder(mandrel, 0.004)
+            self.mandrel = RoundTool.cylinder(mandrel, MANDREL_RADIUS_M)
         self.gap, self.beating = Gap(STALE_S), True
         self.driving = config
         self.driver = ToolDriver(self.session, config, self.send, self.ask, self.closed)
