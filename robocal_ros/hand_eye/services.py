@@ -68,6 +68,7 @@ Ask = Callable[[Command], Awaitable[Outcome]]
 
 KEPT, SUFFIX = "hand_eye", ".mcap"
 RUNS, LONGEST_RUNS_S = 5, 3.0  # of a calibration whose time is taken
+MOST_VERIFIED = 5  # calibrations in a call: so long the node does nothing else
 MOST_APART_PX = 1.0  # two calibrations of one camera agree to some tenths where boards were
 ROUGH = "rough"  # the parameters that say about where the sensor sits
 
@@ -575,6 +576,11 @@ class HandEyeServices:
             if (number := session.in_force.calibration_id) is None:
                 raise ConflictError("no calibration is in force: name candidates")
             numbers = [number]
+        numbers = list(dict.fromkeys(numbers))
+        if len(numbers) > MOST_VERIFIED:
+            raise InputError(
+                f"{len(numbers)} candidates, each of which is solved again: at most {MOST_VERIFIED}"
+            )
         # Places (3,) in base, m, by name.
         names, places = list(request.points), [np.array(_point(p)) for p in request.touched]
         if len(names) != len(places) or len(set(names)) < len(names):
@@ -592,7 +598,7 @@ class HandEyeServices:
             EdgeRule(session.config.sensor.towards, kind=data.feature),
         )
         found = {}
-        for number in dict.fromkeys(numbers):
+        for number in numbers:
             test = touch_test(self._mount(number), scanned, touched, limit_m)
             found[f"calibration {number}"] = test
             accuracy, stability_m = test.accuracy, test.stability_m

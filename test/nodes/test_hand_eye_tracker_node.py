@@ -85,3 +85,6 @@ def test_the_tracker_places_the_sensor_and_marked_points_judge_it(graph, tmp_pat
     assert refused.status == Code.RESIDUAL_TOO_LARGE
     assert verify(sensor, points=["m9"], touched=places[:1]).status == Code.BAD_INPUT
     assert verify(sensor, candidates=[9]).status == Code.BAD_INPUT
+    many = verify(sensor, candidates=range(1, 7))  # refused before any is solved
+    assert (many.status, many.message.startswith("6 candidates")) == (Code.BAD_INPUT, True)
+    assert not many.judged
