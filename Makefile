@@ -129,7 +129,8 @@ $(STAMPS)/interfaces: $(STAMPS)/wheels $(shell find msg_defs tools/interfaces -t
 	@echo "Building $(INTERFACES) (about half a minute, once)"
 	command -v c++ >/dev/null || { echo "make: a C++ compiler is needed (apt install g++)" >&2; exit 1; }
 	rm -rf $(INTERFACES:%=build/%) $(INTERFACES:%=install/%)
-	$(COLCON) $(INTERFACES) --cmake-args -GNinja -DBUILD_TESTING=OFF
+	$(COLCON) $(INTERFACES) --cmake-args -GNinja -DBUILD_TESTING=OFF \
+		-DCMAKE_PROJECT_TOP_LEVEL_INCLUDES="$(CURDIR)/tools/python_only.cmake"
 	touch $@
 
 # Python sources are linked, not copied: only new entry points, config and launch files need this again.
