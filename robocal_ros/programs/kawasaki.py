@@ -20,7 +20,8 @@ docs/programs.md.
 """
 
 import re
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -91,18 +92,21 @@ class KawasakiDialect(Dialect):
             for found in _LOCATION.finditer(clean, start, end)
         ]
         values = {found[1].lower(): found for found in located}
+        arrays: dict[str, list[str]] = {}
+        for name in values:
+            if "[" in name:
+                arrays.setdefault(name.split("[")[0], []).append(name)
         frames: dict[str, Array] = {NULL: np.eye(4)}
-        uses: dict[str, _Use] = {}
+        uses = {name: _Use() for name in values}
         points: list[ProgramPoint] = []
         computed: list[tuple[int, str]] = []
         for start, end in programs:
-            computed += _used(text, clean, (start, end), values, frames, uses)
+            computed += _used(text, clean, (start, end), values, frames, uses, arrays)
             points += _steps(text, clean, start, end)
         for found in located:
-            use = uses.get(found[1].lower())
-            if programs and (use is None or not use.moved):
-                continue
-            points.append(_location(text, found, use))
+            use = uses[found[1].lower()]
+            if use.moved or not programs:
+                points.append(_location(text, found, use if programs else None))
         notes = tuple(
             f"line {line_of(text, found.start())}: {found[1]} is not followed: of a point's "
             "postures the one nearest to the point before is taken"
@@ -119,11 +123,13 @@ def _used(
     span: tuple[int, int],
     values: Mapping[str, "re.Match[str]"],
     frames: dict[str, Array],
-    uses: dict[str, _Use],
+    uses: Mapping[str, _Use],
+    arrays: Mapping[str, Sequence[str]],
 ) -> list[tuple[int, str]]:
     """Note what one program does with each location; the places where it makes points itself."""
     computed = []
-    goals: dict[int, str] = {}
+    goals: set[int] = set()
+    settings, set_up = deque(_SET.finditer(clean, *span)), dict[str, str]()
     for found in _MOTION.finditer(clean, *span):
         group = 1 if found[1] is not None else 2
         target = arguments(clean, found.start(group), found.end(group))[0]
@@ -133,61 +139,58 @@ def _used(
         if not _TOKEN.fullmatch(name):
             computed.append((target.start, name))
         elif name.lower() in values:
-            goals[target.start] = name.lower()
-            use = uses.setdefault(name.lower(), _Use())
+            while settings and settings[0].start() < target.start:
+                _set_up(text, clean, settings.popleft(), values, frames, set_up)
+            goals.add(target.start)
+            use = uses[name.lower()]
             use.goals.append(target.start)
             use.moved = True
-            use.frames.add(_frames_at(text, clean, span[0], target.start, values, frames))
+            use.frames.add((set_up.get("TOOL"), set_up.get("BASE")))
         else:  # a variable index, or a location that another file has
             computed.append((target.start, name))
-            _note_array(name, target.start, values, uses, moved=True)
+            _note_array(name, target.start, uses, arrays, moved=True)
     for found in _POINT.finditer(clean, *span):
         computed.append((found.start(1), f"POINT {found[1]} = {found[2].strip()}"))
     for token in _TOKEN.finditer(clean, *span):
         name = token[0].lower()
         if name in values and token.start() not in goals:
-            use = uses.setdefault(name, _Use())
+            use = uses[name]
             use.other = token.start() if use.other is None else use.other
-        elif "[" in name and name not in values and token.start() not in goals:
-            _note_array(name, token.start(), values, uses)
+        elif "[" in name and name not in values:
+            _note_array(name, token.start(), uses, arrays)
     return computed
 
 
 def _note_array(
     name: str,
     at: int,
-    values: Mapping[str, object],
-    uses: dict[str, _Use],
+    uses: Mapping[str, _Use],
+    arrays: Mapping[str, Sequence[str]],
     moved: bool = False,
 ) -> None:
     """An index that is reckoned may mean each location of its array."""
-    first = name.lower().split("[")[0]
-    for one in values:
-        if one.split("[")[0] == first and "[" in one:
-            use = uses.setdefault(one, _Use())
-            use.other = at if use.other is None else use.other
-            use.moved |= moved
+    for one in arrays.get(name.lower().split("[")[0], ()):
+        use = uses[one]
+        use.other = at if use.other is None else use.other
+        use.moved |= moved
 
 
-def _frames_at(
+def _set_up(
     text: str,
     clean: str,
-    start: int,
-    at: int,
+    setting: "re.Match[str]",
     values: Mapping[str, "re.Match[str]"],
     frames: dict[str, Array],
-) -> tuple[str | None, str | None]:
-    """Names of tool and base that the program has set above; None: it has not."""
-    found: dict[str, str] = {}
-    for setting in _SET.finditer(clean, start, at):
-        kind, word = setting[1].upper(), setting[2].strip()
-        name = f"{kind} of line {line_of(text, setting.start())}"
-        if word.upper() == NULL:
-            name = NULL
-        elif (T := _constant(clean, setting.start(2), setting.end(2), values)) is not None:
-            frames[name] = T
-        found[kind] = name
-    return found.get("TOOL"), found.get("BASE")
+    set_up: dict[str, str],
+) -> None:
+    """The program sets tool or base, whose name is in force from here on."""
+    kind, word = setting[1].upper(), setting[2].strip()
+    name = f"{kind} of line {line_of(text, setting.start())}"
+    if word.upper() == NULL:
+        name = NULL
+    elif (T := _constant(clean, setting.start(2), setting.end(2), values)) is not None:
+        frames[name] = T
+    set_up[kind] = name
 
 
 def _constant(
@@ -197,19 +200,16 @@ def _constant(
     word = clean[start:end].strip()
     located = values.get(word.lower())
     if located is not None and not word.startswith("#"):
-        numbers = [part.value for part in _numbers(located)[:AXES]]
-        return pose_of("kawasaki", numbers) if len(numbers) == AXES else None
-    begins = _TRANS.match(word)
-    if begins is None or not word.endswith(")"):
-        return None
-    parts = [part.text for part in arguments(word, begins.end(), len(word) - 1)]
-    try:
-        given = [float(part or 0.0) for part in parts]
-    except ValueError:
-        return None
-    return (
-        pose_of("kawasaki", [*given, *[0.0] * (AXES - len(given))]) if len(given) <= AXES else None
-    )
+        given = [part.value for part in _numbers(located)[:AXES]]
+    else:
+        begins = _TRANS.match(word)
+        if begins is None or not word.endswith(")"):
+            return None
+        parts = arguments(word, begins.end(), len(word) - 1)
+        given = [part.value if part.text else 0.0 for part in parts]
+        given += [0.0] * (AXES - len(given))
+    known = len(given) == AXES and np.all(np.isfinite(given))  # a variable may be named nan
+    return pose_of("kawasaki", given) if known else None
 
 
 def _numbers(found: "re.Match[str]") -> list[Field]:
@@ -225,6 +225,8 @@ def _location(text: str, found: "re.Match[str]", use: _Use | None) -> ProgramPoi
     point = ProgramPoint(found[1], line, own, joints, external=external, order=found.start(1))
     if len(own) < AXES:
         return replace(point, problem=f"has {len(own)} numbers in place of {AXES}")
+    if problem := require_numbers(own):
+        return replace(point, problem=problem)
     if use is None:
         return point
     if use.other is not None:

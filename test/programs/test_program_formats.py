@@ -2,6 +2,7 @@
 """What is read of programs of each maker, and what of them comes out as it came in."""
 
 import re
+import time
 
 import numpy as np
 import pytest
@@ -457,3 +458,28 @@ def test_a_file_of_locations_alone_has_them_all():
     ]  # fmt: skip
     assert "3 numbers" in found.points[-2].problem
     assert {point.tool for point in found.points} == {None}
+
+
+@pytest.mark.parametrize("tool", ["TRANS(nan)", "TRANS(1e999,0,0)", "inf", "far", "TRANS(1,,x)"])
+def test_what_is_no_number_is_no_tool_and_no_point_of_kawasaki(tool):
+    """Finding: a number too large to be one ended the correction of the whole program."""
+    text = f".PROGRAM m()\n TOOL {tool}\n LMOVE a\n LMOVE b\n JMOVE #c\n.END\n.TRANS\n"
+    text += (
+        "a 1 2 3 0 0 0\nb 1e999 2 3 0 0 0\nfar 1e999 0 0 0 0 0\n.END\n.JOINTS\n#c 0 0 0 1e999 0 0\n"
+    )
+    found = dialect_of(".as").read(text)
+    assert list(found.frames) == ["NULL"]
+    assert ["number" in point.problem for point in found.points] == [False, True, True]
+
+
+def test_a_long_program_of_kawasaki_is_read_in_time():
+    """Finding: 8000 points took 47 s, and four times as long twice as many."""
+    count = 8000
+    moves = "".join(f"  LMOVE p{i}\n  x[.k] = 1\n" for i in range(count))
+    rows = "".join(f"p{i} 1 2 3 0 0 0\n" for i in range(count))
+    text = f".PROGRAM m()\n  TOOL gun\n{moves}.END\n.TRANS\ngun 0 0 9 0 0 0\n{rows}.END\n"
+    begin_s = time.process_time()
+    found = dialect_of(".as").read(text)
+    assert time.process_time() - begin_s < 15.0
+    assert len(found.points) == count
+    assert {point.tool for point in found.points} == {"TOOL of line 2"}
