@@ -24,7 +24,7 @@ from robocal_ros.plc import access
 from robocal_ros.plc.model import METHODS
 
 TYPES = ("Boolean", "Double", "String", "DateTime", "Int32", "UInt32", "Float", "ByteString")
-WITHIN_S = 5.0
+BEAM, WITHIN_S = "x", 5.0
 NEWEST = datetime(2100, 1, 1, tzinfo=UTC)  # of heartbeats: any other time is of before
 
 
@@ -63,8 +63,8 @@ def a_write(rng: random.Random, plc: PlcClient) -> ua.WriteValue:
     """Something that must not be taken: a wrong type, node, attribute, status or range."""
     index = plc.index
     node, right = rng.choice(
-        [("Cell.Gap.Heartbeat", "UInt32"), ("Cell.Beams.x.Blocked", "Boolean"),
-         ("Cell.Beams.x.Time", "DateTime"), ("Cell.Gap.Beat", ""), ("Cell.Accuracy.State", ""),
+        [("Cell.Gap.Heartbeat", "UInt32"), (f"Cell.Beams.{BEAM}.Blocked", "Boolean"),
+         (f"Cell.Beams.{BEAM}.Time", "DateTime"), ("Cell.Gap.Beat", ""), ("Cell.Accuracy.State", ""),
          ("Cell.Nowhere", ""), ("Cell.Methods.Run", ""), ("Code", "")]
     )  # fmt: skip
     item = ua.WriteValue(NodeId=ua.NodeId(node, index), AttributeId=ua.AttributeIds.Value)

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from robocal_msgs.msg import GapOpen, MaintenanceStatus, SessionEvent
+from robocal_msgs.msg import BeamEvent, GapOpen, MaintenanceStatus, SessionEvent
+from trajectory_msgs.msg import JointTrajectory
 
 from bench import hostile
 from bench.live.graph import CellController
@@ -49,7 +50,7 @@ class HostileCell:
     """The cell, its clients and what is watched in it."""
 
     def __init__(self, controller: CellController, folder: Path) -> None:
-        self._controller = controller
+        self._controller, self._folder = controller, folder / "state"
         plc, self.port, page = security_folder(folder / "plc"), free_port(), free_port()
         out = {"~/joint_trajectory": "/robot/joint_trajectory"}
         robot = {"joint_trajectory": "/robot/joint_trajectory"}
@@ -57,6 +58,7 @@ class HostileCell:
         controller.start(folder, "maintenance_node", ROBOT | {"home_deg": HOME_DEG}, out)
         served = {"security_dir": str(plc)} | ROBOT
         bridge = {"security_dir": str(plc), "host": "127.0.0.1", "port": self.port}
+        bridge["beams"] = f"[{hostile.BEAM}]"
         controller.start(folder, "plc_bridge_node", bridge)
         controller.start(folder, "panel_node", served | {"page_port": page})
         self.url = f"https://127.0.0.1:{page}"
@@ -66,6 +68,11 @@ class HostileCell:
         status = "/maintenance_node/status"
         controller.listen(MaintenanceStatus, status, self.statuses, endpoints.LATCHED)
         controller.listen(GapOpen, "gap_open", self.beats, endpoints.RELIABLE)
+        self.moves: deque[JointTrajectory] = deque()
+        self.edges: deque[BeamEvent] = deque()
+        moves = out["~/joint_trajectory"]
+        controller.listen(JointTrajectory, moves, self.moves, endpoints.RELIABLE)
+        controller.listen(BeamEvent, "beam_events", self.edges, endpoints.RELIABLE)
         events = "/maintenance_node/session_events"
         controller.listen(SessionEvent, events, self.events, EVENTS)
         controller.wait(lambda: self.statuses, "maintenance_node", 60.0)
@@ -90,7 +97,9 @@ class HostileCell:
         told = s.state, s.cycle_id, s.fault_code, s.fault, s.at_home, s.last.cycle_id
         decided = [e.command for e in self.events]
         opened = sum(beat.open for beat in self.beats)
-        return *told, s.thermal_pending, s.tool_pending, decided, opened, self._controller.pids
+        went = len(self.moves), [edge.beam for edge in self.edges].count(hostile.BEAM)
+        files = {file: file.read_bytes() for file in self._folder.rglob("*") if file.is_file()}
+        return *told, s.thermal_pending, s.tool_pending, decided, opened, went, files
 
     def good(self) -> float:
         """A good request of each: a heartbeat, a value, the page; s that the slowest took."""
@@ -180,8 +189,9 @@ def _table(
         "soak_hostile",
         f"{requests} hostile requests to a live bridge and a live page; simulated",
         ("what", "value", "goal"),
-        "State: of the maintenance, of its decisions and events, of the gap, and that each node is "
-        "the process that it was. A good request: a heartbeat, a value and the page, by sessions "
+        "State: of the maintenance, its decisions, events and files, of the gap, of the robot, which "
+        "is sent nowhere, and of the beam, which has no edge; a node that ends ends this. A good "
+        "request: a heartbeat, a value and the page, by sessions "
         f"that were there before, after every {GOOD_EVERY} hostile ones. Heartbeats: what went out "
         "on gap_open, less what the good session wrote; none opened the gap. Memory: resident. "
         f"Load of the machine in the last minute: {os.getloadavg()[0]:.2f}; {os.cpu_count()} CPUs.",
