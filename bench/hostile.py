@@ -64,8 +64,8 @@ def a_write(rng: random.Random, plc: PlcClient) -> ua.WriteValue:
     index = plc.index
     node, right = rng.choice(
         [("Cell.Gap.Heartbeat", "UInt32"), (f"Cell.Beams.{BEAM}.Blocked", "Boolean"),
-         (f"Cell.Beams.{BEAM}.Time", "DateTime"), ("Cell.Gap.Beat", ""), ("Cell.Accuracy.State", ""),
-         ("Cell.Nowhere", ""), ("Cell.Methods.Run", ""), ("Code", "")]
+         (f"Cell.Beams.{BEAM}.Time", "DateTime"), ("Cell.Gap.Beat", ""),
+         ("Cell.Accuracy.State", ""), ("Cell.Nowhere", ""), ("Cell.Methods.Run", ""), ("Code", "")]
     )  # fmt: skip
     item = ua.WriteValue(NodeId=ua.NodeId(node, index), AttributeId=ua.AttributeIds.Value)
     item.Value = ua.DataValue(wrong_variant(rng, right))

@@ -189,9 +189,9 @@ def _table(
         "soak_hostile",
         f"{requests} hostile requests to a live bridge and a live page; simulated",
         ("what", "value", "goal"),
-        "State: of the maintenance, its decisions, events and files, of the gap, of the robot, which "
-        "is sent nowhere, and of the beam, which has no edge; a node that ends ends this. A good "
-        "request: a heartbeat, a value and the page, by sessions "
+        "State: of the maintenance, its decisions, events and files, of the gap, of the robot, "
+        "which is sent nowhere, and of the beam, which has no edge; a node that ends ends this. A "
+        "good request: a heartbeat, a value and the page, by sessions "
         f"that were there before, after every {GOOD_EVERY} hostile ones. Heartbeats: what went out "
         "on gap_open, less what the good session wrote; none opened the gap. Memory: resident. "
         f"Load of the machine in the last minute: {os.getloadavg()[0]:.2f}; {os.cpu_count()} CPUs.",
