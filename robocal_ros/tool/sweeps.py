@@ -36,9 +36,11 @@ from robocal_ros.tool.touch_points import (
     ParallelBeams,
     fit_parallel,
     judge_tip,
+    require_turn,
 )
 
 STEP_M = 1e-6  # of numeric derivatives; the fit is linear but for the axis' length
+LONGEST_NS = 120_000_000_000  # of a sweep: edges from before it are those of other work
 QUARTER = frames.exp_rotation([0.0, 0.0, 0.5 * np.pi])
 
 
@@ -76,13 +78,15 @@ class SweepLog:
 
     def add_edge(self, sample: EdgeSample, newest_ns: dict[str, int], joints_ns: int) -> None:
         """Take an edge; as `EdgeLog.add`."""
+        self._edges.forget(sample.stamp_ns - LONGEST_NS)
         self._edges.add(sample, newest_ns, joints_ns)
 
     def add(self, command: Command, stream: JointStream, arm: SerialArm) -> Outcome:
         """Take the sweep that is over.
 
         Raises `ConflictError` where there are no parallel beams, or all sweeps are taken;
-        `BeamError` when its edges are not whole passes: sweep again.
+        `BeamError` when its edges are not whole passes, `InputError` when the flange is turned
+        otherwise: sweep again.
         """
         if self._config.parallel is None:
             raise ConflictError("there are no parallel beams: give parallel_up_mm and its others")
@@ -103,6 +107,8 @@ class SweepLog:
         time_s = 1e-9 * (stamps - origin_ns).astype(np.float64)
         sweep = RecordedSweep(name, edges, time_s, q)
         seen = sweep.seen(arm, self._config.noise)  # refuses what has no readings around it
+        if name in FIRST:
+            require_turn(name, np.concatenate([T for T, _ in seen.values()]))
         self._sweeps.append(sweep)
         words = f"sweep {name} ({len(self._sweeps)} of {len(SWEEPS)}) is taken: {len(edges)} edges"
         if name == FIRST[-1]:
@@ -118,7 +124,8 @@ class SweepLog:
         self._from_ns = 0
 
     def clear(self, command: Command) -> Outcome:
-        """Forget all."""
+        """Forget all, and the edges of a sweep that was not taken."""
+        self._edges.take(0, command.marks or {})
         count, self._sweeps = len(self._sweeps), []
         return Outcome(command, Code.ACCEPT, f"{count} sweeps are forgotten")
 
@@ -234,7 +241,7 @@ def _require_passes(name: str, edges: list[BeamEdge]) -> None:
     """Refuse edges that are not whole passes through each beam; of the plunge the upper one."""
     for beam in PARALLEL[:1] if name == PLUNGE else PARALLEL:
         own = [edge for edge in edges if edge.beam == beam]
-        whole = len(own) >= 2 and len(own) % 2 == 0
+        whole = len(own) >= 2 and len(own) % 2 == 0 and own[0].blocked
         if not whole or any(a.blocked == b.blocked for a, b in pairwise(own)):
             raise BeamError(
                 f"sweep {name}: {len(own)} edges of beam {beam}, which are no whole passes with a "

@@ -279,8 +279,8 @@ def fit_parallel(beams: ParallelBeams, x_beam_m: float | None, edges: Edges) -> 
     """
     more = [name for name, _ in edges if name not in FIRST]
     _require(edges, [*FIRST, *AGAIN] if more else FIRST)
-    for name, R in R_BASE_FLANGE.items():
-        _require_turn(name, edges, R)
+    for name in FIRST:
+        require_turn(name, np.concatenate([edges[name, beam] for beam in HEIGHTS]))
     axis = sweep_axis(beams, *(_across(edges, name, beam) for name in FIRST for beam in HEIGHTS))
     if not more:
         return ParallelFit(axis, None)
@@ -312,9 +312,13 @@ def _require(edges: Edges, names: Sequence[str]) -> None:
                 )
 
 
-def _require_turn(name: str, edges: Edges, R: Array) -> None:
-    T = np.concatenate([edges[name, beam] for beam in HEIGHTS])
-    off = np.linalg.norm(frames.log_rotation(T[:, :3, :3] @ R.T), axis=1).max()
+def require_turn(name: str, T_base_flange: Array) -> None:
+    """Refuse flange poses (m, 4, 4) at the edges of one of `FIRST` that are turned otherwise.
+
+    Raises `InputError`.
+    """
+    turn = T_base_flange[:, :3, :3] @ R_BASE_FLANGE[name].T
+    off = np.linalg.norm(frames.log_rotation(turn), axis=1).max()
     if off > LARGEST_TURN_RAD:
         how = "y along" if name == FIRST[0] else "x along"
         raise InputError(

@@ -8,11 +8,14 @@ from scipy.stats import chi2
 from tool_driver import NOISE, START_NS, TAUGHT, Driver, config_of
 
 from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session.events import ACCEPT, CLEAR_SWEEPS, SOLVE_SWEEPS, SWEEP, Command
+from robocal_ros.tool.edges import MOST_EDGES, EdgeSample
 from robocal_ros.tool.run import ToolConfig
 from robocal_ros.tool.session import ToolSession
+from robocal_ros.tool.sweeps import LONGEST_NS
 from robocal_ros.tool.touch_points import PLUNGE
 
 TRUTH = bent(TAUGHT, [0.0015, -0.001, 0.0006], [0.012, 0.018, 0.0])
@@ -103,6 +106,53 @@ def test_sweeps_that_are_no_whole_passes_are_refused(tmp_path):
         assert early.message.startswith("sweeps turned, upright, upright_turned, plunge are")
         cleared = driver.command(Command(CLEAR_SWEEPS, {}))
         assert cleared.message == "1 sweeps are forgotten"
+
+
+def test_passes_that_begin_with_a_restore_are_refused(tmp_path):
+    """Of there and back the first and the last edge are lost: both others are of one side."""
+    driver = made(tmp_path)
+    with driver.history:
+        samples = driver.program.sweep(STRAIGHT["straight"], TAUGHT[:3, 3], "straight")
+        up, down = (
+            [s for s in samples if getattr(s, "beam", "") == beam] for beam in ("up", "down")
+        )
+        lost = (up[0], up[-1], down[0], down[-1])
+        driver.play([s for s in samples if not any(s is one for one in lost)])
+        assert driver.command(Command(SWEEP, {})).status is Code.BEAM_EDGES_WRONG
+
+
+def test_a_flange_that_is_turned_otherwise_is_refused_at_its_sweep(tmp_path):
+    driver = made(tmp_path)
+    with driver.history:
+        for wrong, name in ((0.03, "straight"), (0.0, "straight"), (0.03, "turned")):
+            R = frames.exp_rotation([0.0, 0.0, wrong]) @ STRAIGHT[name]
+            told = swept(driver, R, TAUGHT[:3, 3], name)
+            assert told.done == (wrong == 0.0), told.message
+            assert wrong == 0.0 or f"sweep {name}: the flange is turned by 1.72" in told.message
+        told = swept(driver, STRAIGHT["turned"], TAUGHT[:3, 3], "turned")
+        assert "sweep turned (2 of 5) is taken" in told.message
+
+
+def test_edges_of_other_work_are_of_no_sweep(tmp_path):
+    """Of a tool that passed for days; of a sweep that nobody had taken when all was cleared."""
+    driver = made(tmp_path)
+    with driver.history:
+        driver.rest(0.5)
+        begun_ns = driver.session.newest_joints_ns
+        for i in range(2 * MOST_EDGES):
+            at_ns = begun_ns - 2 * LONGEST_NS + i * (LONGEST_NS // MOST_EDGES // 2)
+            driver.session.add(EdgeSample(at_ns, "parallel", "up", i % 2 == 0, 0.0))
+        driver.play(driver.program.sweep(STRAIGHT["straight"], TAUGHT[:3, 3], "straight"))
+        assert driver.command(Command(CLEAR_SWEEPS, {})).done
+        told = swept(driver, STRAIGHT["straight"], TAUGHT[:3, 3], "straight")
+        assert told.samples == 8, told.message
+        driver.command(Command(CLEAR_SWEEPS, {}))
+        for i in range(2 * MOST_EDGES):
+            at_ns = driver.session.newest_joints_ns + i
+            driver.session.add(EdgeSample(at_ns, "parallel", "down", i % 2 == 0, 0.0))
+        driver.rest(1e-9 * LONGEST_NS + 1.0)
+        told = swept(driver, STRAIGHT["straight"], TAUGHT[:3, 3], "straight")
+        assert told.samples == 8, told.message
 
 
 def test_a_station_of_crossed_beams_takes_no_sweeps(tmp_path):
