@@ -2,6 +2,7 @@
 """Boards that a camera saw: their corners in images, its intrinsics, and where the boards were."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,11 @@ DICTIONARIES = (
     "ARUCO_ORIGINAL", "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11",
 )  # fmt: skip
 """OpenCV's names of the predefined ones, without ``DICT_``."""
+MARKERS_OF = {
+    "ARUCO_ORIGINAL": 1024, "APRILTAG_16h5": 30, "APRILTAG_25h9": 35, "APRILTAG_36h10": 2320,
+    "APRILTAG_36h11": 587,
+}  # fmt: skip
+"""How many markers they have; the names of the others tell it."""
 
 
 # ---- boards, and their corners in an image ------------------------------------------------------
@@ -84,6 +90,13 @@ class Chessboard:
                 f"{self.square_m * 1e3:g} mm"
             )
 
+        if self.markers is None:
+            return
+        name, needed = self.markers.dictionary, (self.columns + 1) * (self.rows + 1) // 2
+        known = MARKERS_OF.get(name) or int(name.partition("_")[2])
+        if needed > known:
+            raise InputError(f"{self} has {needed} markers, of which {name} has {known} only")
+
     def __str__(self) -> str:
         if self.markers is None:
             return f"board of {self.columns}x{self.rows} inner corners"
@@ -110,11 +123,14 @@ class Chessboard:
         own = np.all((numbers >= 0) & (numbers < len(points)) & (numbers == corners[:, -1]))
         if not own or len(set(numbers.tolist())) < len(numbers):
             raise InputError(f"the corners are not numbered as those of a {self}")
-        lines = min(len(set((numbers % self.columns).tolist())), len(set(numbers // self.columns)))
-        if len(numbers) < FEWEST_MARKED or lines < 2:
+        # With all but one in a line no homography is determined, with which a pose begins.
+        lines = (numbers % self.columns, numbers // self.columns)
+        if len(numbers) < FEWEST_MARKED or any(
+            len(numbers) - np.bincount(line).max() < 2 for line in lines
+        ):
             raise InputError(
-                f"{len(numbers)} corners of the {self} are too few (at least {FEWEST_MARKED}, of "
-                "two rows and two columns)"
+                f"{len(numbers)} corners of the {self} are too few (at least {FEWEST_MARKED}, and "
+                "two of them beside any one row or column)"
             )
         return points[numbers], np.ascontiguousarray(corners[:, :2])
 
@@ -129,7 +145,8 @@ def decode_image(data: bytes, name: str) -> Image:
     image = None
     if data:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
+        with suppress(cv2.error):  # of more pixels than OpenCV takes
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
     if image is None:
         raise InputError(f"{name} is no image that can be read")
     return np.asarray(image, dtype=np.uint8)
@@ -521,7 +538,8 @@ def told_intrinsics(message: Any, rectified: bool) -> Intrinsics:
             "not calibrated; leave intrinsics out to find them from the images"
         )
     model, distortion = str(message.distortion_model), np.array(message.d, dtype=np.float64)
-    if rectified or not np.any(distortion):
+    none = not np.any(distortion) and (model in MODELS or not len(distortion))
+    if rectified or (none and model != "equidistant"):  # a fisheye without them bends all the same
         model, distortion = "plumb_bob", np.zeros(5)
     if len(distortion) not in MODELS.get(model, ()) or not np.all(np.isfinite(distortion)):
         raise InputError(
@@ -562,8 +580,12 @@ def pixels_apart(first: Intrinsics, second: Intrinsics) -> float:
     else:
         rays = cv2.undistortPoints(corners, first.matrix, first.distortion)
     rays = np.insert(np.asarray(rays, dtype=np.float64).reshape(-1, 2), 2, 1.0, axis=1)[None]
-    lens, nowhere = (second.matrix, second.distortion), np.zeros(3)
-    project = cv2.fisheye.projectPoints if second.model == "equidistant" else cv2.projectPoints
-    seen = np.asarray(project(rays, nowhere, nowhere, *lens)[0]).reshape(-1, 2)
-    apart = float(np.max(np.linalg.norm(seen - corners[0], axis=1)))
-    return apart if np.isfinite(apart) else float("inf")
+    nowhere, seen = np.zeros(3), []
+    for camera in (first, second):
+        project = cv2.fisheye.projectPoints if camera.model == "equidistant" else cv2.projectPoints
+        pixels, _ = project(rays, nowhere, nowhere, camera.matrix, camera.distortion)
+        seen.append(np.asarray(pixels).reshape(-1, 2))
+    # Where a lens sees beyond what its model has, the ray that was found is another pixel's.
+    shown = np.all((seen[0] > -1.0) & (seen[0] < [width, height]), axis=1)
+    apart = float(np.max(np.linalg.norm(seen[1] - seen[0], axis=1)[shown], initial=-1.0))
+    return apart if np.isfinite(apart) and apart >= 0.0 else float("inf")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ChArUco boards, fisheyes, compressed images, and intrinsics as ``camera_info`` tells them."""
 
+import struct
+import zlib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -126,7 +128,9 @@ def test_corners_that_are_not_of_the_board_are_refused() -> None:
     whole = np.column_stack([LENS.corners(views(1, 7)[0].take(0), CHARUCO.points), np.arange(54)])
     for wrong, words in (
         (whole[:5], "5 corners .* are too few"),
-        (whole[:9], "two rows"),
+        (whole[:9], "two of them beside any one row"),
+        (whole[[*range(9), 9]], "two of them beside any one row"),
+        (whole[:0], "0 corners .* are too few"),
         (whole[[0, 0, 1, 9, 10, 11]], "not numbered"),
         (whole + np.array([0, 0, 1]), "not numbered"),
         (whole + np.array([0, 0, 0.5]), "not numbered"),
@@ -138,6 +142,23 @@ def test_corners_that_are_not_of_the_board_are_refused() -> None:
         Chessboard(9, 6, 0.02, Markers("4X4_50", 0.02))
     with pytest.raises(InputError, match="no dictionary"):
         Markers("9X9_100", 0.02)
+    with pytest.raises(InputError, match="has 60 markers, of which 4X4_50 has 50 only"):
+        Chessboard(11, 9, 0.02, Markers("4X4_50", 0.015))
+    Chessboard(11, 9, 0.02, Markers("APRILTAG_36h11", 0.015))
+
+
+def test_one_image_of_a_line_of_corners_spoils_no_set() -> None:
+    """No homography is told by eight corners in a line and one beside it."""
+    seen, rng = views(8, 7)
+    whole = []
+    for i in range(8):
+        pixels = NEAR.corners(seen.take(i), CHARUCO.points) + 0.1 * rng.standard_normal((54, 2))
+        whole.append(np.column_stack([pixels, np.arange(54)]))
+    for camera in (NEAR_INTRINSICS, None):
+        names = [str(i) for i in range(8)]
+        corners = [*whole[:7], whole[7][:10]]
+        found = boards_of_corners(names, corners, CHARUCO, NEAR_INTRINSICS.size, camera)
+        assert list(found.rejected) == ["7"]
 
 
 def test_an_opencv_without_marked_boards_says_so(monkeypatch) -> None:
@@ -250,6 +271,8 @@ def test_rectified_images_have_the_projection_without_distortion() -> None:
         ({"k": [float("nan")] * 9}, "is not calibrated"),
         ({"distortion_model": "fov", "d": [0.9]}, "1 coefficients of distortion model 'fov'"),
         ({"d": [0.1] * 3}, "3 coefficients of distortion model 'plumb_bob'"),
+        ({"distortion_model": "fov", "d": [0.0]}, "1 coefficients of distortion model 'fov'"),
+        ({"distortion_model": "equidistant", "d": []}, "0 coefficients"),
         ({"width": 0}, "0x480 px"),
     ],
 )
@@ -259,15 +282,16 @@ def test_a_camera_that_is_not_told_is_refused(changed: dict, words: str) -> None
 
 
 def test_models_of_a_topic() -> None:
-    """Four and five coefficients of plumb_bob; eight; a fisheye; none at all."""
+    """Four and five coefficients of plumb_bob; eight; a fisheye, an ideal one too; none at all."""
     for model, d, length in (
         ("plumb_bob", [0.1] * 4, 4),
         ("rational_polynomial", [0.1] * 8, 8),
         ("equidistant", [0.1] * 4, 4),
+        ("equidistant", [0.0] * 4, 4),
         ("", [], 5),
     ):
         found = told_intrinsics(camera_info(distortion_model=model, d=d), rectified=False)
-        assert len(found.distortion) == length
+        assert (len(found.distortion), found.model) == (length, model or "plumb_bob")
 
 
 def test_how_far_two_cameras_see_a_ray_apart() -> None:
@@ -280,6 +304,13 @@ def test_how_far_two_cameras_see_a_ray_apart() -> None:
     assert pixels_apart(FISHEYE, wide) == 0.0
     assert pixels_apart(INTRINSICS, FISHEYE) > 50.0
     assert pixels_apart(INTRINSICS, Intrinsics(moved, moved[0], (320, 240))) == np.inf
+    # Of half a sphere: the corners of its image are dark.
+    round_K = np.array([[330.0, 0.0, 640.0], [0.0, 330.0, 480.0], [0.0, 0.0, 1.0]])
+    whole = Intrinsics(round_K, FISHEYE.distortion, (1280, 960), model="equidistant")
+    moved = round_K.copy()
+    moved[0, 2] += 0.2
+    aside = replace(whole, matrix=moved)
+    assert pixels_apart(whole, aside) == pytest.approx(0.2, abs=1e-6)
 
 
 # ---- compressed images --------------------------------------------------------------------------
@@ -310,3 +341,12 @@ def test_what_is_no_picture_of_8_bits_is_refused(told: str) -> None:
 def test_a_compressed_image_that_was_cut_is_refused() -> None:
     with pytest.raises(InputError, match="is no image that can be read"):
         message_image(SimpleNamespace(format="jpeg", data=b"\xff\xd8\xff"))
+
+
+def test_an_image_that_says_it_is_huge_is_refused() -> None:
+    """A PNG of a few bytes whose header tells 10^10 pixels."""
+    small = bytearray(cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1].tobytes())
+    small[16:24] = struct.pack(">II", 100_000, 100_000)
+    small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
+    with pytest.raises(InputError, match="is no image that can be read"):
+        message_image(SimpleNamespace(format="png", data=bytes(small)))
