@@ -65,6 +65,9 @@ LATE_S, LATELY_S = 0.1, 5.0  # later ones are told of, for so long
 # and then was the same for `STEADY_S`, with hardly a message left out, is of a clock.
 SLEW, BRIDGED_S, STEADY_S = 0.0834, 0.25, 5.0
 LEFT_OUT, APART = 0.005, 1.75  # share of intervals that are so much longer than the mean
+# Small stalls, or a queue that is hardly too slow, make messages late as a slewed clock does. Where
+# the quickest one is no older than this, the two wall clocks agree, or come to agree, and tell it.
+AGREE_S = 2.0
 
 
 class Lateness:
@@ -74,7 +77,7 @@ class Lateness:
     as that clock has them which has them least, so that setting one of the receiver's makes nothing
     late. A source's clock that is set back begins anew; one that is taken back bit by bit makes
     late while it is, and for `STEADY_S` more. A queue grows by stalls, or drains, or is full and
-    leaves messages out.
+    leaves messages out; by clocks that agree what waits in it is old.
 
     ``late_s``: the last message; 0 where that is usual, or it has no stamp.
     """
@@ -134,6 +137,9 @@ class Lateness:
         if now_s - since_s < STEADY_S:
             return 0.0
         made_up_s = self._slewed_s if self._left_out <= LEFT_OUT * self._count else 0.0
+        for age_s in self._least_s[1:]:
+            if age_s < AGREE_S:
+                made_up_s = min(made_up_s, BEHIND_S - age_s)
         if made_up_s <= USUAL_S:
             made_up_s = 0.0
         self._slewed_s -= made_up_s
@@ -149,8 +155,8 @@ class Lateness:
             f"{self._what} come up to {self._worst_s * 1e3:.0f} ms late, so that nobody knows "
             "where the robot is now: this computer or its network has too much to do; give this "
             "node a core of its own, end other processes, or let the controller publish less "
-            "often. Where the robot's computer takes its clock back bit by bit (chronyd) this ends "
-            f"{STEADY_S:g} s after that"
+            "often. Where the robot's computer takes its clock back bit by bit (chronyd), to what "
+            f"this one's says, this ends {STEADY_S:g} s after that"
         )
 
 

@@ -14,6 +14,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing, MotionCell, ToolBody, joint_way
 from robocal_ros.motion.plan import LEAD_S, SHORTEST_STOP_S, MotionLimits, stop
 from robocal_ros.motion.robot_watch import (
+    BEHIND_S,
     LATE_S,
     LATELY_S,
     LEAST,
@@ -251,11 +252,37 @@ def test_a_clock_that_chronyd_takes_back_makes_late_until_it_has_been_steady(
 @pytest.mark.parametrize("ppm", [1000.0, 5000.0, 20_000.0])
 def test_a_clock_that_is_taken_back_slowly_makes_late_until_it_has_been_steady(ppm: float) -> None:
     lateness, times = Lateness("states"), np.arange(0.0, 540.0, 0.02).tolist()
-    late = [lateness.take(taken_back(t, ppm * 1e-6), t, 1e9) for t in times]
+    stamps = [taken_back(t, ppm * 1e-6) for t in times]
+    late = [lateness.take(at, t, 1e9 + t - at) for at, t in zip(stamps, times, strict=True)]
     over = round((20.0 + 0.5 / (ppm * 1e-6) + 1.5 * STEADY_S) / 0.02)
     assert max(late[over:]) == 0.0
     if ppm < USUAL_S / STEADY_S * 1e6:  # as good as steady
         assert max(late) <= 3.0 * USUAL_S
+    else:
+        assert max(late) > 0.4
+
+
+@pytest.mark.parametrize("stall_s", [0.01, 0.02, 0.03])
+@pytest.mark.parametrize("away_s", [0.0, -0.3, 0.02])
+def test_a_backlog_of_small_stalls_stays_late_by_clocks_that_agree(
+    stall_s: float, away_s: float
+) -> None:
+    """Finding: a relay with one message a cycle, 0.45 to 1 s behind, was believed after 5 s."""
+    stamps = 0.01 * np.arange(4000)
+    backlog = sum(stall_s * (stamps >= at) for at in np.arange(5.0, 20.0, 30.0 * stall_s))
+    came = stamps + backlog
+    late = latest(1e9 + stamps, came, backlog + away_s)
+    assert np.all(late >= backlog - 6e-4 * came - BEHIND_S + min(away_s, 0.0) - USUAL_S)
+
+
+@pytest.mark.parametrize("slower", [0.001, 0.002, 0.004])
+def test_a_queue_that_is_hardly_too_slow_stays_late_by_clocks_that_agree(slower: float) -> None:
+    """Finding: it leaves out too few messages to tell it, and was believed 0.4 s late."""
+    stamps = 0.004 * np.arange(100_000)
+    backlog = np.minimum(slower * np.maximum(stamps - 5.0, 0.0), 0.4)
+    came = stamps + backlog
+    late = latest(1e9 + stamps, came, backlog)
+    assert late[-1] > max(0.4 - 6e-4 * came[-1], 0.0) - BEHIND_S
 
 
 @given(stalls_s=st.lists(st.floats(0.04, 0.4), min_size=1, max_size=3), seed=st.integers(0, 99))
