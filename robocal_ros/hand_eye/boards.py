@@ -341,10 +341,17 @@ def _solve(
 ) -> SeenBoards:  # fmt: skip
     camera = intrinsics or _calibrate(shown, size)
     solve = _fisheye_pose if camera.model == "equidistant" else _pose
-    T, misses, rows = zip(*(solve(*seen, camera) for seen in shown), strict=True)
+    try:
+        T, misses, rows = zip(*(solve(*seen, camera) for seen in shown), strict=True)
+        miss = np.concatenate(misses)
+        with np.errstate(over="ignore"):
+            squares = float(np.sum(miss**2)) if np.all(np.isfinite(T)) else np.inf
+    except np.linalg.LinAlgError:
+        squares = np.inf
+    if not np.isfinite(squares):
+        raise InputError("no pose of a board explains the corners with these intrinsics")
     unknowns = 6 * len(names) + (0 if intrinsics else rows[0].shape[1] - 6)
-    miss = np.concatenate(misses)
-    noise = float(np.sqrt(np.sum(miss**2) / (len(miss) - unknowns)))
+    noise = float(np.sqrt(squares / (len(miss) - unknowns)))
     alone = np.linalg.inv(np.array([J[:, :6].T @ J[:, :6] for J in rows]))
     sensitivity = -alone @ np.array([J[:, :6].T @ J[:, 6:] for J in rows])
     if intrinsics is None:

@@ -242,6 +242,14 @@ def test_a_file_of_a_fisheye(tmp_path) -> None:
     assert pixels_apart(read_intrinsics(path), FISHEYE) == 0.0
 
 
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_intrinsics_that_explain_nothing_give_no_pose(model: str) -> None:
+    seen, _ = views(1, 9)
+    wild = Intrinsics(np.diag([1e300, 1e300, 1.0]), np.zeros(4), FISHEYE.size, model=model)
+    with pytest.raises(InputError, match="no pose of a board explains the corners"):
+        boards_of_corners(["0"], [fisheye_pixels(seen, BOARD.points)], BOARD, FISHEYE.size, wild)
+
+
 # ---- camera_info --------------------------------------------------------------------------------
 
 
