@@ -127,9 +127,10 @@ class PanelState:
         self.cycle_id = ""
         self.steps: deque[dict[str, Any]] = deque(maxlen=STEPS)
         self.gaps: deque[Values] = deque(maxlen=GAPS)
-        # calibrations, as the history says
+        # calibrations, as the history says; of those that it lists, which are the newest ones
         self.in_force: frozenset[int] = frozenset()
-        self.decided: frozenset[int] = frozenset()
+        self.pending: frozenset[int] = frozenset()
+        self.newest = 0
         self.history_trouble = ""
         self._found: dict[str, Values] = {}  # of drift and tool: the last gap that measured it
 
@@ -228,9 +229,9 @@ class PanelState:
             if code not in WELL:
                 found.append(_task(code, "drift", gap["message"]))
         if fixture := self.sources[FIXTURE].values:
-            code = code_of(fixture["code"])
-            new = code is Code.ACCEPT and fixture["candidate_id"] not in self.decided
-            if new or code not in WELL:
+            code, number = code_of(fixture["code"]), fixture["candidate_id"]
+            waits = number in self.pending or number > self.newest
+            if code not in WELL or (code is Code.ACCEPT and waits):
                 found.append(_task(code, "fixture", fixture["reason"]))
         return found
 

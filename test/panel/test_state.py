@@ -139,7 +139,12 @@ def test_a_fixture_that_moved_is_told_until_a_person_has_decided():
     later_s = NOW_S + 1e5  # it is said once, and stays; the others go on
     heard(panel, {ACCURACY: accuracy(), STATUS: status()}, later_s)
     assert not wrongly_told("fixture_moved", panel, later_s)
-    panel.decided = frozenset({9})
+    panel.pending, panel.newest = frozenset({9}), 12
+    assert not wrongly_told("fixture_moved", panel, later_s)
+    panel.pending = frozenset()
+    assert keys(panel, later_s) == ["state/OK"]
+    # Finding: when fifty newer results had taken its place in the list it was told anew.
+    panel.pending, panel.newest = frozenset({60}), 90
     assert keys(panel, later_s) == ["state/OK"]
 
 
