@@ -43,6 +43,7 @@ class Counted:
     """Of one kind: how many there were, and those that were taken."""
 
     sent: int = 0
+    silent: int = 0  # without an answer, as of a busy machine: a good request follows
     taken: list[str] = field(default_factory=list)
 
 
@@ -170,6 +171,9 @@ def _attacked(cell: HostileCell, requests: int, rng: random.Random) -> Table:
             cell.do(attack(rng, target))
         except hostile.TakenError as taken:
             one.taken.append(str(taken))
+        except (TimeoutError, ConnectionError):
+            one.silent += 1
+            good_s.append(cell.good())
         if number % GOOD_EVERY == 0:
             good_s.append(cell.good())
             memory.append(cell.memory_mb())
@@ -200,6 +204,7 @@ def _table(
         print(*(f"{words} TAKEN: {taken}\n" for taken in one.taken), end="")
         table.add(f"{words}: taken of {one.sent}", len(one.taken), Goal(len(one.taken), 0))
     table.add("the state has changed", int(not unchanged), Goal(int(not unchanged), 0))
+    table.add("hostile ones without an answer", sum(o.silent for o in counted.values()), None)
     more = len(cell.beats) - len(cell.plc.written)
     table.add("heartbeats that nobody wrote", more, Goal(abs(more), 0))
     table.add("good requests", 3 * len(good_s), None)

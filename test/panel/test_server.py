@@ -2,6 +2,7 @@
 """The page's server by a real client: who may what, what is refused, and what ends nothing."""
 
 import asyncio
+import contextlib
 import json
 import socket
 import ssl
@@ -399,7 +400,8 @@ def test_open_connections_and_pages_are_bounded(monkeypatch):
             mute.append(one)
         for one in mute:
             one.settimeout(10.0)
-            assert one.recv(1000) in (b"",)  # let go, at once or after a while
+            with contextlib.suppress(ConnectionResetError):  # what it said was not read
+                assert one.recv(1000) == b""  # let go, at once or after a while
         assert client.get("/session")[0] == 200
 
         async def view() -> tuple[list[int], int]:
