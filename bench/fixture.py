@@ -106,7 +106,7 @@ def others_table(cells: Sequence[MeasuredFixture]) -> Table:
         f"What is not the fixture, in {len(cells)} cells; simulated",
         ("what", "told, share", "in doubt", "something else told", "fixture told"),
         "The drift is of a robot that worked since it was taught with no thermal cycle: bending "
-        "and the gears' play too, which no model has. A frame is offered in none of these.",
+        "and the gears' errors too, which no model has. A frame is offered in none of these.",
     )
     cases: list[tuple[str, str, Callable[[MeasuredFixture], FixtureResult]]] = [
         ("nothing", "", lambda c: c.gap()),
