@@ -28,7 +28,11 @@ settings.register_profile(
 settings.load_profile("shared")
 
 # Without rclpy (make test-floor) what needs a node cannot even be imported.
-NEED_ROS = ["nodes", "correction/test_stops_on_controllers.py"]
+NEED_ROS = [
+    "nodes",
+    "correction/test_stops_on_controllers.py",
+    "hand_eye/test_boards.py",  # and OpenCV 4.7 for ChArUco boards
+]
 collect_ignore = [] if importlib.util.find_spec("rclpy") else NEED_ROS
 
 

@@ -4,12 +4,11 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
 from hand_eye_driver import ARM, FRAME, Q_NEAR, Recorded
-from sensor_msgs.msg import CameraInfo
 
 from bench.hand_eye_cell import (
     ArmRobot,
@@ -24,6 +23,9 @@ from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.robot import Effects
 from robocal_ros.hand_eye.boards import Chessboard, Markers
 from robocal_ros.hand_eye.data import COMPRESSED, IMAGE
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import CameraInfo
 
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
 LENS = TrueLens()
@@ -134,8 +136,10 @@ def compressed(
     return Recorded(COMPRESSED, stamp_ns, {"header": header, "format": told, "data": bytes(data)})
 
 
-def camera_info(**changed: Any) -> CameraInfo:
+def camera_info(**changed: Any) -> "CameraInfo":
     """What the driver of the lens tells."""
+    from sensor_msgs.msg import CameraInfo
+
     K = [LENS.fx, 0.0, LENS.cx, 0.0, LENS.fy, LENS.cy, 0.0, 0.0, 1.0]
     message = CameraInfo(
         width=LENS.width,
