@@ -23,6 +23,7 @@ from bench.tables import KEPT, OUT, PAGES, Table, about, show
 # Each part's module, which makes its ``tables()``; imported when asked for, since some load much.
 PARTS = {
     "real_data": "real_data",
+    "real_few": "real_few",
     "monte_carlo": "monte_carlo",
     "thermal": "thermal",
     "tool": "tool",
@@ -47,6 +48,7 @@ PARTS = {
 # Accuracy, each on one core: these share the machine. The others time something, or take all cores.
 TOGETHER = (
     "real_data",
+    "real_few",
     "monte_carlo",
     "thermal",
     "tool",
