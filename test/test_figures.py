@@ -24,6 +24,15 @@ CLOSED_FORMS = [
 ]
 
 
+SENTENCES = [
+    (
+        "ur10_harm",
+        r"([\d.]+) times the geometric model's rms in the median, ([\d.]+) at .*? ([\d.]+) in",
+    ),
+    ("ur10_known_geometry", r"functions to a mean of ([\d.]+), ([\d.]+) and ([\d.]+) mm"),
+]
+
+
 def figures(part, name):
     """Numbers of each row of a kept table, cells with a goal by their value."""
     document = json.loads((DOCS.parent / "bench" / "results" / f"{part}.json").read_text())
@@ -52,6 +61,16 @@ def test_a_table_has_the_kept_figures(first, part, name, rows):
         quoted = [found[0] for cell in cells[1:] for found in NUMBER.finditer(cell)]
         assert quoted, cells
         assert [text for text in quoted if not shown(text, numbers)] == [], (cells[0], numbers)
+
+
+@pytest.mark.parametrize(("name", "words"), SENTENCES, ids=[name for name, _ in SENTENCES])
+def test_a_sentence_has_the_kept_figures_of_few_poses(name, words):
+    _, rows = figures("real_few", name)
+    goals = [cell["value"] for row in rows for cell in row if isinstance(cell, dict)]
+    quoted = re.search(words, " ".join((DOCS / "accuracy.md").read_text().split())).groups()
+    assert list(quoted) == [
+        f"{goal:.{len(t.split('.')[1])}f}" for goal, t in zip(goals, quoted, strict=True)
+    ]
 
 
 @pytest.mark.parametrize(("page", "words"), CLOSED_FORMS, ids=[page for page, _ in CLOSED_FORMS])
