@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from bench.circle_figure import circle_figure
 from bench.real_data import carried_over, own_half
-from bench.ur10_campaigns import SERIES
+from robocal_ros.bags.ur10_campaigns import SERIES
 from robocal_ros.cli.validating import Job, validate_bag
 from robocal_ros.identification.full_model import FullIdentification
 from robocal_ros.report.figures import (

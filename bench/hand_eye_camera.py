@@ -17,11 +17,11 @@ from bench.hand_eye_sets import (
     BOARD_RMS_MM,
     TMAC_MM,
     arm_streams,
-    board_shots,
-    folder,
-    tmac_pairs,
+    board_images,
+    tmac,
     turned_tsai,
 )
+from bench.real_data import data_folder
 from bench.tables import Goal, Table
 from robocal_ros.hand_eye.boards import boards_of_corners, see_boards
 from robocal_ros.hand_eye.camera import distances, pair_streams, rms
@@ -242,7 +242,7 @@ def tracker_table() -> Table:
         "Measured (Landgraf et al. 2021), 25 and 26 poses, none left out.",
     )
     for series, limit in TMAC_MM.items():
-        pairs = tmac_pairs(series)
+        pairs = tmac(series)
         starts = {name: closed_form(name, pairs) for name in CLOSED_FORMS}
         starts["tsai, X and Z exchanged"] = turned_tsai(pairs)
         for name, at in starts.items():
@@ -261,10 +261,10 @@ def board_table() -> Table:
         "Measured (wangrp1997). Intrinsics from the same images. The closed forms have the same "
         "samples; left out: the distance of every one of the 20 from the solution without it.",
     )
-    shots = board_shots()
-    seen = see_boards(shots.images, BOARD)
+    T_base_flange, images = board_images()
+    seen = see_boards(images, BOARD)
     pairs = PosePairs(
-        shots.T_base_flange,
+        T_base_flange,
         seen.T_camera_board,
         seen.names,
         "in-hand",
@@ -320,7 +320,7 @@ def arm_table() -> Table:
 def tables() -> Sequence[Table]:
     """All of them; those of real measurements where these are."""
     made = [bound_table(), intrinsics_table()]
-    if not folder().is_dir():
-        print(f"no real measurements at {folder()} (set ROBOCAL_DATA): left out")
+    if not data_folder().is_dir():
+        print(f"no real measurements at {data_folder()} (set ROBOCAL_DATA): left out")
         return made
     return [*made, tracker_table(), board_table(), arm_table()]

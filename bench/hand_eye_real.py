@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.real_data import data_folder
 from bench.tables import Goal, Table
-from bench.ur10_campaigns import data_folder
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.hand_eye.files import read_pose_table, read_profiles
 from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, leave_one_out, solved_again
@@ -41,7 +41,7 @@ OTHER_MM = (25.0, 39.0, 41.0, 42.0)
 
 def folder() -> Path:
     """Of the sets."""
-    return data_folder().parent / "line_laser_fanuc"
+    return data_folder() / "line_laser_fanuc"
 
 
 def read_set(name: str) -> HandEyeData:

@@ -1,23 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real measurements: what a calibrated model is worth, at poses that it was not made from."""
 
+import os
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 
 from bench.tables import Goal, Table
-from bench.ur10_campaigns import data_folder, halves, load_campaign
+from robocal_ros.bags.ur10_campaigns import halves, load_campaign
 from robocal_ros.estimation.assessment import ErrorSummary, summarise
 from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.frames import Index
+from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.full_model import identify_full
 from robocal_ros.identification.judged import Model
 from robocal_ros.identification.planning import WORKING, plan_poses
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.kinematics.universal_robots import factory_arm, nominal_arm, parse_settings
+from robocal_ros.kinematics.universal_robots import (
+    factory_arm,
+    nominal_arm,
+    parse_settings,
+    read_panel_poses,
+)
 
 LARGEST_MEAN_MM = {
     "geometric": {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365},
@@ -34,37 +42,47 @@ LARGEST_UR5E_MEAN_MM, LARGEST_UR5E_MAX_MM = 0.0445, 0.081
 WHEN = {"A": "July 2020, grid", "B": "Nov. 2020", "C": "Nov. 2020, random", "D": "March 2021"}
 
 
+def data_folder() -> Path:
+    """Folder of all real measurements, whether it is there or not."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    return Path(os.environ.get("ROBOCAL_DATA", beside))
+
+
+def campaign(series: str) -> Measurements:
+    """A series of the UR10."""
+    return load_campaign(series, data_folder() / "ur10_tmac")
+
+
 @lru_cache
 def own_half(series: str, model: Model = "full") -> JudgedIdentification:
     """Identify from half of a campaign, judge on the other half."""
-    train, check = halves(load_campaign(series))
+    train, check = halves(campaign(series))
     return identify_and_judge(load_robot("ur10"), train, check, model=model)
 
 
 @lru_cache
 def carried_over(source: str, series: str, model: Model = "full") -> JudgedIdentification:
     """The model of a campaign's training half on another: only base and tool refitted there."""
-    train, _ = halves(load_campaign(source))
-    check, refit = load_campaign(series), ("base", "tool")
+    train, _ = halves(campaign(source))
+    check, refit = campaign(series), ("base", "tool")
     return identify_and_judge(load_robot("ur10"), train, check, model=model, check_refit=refit)
 
 
 @lru_cache
 def ur5e_errors() -> dict[str, ErrorSummary]:
     """Distances from the controller's own poses, of the nominal and the factory's model."""
-    folder = data_folder().parent / "ur5e_factory"
+    folder = data_folder() / "ur5e_factory"
     nominal, delta = (
         parse_settings((folder / name).read_text(), name)
         for name in ("urcontrol.conf.UR5", "calibration.conf")
     )
-    table = np.loadtxt(folder / "joint-eef-data.csv", delimiter=",", skiprows=1)
+    shown = read_panel_poses(folder / "joint-eef-data.csv")
     arms = {
         "nominal": nominal_arm(nominal, "UR5e"),
         "factory calibration, imported": factory_arm(nominal, delta, "UR5e"),
     }
     return {
-        name: summarise(arm.fk(np.radians(table[:, :6]))[:, :3, 3] - table[:, 6:9] * 1e-3)
-        for name, arm in arms.items()
+        name: summarise(arm.fk(shown.q)[:, :3, 3] - shown.position) for name, arm in arms.items()
     }
 
 
@@ -138,7 +156,7 @@ def few_poses_table() -> Table:
         "Accepted: of the draws, the full model, judged on as many other poses as identified it "
         "(at least 20). The prior's width is found from the data.",
     )
-    arm, data = load_robot("ur10"), load_campaign("C")
+    arm, data = load_robot("ur10"), campaign("C")
     for count in (12, 16, 24, 40, 60, 120, 250):
         squares, accepted = np.zeros(4), 0
         for seed in range(DRAWS):
@@ -166,7 +184,7 @@ def planned_table() -> Table:
         "Planned: chosen one after the other before anything is measured, so that the full model "
         f"errs least (robocal identify --plan). Random: mean of {PLAN_DRAWS} draws.",
     )
-    arm, (train, check) = load_robot("ur10"), halves(load_campaign("C"))
+    arm, (train, check) = load_robot("ur10"), halves(campaign("C"))
     working = train.q[np.random.default_rng(0).permutation(len(train))[:WORKING]]
 
     def mean_mm(chosen: Index) -> float:
@@ -194,7 +212,7 @@ def stated_table() -> Table:
     )
     arm = load_robot("ur10")
     for series, count in product("ABCD", (None, 60, 120, 250)):
-        train, check = halves(load_campaign(series))
+        train, check = halves(campaign(series))
         found = []
         for seed in range(1 if count is None else PLAN_DRAWS):
             chosen = np.random.default_rng(seed).permutation(len(train))[:count]

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.real_data import campaign, data_folder
 from bench.tables import Cell, Goal, Table
-from bench.ur10_campaigns import data_folder, halves, load_campaign
+from robocal_ros.bags.ur10_campaigns import halves
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import CellModel, identify
@@ -416,7 +417,7 @@ def full_model_table() -> Table:
         "and SciPy's linear algebra and loads the compiled kernels.",
     )
     for series, count, limit, rounds in (("C", 250, 0.3, 5), ("A", None, 5.0, 1)):
-        data, _ = halves(load_campaign(series))
+        data, _ = halves(campaign(series))
         data = data.take(np.random.default_rng(0).permutation(len(data))[:count])
         arm, durations = load_robot("ur10"), []
         for _ in range(1 + rounds):

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from bench.real_data import campaign, data_folder
 from bench.tables import Table
-from bench.ur10_campaigns import data_folder, load_campaign
 from robocal_ros.estimation.assessment import summarise
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import Measurements
@@ -37,7 +37,7 @@ def tracked_table() -> Table:
         "the grid's: after the first hours a later block also lies elsewhere, and tracking gains "
         "knowledge of the arm as well. A model that knows the whole series gains by drift alone.",
     )
-    arm, data = load_robot("ur10"), load_campaign("A")
+    arm, data = load_robot("ur10"), campaign("A")
     assert data.stamp_ns is not None
     time_s = (data.stamp_ns - data.stamp_ns[0]) / 1e9
     start = int(np.searchsorted(time_s, FIRST_H * 3600.0))

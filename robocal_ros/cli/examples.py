@@ -7,6 +7,7 @@ Apart from the table of commands, which every start reads: only help needs these
 EXAMPLES = {
     "fk": "robocal fk --robot ur10 --joints-deg 90,0,0,0,0,0",
     "info": "robocal info docs/examples/measured.csv",
+    "data": "robocal data ur10_tmac --out out/ur10 --part B",
     "identify": (
         "robocal identify --robot ur10 --data docs/examples/measured.csv --hold-out 0.5 "
         "--output out/calibrated.yaml"

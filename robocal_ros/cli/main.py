@@ -402,6 +402,9 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
     "info": CliCommand(
         "cli.info:info", "what a bag, table or file holds, and what can be done with it"
     ),
+    "data": CliCommand(
+        "cli.data:data", "measurements that others published: how to get them, and to tables"
+    ),
     "identify": CliCommand(
         "cli.identify:identify",
         "identify a robot's model from a table of measurements, and judge it on unseen ones",

@@ -101,14 +101,15 @@ class Cells:
         raise AssertionError(f"every cell of {name} is a number")
 
 
-def read_cells(path: Path, check: Callable[[list[str], str], None]) -> Cells:
+def read_cells(path: Path, check: Callable[[list[str], str], None], separator: str = ",") -> Cells:
     """Read a table; ``check`` refuses a header (its names, and the file's).
 
     Raises `InputError` when it is no table, has no rows, or rows that are longer or shorter than
     the header.
     """
     file = str(path)
-    reader = csv.reader(io.StringIO(read_text(path, "table"), newline=""), strict=True)
+    stream = io.StringIO(read_text(path, "table"), newline="")
+    reader = csv.reader(stream, strict=True, delimiter=separator)
     rows, numbers = [], []
     try:
         header = next(reader)
@@ -130,6 +131,27 @@ def read_cells(path: Path, check: Callable[[list[str], str], None]) -> Cells:
     names = [name.strip() for name in header]
     columns = zip(*rows, strict=True)
     return Cells(file, tuple(numbers), dict(zip(names, columns, strict=True)))
+
+
+def read_published(path: Path, columns: Sequence[str], separator: str = ",") -> Cells:
+    """Read the ``columns`` of a table that others made, which may have more.
+
+    Between semicolons the decimal mark is a comma, as spreadsheets write it; it is made a point.
+
+    Raises `InputError` as `read_cells`, and for a column that is missing.
+    """
+
+    def check(header: list[str], file: str) -> None:
+        missing = [name for name in columns if name not in map(str.strip, header)]
+        if missing:
+            _fail(f"column {', '.join(missing)} is missing: this is not the published file", file)
+
+    table = read_cells(path, check, separator)
+    if separator != ";":
+        return table
+    points = {name: tuple(cell.replace(",", ".") for cell in table.columns[name])
+              for name in columns}  # fmt: skip
+    return Cells(table.file, table.rows, points)
 
 
 def texts(values: Array) -> list[str]:

@@ -8,12 +8,16 @@ lies hundreds of metres away. The same axes in Hayati's form (Hayati 1983) have 
 import ast
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
+from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics.arm import ALPHA, NEARLY_PARALLEL, THETA, A, D, SerialArm
+from robocal_ros.kinematics.tables import read_published
 
 JOINT_NAMES = (
     "shoulder_pan_joint",
@@ -53,6 +57,31 @@ def _row(settings: Mapping[str, Array], name: str, file: str) -> Array:
     if values is None or values.shape != (6,):
         raise InputError(f"no list '{name}' of six numbers", file=file)
     return values
+
+
+PANEL = (
+    *(f"{joint} (°)" for joint in ("Base", "Shoulder", "Elbow", "Wrist 1", "Wrist 2", "Wrist 3")),
+    *(f"{axis} (mm)" for axis in "XYZ"),
+    *(f"R{axis} (rad)" for axis in "XYZ"),
+)
+
+
+def read_panel_poses(path: Path) -> Measurements:
+    """Joints and poses of the flange in base as the controller's panel shows them, from a CSV.
+
+    The orientation is a rotation vector; a sample's id is its row (the header is row 1).
+
+    Raises `InputError` for a file that is not such a table.
+    """
+    table = read_published(path, PANEL)
+    values = np.stack([table.numbers(name) for name in PANEL], axis=1)
+    return Measurements(
+        q=np.radians(values[:, :6]),
+        position=values[:, 6:9] * 1e-3,
+        rotation=Rotation.from_rotvec(values[:, 9:]).as_matrix(),
+        target=("flange",) * len(values),
+        sample=tuple(map(str, table.rows)),
+    )
 
 
 def factory_dh(nominal: Mapping[str, Array], delta: Mapping[str, Array]) -> Array:

@@ -18,6 +18,7 @@ from robocal_ros.hand_eye.camera import distances
 from robocal_ros.hand_eye.camera_data import CLOSED_FORMS
 from robocal_ros.hand_eye.camera_fit import fit_pairs
 from robocal_ros.hand_eye.files import write_pose_table
+from robocal_ros.hand_eye.published import tmac_pairs
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.tables import joint_texts, write_cells
 
@@ -228,7 +229,11 @@ def test_people_read_it_too(folder: Path, capsys: pytest.CaptureFixture[str]) ->
 @pytest.fixture(scope="module")
 def tables(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("real")
-    hand_eye_sets.write_tables(out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROBOCAL_DATA", str(data_dir))
+        for name, *parts in (("ur10_tmac", "--part", "B", "D"), ("camera_hand_eye",),
+                             ("eth_hand_eye",)):  # fmt: skip
+            assert main(["data", name, "--out", str(out / name), *parts]) == 0
     return out
 
 
@@ -244,7 +249,8 @@ def test_a_tracked_target_from_every_start(
     tables: Path, robocal, series: str, limit_mm: float, method: str
 ) -> None:
     document = robocal(
-        "--poses", tables / f"{series}_poses.csv", "--measured", tables / f"{series}_measured.csv",
+        "--poses", tables / f"ur10_tmac/{series}_flange.csv",
+        "--measured", tables / f"ur10_tmac/{series}_tmac.csv",
         "--mount", "to-hand", "--method", method,
     )  # fmt: skip
     assert document["rejected"] == []
@@ -256,7 +262,7 @@ def test_a_tracked_target_from_every_start(
 @pytest.mark.parametrize(("series", "limit_mm"), hand_eye_sets.TMAC_MM.items())
 def test_a_start_that_failed_does_not_matter(data_dir: Path, series: str, limit_mm: float) -> None:
     """Tsai's method on series B, with X and Z exchanged, is off by 2.9 mm."""
-    pairs = hand_eye_sets.tmac_pairs(series)
+    pairs = tmac_pairs(series, data_dir / "ur10_tmac")
     start = hand_eye_sets.turned_tsai(pairs)
     assert start is not None
     if series == "B":
@@ -268,7 +274,12 @@ def test_a_start_that_failed_does_not_matter(data_dir: Path, series: str, limit_
 
 @pytest.mark.data
 def test_real_images_fit_better_than_any_closed_form(tables: Path, data_dir: Path, robocal) -> None:
-    images = ("--poses", tables / "board_poses.csv", "--images", data_dir / "camera_hand_eye")
+    images = (
+        "--poses",
+        tables / "camera_hand_eye/poses.csv",
+        "--images",
+        data_dir / "camera_hand_eye",
+    )
     document = robocal(*images, *BOARD)
     assert len(document["rejected"]) <= 1
     assert document["residual_mm"]["rms"] <= hand_eye_sets.BOARD_RMS_MM
@@ -279,9 +290,8 @@ def test_real_images_fit_better_than_any_closed_form(tables: Path, data_dir: Pat
 
 @pytest.mark.data
 def test_real_streams_and_their_offset(tables: Path, robocal) -> None:
-    document = robocal(
-        "--poses", tables / "arm_poses.csv", "--measured", tables / "arm_measured.csv"
-    )
+    folder = tables / "eth_hand_eye"
+    document = robocal("--poses", folder / "arm.csv", "--measured", folder / "board.csv")
     assert document["residual_mm"]["rms"] <= hand_eye_sets.ARM_RMS_MM
     assert abs(document["time_offset_s"]) < 0.04  # one image
     assert len(document["rejected"]) < 0.05 * 1703

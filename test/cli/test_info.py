@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``robocal info``: each kind of file is known, and the commands that it names take it."""
 
-import argparse
 import json
 import shlex
 from contextlib import redirect_stdout, suppress
@@ -9,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
-from command import ROOT, robocal, robocal_json
+from command import ROOT, robocal, robocal_json, takes
 from histories import BY
 from history_workers import proposal
 from recordings import plain_bag, shift
@@ -33,20 +32,6 @@ FILES = {
     str(ROOT / "config" / "cells" / "kr150_laser.yaml"): ("laser file", "serial: SIM-KR150"),
     str(ROOT / "config" / "thermal_node.yaml"): ("parameter file", "/**/thermal_node"),
 }
-
-
-def takes(command: str) -> None:
-    """Fail unless the command line is one: words in capitals stand for files and names."""
-    words = shlex.split(command)
-    if words[0] == "robocal":
-        parser = main.CommandParser(prog="robocal")
-        numbers = {"UP": "400", "DOWN": "360", "RADIUS": "20"}
-        arguments = [numbers.get(word, word) for word in words[1:]]
-        named = [word for word in arguments if not word.startswith("-")]
-        main._declare(parser, "command", main.COMMANDS, named)
-        assert isinstance(parser.parse_args(arguments), argparse.Namespace)
-    else:
-        assert words[:3] in (["ros2", "launch", "robocal_ros"], ["ros2", "run", "robocal_ros"])
 
 
 @pytest.mark.parametrize("file", FILES)

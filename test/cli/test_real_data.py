@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from long_form import more
 
-from bench import ur10_campaigns
 from robocal_ros.cli.main import main
 
 pytestmark = pytest.mark.data
@@ -27,7 +26,9 @@ CARRIED_OVER_MM = 0.145
 @pytest.fixture(scope="module")
 def campaigns(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ur10")
-    assert ur10_campaigns.main(["--out", str(folder), "--series", "A", *SERIES]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROBOCAL_DATA", str(data_dir))
+        assert main(["data", "ur10_tmac", "--out", str(folder), "--part", "A", *SERIES]) == 0
     return folder
 
 

@@ -373,6 +373,7 @@ CASES = {
         ["plc", "user", "made.yaml", "eve", "--remove"],
         (2, "BAD_INPUT"),
     ),
+    "data": ("data.json", ["data"], ["data", "ur10_tmak"], (2, "BAD_INPUT")),
     "warm": ("warm.json", ["warm"], ["warm", "ur10"], (2, "BAD_INPUT")),
 }
 

@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 from command import ROOT, robocal
 
-from bench import ur10_campaigns
-
 pytestmark = pytest.mark.data
 
-ROBOCAL, SCRIPT = ".venv/bin/robocal ", ".venv/bin/python bench/ur10_campaigns.py "
+ROBOCAL = ".venv/bin/robocal "
 # Commands, and what they print.
 STEP = re.compile(r"```bash\n(.*?)```\n\n((?:    [^\n]*\n)*)", re.DOTALL)
 
@@ -26,9 +24,8 @@ def steps(section: str) -> list[tuple[list[str], list[str]]]:
 
 @pytest.mark.parametrize("section", ["A robot's model", "A line laser"])
 def test_a_tutorial_runs_as_typed_and_shows_what_comes(
-    section: str, data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    section: str, data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("out").mkdir()
     found = steps(section)
@@ -36,13 +33,8 @@ def test_a_tutorial_runs_as_typed_and_shows_what_comes(
     for typed, shown in found:
         printed = ""
         for line in typed:
-            line = line.replace("$ROBOCAL_DATA", str(data_dir))
-            if line.startswith(SCRIPT):
-                assert ur10_campaigns.main(shlex.split(line.removeprefix(SCRIPT))) == 0
-                printed += capsys.readouterr().out
-                continue
             words, _, file = line.removeprefix(ROBOCAL).partition(" > ")
-            done = robocal(*shlex.split(words))
+            done = robocal(*shlex.split(words), ROBOCAL_DATA=str(data_dir))
             assert done.returncode == 0, (words, done.stderr)
             printed += done.stdout
             if file:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from long_form import amount, more
 
-from bench.ur10_campaigns import halves, load_campaign
+from robocal_ros.bags.ur10_campaigns import halves, load_campaign
 from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import Code

@@ -10,7 +10,7 @@ from long_form import more
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from bench.ur10_campaigns import load_campaign
+from robocal_ros.bags.ur10_campaigns import load_campaign
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.samples import Measurements

@@ -14,7 +14,7 @@ from robocal_msgs.msg import SessionEvent
 from robocal_msgs.srv import Decide, Identify
 from std_msgs.msg import String
 
-from bench import ur10_campaigns
+from robocal_ros.bags import ur10_campaigns
 from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -88,8 +88,8 @@ def with_events(bag: Path, events: list[SessionEvent], path: Path) -> Path:
 
 
 @pytest.mark.parametrize("series", ["D", *more("B")])
-def test_live_equals_replay(graph, tmp_path: Path, series: str) -> None:
-    arm, data = load_robot("ur10"), ur10_campaigns.load_campaign(series)
+def test_live_equals_replay(graph, data_dir: Path, tmp_path: Path, series: str) -> None:
+    arm, data = load_robot("ur10"), ur10_campaigns.load_campaign(series, data_dir / "ur10_tmac")
     bag = tmp_path / f"{series}.mcap"
     ur10_campaigns.write_bag(bag, data, arm.joint_names)
     events = played(graph, bag, series, len(data))

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the real ``robocal`` in a process of its own, and check what it prints."""
 
+import argparse
 import json
 import os
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -92,3 +94,19 @@ def robocal_json(schema: str, *arguments: object, status: int = 0, **variables: 
         conforms(document, "error.json")
         assert "Traceback" not in done.stderr
     return document
+
+
+def takes(command: str) -> None:
+    """Fail unless the command line is one: words in capitals stand for files and names."""
+    from robocal_ros.cli import main
+
+    words = shlex.split(command)
+    if words[0] == "robocal":
+        parser = main.CommandParser(prog="robocal")
+        numbers = {"UP": "400", "DOWN": "360", "RADIUS": "20"}
+        arguments = [numbers.get(word, word) for word in words[1:]]
+        named = [word for word in arguments if not word.startswith("-")]
+        main._declare(parser, "command", main.COMMANDS, named)
+        assert isinstance(parser.parse_args(arguments), argparse.Namespace)
+    else:
+        assert words[:3] in (["ros2", "launch", "robocal_ros"], ["ros2", "run", "robocal_ros"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench import ur10_campaigns
+from robocal_ros.bags import ur10_campaigns
 from robocal_ros.bags.bags import bag_info, read_bag
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements, StandstillRule, joint_sample, pose_sample
@@ -39,8 +39,10 @@ def test_orientations_turn_as_the_arm_turns(data_dir: Path) -> None:
 
 
 @pytest.mark.data
-def test_table_and_bag_say_the_same(campaign: Measurements, tmp_path: Path) -> None:
-    assert ur10_campaigns.main(["--out", str(tmp_path), "--series", "D"]) == 0
+def test_table_and_bag_say_the_same(campaign: Measurements, data_dir: Path, tmp_path: Path) -> None:
+    words, files = ur10_campaigns.convert_campaign("D", data_dir / "ur10_tmac", tmp_path)
+    assert words.startswith("632 poses (")
+    assert {path.name for path in files} == {path.name for path in tmp_path.iterdir()}
     arm = load_robot("ur10")
     table = read_measurements(tmp_path / "D.csv", arm)
     assert len(table) == 632
@@ -94,8 +96,30 @@ def test_series_a_is_put_in_order_of_its_clock(data_dir: Path) -> None:
     assert data.stamp_ns[0] == 1594744744_000_000_000  # 2020-07-14 16:39:04
 
 
-def test_absent_data_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROBOCAL_DATA", str(tmp_path))
-    with pytest.raises(InputError, match="ROBOCAL_DATA"):
-        ur10_campaigns.load_campaign("A")
-    assert ur10_campaigns.main(["--out", str(tmp_path / "out"), "--series", "A"]) == 2
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("wrong", "place", "words"),
+    [
+        ("no day", ("Timestamp", 3), "'no day' is no time such as 20200714163904"),
+        ("1,2,3", ("measurement_x", 2), "'1.2.3' is not a number"),
+        (None, ("", 4), "cells, but the header has"),
+    ],
+)
+def test_a_damaged_file_is_told_with_its_place(
+    data_dir: Path, tmp_path: Path, wrong: str | None, place: tuple[str, int], words: str
+) -> None:
+    path = Path("Series_A") / ur10_campaigns.SERIES["A"]
+    lines = (data_dir / "ur10_tmac" / path).read_text(encoding="utf-8-sig").splitlines()[:6]
+    column, row = place
+    cells = lines[row - 1].split(";")
+    cells = cells[:9] if wrong is None else cells
+    if wrong is not None:
+        cells[lines[0].split(";").index(column)] = wrong
+    lines[row - 1] = ";".join(cells)
+    (tmp_path / "Series_A").mkdir()
+    (tmp_path / path).write_text("\n".join(lines))
+    with pytest.raises(InputError, match=words) as told:
+        ur10_campaigns.convert_campaign("A", tmp_path, tmp_path / "out")
+    assert (told.value.file, told.value.row) == (str(tmp_path / path), row)
+    assert told.value.column == (column or None)
+    assert not (tmp_path / "out").exists()

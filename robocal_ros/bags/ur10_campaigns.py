@@ -1,22 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real measurements as tables and bags: a UR10 with a Leica tracker and T-Mac, four campaigns.
+"""A published UR10 before a Leica tracker with T-Mac, four campaigns, as tables and bags.
 
-Data: Landgraf, Ernst, Schleth, Fabritius, Huber, IEEE CASE 2021 (MIT licence), in the folder
-``ur10_tmac`` below $ROBOCAL_DATA. Writes for each series, say A:
+Data: Landgraf, Ernst, Schleth, Fabritius, Huber, IEEE CASE 2021 (MIT licence). `convert_campaign`
+writes for a series, say A:
 
 - ``A.csv`` for ``robocal identify``, and the same rows in two halves, ``A_train.csv`` and
   ``A_check.csv``; rows with equal joint targets are in the same half;
 - ``A.mcap`` for ``robocal replay`` and the live nodes: ``joint_states`` around each measurement,
   so that the robot is seen at standstill, and ``measured_pose``.
-
-    python bench/ur10_campaigns.py --out DIR [--series A B C D]
 """
 
-import argparse
-import csv
-import os
-import sys
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -28,10 +21,10 @@ from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.kinematics.tables import write_measurements
+from robocal_ros.kinematics.tables import Cells, read_published, write_measurements
 
 SERIES = {
     "A": "measurements_grid.csv",
@@ -48,59 +41,51 @@ MADE_START = {
 }
 MADE_STEP_NS = 30_000_000_000
 AROUND_NS = tuple(int(offset * 1e6) for offset in (-400, -200, 0, 200, 400))
+MEASURED = tuple(f"measurement_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
 FRAME, TARGET = "tracker", "tmac"
 SPLIT_SEED = 0
 
 
-def data_folder() -> Path:
-    """Folder of the campaigns."""
-    root = Path(__file__).resolve().parent.parent
-    return Path(os.environ.get("ROBOCAL_DATA", root.parent / "shared" / "data")) / "ur10_tmac"
-
-
-def load_campaign(series: str, folder: Path | None = None) -> Measurements:
+def load_campaign(series: str, folder: Path) -> Measurements:
     """Read a series in order of time: joint targets and poses of the T-Mac in the tracker frame.
 
-    Orientation is intrinsic XYZ in degrees. A sample's id is the series and its row in the file
-    (the header is row 1). The tracker's own scatter is not passed on as ``sigma``: the robot's
-    repeatability is several times larger.
+    ``folder`` holds ``Series_A`` and its like, as they are published. Orientation is intrinsic XYZ
+    in degrees. A sample's id is the series and its row in the file (the header is row 1). The
+    tracker's own scatter is not passed on as ``sigma``: the robot's repeatability is several times
+    larger.
 
-    Raises
-    ------
-    InputError
-        When the file is not there.
+    Raises `InputError` when the file is not there, or is not the published one.
     """
-    path = (folder or data_folder()) / f"Series_{series}" / SERIES[series]
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = list(csv.DictReader(stream, delimiter=";"))
-    except OSError as error:
-        raise InputError(
-            "these measurements are not here; set ROBOCAL_DATA to the folder that holds ur10_tmac",
-            file=str(path),
-        ) from error
+    path = folder / f"Series_{series}" / SERIES[series]
     joints = load_robot("ur10").joint_names
-    columns = [*joints, *(f"measurement_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))]
-    values = np.array([[float(row[name].replace(",", ".")) for name in columns] for row in rows])
-    stamps = _stamps(series, [row["Timestamp"] for row in rows])
+    columns = [*joints, *MEASURED]
+    table = read_published(path, ["Timestamp", *columns], ";")
+    values = np.stack([table.numbers(name) for name in columns], axis=1)
+    stamps = _stamps(series, table)
     data = Measurements(
         q=values[:, :6],
         position=values[:, 6:9] * 1e-3,
         rotation=Rotation.from_euler("XYZ", values[:, 9:], degrees=True).as_matrix(),
-        target=(TARGET,) * len(rows),
-        sample=tuple(f"{series}{row}" for row in range(2, len(rows) + 2)),
+        target=(TARGET,) * len(values),
+        sample=tuple(f"{series}{row}" for row in table.rows),
         stamp_ns=stamps,
     )
     return data.take(np.argsort(stamps))
 
 
-def _stamps(series: str, texts: Sequence[str]) -> NDArray[np.int64]:
+def _stamps(series: str, table: Cells) -> NDArray[np.int64]:
     """Nanoseconds of each row; series A's clock is taken as UTC and its file is not in order."""
     if series in MADE_START:
         start_ns = int(MADE_START[series].timestamp()) * 1_000_000_000
-        return start_ns + MADE_STEP_NS * np.arange(len(texts), dtype=np.int64)
-    times = [datetime.strptime(text, "%Y%m%d%H%M%S").replace(tzinfo=UTC) for text in texts]
-    return np.array([int(time.timestamp()) * 1_000_000_000 for time in times], dtype=np.int64)
+        return start_ns + MADE_STEP_NS * np.arange(len(table.rows), dtype=np.int64)
+    stamps = []
+    for index, text in enumerate(table.words("Timestamp")):
+        try:
+            time = datetime.strptime(text, "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+        except ValueError:
+            table.fail(f"{quoted(text)} is no time such as 20200714163904", index, "Timestamp")
+        stamps.append(int(time.timestamp()) * 1_000_000_000)
+    return np.array(stamps, dtype=np.int64)
 
 
 def halves(data: Measurements) -> tuple[Measurements, Measurements]:
@@ -140,28 +125,19 @@ def _pose(stamp_ns: int, xyz: list[float], quat: list[float]) -> dict[str, objec
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write tables and bags of the chosen series."""
-    parser = argparse.ArgumentParser(description="UR10 and T-Mac campaigns as tables and bags")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write to")
-    parser.add_argument("--series", nargs="+", choices=list(SERIES), default=list(SERIES))
-    options = parser.parse_args(arguments)
-    arm = load_robot("ur10")
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        for series in options.series:
-            data = load_campaign(series)
-            train, check = halves(data)
-            write_measurements(options.out / f"{series}.csv", data, arm)
-            write_measurements(options.out / f"{series}_train.csv", train, arm)
-            write_measurements(options.out / f"{series}_check.csv", check, arm)
-            write_bag(options.out / f"{series}.mcap", data, arm.joint_names)
-            print(f"{series}: {len(data)} poses ({len(train)} to train, {len(check)} to check)")
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+def convert_campaign(series: str, folder: Path, out: Path) -> tuple[str, list[Path]]:
+    """Write tables and bag of a series; returns how much they hold, in words, and the files.
 
-
-if __name__ == "__main__":
-    sys.exit(main())
+    Raises `InputError` as `load_campaign`, before anything is written, and when ``out`` cannot be
+    written to.
+    """
+    arm, data = load_robot("ur10"), load_campaign(series, folder)
+    train, check = halves(data)
+    out.mkdir(parents=True, exist_ok=True)
+    tables = {"": data, "_train": train, "_check": check}
+    files = [out / f"{series}{part}.csv" for part in tables]
+    for path, rows in zip(files, tables.values(), strict=True):
+        write_measurements(path, rows, arm)
+    bag = out / f"{series}.mcap"
+    write_bag(bag, data, arm.joint_names)
+    return f"{len(data)} poses ({len(train)} to train, {len(check)} to check)", [*files, bag]
