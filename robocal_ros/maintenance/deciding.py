@@ -45,10 +45,10 @@ from robocal_ros.session.events import (
 from robocal_ros.thermal.reference import commissioned_of
 from robocal_ros.tool.judging import KnownTool, change_between
 from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.run import SAME
 
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
-SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser
 MOST_AT_ONCE = 2  # of a kind: each takes up to 20 ms, in which nobody watches the robot
 LOOKED_AT = 200  # newest decisions that a call without an id may mean
 REPEAT_NS = 60 * 1_000_000_000  # a call without an id is repeated within

@@ -56,6 +56,7 @@ from robocal_ros.tool.files import (
 )
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
 from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
+from robocal_ros.tool.run import alike
 from robocal_ros.tool.station import measurement_of, station_shift, station_trend
 from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
 
@@ -453,8 +454,8 @@ def run_station(args: argparse.Namespace) -> CliResult:
         path = str(history.path)
     if not entries:
         raise InputError("no laser frame was measured: mode LASER_FRAME of tcf_node", file=path)
-    of = [(model["made_with"], model["mandrel"]) for model in models]
-    kept = [(e, m) for e, m, own in zip(entries, models, of, strict=True) if own == of[-1]]
+    of = [[model["made_with"], model["mandrel"]] for model in models]
+    kept = [(e, m) for e, m, own in zip(entries, models, of, strict=True) if alike(own, of[-1])]
     first = measurement_of(kept[0][1])
     later = [(entry, measurement_of(model)) for entry, model in kept[1:]]
     shifts = [station_shift(first, found) for _, found in later]

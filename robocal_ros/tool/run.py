@@ -438,6 +438,21 @@ def made_with(config: ToolConfig) -> dict[str, Any]:
     return {name: json.loads(json.dumps(value)) for name, value in document.items()}
 
 
+# m, and of unit vectors: a file in millimetres changes the last digit of what it is given.
+SAME = 1e-6
+
+
+def alike(one: object, other: object) -> bool:
+    """Whether two `made_with`, or parts of them, are the same but for rounding."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(alike(one[name], other[name]) for name in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, int | float) and isinstance(other, int | float):
+        return abs(one - other) <= SAME
+    return one == other
+
+
 PLANNING = Held(along_m=5e-3)  # before any plunge the tip is taken where it was taught
 BEFORE_NS = AFTER_NS = 1_000_000_000  # joint readings kept about the edges of a step
 

@@ -75,6 +75,7 @@ from robocal_ros.tool.run import (
     RunTraits,
     ToolConfig,
     ToolRun,
+    alike,
     made_with,
 )
 from robocal_ros.tool.station import (
@@ -144,22 +145,22 @@ class ToolInForce(HistoryFollower):
     def measured_mandrel(self) -> KnownTool | None:
         """How the mandrel was measured; None without, or with another one or another station."""
         model = self.mandrel.model
-        if model is None or model["made_with"] != self._made_with:
+        if model is None or not alike(model["made_with"], self._made_with):
             return None
-        return KnownTool.of_document(model) if model["mandrel"] == self._mandrel else None
+        return KnownTool.of_document(model) if alike(model["mandrel"], self._mandrel) else None
 
     @property
     def commissioned_station(self) -> StationMeasurement | None:
         """The first measurement of the beams with this mandrel and laser file; None before it."""
         model = self.station.model
-        if model is None or model["made_with"] != self._made_with:
+        if model is None or not alike(model["made_with"], self._made_with):
             return None
-        return measurement_of(model["first"]) if model["mandrel"] == self._mandrel else None
+        return measurement_of(model["first"]) if alike(model["mandrel"], self._mandrel) else None
 
     @property
     def _healthy_model(self) -> dict[str, Any] | None:
         model = self.healthy.model
-        return None if model is None or model["made_with"] != self._made_with else model
+        return model if model and alike(model["made_with"], self._made_with) else None
 
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"

@@ -24,7 +24,8 @@ from robocal_ros.session.events import (
 )
 from robocal_ros.tool.edges import BeamEdge, EdgeSample
 from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.run import ToolConfig, rows_of
+from robocal_ros.tool.laser_frame import LaserFile, read_laser, write_laser
+from robocal_ros.tool.run import SAME, ToolConfig, rows_of
 from robocal_ros.tool.session import ToolSession
 
 
@@ -308,6 +309,21 @@ def test_a_reference_of_another_tool_counts_for_nothing(history):
     found = KnownTool.of_document(history.model(outcome.calibration_id))
     away = found.T_flange_tool[:3, 3] - second[:3, 3]
     assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3
+
+
+def test_the_healthy_tool_counts_after_its_beams_went_through_a_file(history, tmp_path):
+    """In millimetres their last digits are others; beams that were placed anew are other beams."""
+    driver = driver_of(history, TAUGHT)
+    assert driver.measure("reference").done
+    laser, path = driver.session.config.laser, tmp_path / "laser.yaml"
+    write_laser(path, LaserFile(laser, "station", "robot", "hash"))
+    points = read_laser(path).laser.points
+    assert not np.array_equal(points, laser.points)
+    again = driver_of(history, TAUGHT, points_m=rows_of(points))
+    assert again.session.current.measured_healthy is not None
+    assert again.measure().document["absolute"] is False
+    other = driver_of(history, TAUGHT, points_m=rows_of(points + 2.0 * SAME))
+    assert other.session.current.measured_healthy is None
 
 
 def test_a_bent_tool_is_no_healthy_one(history):
