@@ -28,7 +28,13 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse
-from robocal_ros.tool.circle import CircleMethod, CircleMotion, CommandedCircle, fit_circle
+from robocal_ros.tool.circle import (
+    CircleMethod,
+    CircleMotion,
+    CommandedCircle,
+    classic_tool,
+    fit_circle,
+)
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
 from robocal_ros.tool.edges import BeamEdge, EdgeSample, StepKind
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, axis_from_centres, upright_pose
@@ -153,6 +159,14 @@ class MeasuredRun:
         return estimate_tool(
             cell.laser, self.path, self.steps, self.taught, noise=cell.robot, held=held
         )
+
+    def classic(self) -> Array:
+        """T_flange_tool (4, 4) as the source finds it."""
+        edges = [np.array([e.time_s for e in step.edges]) for step in self.steps[3:]]
+        plunge = np.concatenate([self.path.at(t)[0][:, :3, 3] for t in edges])
+        R = self.commanded(2).T_base_centre[:3, :3]
+        circles = self.commanded(0), self.commanded(1)
+        return classic_tool(self.cell.laser, circles, R, plunge, self.taught)
 
     def commanded(self, i: int) -> CommandedCircle:
         """Circle ``i`` as commanded."""
