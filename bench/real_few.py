@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.real_data import PLAN_DRAWS, PLANNED
+from bench.real_data import PLAN_DRAWS, PLANNED, campaign, data_folder
 from bench.tables import Goal, Table
-from bench.ur10_campaigns import data_folder, halves, load_campaign
+from robocal_ros.bags.ur10_campaigns import halves
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import Identification, identify
@@ -35,7 +35,7 @@ def harm_table() -> Table:
         "ratio is 1.",
     )
     arm = load_robot("ur10")
-    split = {series: halves(load_campaign(series)) for series in "ABCD"}
+    split = {series: halves(campaign(series)) for series in "ABCD"}
     ratios, counts, refused = [], [], Counter[str]()
     for seed in range(SUBSETS):
         rng = np.random.default_rng(seed)
@@ -77,7 +77,7 @@ def known_geometry_table() -> Table:
         ("poses", "draws", "mean, mm", "goal", "worst of the draws, mm"),
         "Nominal is here the geometric model of the half that identifies; the other half judges.",
     )
-    train, check = halves(load_campaign("C"))
+    train, check = halves(campaign("C"))
     arm = identify(load_robot("ur10"), train).cell.arm
     for count in PLANNED:
         means = []

@@ -20,9 +20,8 @@ from bench.measured_runs import (
     ToolCell,
     point_sigma,
 )
-from bench.real_data import own_half
+from bench.real_data import data_folder, own_half
 from bench.tables import Table
-from bench.ur10_campaigns import data_folder
 from robocal_ros.cell_sim.beams import (
     CYLINDER_M,
     BeamStation,
