@@ -181,7 +181,7 @@ def experiment(
 
 def erring_table() -> Table | None:
     """The source's figure under its conditions; None where the measurements are not here."""
-    if not data_folder().is_dir():
+    if not (data_folder() / "ur10_tmac").is_dir():
         print(f"no real measurements at {data_folder()}: the erring UR10 is left out")
         return None
     table = Table(
