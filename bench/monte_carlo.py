@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.parallel_axes import notation_table
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects, Warmth
@@ -275,4 +276,4 @@ def _unmodelled(effects: Effects, poses: int) -> Array:
 
 def tables() -> Sequence[Table]:
     """All tables of this module."""
-    return [efficiency_table(), sigma_table(), unmodelled_table()]
+    return [efficiency_table(), sigma_table(), unmodelled_table(), notation_table()]
