@@ -62,6 +62,7 @@ class TrackerCell:
         ``lean_rad`` turns the cube about that edge.
     sensor : that of the source, without the form of real ones: its method has no model of it.
     around : whatever else the sensor may see.
+    true : the arm as it is; None: as it is told, by elementary motions.
     """
 
     arm: SerialArm
@@ -75,12 +76,17 @@ class TrackerCell:
     edge_rad: float = float(np.radians(40.0))
     lean_rad: float = float(np.radians(7.0))
     around: tuple[ScannedBody, ...] = ()
+    true: SerialArm | None = None
+
+    def flange(self, q: Array) -> Array:
+        """True T_base_flange (m, 4, 4) at joint values (m, dof)."""
+        return true_flange(self.arm, q) if self.true is None else self.true.fk(q)
 
     @property
     def T_base_view(self) -> Array:
         """Pose (4, 4) in which the sensor stands in the middle of its scan."""
         q = self.scan.mean(axis=0, keepdims=True)
-        return np.asarray(true_flange(self.arm, q)[0] @ self.T_flange_sensor)
+        return np.asarray(self.flange(q)[0] @ self.T_flange_sensor)
 
     @cached_property
     def T_base_cube(self) -> Array:
@@ -111,14 +117,14 @@ class TrackerCell:
         """Everything without noise."""
         still = replace(self.sensor, noise_m=0.0)
         rng = np.random.default_rng(0)
-        T = true_flange(self.arm, self.scan) @ self.T_flange_sensor
+        T = self.flange(self.scan) @ self.T_flange_sensor
         shots = [still.shoot(pose, self.scene, rng) for pose in T]
         lit = [i for i, xz in enumerate(shots) if np.sum(np.isfinite(xz[:, 0])) >= FEWEST_LIT]
         names = ("arc_a", "arc_b")
         arcs = [
             Arc(name, q, self._seen(T_flange[:, :3, :3] @ self.reflector + T_flange[:, :3, 3]))
             for name, q in zip(names, self.arcs, strict=True)
-            for T_flange in [true_flange(self.arm, q)]
+            for T_flange in [self.flange(q)]
         ]
         # Centres (9, 3) of the reflector while it touches the face z = 0, and y = 0; base.
         a, b = (0.5 * CUBE_M + grid.ravel() for grid in np.meshgrid(GRID, GRID))
