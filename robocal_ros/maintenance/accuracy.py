@@ -94,9 +94,8 @@ class MaintenanceConfig:
     # and never
     check_every_s: float = 0.0
     full_every_s: float = 0.0
-    laser_frame_every_s: float = (
-        0.0  # the beams' own place is found again, with a mandrel; 0: never
-    )
+    # the beams' own place is found again, with a mandrel; 0: never
+    laser_frame_every_s: float = 0.0
     # tool_due_s, tool_expires_s: age of a tool check at which it is due, and says nothing any more
     tool_due_s: float = 2.0 * 3600.0
     tool_expires_s: float = 8.0 * 3600.0

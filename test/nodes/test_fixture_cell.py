@@ -113,10 +113,10 @@ class FixtureCell:
         answer = self.graph.call(Trigger, f"/fixture_node/{name}_trigger")
         return answer.success, answer.message
 
-    def page(self, decided: frozenset[int] = frozenset()) -> PanelState:
-        """What panel_node makes of what was said last."""
+    def page(self, decided: int = 0) -> PanelState:
+        """What panel_node makes of what was said last, with all up to a result decided."""
         panel = PanelState()
-        panel.decided = decided
+        panel.newest = decided
         said = {STATUS: self.status, ACCURACY: self.states[-1], FIXTURE: self.verdicts[-1]}
         for stamp in (1, 2):
             for source, message in said.items():
@@ -152,7 +152,7 @@ def test_a_fixture_that_moved_is_told_in_one_gap_and_corrected(cell: FixtureCell
     )
     assert decided.success, decided.message
     cell.graph.spin_until(lambda: len(cell.frames) == 2, "the new frame")
-    assert "ACCEPT/fixture" not in [task.key for task in cell.page(frozenset({number})).tasks(0.0)]
+    assert "ACCEPT/fixture" not in [task.key for task in cell.page(number).tasks(0.0)]
     before, after = (
         frames.transform_from_quat(
             np.array([p.position.x, p.position.y, p.position.z]),
