@@ -11,7 +11,7 @@ from session_events import EventLog
 from robocal_ros import __version__
 from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
 from robocal_ros.ground.samples import JOINTS
-from robocal_ros.hand_eye.data import IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
+from robocal_ros.hand_eye.data import COMPRESSED, IMAGE, PROFILE, TARGET_POSE, TRACKER_POINT
 from robocal_ros.hand_eye.session import (
     HandEyeConfig,
     HandEyeSession,
@@ -25,7 +25,8 @@ from robocal_ros.session.events import Command, Outcome
 
 EVENTS = "/hand_eye_node/session_events"
 SERIAL, BY = "SIM-UR10-1", "cell controller"
-TOPICS = {kind: f"/{kind}" for kind in (JOINTS, PROFILE, TARGET_POSE, IMAGE, TRACKER_POINT)}
+INPUTS = (JOINTS, PROFILE, TARGET_POSE, IMAGE, COMPRESSED, TRACKER_POINT)
+TOPICS = {kind: f"/{kind}" for kind in INPUTS}
 KINDS = {topic: kind for kind, topic in TOPICS.items()}
 
 Asked = tuple[int, Command]

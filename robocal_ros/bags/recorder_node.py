@@ -43,6 +43,7 @@ TOPICS = (
     "profile",
     "target_pose",
     "tracker_point",
+    "camera_info",
     "fixture_point",
     "gap_open",
     "motion_lease",

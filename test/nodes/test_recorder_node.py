@@ -42,7 +42,7 @@ from robocal_ros.tool.node import TcfNode
 NODE = "recorder_node"
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 TEXT, ALL = "std_msgs/msg/String", 10**9
-LEFT_OUT = {"/image"}  # large
+LEFT_OUT = {"/image", "/image/compressed"}  # large
 WIRED = {"/kinematic_model": "/thermal_node/model", "/tool": "/tcf_node/tool"}
 MOTION = {  # by what moves a robot
     "trajectory_msgs/msg/JointTrajectory",
