@@ -75,6 +75,19 @@ class PoseRobot:
         return Standstill(T_base_flange, reported)
 
 
+def reached(arm: SerialArm, q_near: Array, T_base_flange: Array) -> Array:
+    """Joints (n,) of a pose, by way of poses between: inverse kinematics begin near each."""
+    start = arm.fk(q_near)
+    turned = frames.log_rotation(start[:3, :3].T @ T_base_flange[:3, :3])
+    moved = T_base_flange[:3, 3] - start[:3, 3]
+    far = max(float(np.linalg.norm(moved)) / WAY_M, float(np.linalg.norm(turned)) / WAY_RAD)
+    share = np.linspace(0.0, 1.0, int(far) + 2)[:, None]
+    way = frames.transform(
+        start[:3, :3] @ frames.exp_rotation(share * turned), start[:3, 3] + share * moved
+    )
+    return np.asarray(inverse(arm, way, q_near)[-1])
+
+
 @dataclass(frozen=True, eq=False)
 class ArmRobot:
     """A robot with joints; its poses are reported by the nominal model of the true one.
@@ -95,16 +108,7 @@ class ArmRobot:
     def stand(self, T_base_flange: Array, rng: np.random.Generator) -> Standstill:
         """See `Robot`."""
         cold = Warmth.cold(self.nominal.n)
-        # By way of poses between: inverse kinematics begin near each.
-        start = self.nominal.fk(self.q_near)
-        turned = frames.log_rotation(start[:3, :3].T @ T_base_flange[:3, :3])
-        moved = T_base_flange[:3, 3] - start[:3, 3]
-        far = max(float(np.linalg.norm(moved)) / WAY_M, float(np.linalg.norm(turned)) / WAY_RAD)
-        share = np.linspace(0.0, 1.0, int(far) + 2)[:, None]
-        way = frames.transform(
-            start[:3, :3] @ frames.exp_rotation(share * turned), start[:3, 3] + share * moved
-        )
-        q = inverse(self.nominal, way, self.q_near)[-1]
+        q = reached(self.nominal, self.q_near, T_base_flange)
         there = self.true.flange(q, cold)[0]
         wanted = self.nominal.fk(q) @ frames.invert(there) @ T_base_flange
         q = inverse(self.nominal, wanted[None], q)[0]

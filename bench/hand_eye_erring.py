@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.hand_eye_cell import WAY_M, WAY_RAD, HandEyeCell, Standstill
+from bench.hand_eye_cell import HandEyeCell, Standstill, reached
 from bench.hand_eye_tracker import largest_of_three
 from bench.hand_eye_worlds import sphere_set
 from bench.laser_tracker import TrackerCell, prp_cell, six_axis_cell
@@ -24,7 +24,6 @@ from robocal_ros.hand_eye.result import Method
 from robocal_ros.hand_eye.tracker import solve_best
 from robocal_ros.hand_eye.tracker_scan import solve_classic
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import inverse
 from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -49,15 +48,7 @@ class ErringArm:
 
     def stand(self, T_base_flange: Array, rng: np.random.Generator) -> Standstill:
         """See `bench.hand_eye_cell.Robot`."""
-        start = self.nominal.fk(self.q_near)
-        turned = frames.log_rotation(start[:3, :3].T @ T_base_flange[:3, :3])
-        moved = T_base_flange[:3, 3] - start[:3, 3]
-        far = max(float(np.linalg.norm(moved)) / WAY_M, float(np.linalg.norm(turned)) / WAY_RAD)
-        share = np.linspace(0.0, 1.0, int(far) + 2)[:, None]
-        way = frames.transform(
-            start[:3, :3] @ frames.exp_rotation(share * turned), start[:3, 3] + share * moved
-        )
-        q = inverse(self.nominal, way, self.q_near)[-1]
+        q = reached(self.nominal, self.q_near, T_base_flange)
         missed = q + self.joint_rad * rng.standard_normal(len(q))
         return Standstill(self.true.fk(missed), self.nominal.fk(q), q)
 

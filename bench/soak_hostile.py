@@ -6,7 +6,6 @@ docs/figures/soak_hostile.md too. Robot, thermal_node, maintenance_node, bridge 
 processes, all of it simulated; one PLC and one engineer have good sessions meanwhile.
 """
 
-import argparse
 import os
 import random
 import tempfile
@@ -25,7 +24,8 @@ from bench import hostile
 from bench.live.graph import CellController
 from bench.live.opc_ua import ENGINEER, PlcClient, free_port, security_folder
 from bench.processes import resident_mb
-from bench.tables import PAGES, Goal, Table, about, show
+from bench.soaking import soak_main
+from bench.tables import Goal, Table
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS
 
@@ -219,19 +219,7 @@ def _table(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run it; 1 when a goal is missed."""
-    parser = argparse.ArgumentParser(prog="python -m bench.soak_hostile", description=__doc__)
-    parser.add_argument("--requests", type=int, default=REQUESTS, help="how many")
-    parser.add_argument("--keep", action="store_true", help="write docs/figures too")
-    given = parser.parse_args(arguments)
-    start = time.monotonic()
-    table = soak(given.requests)
-    show([table])
-    if given.keep:
-        command = f"python -m bench.soak_hostile --requests {given.requests} --keep"
-        facts = ", ".join(f"{name} {x}" for name, x in about(time.monotonic() - start).items())
-        text = f"Made by `{command}`: {facts}.\n\n{table.markdown()}"
-        (PAGES / f"{table.name}.md").write_text(text, encoding="utf-8")
-    return 0 if table.met else 1
+    return soak_main("soak_hostile", soak, __doc__, arguments, "requests", REQUESTS)
 
 
 if __name__ == "__main__":

@@ -57,7 +57,6 @@ class PlcClient:
         self.folder, self.port, self.user, self.name = folder, port, user, name
         self.beating, self.is_open, self.stamped = False, True, False
         self.written: list[int] = []
-        self.refused: list[str] = []
         self.called_s: list[float] = []  # that each call of a method took to its answer
         self._beat = 0
         self._came = asyncio.Event()
@@ -177,7 +176,7 @@ class PlcClient:
                 await self.write("Gap.Heartbeat", ua.Variant(echo, ua.VariantType.UInt32), at)
                 self.written.append(echo)
             except Exception as error:
-                self.refused.append(type(error).__name__)
+                logging.getLogger(__name__).info("heartbeat: %r", error)  # written again
 
     def close(self) -> None:
         """Leave."""

@@ -34,6 +34,7 @@ from robocal_ros.ros.parameters import Setting, number
 NONE, CLOUD, SCAN, TF = "none", "cloud", "scan", "tf"
 TOPICS = {UR_IO: "io_states", GPIO: "gpio_states"}
 EVENTS, PROFILE, TARGET_POSE = "beam_events", "profile", "target_pose"
+MOST_CAMERAS = 10  # frames that are remembered: anybody may write on /tf
 LATE_PERIODS = 10.0  # a driver that is silent for so many has stopped
 
 SETTINGS = (
@@ -238,6 +239,8 @@ class AdapterNode(HouseNode):
             if self._cameras.get(camera) == at_ns:
                 continue
             self._cameras[camera] = at_ns
+            if len(self._cameras) > MOST_CAMERAS:
+                self._cameras.pop(next(iter(self._cameras)))
             self._poses += 1
             t = found.transform.translation
             place = Point(x=t.x, y=t.y, z=t.z)

@@ -89,7 +89,7 @@ def board_shots(folder: Path) -> tuple[Array, list[Path]]:
         cells = line.strip(" []").split()
         if cells:
             rows.append(_numbers(cells, 6, "x y z (m) and a rotation vector (rad)", path, row))
-    values = np.array(rows)
+    values = _some(rows, path)
     images = [found(folder, f"image{index:02d}.bmp") for index in range(1, len(rows) + 1)]
     T = frames.transform(Rotation.from_rotvec(values[:, 3:]).as_matrix(), values[:, :3])
     return T, images
@@ -115,6 +115,12 @@ def _numbers(cells: Sequence[str], count: int, what: str, path: Path, row: int) 
     return numbers
 
 
+def _some(rows: list[list[float]], path: Path) -> Array:
+    if not rows:
+        raise InputError("holds no poses", file=str(path))
+    return np.array(rows)
+
+
 def stream_rows(which: str, folder: Path) -> tuple[NDArray[np.int64], Array]:
     """Stamps (n,), ns, and poses (n, 4, 4), m, of one side: the flange's, or T_camera_board."""
     path = found(folder, STREAM.format(which))
@@ -129,7 +135,7 @@ def stream_rows(which: str, folder: Path) -> tuple[NDArray[np.int64], Array]:
             text = f"{quoted(time)} is not seconds since 1970"
             raise InputError(text, file=str(path), row=row) from error
         rows.append(_numbers(cells, 7, "x, y, z (m) and a quaternion", path, row))
-    values = np.array(rows)
+    values = _some(rows, path)
     T = frames.transform_from_quat(values[:, :3], values[:, 3:])
     if which == CAMERA:
         T = frames.invert(T)  # the file has the camera in the target's frame

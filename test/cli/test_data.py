@@ -15,7 +15,15 @@ from robocal_ros.cli.data import SETS
 from robocal_ros.cli.main import main
 from robocal_ros.ground.errors import InputError
 from robocal_ros.hand_eye.files import read_pose_table, read_profile
-from robocal_ros.hand_eye.published import convert_laser, laser_sets
+from robocal_ros.hand_eye.published import (
+    ARM,
+    STREAM,
+    TCP_POSES,
+    convert_board,
+    convert_laser,
+    convert_streams,
+    laser_sets,
+)
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.kinematics.tables import read_measurements
 
@@ -221,6 +229,15 @@ def test_what_is_no_such_set_is_said(published, tmp_path: Path):
     write_program(place / "calib.ls", shown, tool=1)
     (place / "p1.yml").write_text(whole)
     refused(r"has no point P\[1\] with a pose of the flange")
+
+
+def test_a_table_without_poses_is_said(tmp_path: Path):
+    for name in (TCP_POSES, STREAM.format(ARM)):
+        (tmp_path / name).write_text("\n")
+    for convert in (convert_board, convert_streams):
+        with pytest.raises(InputError, match="holds no poses"):
+            convert(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.data
