@@ -232,8 +232,8 @@ def test_what_is_no_such_set_is_said(published, tmp_path: Path):
 
 
 def test_a_table_without_poses_is_said(tmp_path: Path):
-    for name in (TCP_POSES, STREAM.format(ARM)):
-        (tmp_path / name).write_text("\n")
+    (tmp_path / TCP_POSES).write_text("[ ]\n")
+    (tmp_path / STREAM.format(ARM)).write_text(",,,\n")
     for convert in (convert_board, convert_streams):
         with pytest.raises(InputError, match="holds no poses"):
             convert(tmp_path, tmp_path / "out")
