@@ -220,7 +220,7 @@ def _write(folder: Path, tables: Sequence[Table], words: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do all of it; 1 when something failed or a goal is missed."""
     parser = argparse.ArgumentParser(prog="python -m bench.soak", description=__doc__)
-    parser.add_argument("--short", action="store_true", help="minutes, to see that it works")
+    parser.add_argument("--short", action="store_true", help="fewer rounds, to see that it works")
     parser.add_argument("--keep", action="store_true", help="write docs/figures too")
     given = parser.parse_args(arguments)
     amount = SHORT if given.short else LONG
