@@ -3,6 +3,7 @@
 
 import argparse
 import math
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +27,7 @@ from robocal_ros.cli.main import (
     refusal,
     seed,
     share,
+    text,
 )
 from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
@@ -96,6 +98,10 @@ def show_identification(console: "Console", document: Document) -> None:
         _show_joints(console, document)
     _show_parameters(console, document)
     _show_doubts(console, document)
+    if number := document.get("calibration_id"):
+        accept = verdict["accept"]
+        then = f"'robocal history accept {number}' brings it into force" if accept else "refused"
+        print_words(console, f"Kept as calibration {number} of the history: {then}.")
     print_output(console, document)
 
 
@@ -238,6 +244,21 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write the identified robot file, only if the verdict accepts it; of --plan the poses",
     )
+    parser.add_argument(
+        "--keep",
+        action="store_true",
+        help="keep the model in the robot's history: 'robocal history accept' brings it into "
+        "force, for thermal_node and joint_correction_node",
+    )
+    parser.add_argument(
+        "--robot-serial",
+        type=text,
+        metavar="S",
+        help="serial of the robot as its nodes name it, for --keep",
+    )
+    parser.add_argument(
+        "--state", type=Path, metavar="DIR", help="folder of the histories, for --keep"
+    )
 
 
 def _add_judging(parser: argparse.ArgumentParser) -> None:
@@ -269,7 +290,14 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         return _planned(args)
 
     robot, warnings = describe_robot(args.robot)
-    judged, document = _identified(robot.arm, args, warnings)
+    in_force = None
+    if args.keep:
+        from robocal_ros.cli.programs import model_history
+        from robocal_ros.thermal.proposing import commissioned_in_force, keep_identified
+
+        with model_history(args, robot.arm, create=True) as history:
+            in_force = commissioned_in_force(history, robot.arm)
+    judged, data, document = _identified(robot.arm, args, warnings, in_force)
     verdict = judged.verdict
     document["output"] = None
     if args.output is not None and verdict.accept:  # a script may use it at once
@@ -287,7 +315,12 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         warnings.append(f"{args.output} is not written: the verdict is {verdict.code.name}")
     if words := contradicted(judged.identification):
         warnings.append(f"{args.data}: {words}")
-    document |= {"figures": None, "warnings": warnings}
+    document |= {"figures": None, "calibration_id": None, "warnings": warnings}
+    if args.keep:
+        with model_history(args, robot.arm) as history:
+            document["calibration_id"] = keep_identified(
+                history, robot.arm, judged, data, args.method, time.time_ns()
+            )
     result = judged.identification
     if args.figures is not None and isinstance(result, FullIdentification):
         from robocal_ros.report.figures import joint_functions_figure, svg
@@ -317,6 +350,10 @@ def _require_sense(args: argparse.Namespace) -> None:
         raise InputError("--seed chooses what is held out: leave it out beside --check")
     if "geometry" in args.check_refit:
         raise InputError("--check-refit: the geometry is what is checked; only base and tool")
+    if args.keep and (args.plan is not None or args.robot_serial is None):
+        raise InputError("--keep puts an identified model into a history: give --robot-serial")
+    if not args.keep and (args.robot_serial, args.state) != (None, None):
+        raise InputError("--robot-serial and --state name a history, for --keep")
     if args.output is not None and not args.output.parent.is_dir():
         raise InputError("no such folder for --output", file=str(args.output.parent))
 
@@ -388,9 +425,12 @@ _OTHER_SET_UP = (
 
 
 def _identified(
-    arm: SerialArm, args: argparse.Namespace, warnings: list[str]
-) -> tuple[JudgedIdentification, Document]:
-    """Identify from tables and judge, else by a share of the poses that is held out."""
+    arm: SerialArm, args: argparse.Namespace, warnings: list[str], in_force: SerialArm | None
+) -> tuple[JudgedIdentification, Measurements, Document]:
+    """Identify from tables and judge, else by a share of the poses that is held out.
+
+    Beside the judgement and its document, the measurements that were used to solve.
+    """
 
     def read(path: Path) -> Measurements:
         data = read_measurements(path, arm)
@@ -410,7 +450,14 @@ def _identified(
     refit = args.check_refit
     try:
         judged = identify_and_judge(
-            arm, train, check, fit=args.fit, method=args.method, model=args.model, check_refit=refit
+            arm,
+            train,
+            check,
+            fit=args.fit,
+            method=args.method,
+            model=args.model,
+            check_refit=refit,
+            in_force=in_force,
         )
     except TooFewSamplesError as error:
         if file is not None:
@@ -440,7 +487,7 @@ def _identified(
         "train": len(train),
         "check": len(check),
     }
-    return judged, document
+    return judged, train, document
 
 
 def _compared(train: Measurements, check: Measurements, args: argparse.Namespace) -> list[str]:

@@ -170,14 +170,16 @@ def read_model(path: Path, nominal: SerialArm) -> SerialArm:
     return arm
 
 
-def model_history(args: argparse.Namespace, nominal: SerialArm) -> CalibrationHistory:
-    """The history of ``--robot-serial``."""
+def model_history(
+    args: argparse.Namespace, nominal: SerialArm, *, create: bool = False
+) -> CalibrationHistory:
+    """The history of ``--robot-serial``; ``create``: also where the robot has none yet."""
     folder = state_folder() if args.state is None else args.state.absolute()
     return CalibrationHistory.open(
         args.robot_serial,
         model_hash=nominal.model_hash,
         state_dir=folder,
-        create=False,
+        create=create,
         owner=False,
     )
 

@@ -17,9 +17,13 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import FRAME_SHIFT, REFERENCE, THERMAL, Proposal
 from robocal_ros.identification import Method, identify_and_hold_out
-from robocal_ros.identification.judged import identification_document, identified_model_document
+from robocal_ros.identification.judged import (
+    JudgedIdentification,
+    identification_document,
+    identified_model_document,
+)
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.arm import arm_of, model_document
 from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import FrameShift, given_shift
 from robocal_ros.session.events import Command, Outcome
@@ -426,6 +430,51 @@ def shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -
         "after": errors_of(shift.after, limit_mm),
         "poses": [{"name": name, "before": one, "after": other} for name, one, other in poses],
     }
+
+
+def commissioned_in_force(history: CalibrationHistory, nominal: SerialArm) -> SerialArm | None:
+    """The arm that a model identified from tables is judged against; None: the nominal one.
+
+    Raises `ConflictError` where a cold reference is in force: drifts are told against its model.
+    """
+    head, reference = history.head(THERMAL), history.head(REFERENCE)
+    if reference.model is not None:
+        raise ConflictError(
+            f"a cold reference is in force (calibration {reference.calibration_id}), and drifts "
+            "count from its model: return to none with 'robocal history rollback --kind reference "
+            "--to nominal', accept the new model, then capture a new reference"
+        )
+    return None if head.model is None else arm_of(head.model, nominal)
+
+
+def keep_identified(
+    history: CalibrationHistory,
+    nominal: SerialArm,
+    judged: JudgedIdentification,
+    data: Measurements,
+    method: Method,
+    wall_ns: int,
+) -> int:
+    """Put a model identified from tables into the history as a candidate; its number there."""
+    document = identification_document(judged) | {"stamp_ns": wall_ns, "cycle_id": ""}
+    return history.propose(
+        Proposal(
+            kind=THERMAL,
+            model_hash=nominal.model_hash,
+            based_on=history.head(THERMAL).revision,
+            cycle_id="",
+            stamp_ns=wall_ns,
+            created_ns=wall_ns,
+            software=__version__,
+            method=method,
+            code=judged.verdict.code,
+            reason=judged.verdict.reason,
+            candidate_rms_mm=document["calibrated"]["held_out"]["rms_mm"],
+            document=document,
+            model=identified_model_document(judged.identification),
+            inputs=data.arrays(),
+        )
+    )
 
 
 def shift_verdict(document: Document, only_judged: bool) -> Verdict:

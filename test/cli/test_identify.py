@@ -11,7 +11,12 @@ from campaign import NOISE_M, ROBOT, edited, measured, renamed, table, true_arm,
 from command import conforms, robocal, robocal_json
 
 from robocal_ros.cli.main import main
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import REFERENCE
+from robocal_ros.identification.solve import random_postures
+from robocal_ros.kinematics.arm import arm_of, model_document
 from robocal_ros.kinematics.robots import load_description, load_robot
+from robocal_ros.session.events import bring_into_force
 
 
 @pytest.fixture(scope="module")
@@ -306,6 +311,45 @@ class TestOutput:
         assert not path.exists()
         assert any("is not written: the verdict is" in words for words in document["warnings"])
 
+    def test_a_kept_model_comes_into_force_by_a_decision(
+        self, data: Path, folder: Path, identify
+    ) -> None:
+        """As a robot file and in the history it is one model; the next is judged against it."""
+        state = folder / "state"
+        keep = ("--keep", "--robot-serial", "R1", "--state", state)
+        path = folder / "kept.yaml"
+        status, document = identify("--data", data, "--output", path, *keep)
+        assert (status, document["calibration_id"]) == (0, 1)
+        nominal = load_robot(ROBOT)
+        with CalibrationHistory.open(
+            "R1", model_hash=nominal.model_hash, state_dir=state
+        ) as history:
+            assert history.head().revision == 0
+            history.accept(1, by="Ada", reason="", wall_ns=0)
+            found = arm_of(history.head().model, nominal)
+            assert history.inputs(1)["q"].shape == (document["data"]["train"], 6)
+        q = random_postures(nominal, 20)
+        np.testing.assert_allclose(found.fk(q), load_robot(str(path)).fk(q), atol=1e-12)
+        again = table(folder / "again.csv", measured(60, 9))
+        _, document = identify("--data", again, *keep)
+        assert document["calibration_id"] == 2
+        errors = [document[name]["held_out"]["rms_mm"] for name in ("in_force", "nominal")]
+        assert errors[0] < errors[1] / 3
+
+    def test_no_model_is_kept_beside_a_cold_reference(
+        self, data: Path, folder: Path, identify
+    ) -> None:
+        state, nominal = folder / "cold", load_robot(ROBOT)
+        with CalibrationHistory.open(
+            "R1", model_hash=nominal.model_hash, state_dir=state
+        ) as history:
+            bring_into_force(history, REFERENCE, nominal, model_document(nominal), "test")
+        status, document = identify(
+            "--data", data, "--keep", "--robot-serial", "R1", "--state", state
+        )
+        assert (status, document["error"]["code"]) == (3, "CONFLICT")
+        assert "--kind reference --to nominal" in document["error"]["message"]
+
     def test_no_folder_for_it(self, data: Path, folder: Path, identify) -> None:
         status, document = identify("--data", data, "--output", folder / "no" / "m.yaml")
         assert status == 2
@@ -327,6 +371,8 @@ class TestRefusals:
             (("--hold-out", "1"), "not a share between 0 and 1"),
             (("--hold-out", "nan"), "not a share between 0 and 1"),
             (("--seed", "-1"), "not a whole number from 0"),
+            (("--keep",), "give --robot-serial"),
+            (("--state", "x"), "for --keep"),
         ],
     )
     def test_options_without_sense(self, data: Path, identify, options, words) -> None:
