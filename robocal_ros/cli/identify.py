@@ -244,6 +244,10 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write the identified robot file, only if the verdict accepts it; of --plan the poses",
     )
+    _add_keeping(parser)
+
+
+def _add_keeping(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep",
         action="store_true",

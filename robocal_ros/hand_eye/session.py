@@ -105,7 +105,7 @@ class HandEyeConfig:
     capture_timeout_s: float = 10.0
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
-    limit_m: float = 1e-3
+    limit_m: float = HandEyeSettings.limit_m
     sensor: SensorDescription = DEFAULT
     tracker_frame: str = "tracker"
     tracker_sigma_m: float = 1.5e-5

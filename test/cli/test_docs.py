@@ -13,7 +13,7 @@ import pytest
 from command import ROOT, environment, robocal
 
 PREFIX = ".venv/bin/robocal "
-PAGES = ("README.md", *(f"docs/{name}.md" for name in ("install", "identify", "history", "replay")))
+PAGES = [f"docs/{name}.md" for name in ("README", "install", "identify", "history", "replay")]
 # Sections of docs/replay.md that show what their first command prints.
 SHOWN = ("replay", "validate")
 REPLAY = ("replay", "bags/demo_shift.mcap", "--robot", "kr150_r3100", "--auto")
