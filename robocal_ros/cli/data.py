@@ -25,6 +25,8 @@ from robocal_ros.ground.files import nearest, quoted
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.cli.documents import ConvertedDocument, DataDocument, DataSetDocument
+
 Converted = tuple[str, list[Path]]  # how much a part holds, in words, and the files written
 VARIABLE = "ROBOCAL_DATA"
 
@@ -227,7 +229,7 @@ def run_data(args: argparse.Namespace) -> CliResult:
         raise InputError("--part needs --out, the folder to convert to")
     written = _convert(args.name, root, args.out, args.part) if args.out else []
     names = [args.name] if args.name else list(SETS)
-    document: Document = {
+    document: DataDocument = {
         "folder": given or None,
         "sets": [_told(name, root, args.out) for name in names],
         "written": written,
@@ -235,7 +237,9 @@ def run_data(args: argparse.Namespace) -> CliResult:
     return CliResult(document, _show_written if written else _show_one if args.name else _show_all)
 
 
-def _convert(name: str, root: Path | None, out: Path, chosen: list[str] | None) -> list[Document]:
+def _convert(
+    name: str, root: Path | None, out: Path, chosen: list[str] | None
+) -> "list[ConvertedDocument]":
     one = SETS[name]
     if root is None:
         raise InputError(f"set {VARIABLE} to the folder that holds {name}: robocal data {name}")
@@ -251,14 +255,14 @@ def _convert(name: str, root: Path | None, out: Path, chosen: list[str] | None) 
         if part not in parts:
             text = f"{quoted(part)} is no part of {name}{nearest(part, parts)}"
             raise InputError(f"{text}: {', '.join(parts)}")
-    written = []
+    written: list[ConvertedDocument] = []
     for part in chosen or parts:
         words, files = one.convert(part, folder, out)
         written.append({"part": part, "holds": words, "files": [str(file) for file in files]})
     return written
 
 
-def _told(name: str, root: Path | None, out: Path | None) -> Document:
+def _told(name: str, root: Path | None, out: Path | None) -> "DataSetDocument":
     one = SETS[name]
     folder = None if root is None else root / name
     here = f"${VARIABLE}/{name}"

@@ -58,6 +58,8 @@ from robocal_ros.kinematics.tables import (
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.identification.documents import PlannedPoseDocument, PosePlanDocument
+
 
 MOVED_SIGMA = 2.0
 MOST_LISTED = 12
@@ -387,11 +389,11 @@ def _planned(args: argparse.Namespace) -> CliResult:
     names = [f"p{i}" for i in range(1, len(plan.q) + 1)]
     if args.output is not None:
         write_cells(args.output, {"sample": names} | columns)
-    poses = [
+    poses: list[PlannedPoseDocument] = [
         {"pose": name, "joints": [float(cell) for cell in cells]}
         for name, *cells in zip(names, *columns.values(), strict=True)
     ]
-    document: Document = {
+    document: PosePlanDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "columns": list(columns),
@@ -479,7 +481,7 @@ def _identified(
             raise InputError(mistake, file=file)
         if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not refit:
             warnings.append(_OTHER_SET_UP)
-    document = identification_document(judged)
+    document: Document = {**identification_document(judged)}
     document["data"] = {
         "file": str(args.data),
         "check_file": file,

@@ -15,6 +15,8 @@ from robocal_ros.ground.files import read_bytes
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.cli.documents import BagTopicDocument, InfoDocument
+
 Facts = list[tuple[str, str]]
 Told = tuple[str, Facts, list[str]]  # what it is, facts of it, commands that take it
 BAGS = (".mcap", ".db3", ".bag")
@@ -28,12 +30,12 @@ def add_info(parser: argparse.ArgumentParser) -> None:
 def run_info(args: argparse.Namespace) -> CliResult:
     """Do ``info``. Raises `InputError` for a file that cannot be read, or is of no known kind."""
     path: Path = args.file
-    topics: list[Document] = []
+    topics: list[BagTopicDocument] = []
     if path.is_dir() or path.suffix in BAGS:
         kind, facts, commands, topics = _bag(path)
     else:
         kind, facts, commands = _file(path)
-    document = {
+    document: InfoDocument = {
         "file": str(path),
         "kind": kind,
         "facts": [{"name": name, "value": value} for name, value in facts],
@@ -64,7 +66,7 @@ def _typed(name: Path | str) -> str:
     return shlex.quote(str(name))
 
 
-def _bag(path: Path) -> tuple[str, Facts, list[str], list[Document]]:
+def _bag(path: Path) -> tuple[str, Facts, list[str], "list[BagTopicDocument]"]:
     from robocal_ros.bags.foreign import open_bag
     from robocal_ros.bags.replay import EVENTS, first_configuration
     from robocal_ros.cli.recording import event_topics, is_simulated
@@ -103,7 +105,7 @@ def _bag(path: Path) -> tuple[str, Facts, list[str], list[Document]]:
     else:
         facts.append(("session", "none, and no joint_states: there is nothing to replay"))
         commands = []
-    topics = [
+    topics: list[BagTopicDocument] = [
         {"topic": topic, "type": held.msgtype, "messages": held.messages}
         for topic, held in info.topics.items()
     ]

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
+    from robocal_ros.ground.documents import FailureDocument
     from robocal_ros.kinematics.robots import RobotDescription
 
 
@@ -256,8 +257,8 @@ class CliResult:
     where there is one, are told on standard error. ``render``: prints the document for people.
     """
 
-    document: Document
-    render: "Callable[[Console, Document], None]"
+    document: Mapping[str, Any]
+    render: "Callable[[Console, Any], None]"
     exit_code: int = DONE
 
 
@@ -266,30 +267,26 @@ def exit_status(error: RobocalError) -> int:
     return BAD_REQUEST if error.code in _REQUEST_CODES else NO_ANSWER
 
 
-def failure(error: RobocalError) -> Document:
+def failure(error: RobocalError) -> "FailureDocument":
     """JSON document of a command that ends with this error."""
-    where = error if isinstance(error, InputError) else None
     document = refusal(error.code, str(error))
-    document["error"] |= {
-        "file": where and where.file,
-        "row": where and where.row,
-        "column": where and where.column,
-    }
+    if isinstance(error, InputError):
+        told = document["error"]
+        told["file"], told["row"], told["column"] = error.file, error.row, error.column
     if isinstance(error, RankDeficientError):
         document["unobservable"] = list(error.directions)
     return document
 
 
-def crash(error: BaseException) -> Document:
+def crash(error: BaseException) -> "FailureDocument":
     """JSON document of a crash: no verdict came about."""
     return refusal(Code.NONE, f"internal error, {type(error).__name__}: {error}")
 
 
-def refusal(code: Code, message: str) -> Document:
+def refusal(code: Code, message: str) -> "FailureDocument":
     """``error`` and ``verdict`` of a command that cannot answer."""
-    place = {"file": None, "row": None, "column": None}
     return {
-        "error": {"code": code.name, "message": message, **place},
+        "error": {"code": code.name, "message": message, "file": None, "row": None, "column": None},
         "verdict": {"accept": False, "code": code.name, "reason": message},
     }
 
@@ -299,7 +296,7 @@ def tell(code: str, message: object) -> None:
     print(f"robocal: {message} [{code}]", file=sys.stderr)
 
 
-def write_json(document: Document, stream: TextIO) -> None:
+def write_json(document: Mapping[str, Any], stream: TextIO) -> None:
     """Write the one document."""
     stream.write(json.dumps(document, indent=2, allow_nan=False) + "\n")
     stream.flush()
@@ -584,6 +581,8 @@ COMMANDS: Mapping[str, "CliCommand | CliGroup"] = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``robocal`` with these arguments (default: the process's) and return its exit status."""
+    if "_ARGCOMPLETE" in os.environ:
+        _complete()
     arguments = with_negative_values(sys.argv[1:] if argv is None else argv)
     stream = sys.stdout
     as_json = "--json" in arguments
@@ -603,18 +602,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
     try:
         try:
-            parser = CommandParser(
-                prog="robocal", description="Accuracy of industrial robots, on files and bags."
-            )
-            parser.add_argument(
-                "--version",
-                action=_Information,
-                version=f"robocal {__version__}",
-                help="show the version and leave",
-            )
-            words = [word for word in arguments if not word.startswith("-")]
-            _declare(parser, "command", COMMANDS, words)
-            args = parser.parse_args(arguments)
+            args = _parser(arguments).parse_args(arguments)
             outcome: CliResult = args.run_command(args)
             warn(outcome.document.get("warnings", ()))
             if "error" in outcome.document:
@@ -648,6 +636,35 @@ def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
     if as_json:
         write_json(document, stream)
     return status
+
+
+def _parser(arguments: Sequence[str]) -> CommandParser:
+    """With the options of the command that the arguments name."""
+    parser = CommandParser(
+        prog="robocal", description="Accuracy of industrial robots, on files and bags."
+    )
+    parser.add_argument(
+        "--version",
+        action=_Information,
+        version=f"robocal {__version__}",
+        help="show the version and leave",
+    )
+    words = [word for word in arguments if not word.startswith("-")]
+    _declare(parser, "command", COMMANDS, words)
+    return parser
+
+
+def _complete() -> NoReturn:
+    """Tell a shell what may follow in the line that it has."""
+    try:
+        from argcomplete import autocomplete
+        from argcomplete.lexers import split_line
+    except ImportError:
+        sys.exit(BAD_REQUEST)
+    line, point = os.environ["COMP_LINE"], int(os.environ["COMP_POINT"])
+    *_, words, _ = split_line(line, point)
+    autocomplete(_parser(words[1:]), always_complete_options="long")
+    sys.exit()
 
 
 def _declare(

@@ -56,6 +56,8 @@ from robocal_ros.thermal.proposing import (
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.programs.documents import CorrectedProgramDocument
+
 _MODEL = (
     "robot file of the robot as identified, or what 'robocal history show --json' prints of a "
     "calibration"
@@ -276,8 +278,8 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
     )
     done = correction.correct(_program_text(args.program, dialect))
-    document = report(done)
-    left = document["count"]["not_corrected"]
+    told = report(done)
+    left = told["count"]["not_corrected"]
     verdict = Verdict(Code.ACCEPT, f"all of {len(done.points)} points are as they should be")
     if not done.points:
         raise InputError("holds no point that is known here", file=str(args.program))
@@ -288,14 +290,14 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     written = args.output is not None and (args.partial or not left)
     if written:
         write_bytes(args.output, done.text.encode("latin-1"))
-    document = {
+    document: CorrectedProgramDocument = {
         "program": str(args.program),
         "maker": dialect.maker,
         "robot": models.nominal.name,
         "model_hash": models.nominal.model_hash,
         "output": str(args.output) if written else None,
-        **document,
-        "warnings": warnings + document["warnings"],
+        **told,
+        "warnings": warnings + told["warnings"],
         "verdict": verdict_document(verdict),
     }
     return CliResult(document, _show_corrected)

@@ -380,7 +380,7 @@ def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
     if not failed and (made or not asked):
         return {}
     first = next((o for o in (*failed, *asked) if not o.done), asked[0])
-    return refusal(first.status, first.message)
+    return {**refusal(first.status, first.message)}
 
 
 MOST_REASONS = 5

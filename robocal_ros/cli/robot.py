@@ -3,9 +3,10 @@
 
 import argparse
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import yaml
@@ -45,6 +46,17 @@ from robocal_ros.kinematics.urdf import (
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.cli.documents import (
+        ConvertedUrdfDocument,
+        ExportUrdfDocument,
+        FunctionsOfJointsDocument,
+        HayatiRowDocument,
+        ImportUrdfDocument,
+        ImportUrDocument,
+        JointValueDocument,
+        PredictedErrorDocument,
+    )
+
 
 _VALUE = re.compile(r"\s*([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", re.IGNORECASE)
 _TO_SI = {"deg": 3.141592653589793 / 180.0, "rad": 1.0, "mm": 1e-3, "m": 1.0}
@@ -68,11 +80,11 @@ def run_fk(args: argparse.Namespace) -> CliResult:
     arm = robot.arm
     q = np.array(_given_joints(args, arm))
     T_base_flange = arm.fk(q)
-    joints = []
+    joints: list[JointValueDocument] = []
     for name, value, slides, lower, upper in zip(
         arm.joint_names, q.tolist(), arm.prismatic, arm.lower, arm.upper, strict=True
     ):
-        unit = "mm" if slides else "deg"
+        unit: Literal["mm", "deg"] = "mm" if slides else "deg"
         shown, within = value / _TO_SI[unit], bool(lower <= value <= upper)
         joints.append({"name": name, "value": shown, "unit": unit, "within_limits": within})
         if not within:
@@ -171,7 +183,8 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
     delta, slope = functions.delta(q), functions.slope(q)
     known = None if functions.identified_from is None else known_model(arm)
     sigma = np.full(q.shape, np.nan) if known is None else known.function_sigma(q)
-    joints, rows = [], ["joint,q,q_unit,delta,delta_unit,slope,sigma"]
+    joints: list[Any] = []  # names of fields have the joint's unit
+    rows = ["joint,q,q_unit,delta,delta_unit,slope,sigma"]
     for i, name in enumerate(arm.joint_names):
         unit, small = ("mm", "um") if arm.prismatic[i] else ("deg", "urad")
         shown, micro = q[:, i] / _TO_SI[unit], 1e6 * delta[:, i]
@@ -195,7 +208,7 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
         )
     if args.output is not None:
         write_text(args.output, "\n".join(rows) + "\n")
-    document: Document = {
+    document: FunctionsOfJointsDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "joints": joints,
@@ -217,7 +230,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _predicted(arm: SerialArm, path: Path) -> Document:
+def _predicted(arm: SerialArm, path: Path) -> "PredictedErrorDocument":
     """Error to expect of the first target at the poses of a table, base and target placed there."""
     known, q = known_model(arm), read_joints(path, arm)
     variance = known.predicted_variance(q, np.zeros(len(q), dtype=np.int64), ("base", "tool"))
@@ -301,7 +314,7 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
     dh = replace(nominal, mdh=factory_dh(settings[0], settings[1]))
     save_robot(factory, args.output)
     distances = _distances(nominal, factory)
-    document: Document = {
+    document: ImportUrDocument = {
         "robot": name,
         "model_hash": factory.model_hash,
         "output": str(args.output),
@@ -316,14 +329,25 @@ def run_import_ur(args: argparse.Namespace) -> CliResult:
     return CliResult(document, _show_import_ur)
 
 
-def joint_rows(arm: "SerialArm") -> list[Document]:
+def joint_rows(arm: "SerialArm") -> "list[HayatiRowDocument]":
     """Each joint's name and its numbers `_MDH`."""
     factors = np.array([1e3, 180.0 / np.pi, 1e3, 180.0 / np.pi, 180.0 / np.pi])
-    rows = zip(arm.joint_names, (arm.mdh * factors).tolist(), strict=True)
-    return [{"name": joint, **dict(zip(_MDH, row, strict=True))} for joint, row in rows]
+    return [
+        {
+            "name": joint,
+            "d_mm": d,
+            "theta_deg": theta,
+            "a_mm": a,
+            "alpha_deg": alpha,
+            "beta_deg": beta,
+        }
+        for joint, (d, theta, a, alpha, beta) in zip(
+            arm.joint_names, (arm.mdh * factors).tolist(), strict=True
+        )
+    ]
 
 
-def print_joints(console: "Console", title: str, joints: list[Document]) -> None:
+def print_joints(console: "Console", title: str, joints: Sequence[Mapping[str, Any]]) -> None:
     """Print them as a table."""
     rows = [[joint["name"], *(f"{joint[key]:z.4f}" for key in _MDH)] for joint in joints]
     print_table(console, title, ("joint", *(key.replace("_", " ") for key in _MDH)), rows)
@@ -390,11 +414,17 @@ def run_import_urdf(args: argparse.Namespace) -> CliResult:
         )
     comment = f"From {args.urdf.name}, {links.base} to {links.tip}, by robocal import-urdf."
     save_robot(arm, args.output, description, comment)
-    document = _document(links, arm, args.output, np.eye(4)) | {"joints": joint_rows(arm)}
-    return CliResult(document | {"warnings": warnings}, _show_import)
+    document: ImportUrdfDocument = {
+        **_document(links, arm, args.output, np.eye(4)),
+        "joints": joint_rows(arm),
+        "warnings": warnings,
+    }
+    return CliResult(document, _show_import)
 
 
-def _document(links: Chain, arm: SerialArm, output: Path, T_tip_flange: Array) -> Document:
+def _document(
+    links: Chain, arm: SerialArm, output: Path, T_tip_flange: Array
+) -> "ConvertedUrdfDocument":
     """What both commands tell: in it the largest difference of the flange over the joints' ranges.
 
     Of an element of its pose, mm, or its like in rad at a metre.
@@ -471,8 +501,11 @@ def run_export_urdf(args: argparse.Namespace) -> CliResult:
             f"kinematics.yaml has no place: add ({xyz}) mm and that turn to the tool, or use a URDF"
         )
     write_text(args.output, text)
-    document = _document(links, arm, args.output, beyond)
-    document |= {"T_tip_flange": transform_document(beyond), "warnings": warnings}
+    document: ExportUrdfDocument = {
+        **_document(links, arm, args.output, beyond),
+        "T_tip_flange": transform_document(beyond),
+        "warnings": warnings,
+    }
     return CliResult(document, _show_export)
 
 

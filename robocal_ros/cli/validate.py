@@ -15,7 +15,7 @@ import tempfile
 import threading
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -112,7 +112,7 @@ def _lost(job: "Job", error: BaseException) -> "Validated":
     return _not_validated(job, crash(error))
 
 
-def _not_validated(job: "Job", answer: Document) -> "Validated":
+def _not_validated(job: "Job", answer: Mapping[str, Any]) -> "Validated":
     from robocal_ros.cli.validating import Validated
 
     return Validated({"bag": job.name, "path": job.path, "error": answer["error"]})
@@ -345,7 +345,7 @@ def _failure(bags: Sequence[Document]) -> Document:
         return {}
     words = "; ".join(f"{bag['bag']}: {bag['error']['message']}" for bag in failed)
     message = f"{len(failed)} of {len(bags)} bags could not be validated: {words}"
-    return refusal(Code[failed[0]["error"]["code"]], message)
+    return {**refusal(Code[failed[0]["error"]["code"]], message)}
 
 
 def _keep_figures(folder: Path, name: str, result: "Validated") -> None:

@@ -27,6 +27,8 @@ from robocal_ros.kinematics.joint_functions import JointFunctions
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.cli.documents import WarmDocument, WarmStepDocument
+
 POSES = 30
 LINE_EVERY = 10  # kernels, where no terminal shows each
 
@@ -113,22 +115,23 @@ def run_warm(args: argparse.Namespace) -> CliResult:
             if not console.is_terminal and len(names) % LINE_EVERY == 0:
                 console.print(words)
 
-        done: list[Document] = []
+        done: list[WarmStepDocument] = []
         with compiled.compiling(tell):
             for number, (name, call) in enumerate(steps.items(), start=1):
                 before, begun_s = len(names), time.monotonic()
                 call()
-                step = {
+                step: WarmStepDocument = {
                     "name": name,
                     "compiled": len(names) - before,
                     "seconds": time.monotonic() - begun_s,
                 }
                 done.append(step)
                 console.print(f"{number} of {len(steps)}: {_in_words(step)}")
-    return CliResult({"steps": done, "compiled": len(names), "warnings": []}, _show)
+    document: WarmDocument = {"steps": done, "compiled": len(names), "warnings": []}
+    return CliResult(document, _show)
 
 
-def _in_words(step: Document) -> str:
+def _in_words(step: "WarmStepDocument") -> str:
     return f"{step['name']}, {step['compiled']} kernels compiled, {step['seconds']:.1f} s"
 
 

@@ -2,12 +2,16 @@
 """Is it good, in mm? Errors on data not used to solve, and the decision with its reason."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.ground.errors import Code, TooFewSamplesError
-from robocal_ros.ground.frames import Array, Document, Index
+from robocal_ros.ground.frames import Array, Index
+
+if TYPE_CHECKING:
+    from robocal_ros.ground.documents import ErrorsDocument, JudgementDocument, VerdictDocument
 
 SAME_POSE_RAD = 1e-3
 FEWEST_GROUPS = 5
@@ -191,7 +195,7 @@ def _one_sided_p(gain: Array) -> float:
     return float(1.0 - stdtr(len(gain) - 1, t))
 
 
-def errors_document(errors: ErrorSummary) -> Document:
+def errors_document(errors: ErrorSummary) -> "ErrorsDocument":
     """Held-out errors in mm."""
     return {
         "mean_mm": errors.mean_m * 1e3,
@@ -202,7 +206,7 @@ def errors_document(errors: ErrorSummary) -> Document:
     }
 
 
-def judged_errors_document(judged: Judgement) -> Document:
+def judged_errors_document(judged: Judgement) -> "JudgementDocument":
     """Held-out errors before and after, and those that the candidate's covariance predicts."""
     return {
         "nominal": {"held_out": errors_document(judged.nominal)},
@@ -218,6 +222,6 @@ def judged_errors_document(judged: Judgement) -> Document:
     }
 
 
-def verdict_document(verdict: Verdict) -> Document:
+def verdict_document(verdict: Verdict) -> "VerdictDocument":
     """Decision, its code's name and its reason."""
     return {"accept": verdict.accept, "code": verdict.code.name, "reason": verdict.reason}

@@ -6,10 +6,13 @@ Quaternions are x, y, z, w. scipy's rotations are loaded when they are first use
 second that the start of a node does not need, which is why quaternions do without them.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from robocal_ros.ground.documents import PoseDocument
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -169,6 +172,6 @@ def urdf_joint(parent: str, child: str, xyz: str, rpy: str) -> str:
     )
 
 
-def transform_document(T: Array) -> Document:
+def transform_document(T: Array) -> "PoseDocument":
     """A pose (4, 4) as ``xyz_mm`` and ``quat_xyzw``."""
     return {"xyz_mm": (T[:3, 3] * 1e3).tolist(), "quat_xyzw": quat_xyzw(T).tolist()}

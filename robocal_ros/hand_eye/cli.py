@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -77,11 +77,16 @@ from robocal_ros.session.events import session_kind
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.hand_eye.documents import (
+        TouchedResultDocument,
+        TouchTestDocument,
+    )
+
 
 BagShots = tuple[HandEyeData, dict[str, str]]
 
 KINDS = ("sphere", "step", "line")
-POINT = "point"
+POINT: Final = "point"
 LIMIT_MM = 1e3 * HandEyeSettings.limit_m
 MOST_NAMED = 5  # samples left out for one reason
 
@@ -592,7 +597,7 @@ def run_verify(args: argparse.Namespace) -> CliResult:
         "kind": args.target_kind,
         "T_flange_sensor": transform_document(T_flange_sensor),
         "target": found.target,
-        "held_out": errors | {"rejected": list(rejected), "rejected_because": rejected},
+        "held_out": {**errors, "rejected": list(rejected), "rejected_because": rejected},
         "per_sample_mm": dict(zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)),
         "verdict": verdict_document(found.verdict),
     }
@@ -604,7 +609,7 @@ def _run_touch_test(args: argparse.Namespace) -> CliResult:
         raise InputError("--target-kind point needs --poses, a table of what was seen of them")
     scanned = read_scanned_points(args.poses, arm_of(args))
     touched = {} if args.touched is None else read_touched_points(args.touched)
-    rows: list[Document] = []
+    rows: list[TouchedResultDocument] = []
     tests: dict[str, TouchTest] = {}
     for path in args.result:
         mount = read_flange_mount(path)
@@ -612,10 +617,16 @@ def _run_touch_test(args: argparse.Namespace) -> CliResult:
         tests[str(path)] = found
         fields = read_fields(path, "mount file").values
         used = shots_of((fields.get("residual_mm") or {}).get("per_sample") or {})
-        row = {"result": str(path), "shots": len(used) or None} | found.document()
-        rows.append(row | {"verdict": verdict_document(found.verdict)})
+        verdict = verdict_document(found.verdict)
+        named: TouchedResultDocument = {
+            "result": str(path),
+            "shots": len(used) or None,
+            **found.document(),
+            "verdict": verdict,
+        }
+        rows.append(named)
     verdict = verdict_document(compared(tests))
-    document: Document = {"kind": POINT, "results": rows, "verdict": verdict}
+    document: TouchTestDocument = {"kind": POINT, "results": rows, "verdict": verdict}
     return CliResult(document, _show_touch_test)
 
 

@@ -97,6 +97,8 @@ from robocal_ros.kinematics import SerialArm
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.hand_eye.documents import CheckedPlanDocument
+
 
 # ---- from the tables and images of ``robocal hand-eye camera`` to its result --------------------
 
@@ -518,11 +520,13 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
     if args.propose is not None:
         names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
         write_pose_table(args.propose, report.proposed, names=names, mark=marks)
-    document = _document(report, table.names) | {"proposed_marks": marks}
+    document = _document(report, table.names, marks)
     return CliResult(document, _show_check_plan)
 
 
-def _document(report: PlanReport, names: tuple[str, ...]) -> Document:
+def _document(
+    report: PlanReport, names: tuple[str, ...], marks: list[str] | None
+) -> "CheckedPlanDocument":
     sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
     return {
         "rank": report.rank,
@@ -539,6 +543,7 @@ def _document(report: PlanReport, names: tuple[str, ...]) -> Document:
         "proposed": [transform_document(T) for T in report.proposed],
         "proposed_error_mm": None if better_m is None else better_m * 1e3,
         "verdict": verdict_document(report.verdict),
+        "proposed_marks": marks,
     }
 
 

@@ -10,14 +10,17 @@ allows for what else the residuals of one profile share (Liang and Zeger 1986, t
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.estimation.sphere import linearised
 from robocal_ros.estimation.surfaces import mirror
-from robocal_ros.ground.frames import Array, Document
+from robocal_ros.ground.frames import Array
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.documents import LinearityDocument
 
 FEWEST_POSES = 8  # more than the terms of the third degree
 BESIDE_M = 6e-4  # from a corner: so far its rounded top reaches (measured: up to 0.5 mm)
@@ -175,7 +178,7 @@ class SensorLinearity:
         degree = int(document["degree"])
         return cls(low, high, degree, coefficients, unknown, rms, most, residual, left_out)
 
-    def document(self) -> Document:
+    def document(self) -> "LinearityDocument":
         """Figures and coefficients in um, the degree, and the field in mm: x and z."""
         return {
             "degree": self.degree,

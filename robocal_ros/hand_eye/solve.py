@@ -128,7 +128,7 @@ def _result_of(
     if linearity is not None:
         own_m = float(expected_error_m(of_it[:6, :6], field - pivot))
         if not linearity.assumed:
-            more["linearity"] = linearity.document() | {"working_error_mm": own_m * 1e3}
+            more["linearity"] = {**linearity.document(), "working_error_mm": own_m * 1e3}
         error_m = float(np.hypot(error_m, linearity.rms_m))  # of points as the sensor tells them
     found: Document = {}
     for task, view, place, read in zip(tasks, fit.views, fit.state.places, reads, strict=True):

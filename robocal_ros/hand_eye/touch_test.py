@@ -8,6 +8,7 @@ scanned from several poses, along the worst axis of the base.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +16,12 @@ from robocal_ros.estimation.assessment import ErrorSummary, Verdict, errors_docu
 from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
-from robocal_ros.ground.frames import Array, Document
+from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.files import ScannedPoints, SensorMount
 from robocal_ros.hand_eye.profiles import Profile
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.documents import TouchedPointsDocument
 
 FEWEST_SCANS = 3  # of a point, for a standard deviation
 
@@ -51,7 +55,7 @@ class TouchTest:
         known = self.three_sigma_m[np.isfinite(self.three_sigma_m)]
         return float(known.max()) if len(known) else None
 
-    def document(self) -> Document:
+    def document(self) -> "TouchedPointsDocument":
         """In the units people read."""
         sigma = [1e3 * s if np.isfinite(s) else None for s in self.three_sigma_m.tolist()]
         rows = zip(self.points, self.count, self.place.tolist(), sigma, strict=True)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,16 @@ from robocal_ros.identification.solve import Identification, Method, identify, s
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document, parameters_document
 from robocal_ros.kinematics.tables import POSITION, check_plain, read_cells
+
+if TYPE_CHECKING:
+    from robocal_ros.ground.documents import JudgedErrorsDocument
+    from robocal_ros.identification.documents import (
+        CellDocument,
+        CoverageDocument,
+        CoveredDocument,
+        IdentificationDocument,
+        IdentifiedJointDocument,
+    )
 
 # ---- why data do not fit a robot at all ---------------------------------------------------------
 
@@ -400,7 +410,7 @@ def identified_model_document(result: Identification) -> Document:
     }
 
 
-def cell_document(cell: CellModel) -> Document:
+def cell_document(cell: CellModel) -> "CellDocument":
     """Base and targets of a cell model."""
     return {
         "T_frame_base": transform_document(cell.T_frame_base),
@@ -411,10 +421,10 @@ def cell_document(cell: CellModel) -> Document:
     }
 
 
-def joints_document(judged: JudgedIdentification) -> list[Document]:
+def joints_document(judged: JudgedIdentification) -> "list[IdentifiedJointDocument]":
     """Of each joint: from where to where it was measured, what its function and its load do."""
     result, arm = judged.identification, judged.identification.cell.arm
-    found = []
+    found: list[Any] = []  # names of fields have the joint's unit
     for joint, name in enumerate(arm.joint_names):
         unit, factor = ("mm", 1e3) if arm.prismatic[joint] else ("deg", float(np.degrees(1.0)))
         function = None
@@ -451,24 +461,31 @@ def _function_document(result: FullIdentification, joint: int) -> Document:
     }
 
 
-def _coverage_document(judged: JudgedIdentification) -> Document:
+def _coverage_document(judged: JudgedIdentification) -> "CoverageDocument":
     """Errors at check poses that are covered and that are not, each with its code."""
-    found: Document = {"covered": None, "not_covered": None}
+    found: dict[str, CoveredDocument] = {}
     for name, part in judged.parts.items():
         code = judged.verdict.code if name == "covered" else Code.POSES_NOT_INFORMATIVE
-        found[name] = {"code": code.name} | {
-            key: errors_document(errors) for key, errors in part.items()
+        found[name] = {
+            "code": code.name,
+            "in_force": errors_document(part["in_force"]),
+            "calibrated": errors_document(part["calibrated"]),
         }
-    return found
+    return {"covered": found.get("covered"), "not_covered": found.get("not_covered")}
 
 
-def identification_document(judged: JudgedIdentification) -> Document:
+def identification_document(judged: JudgedIdentification) -> "IdentificationDocument":
     """The ``identify`` document: errors before and after, parameters, rank, verdict."""
     result = judged.identification
     seen = result.estimate.observability
     errors = judged_errors_document(judged)
+    parts: dict[str, JudgedErrorsDocument] = {
+        "nominal": errors["nominal"],
+        "in_force": errors["in_force"],
+        "calibrated": errors["calibrated"],
+    }
     for name, robust in judged.robust.items():
-        errors[name]["held_out_robust"] = errors_document(robust)
+        parts[name]["held_out_robust"] = errors_document(robust)
     return {
         "robot": result.nominal.name,
         "model_hash": result.nominal.model_hash,

@@ -5,7 +5,7 @@ import hashlib
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -545,7 +545,7 @@ yaml.SafeDumper.add_representer(
 # ---- files that a command made for one robot: YAML, with the nominal model they belong to -------
 
 
-def write_made(path: Path, document: dict[str, Any], keys: Sequence[str], command: str) -> None:
+def write_made(path: Path, document: Mapping[str, Any], keys: Sequence[str], command: str) -> None:
     """Write the parts of a document that a later command needs; the file appears whole or not."""
     kept = {key: document[key] for key in keys}
     text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None, width=2**16)

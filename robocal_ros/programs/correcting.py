@@ -15,12 +15,13 @@ the robot as it was when it was taught for one that was taught by hand.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
-from robocal_ros.ground.frames import Array, Document
+from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.programs.conventions import numbers_of, pose_of
 from robocal_ros.programs.fanuc import FanucDialect
@@ -38,6 +39,9 @@ from robocal_ros.programs.points import (
 from robocal_ros.programs.postures import chosen_posture, is_singular, reach, stance_of
 from robocal_ros.programs.rapid import RapidDialect
 from robocal_ros.programs.urscript import UrScriptDialect
+
+if TYPE_CHECKING:
+    from robocal_ros.programs.documents import ProgramPointDocument, ProgramReportDocument, State
 
 DIALECTS: tuple[Dialect, ...] = (
     KrlDialect(),
@@ -264,13 +268,17 @@ def _apart(T: Array, other: Array) -> tuple[float, float]:
     return float(np.linalg.norm(T[:3, 3] - other[:3, 3])), float(np.linalg.norm(turn))
 
 
-def report(done: CorrectedProgram) -> Document:
+def report(done: CorrectedProgram) -> "ProgramReportDocument":
     """What became of each point, as a document (JSON)."""
     points = [_point_document(one) for one in done.points]
-    count = {name: sum(one["state"] == name for one in points) for name in STATES}
+    states = [one["state"] for one in points]
     return {
         "points": points,
-        "count": count,
+        "count": {
+            "corrected": states.count("corrected"),
+            "unchanged": states.count("unchanged"),
+            "not_corrected": states.count("not_corrected"),
+        },
         "warnings": list(done.program.notes),
         "computed": [{"line": line, "text": text} for line, text in done.program.computed],
     }
@@ -279,8 +287,8 @@ def report(done: CorrectedProgram) -> Document:
 STATES = ("corrected", "unchanged", "not_corrected")
 
 
-def _point_document(one: CorrectedPoint) -> Document:
-    state = "not_corrected" if one.reason else "corrected" if one.changes else "unchanged"
+def _point_document(one: CorrectedPoint) -> "ProgramPointDocument":
+    state: State = "not_corrected" if one.reason else "corrected" if one.changes else "unchanged"
     return {
         "name": one.point.name,
         "line": one.point.line,

@@ -2,7 +2,7 @@
 """Figures of reports, drawn without a display."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -220,7 +220,7 @@ def png(figure: Figure, dpi: int = 160) -> bytes:
     return stream.getvalue()
 
 
-def draw_rounds(path: Path, document: dict[str, Any]) -> None:
+def draw_rounds(path: Path, document: Mapping[str, Any]) -> None:
     """Draw the share of directions within the threshold against the number of parameters left.
 
     ``document``: what ``robocal thermal screen --json`` prints. Rounds that the poses do not

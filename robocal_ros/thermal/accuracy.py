@@ -15,7 +15,7 @@ import numpy as np
 
 from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
-from robocal_ros.ground.frames import Array, Document
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, CalibrationState, Entry
@@ -341,7 +341,7 @@ KEYS = ("robot", "model_hash", "parameters", "covariance", "cycles")
 SYMMETRY = 1e-9  # of the largest element
 
 
-def write_prior(path: Path, document: Document) -> None:
+def write_prior(path: Path, document: Mapping[str, Any]) -> None:
     """Write the parts of a learned prior's document that an estimator needs."""
     write_made(path, document, KEYS, "thermal learn-prior")
 

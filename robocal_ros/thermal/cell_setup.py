@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.ground.frames import Array, Document, transform_document
+from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel, linear_start
 from robocal_ros.identification.judged import require_match
@@ -38,6 +38,9 @@ from robocal_ros.identification.solve import identify, random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_made, write_made
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
+
+if TYPE_CHECKING:
+    from robocal_ros.thermal.documents import PlacedSensorDocument
 
 SensorMethod = Literal["ml", "classic"]
 FEWEST_POSES = 5
@@ -208,7 +211,7 @@ class PlacedSensor:
     sphere_in_flange: Array
 
 
-def write_sensor(path: Path, document: Document) -> None:
+def write_sensor(path: Path, document: Mapping[str, Any]) -> None:
     """Write the parts of a sensor's document that place it; the file appears whole or not."""
     write_made(path, document, KEYS, "thermal calibrate-sensor")
 
@@ -229,7 +232,7 @@ def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
     return placed_of(top.values)
 
 
-def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
+def sensor_document(found: SensorCalibration, arm: SerialArm) -> "PlacedSensorDocument":
     """A placed sensor: where, how well, and whether to trust it.
 
     ``covariance`` is in SI, of ``covariance_of``.

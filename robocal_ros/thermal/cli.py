@@ -73,6 +73,9 @@ from robocal_ros.thermal.screening import DriftHistory, best_subset, screen, sha
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.identification.documents import PlannedPoseDocument
+    from robocal_ros.thermal import documents
+
 
 def add_calibrate_sensor(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", required=True, metavar="R.yaml", help=ROBOT_HELP)
@@ -94,15 +97,18 @@ def run_calibrate_sensor(args: argparse.Namespace) -> CliResult:
     robot, warnings = describe_robot(args.robot)
     arm = robot.arm
     data = read_measurements(args.data, arm)
-    document = sensor_document(calibrate_sensor(arm, data, args.method), arm)
-    document |= {"data": {"file": str(args.data)}, "output": None}
+    document: documents.SensorDocument = {
+        **sensor_document(calibrate_sensor(arm, data, args.method), arm),
+        "data": {"file": str(args.data)},
+        "output": None,
+        "warnings": warnings,
+    }
     verdict = document["verdict"]
     if args.output is not None and verdict["accept"]:
         write_sensor(args.output, document)
         document["output"] = str(args.output)
     elif args.output is not None:
         warnings.append(f"{args.output} is not written: the verdict is {verdict['code']}")
-    document["warnings"] = warnings
     return CliResult(document, _show_calibrate_sensor)
 
 
@@ -235,7 +241,7 @@ def run_learn_prior(args: argparse.Namespace) -> CliResult:
         histories.append((spots, [warm.of_cycle(name).data for name in warm.cycles]))
     covariance = learn_drift(histories, sigma_m=args.sigma_mm * 1e-3)
     spread = np.sqrt(np.diag(covariance)) * arm.parameters.to_display
-    document: Document = {
+    document: documents.PriorDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "parameters": list(arm.parameters.names),
@@ -402,12 +408,14 @@ def run_plan_poses(args: argparse.Namespace) -> CliResult:
     )
     plan, unit = found.plan, np.where(arm.prismatic, 1e3, np.degrees(1.0))
     names = [f"q{i}_{'mm' if slides else 'deg'}" for i, slides in enumerate(arm.prismatic, 1)]
-    poses = [{"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, 1)]
+    poses: list[PlannedPoseDocument] = [
+        {"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, 1)
+    ]
     if args.output is not None:
         rows = [[pose["pose"], *(f"{value:.4f}" for value in pose["joints"])] for pose in poses]
         lines = [",".join(row) for row in [["pose", *names], *rows]]
         write_text(args.output, "\n".join(lines) + "\n")
-    document: Document = {
+    document: documents.ThermalPlanDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "columns": names,
@@ -493,7 +501,7 @@ def run_screen(args: argparse.Namespace) -> CliResult:
     found = screen(
         history, wanted=args.wanted, removal=args.removal, test=args.stationarity, threshold_m=limit
     )
-    document: Document = {
+    document: documents.ScreenDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "removal": args.removal,
@@ -605,7 +613,7 @@ def run_correct_points(args: argparse.Namespace) -> CliResult:
             columns["stamp_s"] = stamp_texts(stamps)
         columns |= {f"{axis}_mm": texts(1e3 * points[:, i]) for i, axis in enumerate("xyz")}
         write_cells(args.output, columns)
-    document: Document = {
+    document: documents.CorrectedPointsDocument = {
         "robot": robot.arm.name,
         "model_hash": robot.arm.model_hash,
         "T_flange_sensor": transform_document(mount),

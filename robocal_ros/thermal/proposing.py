@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,9 @@ from robocal_ros.thermal.reference import (
     drift_size_m,
     reference_document,
 )
+
+if TYPE_CHECKING:
+    from robocal_ros.programs.documents import PoseErrorDocument, ShiftDocument, ShiftErrorsDocument
 
 SENSOR = "sensor"
 SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")
@@ -171,7 +174,7 @@ class Proposer:
                 in_force=current.arm if current.head.model is not None else None,
             )
             model = identified_model_document(found.identification)
-            document = identification_document(found)
+            document = {**identification_document(found)}
             return self._keep(command, document, model, found.verdict, method, data, {}, wall_ns)
         data = reference.placed(data)
         with follower.attempt():
@@ -363,7 +366,8 @@ class Proposer:
         if method is None:
             raise InputError(f"method '{named}' is not one of {', '.join(SENSOR_METHODS)}")
         found = calibrate_sensor(self._current.arm, data, method)
-        verdict, document = sensor_verdict(found), sensor_document(found, self._nominal)
+        verdict = sensor_verdict(found)
+        document: Document = {**sensor_document(found, self._nominal)}
         inputs, model = data.arrays(), document | {"frame": frame}
         chosen = self._propose(SENSOR, command, wall_ns, method, verdict, document, model, inputs)
         if verdict.accept:
@@ -420,7 +424,7 @@ def shift_in_force(
     return FrameShiftInForce(head.revision, given_shift(models, q, T_flange_tool, T_base, T_tool))
 
 
-def shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -> Document:
+def shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -> "ShiftDocument":
     """A shift, and its errors, of each pose by its name; ``limit_mm``: for the shares."""
     poses = zip(names, _sizes(shift.before), _sizes(shift.after), strict=True)
     return {
@@ -456,7 +460,7 @@ def keep_identified(
     wall_ns: int,
 ) -> int:
     """Put a model identified from tables into the history as a candidate; its number there."""
-    document = identification_document(judged) | {"stamp_ns": wall_ns, "cycle_id": ""}
+    document: Document = {**identification_document(judged), "stamp_ns": wall_ns, "cycle_id": ""}
     return history.propose(
         Proposal(
             kind=THERMAL,
@@ -529,14 +533,14 @@ def keep_shift(
     )
 
 
-def _sizes(twist: Array) -> list[Document]:
+def _sizes(twist: Array) -> "list[PoseErrorDocument]":
     return [
         {"mm": 1e3 * float(np.linalg.norm(e[:3])), "deg": float(np.degrees(np.linalg.norm(e[3:])))}
         for e in twist
     ]
 
 
-def errors_of(twist: Array, limit_mm: float) -> Document:
+def errors_of(twist: Array, limit_mm: float) -> "ShiftErrorsDocument":
     """Of twists (m, 6) from where the tool stands to where it should; the share is of axes."""
     mm = 1e3 * np.linalg.norm(twist[:, :3], axis=1)
     share = float(np.mean(1e3 * np.abs(twist[:, :3]) <= limit_mm))

@@ -4,7 +4,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations, islice
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.thermal.identification import entangled, open_directions, subset_drift
 from robocal_ros.thermal.reference import ColdSpots
+
+if TYPE_CHECKING:
+    from robocal_ros.thermal.documents import ScreenRoundDocument
 
 THRESHOLD_M = 1e-4
 FEWEST_KNOWN = 21  # as many as the test of stationarity needs
@@ -233,7 +236,7 @@ class Screening:
         """The round of the highest share; of several the one with the fewest parameters."""
         return max(reversed(self.rounds), key=lambda r: _order(r.share))
 
-    def rows(self) -> list[dict[str, object]]:
+    def rows(self) -> "list[ScreenRoundDocument]":
         """The rounds as plain values, for JSON and tables."""
         return [
             {

@@ -63,6 +63,14 @@ from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel,
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.tool.documents import (
+        BeamsDocument,
+        ExportedToolDocument,
+        StationDocument,
+        ToolRunDocument,
+        TouchesDocument,
+    )
+
 
 def add_beams(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -104,11 +112,10 @@ def run_beams(args: argparse.Namespace) -> CliResult:
     radius_m = None if args.radius_mm is None else args.radius_mm * 1e-3
     sigma_m = 1e-3 * (SIGMA_MM if args.sigma_mm is None else args.sigma_mm)
     laser = calibrate_laser(read_beam_points(args.data), sigma_m, radius_m)
-    document: Document = laser_document(laser)
-    document["reach_mm"] = None
+    document: BeamsDocument = {**laser_document(laser), "reach_mm": None, "output": None}
     if radius_m is not None:
-        document["reach_mm"] = dict(zip("xy", (laser.reach * 1e3).tolist(), strict=True))
-    document["output"] = None
+        x, y = (laser.reach * 1e3).tolist()
+        document["reach_mm"] = {"x": x, "y": y}
     if args.output is not None:
         robot, warnings = describe_robot(args.robot)
         arm = robot.arm
@@ -201,13 +208,13 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
     edges, names = read_step_edges(args.events, rule.sigma_s, origin_ns)
     steps = named_steps(edges, names, rule.debounce_s)
     if args.method == "classic":
-        document = classic_run_document(classic_from_path(laser, path, steps, taught))
+        tool = classic_run_document(classic_from_path(laser, path, steps, taught))
     else:
         circles = [step.name for step in steps if step.kind == "circle"]
         found = estimate_tool(laser, path, steps, taught)
         known = KnownTool.measured(found)
-        document = run_document(known, found, circles, judge_run(found, ToolLimits()))
-    document["warnings"] = warnings
+        tool = run_document(known, found, circles, judge_run(found, ToolLimits()))
+    document: ToolRunDocument = {**tool, "warnings": warnings}
     return CliResult(document, _show_tool)
 
 
@@ -344,8 +351,8 @@ def add_points(parser: argparse.ArgumentParser) -> None:
 def run_points(args: argparse.Namespace) -> CliResult:
     fit = {"four": fit_four, "seven": fit_seven}[args.method]
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
-    document: Document = {"method": args.method}
-    document |= touch_document(fit(read_flange_poses(args.data), sigma_m))
+    touched = touch_document(fit(read_flange_poses(args.data), sigma_m))
+    document: TouchesDocument = {"method": args.method, **touched}
     return CliResult(document, _show_tool)
 
 
@@ -419,7 +426,7 @@ def run_export(args: argparse.Namespace) -> CliResult:
             raise InputError("--mass-kg and --cog-mm go together: a load has both")
         x, y, z = args.cog_mm
         load = Load(args.mass_kg, (x * 1e-3, y * 1e-3, z * 1e-3))
-    document: Document = {
+    document: ExportedToolDocument = {
         "format": args.format,
         "text": exported(T_flange_tool, args.format, load),
         "T_flange_tool": transform_document(T_flange_tool),
@@ -461,14 +468,14 @@ def run_station(args: argparse.Namespace) -> CliResult:
     shifts = [station_shift(first, found) for _, found in later]
     stamps = [entry.stamp_ns for entry, _ in later]
     last = measurement_of(kept[-1][1])
-    document: Document = {
+    document: StationDocument = {
         "robot": robot.arm.name,
         "model_hash": robot.arm.model_hash,
         "station": kept[-1][1]["made_with"]["station"],
         **laser_document(last.laser),
         "first_stamp_ns": kept[0][0].stamp_ns,
         "measured": [
-            {"stamp_ns": stamp, "calibration": entry.id} | shift.document()
+            {"stamp_ns": stamp, "calibration": entry.id, **shift.document()}
             for stamp, (entry, _), shift in zip(stamps, later, shifts, strict=True)
         ],
         "trend": station_trend(stamps, shifts),

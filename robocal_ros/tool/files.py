@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -31,6 +31,16 @@ from robocal_ros.tool.edges import BEAMS, Beam, BeamEdge, StepKind, debounced
 from robocal_ros.tool.judging import KnownTool, QuickCheck
 from robocal_ros.tool.laser_frame import JointPath, LaserFrame, first_rotation
 from robocal_ros.tool.touch_points import HEIGHTS, SWEEPS, Height, TouchFit
+
+if TYPE_CHECKING:
+    from robocal_ros.tool.documents import (
+        CircleDocument,
+        FoundToolDocument,
+        LaserDocument,
+        ParallelBeamsDocument,
+        ToolFrameDocument,
+        TouchedToolDocument,
+    )
 
 QUATERNION_TOLERANCE = 1e-3
 
@@ -257,7 +267,7 @@ def named_steps(
 COVARIANCE_UNITS = ("m", "m", "m", "rad", "rad")
 
 
-def laser_document(laser: LaserFrame) -> Document:
+def laser_document(laser: LaserFrame) -> "LaserDocument":
     """Where two beams cross: origin, gap and angle; ``axes`` has x, y, z as rows, base."""
     T_base_laser = laser.T_base_laser
     return {
@@ -268,10 +278,10 @@ def laser_document(laser: LaserFrame) -> Document:
     }
 
 
-def circle_document(fit: CircleFit) -> Document:
+def circle_document(fit: CircleFit) -> "CircleDocument":
     """The tool's axis on one circle; what the method does not tell is null."""
     sigma = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance)) * 1e3
-    rho = None if fit.rho is None else dict(zip("xy", (fit.rho * 1e3).tolist(), strict=True))
+    rho = None if fit.rho is None else fit.rho * 1e3
     words = f"the axis is at ({fit.centre[0] * 1e3:.3f}, {fit.centre[1] * 1e3:.3f}) mm"
     if sigma is not None:
         words += f", known to {float(sigma.max()):.4f} mm; edges within {fit.misfit_m * 1e3:.4f} mm"
@@ -279,7 +289,7 @@ def circle_document(fit: CircleFit) -> Document:
         "method": fit.method,
         "center_mm": (fit.centre * 1e3).tolist(),
         "sigma_mm": None if sigma is None else sigma.tolist(),
-        "tool_radius_mm": rho,
+        "tool_radius_mm": None if rho is None else {"x": float(rho[0]), "y": float(rho[1])},
         "latency_s": fit.latency_s,
         "misfit_mm": None if sigma is None else fit.misfit_m * 1e3,
         "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
@@ -288,7 +298,7 @@ def circle_document(fit: CircleFit) -> Document:
 
 def run_document(
     found: KnownTool, estimate: ToolEstimate, circles: Sequence[str], verdict: Verdict
-) -> Document:
+) -> "FoundToolDocument":
     """A tool ``found`` by a whole run; ``circles``: names in the order of their radii.
 
     ``covariance`` (5, 5), SI: of the tip along the flange's x, y, z and of the axis' tilt along the
@@ -313,32 +323,37 @@ def run_document(
     }
 
 
-def classic_run_document(T_flange_tool: Array) -> Document:
+def classic_run_document(T_flange_tool: Array) -> "FoundToolDocument":
     """A tool by the classic method; what it does not tell is null."""
     words = "mid-times: no covariance, and biased for a thick tool; compare with method best"
-    unknown = (
-        *("covariance", "covariance_units", "sigma_mm", "sigma_deg", "tool_radius_mm"),
-        *("latency_s", "latency_sigma_s", "misfit_mm", "shift_mm"),
-    )
     return {
         "method": "classic",
         **_tool_part(T_flange_tool),
-        **dict.fromkeys(unknown),
+        "covariance": None,
+        "covariance_units": None,
+        "sigma_mm": None,
+        "sigma_deg": None,
+        "tool_radius_mm": None,
+        "latency_s": None,
+        "latency_sigma_s": None,
+        "misfit_mm": None,
+        "shift_mm": None,
         "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
     }
 
 
-def parallel_document(axis: Array, tip: Array | None) -> Document:
+def parallel_document(axis: Array, tip: Array | None) -> "ParallelBeamsDocument":
     """A tool by parallel beams: turned from the flange's by the smallest angle; SI in, mm out."""
     words = "the straightened tool stands upright" if tip is not None else "the axis alone"
     T = frames.transform(first_rotation(axis), np.zeros(3) if tip is None else tip)
-    return _tool_part(T) | {
+    return {
+        **_tool_part(T),
         "tcp_mm": None if tip is None else (tip * 1e3).tolist(),
         "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
     }
 
 
-def _tool_part(T_flange_tool: Array) -> Document:
+def _tool_part(T_flange_tool: Array) -> "ToolFrameDocument":
     return {
         "tcp_mm": (T_flange_tool[:3, 3] * 1e3).tolist(),
         "quat_xyzw": frames.quat_xyzw(T_flange_tool).tolist(),
@@ -346,7 +361,7 @@ def _tool_part(T_flange_tool: Array) -> Document:
     }
 
 
-def touch_document(fit: TouchFit) -> Document:
+def touch_document(fit: TouchFit) -> "TouchedToolDocument":
     """A touched tool; without an orientation its quaternion is null."""
     far = np.linalg.norm(fit.residual, axis=1)
     turn = None if fit.rotation is None else frames.transform(fit.rotation, np.zeros(3))

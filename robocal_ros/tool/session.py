@@ -282,7 +282,7 @@ class ToolResults:
         taught, mandrel = self.taught(run.mode), run.mode == WITNESS_REFERENCE
         kind = MANDREL if mandrel else HEALTHY_TOOL
         verdict = judge_healthy(found, estimate, taught)
-        document = run_document(found, estimate, run.circles, verdict)
+        document: Document = {**run_document(found, estimate, run.circles, verdict)}
         document["change"] = change_between(taught, found.T_flange_tool).document()
         own: Document = {"traits": run.traits(estimate).document()}
         if mandrel:

@@ -10,6 +10,7 @@ alike: it is not in the sigma, and cancels in a change.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,6 +29,9 @@ from robocal_ros.tool.crossed_model import (
 )
 from robocal_ros.tool.laser_frame import POINTS, FlangePath, LaserFrame
 from robocal_ros.tool.run import LITTLE_TURN_RAD, WrongToolError
+
+if TYPE_CHECKING:
+    from robocal_ros.tool.documents import StationShiftDocument, StationTrendDocument
 
 ROUGH_M = 5e-3  # how well the beams' points are known before: a drawing, or before a knock
 KNOWN = Held(tilt_rad=EXACT_M, along_m=EXACT_M, across_m=EXACT_M)
@@ -93,7 +97,7 @@ class StationShift:
         """Angle of the turn."""
         return float(np.linalg.norm(self.turn))
 
-    def document(self) -> Document:
+    def document(self) -> "StationShiftDocument":
         """For people: mm and degrees."""
         sigma = np.sqrt(np.diag(self.covariance))
         return {
@@ -258,7 +262,9 @@ def measurement_of(document: Document) -> StationMeasurement:
     return StationMeasurement(laser, C, document["misfit_m"])
 
 
-def station_trend(stamp_ns: Sequence[int], shifts: Sequence[StationShift]) -> Document:
+def station_trend(
+    stamp_ns: Sequence[int], shifts: Sequence[StationShift]
+) -> "StationTrendDocument":
     """Straight line through the crossing's shifts: mm a day (3), and its sigma; none of one.
 
     Weighted by the covariance of each later measurement; what the first one is off by is in all

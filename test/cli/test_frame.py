@@ -2,11 +2,13 @@
 import io
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Annotated, Literal, NotRequired, TypedDict
 
 import pytest
 from command import COMMAND, ROOT, SCHEMAS, conforms, environment, robocal, robocal_json
@@ -15,6 +17,7 @@ from jsonschema import Draft202012Validator
 from robocal_ros import __version__
 from robocal_ros.cli import main as frame
 from robocal_ros.cli.main import CliResult, exit_status, failure
+from robocal_ros.ground.documents import Three, keywords
 from robocal_ros.ground.errors import (
     Code,
     ConflictError,
@@ -31,6 +34,45 @@ from robocal_ros.ground.errors import (
 def test_schemas_are_schemas(name):
     Draft202012Validator.check_schema(SCHEMAS[name])
     assert SCHEMAS[name]["$id"] == name
+
+
+def test_the_schemas_are_made_from_the_declarations():
+    made = runpy.run_path(str(ROOT / "tools" / "schemas.py"))["all_schemas"]()
+    kept = {path.name: path.read_text() for path in (ROOT / "docs" / "schemas").iterdir()}
+    assert made == kept, "run tools/schemas.py"
+
+
+class Part(TypedDict):
+    share: Annotated[float, keywords(minimum=0, maximum=1), "Of all."]
+    way: NotRequired[Literal["up", "down"]]
+
+
+class Whole(TypedDict):
+    parts: Annotated[dict[str, Part | None], keywords(minProperties=1)]
+    place: Three | None
+
+
+@pytest.mark.parametrize(
+    ("change", "fits"),
+    [
+        ({}, True),
+        ({"place": None}, True),
+        ({"place": [1, 2]}, False),
+        ({"place": [1, 2, "3"]}, False),
+        ({"parts": {}}, False),
+        ({"parts": {"a": None}}, True),
+        ({"parts": {"a": {"share": 1.1}}}, False),
+        ({"parts": {"a": {"share": 1, "way": "left"}}}, False),
+        ({"parts": {"a": {"way": "up"}}}, False),
+        ({"more": 1}, False),
+    ],
+)
+def test_a_schema_holds_what_its_declaration_says(change, fits):
+    schema = runpy.run_path(str(ROOT / "tools" / "schemas.py"))["Schemas"]({}).of(Whole)
+    document = {"parts": {"a": {"share": 0.5, "way": "up"}}, "place": [1, 2, 3]} | change
+    assert Draft202012Validator(schema).is_valid(document) is fits
+    words = schema["properties"]["parts"]["additionalProperties"]["properties"]["share"]
+    assert words["description"] == "Of all."
 
 
 class TestUsage:
@@ -240,6 +282,7 @@ class TestOutcomes:
 SLOW = """
 import sys, time
 from types import SimpleNamespace
+from typing import Annotated, Literal, NotRequired, TypedDict
 from robocal_ros.cli import main as frame
 from robocal_ros.cli.main import CliResult
 def run(args):

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What correct-program and frame-shift print as JSON; see `robocal_ros.ground.documents`."""
+
+from typing import Annotated, Literal, TypedDict
+
+from robocal_ros.ground.documents import (
+    Count,
+    NotNegative,
+    Numbers,
+    Ordinal,
+    PoseDocument,
+    RobotDocument,
+    Share,
+    Texts,
+    VerdictDocument,
+    Words,
+    keywords,
+    printed,
+)
+
+Maker = Literal["abb", "fanuc", "kawasaki", "kuka", "ur"]
+State = Literal["corrected", "unchanged", "not_corrected"]
+
+
+class ProgramPointDocument(TypedDict):
+    name: str
+    line: Ordinal
+    by: Literal["pose", "joints"]
+    state: State
+    reason: Annotated[str, "Why it was not corrected; else empty."]
+    shift_mm: Annotated[NotNegative, "How far the tool was moved in the program."]
+    shift_deg: NotNegative
+    left_mm: Annotated[
+        NotNegative | None,
+        "By how much the robot as identified misses the place with what is written; null "
+        "where the point's joints are not known.",
+    ]
+    left_deg: NotNegative | None
+    joints: Annotated[
+        Numbers | None, "Taught joints, rad (prismatic: m); null where they are not known."
+    ]
+
+
+class PointCountsDocument(TypedDict):
+    corrected: Count
+    unchanged: Count
+    not_corrected: Count
+
+
+class ComputedPointDocument(TypedDict):
+    line: Ordinal
+    text: str
+
+
+class ProgramReportDocument(TypedDict):
+    points: Annotated[list[ProgramPointDocument], keywords(minItems=1), "In the order of the text."]
+    count: PointCountsDocument
+    computed: Annotated[
+        list[ComputedPointDocument], "Places where the program makes a point itself."
+    ]
+    warnings: Texts
+
+
+@printed("correct-program")
+class CorrectedProgramDocument(RobotDocument, ProgramReportDocument):
+    program: str
+    maker: Maker
+    output: Annotated[str | None, "The program that was written; null where none was."]
+    verdict: VerdictDocument
+
+
+class ShiftErrorsDocument(TypedDict):
+    rms_mm: NotNegative
+    max_mm: NotNegative
+    share_within_limit: Annotated[Share, "Of the coordinates of all errors."]
+
+
+class PoseErrorDocument(TypedDict):
+    mm: NotNegative
+    deg: NotNegative
+
+
+class ShiftedPoseDocument(TypedDict):
+    name: str
+    before: PoseErrorDocument
+    after: PoseErrorDocument
+
+
+class ShiftInForceDocument(ShiftErrorsDocument):
+    revision: Ordinal
+
+
+class ShiftDocument(TypedDict):
+    T_base_shift: Annotated[PoseDocument, "Goes before every base frame."]
+    T_tool_shift: Annotated[PoseDocument, "Goes behind every tool."]
+    before: ShiftErrorsDocument
+    after: ShiftErrorsDocument
+    poses: Annotated[list[ShiftedPoseDocument], keywords(minItems=1)]
+
+
+@printed("frame-shift")
+class FrameShiftDocument(RobotDocument, ShiftDocument):
+    maker: Maker
+    text: Annotated[Words, "The frames as shifted, for the controller."]
+    output: Annotated[str | None, "The file that was written."]
+    warnings: Texts
+    verdict: VerdictDocument
+    in_force: Annotated[
+        ShiftInForceDocument | None,
+        "The shift in force in the history, judged with the present model; null where the "
+        "frames are as they were.",
+    ]
+    calibration_id: Annotated[Ordinal | None, "Its number in the history, where it was kept."]
