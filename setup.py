@@ -80,6 +80,7 @@ setup(
     install_requires=["setuptools", *NEEDED],
     extras_require={
         "cluster": [f"{name}>={OLDEST[name]}" for name in CLUSTER],
+        "completion": [f"argcomplete>={OLDEST['argcomplete']}"],
         "plc": [f"asyncua~={OLDEST['asyncua']}"],  # its inner parts are used
         "panel": [f"{name}>={OLDEST[name]}" for name in ("aiohttp", "cryptography")],
         "dev": [f"{name}=={version}" for name, version in (LINE | DEV).items()],

@@ -101,7 +101,7 @@ def test_what_it_needs_is_declared_from_the_oldest_that_is_tested(metadata: Mess
         assert int(newest[1]) == int(core[name].split(".")[0]) + 1
         assert name in floor
     extras = {str(extra) for extra in metadata.get_all("Provides-Extra", [])}
-    assert extras == {"cluster", "dev", "panel", "plc"}
+    assert extras == {"cluster", "completion", "dev", "panel", "plc"}
 
 
 def test_it_lays_no_script_over_pips_own(wheel: Path) -> None:
