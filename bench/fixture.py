@@ -17,6 +17,7 @@ from bench.measured_fixture import (
     PLATE,
     TAUGHT_VISITS,
     MeasuredFixture,
+    fixture_poses,
 )
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.cell import worked_for
@@ -26,6 +27,7 @@ from robocal_ros.fixture.witnesses import ROBOT
 from robocal_ros.ground.frames import Array
 
 CELLS = range(101, 161)  # other ones than those of the tests
+RESUMED = 30  # of these, in which a measurement goes on in another gap
 MOVED_M = (1e-4, 2e-4, 5e-4, 1e-3, 2e-3)
 MOST_OFF_MM = 0.1
 VISITS = (TAUGHT_VISITS, GAP_VISITS)
@@ -71,7 +73,7 @@ def _findings(result: FixtureResult) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def tables() -> Sequence[Table]:
     """All tables of this module."""
     cells = [MeasuredFixture(seed) for seed in CELLS]
-    return [moved_table(cells), others_table(cells)]
+    return [moved_table(cells), others_table(cells), resumed_table(cells[:RESUMED])]
 
 
 def moved_table(cells: Sequence[MeasuredFixture]) -> Table:
@@ -126,6 +128,40 @@ def others_table(cells: Sequence[MeasuredFixture]) -> Table:
         said = Said(truth, [made(cell) for cell in cells])
         as_fixture = sum(NAME in _findings(result)[0] for result in said.results)
         table.add(words, said.told, said.doubtful, said.wrong, Goal(as_fixture, 0))
+    return table
+
+
+def resumed_table(cells: Sequence[MeasuredFixture]) -> Table:
+    """A measurement that goes on in a second gap."""
+    table = Table(
+        "fixture_resumed",
+        f"A measurement that another gap goes on with, in {len(cells)} cells with backlash",
+        ("reached from the pose after it, not from the one before", "most displaced by that, mm",
+         "nothing moved: told", "in doubt", "something told", "moved by 0.2 mm: told", "in doubt",
+         "something else told", "worst place by the new frame, mm"),
+        "Joints come from the other side there, 70 urad each. maintenance_node drives to each pose "
+        "through those before it, in every gap: the first row.",
+    )  # fmt: skip
+    size_m, count = MOVED_M[1], len(fixture_poses())
+    for words, chosen in (
+        ("none", lambda first: ()),
+        ("the first one of the second gap", lambda first: (first,)),
+        ("the first one of each of five gaps", lambda first: range(first % 6, 2 * count, 6)),
+        ("all", lambda first: range(2 * count)),
+    ):
+        away, still, moved, off = [0.0], [], [], []
+        for number, cell in enumerate(cells):
+            visits = chosen(number % (2 * count))
+            points = [cell.points(cell.faults(), GAP_VISITS, 2, backwards=v) for v in ((), visits)]
+            away.append(float(np.max(np.linalg.norm(points[1].p - points[0].p, axis=1))))
+            still.append(cell.gap(backwards=visits))
+            moved.append(cell.gap("fixture_moved", size_m, backwards=visits))
+            off.append(1e3 * cell.worst_m(moved[-1], "fixture_moved", size_m))
+        nothing, fixture = Said("", still), Said(NAME, moved)
+        doubt = float(np.mean([bool(_findings(result)[1]) for result in still]))
+        figures = nothing.told, doubt, nothing.wrong
+        figures += fixture.told, fixture.doubtful, fixture.wrong
+        table.add(words, 1e3 * max(away), *figures, max(off))
     return table
 
 

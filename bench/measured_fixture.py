@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A fixture measured by a sensor on the flange of a warm robot: what a session is given."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -64,13 +65,27 @@ class MeasuredFixture:
         return faults
 
     def points(
-        self, faults: Faults, visits: int, gap: int, warm: Warmth | None = None
+        self,
+        faults: Faults,
+        visits: int,
+        gap: int,
+        warm: Warmth | None = None,
+        backwards: Sequence[int] = (),
     ) -> FixturePoints:
-        """Each pose so many times; every ``gap`` has noise of its own."""
-        q = np.tile(fixture_poses(), (visits, 1))
+        """Each pose so many times, from the one before it, the first from home; with backlash.
+
+        Every ``gap`` has noise of its own. ``backwards``: visits, from 0, that come from the pose
+        after it instead.
+        """
+        ring = np.vstack([poses("home")[0], fixture_poses()])
+        q, before = np.tile(ring[1:], (visits, 1)), np.tile(np.arange(len(ring) - 1), visits)
+        before[[*backwards]] += 2
+        before %= len(ring)
         rng, draws = np.random.default_rng([self.seed, gap]), Draws(1000 * gap + self.seed)
-        cold = Warmth.cold(ARM.n) if warm is None else warm
-        true = self.cell.robot.flange(q + REPEATS * rng.standard_normal(q.shape), cold)
+        cold, gears = Warmth.cold(ARM.n) if warm is None else warm, self.cell.robot.backlash
+        behind = None if gears is None else gears.behind(q - ring[before])
+        reading = q + REPEATS * rng.standard_normal(q.shape)
+        true = self.cell.robot.flange(reading, cold, behind=behind)
         known = ARM.fk(q)
         shots = [STATION.shoot(T, i, 0.0, faults, draws) for i, T in enumerate(true)]
         p = np.array(
@@ -98,12 +113,13 @@ class MeasuredFixture:
         without: tuple[str, ...] = (),
         number: int = 2,
         visits: tuple[int, int] = (TAUGHT_VISITS, GAP_VISITS),
+        backwards: Sequence[int] = (),
     ) -> FixtureResult:
         """What is said in a gap after a fault; ``without``: what was not measured.
 
-        ``visits``: of each pose when it was taught, and in the gap.
+        ``visits``: of each pose when it was taught, and in the gap. ``backwards``: see `points`.
         """
-        points = self.points(self.faults(fault, size_m), visits[1], number, warm)
+        points = self.points(self.faults(fault, size_m), visits[1], number, warm, backwards)
         seen = points.take(np.array([name not in without for name in points.name]))
         return judge_fixture(PLATE, seen, ARM, LIMITS, self.taught(visits[0]))
 

@@ -70,10 +70,8 @@ class ThermalPart:
         self._times = cell.config.times
 
     def worst_s(self) -> float:
-        """The longest first step of a gap, before it is planned: one pose, with its way home."""
-        ways = self._cell.ways
-        homes = max((ways.home_s(i) for i in range(1, ways.count + 1)), default=0.0)
-        return self._first_s(max(ways.line_s), homes)
+        """The longest first step of a gap: one pose, with its way home."""
+        return self._first_s(self._cell.ways.first_s())
 
     def drop_old(self) -> str:
         """Give up an open cycle whose last pose is too old, and say so; empty: there is none."""
@@ -97,8 +95,8 @@ class ThermalPart:
         cell, thermal = self._cell, self._thermal
         todo = [i for i in range(1, cell.ways.count + 1) if i not in thermal.visited]
         if todo:
-            way_s = cell.ways.to((HOME, HOME), cell.config.home, todo[0]).plan.duration_s
-            if not cell.fits(self._first_s(way_s, cell.ways.home_s(todo[0]))):
+            way = cell.ways.onward((HOME, HOME), cell.config.home, todo[0]).plan
+            if not cell.fits(self._first_s(way.duration_s + cell.ways.home_s(todo[0]))):
                 return None, f"{MEASUREMENT}, {len(todo)} poses"
             cell.doing = "thermal cycle begins"
             name = thermal.id or cycle_id
@@ -134,8 +132,8 @@ class ThermalPart:
         yield from cell.stand(STANDS_S)
         for done, pose in enumerate(todo):
             q = yield from cell.stand()
-            route = cell.ways.to(cell.robot.place, q, pose)
-            worst_s = self._step_s(route.plan.duration_s, cell.ways.home_s(pose))
+            route = cell.ways.onward(cell.robot.place, q, pose)
+            worst_s = self._step_s(route.plan.duration_s + cell.ways.home_s(pose))
             if not cell.fits(worst_s):
                 return len(todo) - done
             cell.doing = f"on its way to measuring pose {pose} of {cell.ways.count}"
@@ -159,16 +157,16 @@ class ThermalPart:
         self._thermal.moved = answer.code is Code.SENSOR_OR_ROBOT_MOVED
         return answer
 
-    def _first_s(self, way_s: float, home_s: float) -> float:
+    def _first_s(self, ways_s: float) -> float:
         """The cycle begins before it."""
-        return 2.0 * self._times.answer_s + STANDS_S + self._step_s(way_s, home_s)
+        return 2.0 * self._times.answer_s + STANDS_S + self._step_s(ways_s)
 
-    def _step_s(self, way_s: float, home_s: float) -> float:
+    def _step_s(self, ways_s: float) -> float:
         """At the most: a rest at each arrival, before the measurement and after it.
 
         What stands before a pose that does not fit need not stand again before its way home.
         """
-        return way_s + home_s + 4.0 * self._times.rest_s + self._times.measure_s
+        return ways_s + 4.0 * self._times.rest_s + self._times.measure_s
 
 
 @dataclass

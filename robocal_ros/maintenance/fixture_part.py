@@ -48,12 +48,9 @@ class FixturePart:
         self._times = cell.config.times
 
     def worst_s(self) -> float:
-        """The longest first step of a gap, before it is planned: one pose, with its way home."""
+        """The longest first step of a gap: one pose, with its way home."""
         ways = self._cell.fixture_ways
-        if ways is None:
-            return 0.0
-        homes = max(ways.home_s(i) for i in range(1, ways.count + 1))
-        return self._step_s(max(ways.line_s), homes)
+        return 0.0 if ways is None else self._step_s(ways.first_s())
 
     def script(self) -> Script[tuple[DriverAnswer | None, str]]:
         """The answer of its node, None where it is not reached, and what is left.
@@ -85,8 +82,8 @@ class FixturePart:
         yield from cell.stand(STANDS_S)
         for pose in poses[visits.done :]:
             q = yield from cell.stand()
-            route = ways.to(cell.robot.place, q, pose)
-            worst_s = self._step_s(route.plan.duration_s, ways.home_s(pose))
+            route = ways.onward(cell.robot.place, q, pose)
+            worst_s = self._step_s(route.plan.duration_s + ways.home_s(pose))
             if not cell.fits(worst_s):
                 return
             cell.doing = f"on its way to fixture pose {pose} of {ways.count}"
@@ -115,6 +112,6 @@ class FixturePart:
         visits = self._visits
         visits.done, visits.unmeasured, visits.last_s = 0, 0, -np.inf
 
-    def _step_s(self, way_s: float, home_s: float) -> float:
+    def _step_s(self, ways_s: float) -> float:
         """At the most, as of a measuring pose of the thermal cycle."""
-        return way_s + home_s + 4.0 * self._times.rest_s + self._times.measure_s
+        return ways_s + 4.0 * self._times.rest_s + self._times.measure_s

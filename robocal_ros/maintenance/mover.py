@@ -97,31 +97,44 @@ class Ways:
         away: Array = np.abs(start + share * way - q)
         return away
 
-    def to(self, place: Line, q: Array, goal: int) -> Route:
-        """The shortest way from a place, where the robot stands at joints (n,), to a point."""
-        routes = []
-        for near in dict.fromkeys(place):
-            other = place[0] if near == place[1] else place[1]
-            for sense in (+1, -1):
-                lines = self._ring(near, (goal - near) * sense % len(self._points), sense)
-                if other != near or not lines:
-                    lines = [(other, near), *lines]
-                routes.append(self._route(q, lines))
-        return min(routes, key=lambda route: route.plan.duration_s)
+    def first_s(self) -> float:
+        """The longest `onward` from home to a pose, and home from there; no more than the ring."""
+        out = np.cumsum(self.line_s[:-1]).tolist()
+        return max((out_s + self.home_s(i) for i, out_s in enumerate(out, 1)), default=0.0)
+
+    def onward(self, place: Line, q: Array, pose: int) -> Route:
+        """The way to a pose through those before it, from where the robot stands at joints (n,).
+
+        So its joints come from one side, in whatever gap: backlash is the same at each visit.
+        """
+        ahead = self._ring(place[1], (pose - place[1]) % len(self._points), +1)
+        return self._route(q, ahead if place[0] == place[1] and ahead else [place, *ahead])
 
     def home(self, place: Line, q: Array) -> Route:
-        """The way home, also from the station. Raises `LimitError` when there is none.
+        """The shortest way home, or that from the station. Raises `LimitError` when there is none.
 
         From there the tip leads that hangs lower, the tool's or the mandrel's: it is in the beams.
         """
         if place != STATION:
-            return self.to(place, q, HOME)
+            return self._back(place, q)
         cells = [self.station]
         if (mandrel := self.station.beside) is not None:
             cells.append(replace(self.station, tool=mandrel, beside=self.station.tool))
         lower = min(cells, key=lambda cell: cell.in_laser(cell.T_base_tip(q)[:3, 3])[2])
         plan = departure(lower, q, self._home)
         return Route(plan, ((STATION[0], HOME),), (plan.duration_s,))
+
+    def _back(self, place: Line, q: Array) -> Route:
+        """The shortest of the ways home by the ring."""
+        routes = []
+        for near in dict.fromkeys(place):
+            other = place[0] if near == place[1] else place[1]
+            for sense in (+1, -1):
+                lines = self._ring(near, -near * sense % len(self._points), sense)
+                if other != near or not lines:
+                    lines = [(other, near), *lines]
+                routes.append(self._route(q, lines))
+        return min(routes, key=lambda route: route.plan.duration_s)
 
     def _require_time(self, tool_home_s: float) -> None:
         """Refuse a time for the way home from the beams that is surely too short.

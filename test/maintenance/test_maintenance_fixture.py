@@ -48,6 +48,18 @@ def ends(cell):
     return np.array([r.plan.q[-1] for r in cell.log if isinstance(r, ask.Move)])
 
 
+def sides(cell, poses):
+    """Of each visit of one of these poses: which, and which way each joint went last."""
+    found = []
+    for plan in (r.plan for r in cell.log if isinstance(r, ask.Move)):
+        away = np.max(np.abs(poses - plan.q[-1]), axis=1)
+        if np.min(away) < 1e-9:
+            went = np.sign(np.diff(plan.q, axis=0)).T
+            last = tuple(float(way[np.flatnonzero(way)[-1]]) for way in went)
+            found.append((int(np.argmin(away)), last))
+    return found
+
+
 def fixture_log(cell):
     """What was asked from the fixture's step on."""
     return kinds(cell)[kinds(cell).index("BeginFixture") :]
@@ -79,6 +91,35 @@ def test_what_does_not_fit_goes_on_in_the_next_gap_and_is_asked_for_once(lone):
     assert kinds(lone).count("MeasureFixture") == 1
     at = [q for q in ends(lone) if min(np.max(np.abs(FIXTURE_POSES - q), axis=1)) < 1e-9]
     np.testing.assert_allclose(at, WAYS, atol=1e-9)
+
+
+@pytest.mark.parametrize("step", ["fixture", "thermal"])
+def test_a_pose_is_reached_from_one_side_in_whatever_gap(step, history):
+    """From the other a joint's backlash is in the comparison with what was taught, or the cold."""
+    steps = [[-9.0, 4, 3, 2, -3, 1], [-9.0, -2, 2, -3, 4, -2], [-3.0, 3, -2, -2, 2, 5]]
+    steps += [[2.0, -2, -2, 3, 3, -3], [2.0, 2, 3, 3, -3, -3]]
+    taught = HOME + np.radians(np.cumsum(steps, axis=0))  # each joint turns on each line
+    if step == "fixture":
+        changed = {"poses": np.empty((0, len(HOME))), "fixture_poses": taught}
+    else:
+        changed = {"poses": taught}
+    cell = Cell(history, config_of(T_base_laser=None, **changed))
+    cell.open_gap()
+    assert cell.ran("long").complete
+    over(cell)
+    at_once, at_first = dict(sides(cell, taught)), len(sides(cell, taught)) // len(taught)
+    assert len(at_once) == len(taught)
+    assert len(set(at_once.values())) == len(taught), "another side for each, else nothing is shown"
+    cell.log.clear()
+    cell.run("broken off", LONG_S)
+    while "measuring" not in (doing := cell.session.status(cell.now_s).doing) or "4" not in doing:
+        cell.step()
+    cell.session.cancel("by hand")
+    cell.finish()
+    over(cell)
+    assert cell.ran("goes on").complete
+    assert [pose for pose, _ in sides(cell, taught)].count(0) == at_first
+    assert {visit in at_once.items() for visit in sides(cell, taught)} == {True}
 
 
 def test_one_that_waited_too_long_begins_anew(history):
