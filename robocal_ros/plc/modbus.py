@@ -65,6 +65,8 @@ INPUTS = (
     Register(32, "Candidates.ToolId", "I", "Tool candidate that waits; 0: none"),
     Register(34, "LastCycle.ThermalId", "I", "Candidate of the last thermal cycle"),
     Register(36, "LastCycle.ToolId", "I", "Candidate of the last tool measurement"),
+    Register(38, "Fixture.Id", "I", "The fixture's new frame, to be decided; 0: none"),
+    Register(40, "Fixture.Code", "H", "What its last measurement said; 0: none was yet"),
 )
 HOLDINGS = (
     Register(HEARTBEAT_AT, "Heartbeat", "I", "Beat while the robot may be moved, else 0"),
@@ -73,7 +75,7 @@ HOLDINGS = (
     Register(5, "Request.GapS", "H", "Length of the gap, s"),
     Register(6, "Request.Cycle", "I", "Number of the cycle; its id"),
 )
-INPUT_WORDS = INPUTS[-1].address + 2
+INPUT_WORDS = 41
 
 
 class Image(Protocol):

@@ -8,11 +8,16 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from domains import free_domain
+from robocal_msgs.msg import MaintenanceStatus
 
 from bench.live.cell import SERIAL, TRUTH
+from bench.live.graph import CellController, LiveError
+from bench.live.lines import Answer, Look
+from bench.live.plc import Plc
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.cell_sim.trajectory_controller import ROOM
@@ -154,3 +159,48 @@ def test_the_page_shows_what_the_line_reads(demo):
     if not gap["broken_off"]:
         assert page["last"]["tool_found_code"] == "LIMIT_EXCEEDED"
         assert page["tasks"][0]["key"] == "LIMIT_EXCEEDED/tool mended"
+
+
+class ScriptedLine:
+    """A line whose cycle ends in the fault that is given, and then as planned."""
+
+    def __init__(self, fault: str) -> None:
+        self.is_open, self.fault, self.ran, self.acknowledged = False, fault, [], 0
+
+    def run(self, cycle_id: str, gap_s: float) -> Answer:
+        self.ran.append(cycle_id)
+        return Answer(True, Code.ACCEPT, "begins")
+
+    def acknowledge(self) -> Answer:
+        self.fault, self.acknowledged = "", self.acknowledged + 1
+        return Answer(True, Code.ACCEPT, "")
+
+    def look(self) -> Look:
+        code = Code.LIMIT_EXCEEDED if self.fault else Code.ACCEPT
+        last = SimpleNamespace(
+            cycle_id=self.ran[-1], code=code, message=self.fault, complete=not self.fault
+        )
+        now = {"doing": "", "at_home": True, "fault": self.fault, "last": last}
+        state = MaintenanceStatus.FAULT if self.fault else MaintenanceStatus.IDLE
+        return Look(SimpleNamespace(state=state, **now), None)
+
+
+@pytest.mark.parametrize("fault", ["robot is not at home", "gap_open is silent for more than 1 s"])
+def test_only_a_gap_that_closed_by_its_own_rule_is_given_again(fault, graph, monkeypatch):
+    """Any other fault waits for a person, as at a PLC's program: it ends the demo, in one line."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    controller, line = CellController(), ScriptedLine(fault)
+    plc = Plc(controller, line, print)
+    monkeypatch.setattr(plc, "_see_to_it", line.acknowledge)  # no robot stands here
+    try:
+        if fault.startswith("gap_open"):
+            assert plc.gap("gap", 60.0).result.complete
+            assert (line.ran, line.acknowledged) == (["gap", "gap+"], 1)
+        else:
+            with pytest.raises(LiveError) as ended:
+                plc.gap("gap", 60.0)
+            assert str(ended.value).startswith("gap: FAULT LIMIT_EXCEEDED: robot is not at home; ")
+            assert "\n" not in str(ended.value)
+            assert (line.ran, line.acknowledged, line.is_open) == (["gap"], 0, False)
+    finally:
+        controller.close()

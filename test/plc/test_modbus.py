@@ -133,7 +133,7 @@ def test_each_write_of_the_heartbeat_is_passed_on_and_half_of_one_is_not(served:
         client.write_registers(1, [1, 2]),
         client.write_registers(0, [0] * 9),
         client.write_registers(2, [0, 1]),
-        client.read_input_registers(37, count=2),
+        client.read_input_registers(INPUT_WORDS - 1, count=2),
     ):
         assert wrong.exception_code == ILLEGAL_ADDRESS
     assert client.write_coil(0, True).exception_code == ILLEGAL_FUNCTION
