@@ -7,7 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.cell_sim.beams import PEAK
 from robocal_ros.cell_sim.cell import Happened, station_name
 from robocal_ros.cell_sim.faults import Faults
+from robocal_ros.cell_sim.fixture import FRAME as FEATURE_FRAME
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
+from robocal_ros.fixture.session import FixturePointSample
 from robocal_ros.ground.samples import (
     MEASURED_POINT,
     REFERENCE_SPHERE,
@@ -21,7 +23,7 @@ from robocal_ros.tool.edges import EdgeSample
 Array = NDArray[np.float64]
 
 SPIN_RAD = float(np.radians(-135.0))  # of the flange about the laser's z, where the robot measures
-Sample = JointSample | PointSample | TemperatureSample | EdgeSample
+Sample = JointSample | PointSample | TemperatureSample | EdgeSample | FixturePointSample
 
 
 class CellSamples:
@@ -71,6 +73,10 @@ class CellSamples:
             else:
                 ball = PointSample(at, frame, "ball", shot.centre, MEASURED_POINT)
             samples += [ball, floor]
+        samples += [
+            FixturePointSample(self.ns(seen.at_s), FEATURE_FRAME, seen.point)
+            for seen in came.features
+        ]
         for told in came.temperatures:
             at = self.ns(told.time_s)
             samples += [

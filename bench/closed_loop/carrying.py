@@ -24,6 +24,7 @@ class Carrier:
     to_thermal : gives a command to the thermal session; `thermal_ended` takes its outcome.
     to_tool : gives a command to the tool session and returns its outcome; `tool_ended` takes the
         last outcome of a run.
+    to_fixture : gives a command to the fixture session; `fixture_ended` takes its outcome.
     """
 
     def __init__(
@@ -34,10 +35,12 @@ class Carrier:
         send: Callable[[JointPlan], None],
         to_thermal: Callable[[Command], None],
         to_tool: Callable[[Command], Outcome | None],
+        to_fixture: Callable[[Command], None] = lambda command: None,
     ) -> None:
         self._maintenance, self._tool, self._driver = maintenance, tool, driver
         self._send, self._to_thermal, self._to_tool = send, to_thermal, to_tool
-        self._ending: dict[str, int] = {}  # request that a thermal command answers
+        self._to_fixture = to_fixture
+        self._ending: dict[str, int] = {}  # request that a thermal or fixture command answers
         self._measuring = 0  # request that the open run answers
 
     def carry_out(self, request: ask.DriverRequest, now_s: float) -> None:
@@ -49,6 +52,12 @@ class Carrier:
                 self._cycle(events.BEGIN_CYCLE, request)
             case ask.EndCycle():
                 self._cycle(events.END_CYCLE, request)
+            case ask.BeginFixture():
+                self._ending[events.START] = request.number
+                self._to_fixture(Command(events.START))
+            case ask.MeasureFixture():
+                self._ending[events.CALIBRATE] = request.number
+                self._to_fixture(Command(events.CALIBRATE))
             case ask.Arm():
                 self._answer(request.number, lambda: self._driver.arm(now_s))
             case ask.Disarm():
@@ -70,6 +79,12 @@ class Carrier:
                 tuple(poses.get("missing", ())),
                 visited=poses.get("visited"),
             )
+            self._maintenance.answered(number, answer)
+
+    def fixture_ended(self, outcome: Outcome) -> None:
+        """The same, of the fixture."""
+        if (number := self._ending.pop(outcome.command.name, 0)) != 0:
+            answer = DriverAnswer(outcome.status, outcome.message, outcome.calibration_id)
             self._maintenance.answered(number, answer)
 
     def tool_ended(self, outcome: Outcome) -> None:

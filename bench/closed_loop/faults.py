@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 
 from bench.closed_loop.judging import Harm, harm
-from bench.closed_loop.plant import GapReport
+from bench.closed_loop.plant import FIXTURE_GAP_S, GapReport
 from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord
 from robocal_ros.cell_sim.faults import FAULTS, SIZES, Fault
 from robocal_ros.ground.errors import Code
@@ -41,6 +41,7 @@ RIGHT: Mapping[Fault, Code] = {
     "joints_silent": Code.TOO_FEW_SAMPLES,
     "frozen_clock": Code.TOO_FEW_SAMPLES,
     "frozen_encoder": Code.LIMIT_EXCEEDED,
+    "fixture_moved": Code.ACCEPT,
 }
 """What a PLC must read (docs/simulation.md). Exchanged motor temperatures need none: they are only
 used where the drift was learned with them. Nor does a jump of the sensor's clock: the robot stands
@@ -48,7 +49,7 @@ until the joint readings have passed a measurement's stamp, so it is taken at th
 that is too large for that leaves poses unmeasured. Nor does a station that turns about the crossing
 of its beams: neither tip nor axis of the tool change with it."""
 
-ONLY_BY: Mapping[Fault, str] = {"collision": "tool"}
+ONLY_BY: Mapping[Fault, str] = {"collision": "tool", "fixture_moved": "fixture"}
 """Who must give the right code, where it means something else of others."""
 
 STATION_MM = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 2.0)
@@ -67,6 +68,7 @@ SWEEP: Mapping[Fault, tuple[float, ...]] = {
     "station_knocked": STATION_MM,
     "station_knocked_shift": STATION_MM,
     "station_knocked_turn": (0.05, 0.2, 0.5, 1.0),
+    "fixture_moved": (0.1, 0.2, 0.5, 1.0, 2.0),
 }
 """Sizes in the faults' own units; a fault that is not here is tried at its usual one."""
 
@@ -94,11 +96,15 @@ class Trial:
     @property
     def plan(self) -> ShiftPlan:
         """A short shift with the fault after its first gap."""
+        fixture = self.fault == "fixture_moved"
+        gap_s, every_s = (FIXTURE_GAP_S, FIXTURE_GAP_S + EVERY_S) if fixture else (90.0, EVERY_S)
         return ShiftPlan(
-            hours=(CLEAN + self.gaps) * EVERY_S / 3600.0,
+            hours=(CLEAN + self.gaps) * every_s / 3600.0,
             work_s=WARM_S if self.gaps > AFTER else 0.0,
-            every_s=EVERY_S,
-            incidents=(Incident(CLEAN * EVERY_S, self.fault, self.size),),
+            every_s=every_s,
+            gap_s=gap_s,
+            incidents=(Incident(CLEAN * every_s, self.fault, self.size),),
+            fixture=fixture,
             # Exchanged temperatures matter to nobody else.
             prior="learned" if self.fault == "swapped_temperatures" else "default",
         )
@@ -169,7 +175,9 @@ def _told(gap: GapReport) -> list[tuple[str, Code]]:
     told = [("thermal", result.thermal_code)]
     told += [("tool", result.tool_found_code), ("tool", result.tool_code)]
     told += [("maintenance", gap.fault_code), ("maintenance", result.code)]
-    return [(name, code) for name, code in told if code not in WELL]
+    told = [(name, code) for name, code in told if code not in WELL]
+    found = result.fixture_code  # ACCEPT: it has moved, and nothing else has
+    return told + [("fixture", found)] * (found not in (Code.NONE, Code.NO_SIGNIFICANT_GAIN))
 
 
 def unseen(seeds: Sequence[int]) -> list[Trial]:
@@ -187,7 +195,7 @@ def sweep(seeds: Sequence[int]) -> list[Trial]:
     return [
         Trial(fault, size, seed)
         for fault in FAULTS
-        if fault not in ("none", "fixture_moved")  # a fixture is measured by its own node
+        if fault != "none"
         for size in SWEEP.get(fault, (0.0,))
         for seed in seeds
     ]

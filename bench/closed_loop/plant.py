@@ -37,6 +37,7 @@ ROUNDS = 3  # of the cold robot
 DWELL_S = 1.0  # at each of its poses
 REST_S = 0.2  # after a pass
 WITHIN_S = 120.0  # a commissioning step
+FIXTURE_GAP_S = 300.0  # in which a fixture is measured too
 WORK, HOME, CYCLE = poses("work"), poses("home")[0], poses("cycle")
 LEAD = 2  # rests at home, a second each: after a gap the offset begins at 0 and grows by 2 deg/s
 PROGRAMME = programme(HOME, [*[HOME] * LEAD, *WORK, HOME])
@@ -163,6 +164,20 @@ class Plant:
         if not measured.done:
             raise RobocalError(f"commissioning of the tool: {measured}")
         self.home_from_station(suite)
+        if suite.fixture is not None:
+            self._teach_fixture(suite)
+
+    def _teach_fixture(self, suite: Suite) -> None:
+        """By the points of a gap, which says that it is not taught, as docs/maintenance_node.md."""
+        untaught = self.gap("untaught", FIXTURE_GAP_S)
+        suite.fixture_command(Command(events.CALIBRATE, {"teach": True}))
+        before = suite.last_fixture
+        self._until(lambda: suite.last_fixture is not before)
+        suite.fixture_command(Command(events.ACCEPT, {"choose": "only", "by": "commissioning"}))
+        before = suite.last_fixture
+        self._until(lambda: suite.last_fixture is not before)
+        if suite.last_fixture is None or not suite.last_fixture.done:
+            raise RobocalError(f"teaching: {suite.last_fixture}, after {untaught}")
 
     def measure_drift(self, suite: Suite, cycle_id: str) -> Outcome:
         """A thermal cycle from home to home, outside any gap.
@@ -292,5 +307,6 @@ def equipped(
     ):
         plant = Plant(cell, None)
         laser = setting.laser_of(cell.plan)
-        plant.suite = Suite(nominal, history, laser, plant.send, record, expected)
+        fixture = cell.plan.fixture is not None
+        plant.suite = Suite(nominal, history, laser, plant.send, record, expected, fixture)
         yield plant, plant.suite

@@ -4,9 +4,15 @@
 import numpy as np
 
 from bench.cell_samples import SPIN_RAD
+from bench.measured_fixture import LIMITS as FIXTURE_LIMITS
+from bench.measured_fixture import fixture_poses
 from bench.measured_runs import point_sigma
 from robocal_ros.cell_sim.beams import CYLINDER_M
 from robocal_ros.cell_sim.cell import T_BASE_LASER, TAUGHT, CellPlan, known_laser, poses
+from robocal_ros.cell_sim.fixture import FRAME as FEATURE_FRAME
+from robocal_ros.cell_sim.fixture import PLATE
+from robocal_ros.fixture.files import fixture_document
+from robocal_ros.fixture.session import FixtureConfig
 from robocal_ros.maintenance.accuracy import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.plan import MotionLimits
@@ -55,14 +61,20 @@ def tool_config(laser: LaserFrame) -> ToolConfig:
     )
 
 
-def maintenance_config(laser: LaserFrame) -> MaintenanceConfig:
-    """Of the maintenance."""
+def fixture_config() -> FixtureConfig:
+    """Of the fixture session."""
+    return FixtureConfig(fixture_document(PLATE), sensor_frame=FEATURE_FRAME, limits=FIXTURE_LIMITS)
+
+
+def maintenance_config(laser: LaserFrame, fixture: bool = False) -> MaintenanceConfig:
+    """Of the maintenance; ``fixture``: it measures one, too."""
     return MaintenanceConfig(
         home=poses("home")[0],
         poses=poses("cycle"),
         T_flange_tool=TAUGHT,
         driving=DRIVING,
         T_base_laser=laser.T_base_laser,
+        fixture_poses=fixture_poses() if fixture else None,
         travel_speed_m_s=TRAVEL_M_S,
         home_near=HOME_NEAR_RAD,
         tolerance_m=TOLERANCE_M,

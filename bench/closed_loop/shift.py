@@ -53,6 +53,7 @@ class ShiftPlan:
     incidents : in their order; one within a gap happens at its end.
     prior : what drift to expect: the default, or as earlier shifts of this robot have taught.
     points : of a sphere's cloud; 0: centres alone.
+    fixture : there is one, which is measured in each gap.
     """
 
     hours: float
@@ -64,6 +65,7 @@ class ShiftPlan:
     incidents: tuple[Incident, ...] = ()
     points: int = 2000
     prior: Prior = "default"
+    fixture: bool = False
 
     @property
     def cycles(self) -> int:
@@ -146,7 +148,7 @@ def run_shift(
 ) -> ShiftRecord:
     """A whole shift; ``watch`` is given the plant before its commissioning."""
     nominal = load_robot(ROBOT)
-    made = kr150_cell(nominal, seed, points=plan.points)
+    made = kr150_cell(nominal, seed, points=plan.points, fixture=plan.fixture)
     cell = SimulatedCell(made)
     if not suite:
         watch(plant := Plant(cell, None))

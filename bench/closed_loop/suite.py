@@ -13,9 +13,12 @@ from bench.closed_loop import setting
 from bench.closed_loop.carrying import Carrier
 from bench.closed_loop.words import model_of, told_by, tool_of
 from robocal_ros import __version__
+from robocal_ros.cell_sim.fixture import FRAME as FEATURE_FRAME
+from robocal_ros.cell_sim.fixture import T_FLANGE_SENSOR
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import JointCommand
 from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.fixture.session import FixturePointSample, FixtureSession
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ground.samples import (
     JOINTS,
@@ -25,6 +28,7 @@ from robocal_ros.ground.samples import (
     PointSample,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import hand_eye_kind
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.maintenance.session import MaintenanceSession
@@ -84,6 +88,7 @@ class Suite:
     record : takes each command of a session (``thermal``, ``tool``, ``maintenance``) with its
         outcome.
     expected : drift that earlier shifts have taught; None: the default.
+    fixture : one is measured in each gap, by a sensor on the flange whose place is known.
 
     Attributes
     ----------
@@ -98,18 +103,27 @@ class Suite:
         send: Callable[[JointPlan], None],
         record: Record = unrecorded,
         expected: LearnedProcess | None = None,
+        fixture: bool = False,
     ) -> None:
         self._nominal, self._send, self._record = nominal, send, record
         self._expected = expected
         config = replace(setting.THERMAL, prior="learned" if expected else "default")
         self.thermal = ThermalSession(nominal, history, config, __version__)
+        self.fixture: FixtureSession | None = None
+        if fixture:
+            place = {"parent": setting.FLANGE, "child": FEATURE_FRAME}
+            place |= {"T_parent_sensor": T_FLANGE_SENSOR.tolist()}
+            kind = hand_eye_kind(FEATURE_FRAME)
+            events.bring_into_force(history, kind, nominal, place, "commissioning")
+            told = setting.fixture_config()
+            self.fixture = FixtureSession(nominal, history, told, __version__)
         self.tool = ToolSession(nominal, history, setting.tool_config(laser), __version__)
         self._gap = Gap(setting.STALE_S)
         self.driver = ToolDriver(self.tool, setting.DRIVING, send, self.tool_command, self._closed)
         self.maintenance = MaintenanceSession(
             nominal,
             history,
-            setting.maintenance_config(laser),
+            setting.maintenance_config(laser, fixture),
             Shelf(),
             lambda command, outcome: record("maintenance", command, outcome),
         )
@@ -120,10 +134,12 @@ class Suite:
             send,
             self.thermal_command,
             self.tool_command,
+            self.fixture_command,
         )
         self.correction: CorrectionSession | None = None
         self.last_tool: Outcome | None = None  # of a run that has ended
         self.last_thermal: Outcome | None = None
+        self.last_fixture: Outcome | None = None
         self._names = nominal.joint_names
         self._clock = Clock(0.0, 0)
         self._polled_s = -np.inf
@@ -157,6 +173,7 @@ class Suite:
                 self.correction.reading(state, clock.now_s, max(age_s, 0.0))
             self.correction.look(clock.now_s, clock.now_ns)
         self._thermal_goes_on()
+        self._fixture_goes_on()
         self.driver.tick(clock.now_s)
         if clock.now_s >= self._polled_s + POLL_S:
             self.poll()
@@ -171,9 +188,15 @@ class Suite:
             self.maintenance.reading(stamp_s, sample.position, now_s)
             self.thermal.add(sample)
             self._to_tool(sample)
+            if self.fixture is not None:
+                self.fixture.add(sample)
         elif isinstance(sample, EdgeSample):
             self.driver.beam(sample.blocked)
             self._to_tool(sample)
+        elif isinstance(sample, FixturePointSample):
+            if self.fixture is not None:
+                self.fixture.add(sample)
+                self.maintenance.measured(sample.stamp_ns / NS, of_fixture=True)
         else:
             self.thermal.add(sample)
             if isinstance(sample, PointSample) and sample.topic in (MEASURED_POINT, SPHERE_CLOUD):
@@ -203,6 +226,19 @@ class Suite:
             self._record("thermal", outcome.command, outcome)
             self.last_thermal = outcome
             self._carrier.thermal_ended(outcome)
+
+    def fixture_command(self, command: Command) -> None:
+        """Ask the fixture session; carried out once its points are complete."""
+        if self.fixture is not None:
+            self.fixture.submit(command, self._clock.now_ns)
+
+    def _fixture_goes_on(self) -> None:
+        if self.fixture is None:
+            return
+        for outcome in self.fixture.step(wall_ns=self._clock.now_ns):
+            self._record("fixture", outcome.command, outcome)
+            self.last_fixture = outcome
+            self._carrier.fixture_ended(outcome)
 
     def tool_command(self, command: Command) -> Outcome | None:
         """Ask the tool session, at once."""

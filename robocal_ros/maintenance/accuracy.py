@@ -147,6 +147,9 @@ class CycleResult:
     stamp_ns: int = 0
     # the how many-th since the state folder was made; 0: of a version that did not count
     run: int = 0
+    # of the fixture's measurement, where it was judged, and its candidate; NONE where it was not
+    fixture_code: Code = Code.NONE
+    fixture_id: int = 0
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""
@@ -156,7 +159,7 @@ class CycleResult:
     def of_document(cls, document: Mapping[str, Any]) -> "CycleResult":
         """Read what `document` gave, also after JSON."""
         values = dict(document)
-        for name in ("code", "thermal_code", "tool_code", "tool_found_code"):
+        for name in ("code", "thermal_code", "tool_code", "tool_found_code", "fixture_code"):
             values[name] = Code(values.get(name, Code.NONE))
         for name in ("left", "accepted"):
             values[name] = tuple(values[name])

@@ -635,6 +635,8 @@ class CycleRun:
             self._leave(left)
         if answer is None:
             return
+        found = answer.code, answer.candidate_id
+        self.result = replace(self.result, fixture_code=found[0], fixture_id=found[1])
         waits = f"; candidate {answer.candidate_id} waits for a decision"
         self._messages.append(f"fixture: {answer.message}{waits if answer.done else ''}")
 

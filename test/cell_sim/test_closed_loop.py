@@ -9,6 +9,7 @@ import pytest
 from long_form import more
 
 from bench.closed_loop import tables
+from bench.closed_loop.faults import ALARM, Trial, report_of
 from bench.closed_loop.judging import gaps_to_recover, harm, per_hour, refused, within_at_worst
 from bench.closed_loop.plant import (
     AT_WORK,
@@ -37,8 +38,9 @@ from bench.closed_loop.shift import (
 )
 from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
-from robocal_ros.ground.errors import ConflictError
+from robocal_ros.ground.errors import Code, ConflictError
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.accuracy import CycleResult
 from robocal_ros.motion.cell import joint_way
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.session import events
@@ -355,3 +357,34 @@ def test_a_drive_fault_misses_its_goal(faults):
     named = {row[0]: row for row in table.rows}
     assert named["drive faults"][2].met is (faults == 0)
     assert named["greatest joint speed commanded, % of its drive's"][1] == 80.0
+
+
+# ---- faults -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        (Code.NO_SIGNIFICANT_GAIN, Code.ACCEPT, ("fixture", Code.ACCEPT, 1.0)),
+        (Code.NO_SIGNIFICANT_GAIN, Code.NO_SIGNIFICANT_GAIN, ("", Code.NONE, 2.0)),
+        (Code.NONE, Code.SENSOR_OR_ROBOT_MOVED, ("fixture", Code.SENSOR_OR_ROBOT_MOVED, 2.0)),
+        (Code.ACCEPT, Code.ACCEPT, (ALARM, Code.ACCEPT, 2.0)),
+    ],
+)
+def test_a_fixture_that_moved_is_told_by_its_own_measurement(before, after, told):
+    trial = Trial("fixture_moved", 0.5, 3, gaps=1)
+    made = replace(always(GOOD), plan=trial.plan)
+    results = [CycleResult("c", Code.ACCEPT, fixture_code=code) for code in (before, after)]
+    said = replace(made, gaps=[GapReport(result) for result in results])
+    report = report_of(trial, said, made)
+    assert (report.who, report.code, report.gaps) == told
+
+
+@pytest.mark.parametrize("seed", more(3))
+def test_a_fixture_that_moved_is_told_in_one_gap(seed):
+    """Taught, a clean gap, moved, a gap: with drift and tool in all of them."""
+    trial = Trial("fixture_moved", 0.5, seed, gaps=1)
+    report = report_of(trial, *(run_shift(trial.plan, seed, suite=s) for s in (True, False)))
+    assert (report.who, report.code, report.gaps) == ("fixture", Code.ACCEPT, 1.0)
+    assert report.over_s <= 0.0
+    assert report.drive_faults == 0
