@@ -7,6 +7,7 @@ and the rest is solved by plain (efficient) least squares.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import count
 from typing import Generic, Protocol, TypeVar
 
@@ -231,6 +232,7 @@ FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
 SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
 
 
+@lru_cache(maxsize=1024)
 def chi2_quantile(probability: float, dof: float) -> float:
     """Quantile of the chi-square distribution."""
     from scipy.special import gammaincinv

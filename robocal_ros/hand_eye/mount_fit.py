@@ -33,6 +33,8 @@ ENOUGH = "by 20 deg or more"
 # a Gaussian's; a shot of another pose or target is off by far more than this asks for.
 FALSE_REJECTION = 1e-4
 LOOKS = 3
+HOPELESS = 10.0  # times the least sum of squares, from which a start leads to a false minimum
+LARGEST_POSE_M = 2e-3  # error of a pose in space that a robot may have
 ROUNDS = 8
 POSE_NUMBERS = 6
 CALM_M = 1e-4  # and rad at 1 m: the noise of a good robot, to tell poses from noise
@@ -177,9 +179,43 @@ def first_look(views: tuple[TargetView, ...], start: MountState) -> MountState:
     """
     state = start
     for _ in range(LOOKS):
-        noise = _noise_of(misfit(views, state))
-        state = _solved(MountProblem(views, noise, state, together=False), state).state
+        state = _looked_nearer(views, state)
     return state
+
+
+def _looked_nearer(views: tuple[TargetView, ...], state: MountState) -> MountState:
+    """One of the rounds of `first_look`."""
+    noise = _noise_of(misfit(views, state))
+    return _solved(MountProblem(views, noise, state, together=False), state).state
+
+
+def minima(
+    view: TargetView, starts: Sequence[MountState]
+) -> tuple[list[tuple[float, MountState]], RobocalError | None]:
+    """The sums of squares and states to which the starts lead, the least first.
+
+    Where none leads anywhere: why the first one does not. Once a start fits as right data do,
+    others that are far from that after the same round are false minima, and cost most to follow.
+    """
+    runs = [(np.inf, start) for start in starts]
+    failure: RobocalError | None = None
+    for _ in range(LOOKS):
+        least = min((squares for squares, _ in runs), default=np.inf)
+        fits = least < len(view.sightings.names) * FITS_M**2
+        going, runs = runs, []
+        for squares, state in going:
+            if fits and squares > HOPELESS * least:
+                continue
+            try:
+                state = _looked_nearer((view,), state)
+            except RobocalError as error:
+                failure = failure or error
+                if isinstance(error, RankDeficientError):
+                    break  # it lies in the poses, not in the start
+                continue
+            far = np.minimum(distances((view,), state), LARGEST_POSE_M)
+            runs.append((float(np.sum(far**2)), state))
+    return sorted(runs, key=lambda pair: pair[0]), failure
 
 
 def _noise_of(misfit_m: float) -> PoseNoise:

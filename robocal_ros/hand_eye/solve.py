@@ -20,6 +20,7 @@ from robocal_ros.ground.errors import (
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
+    LARGEST_POSE_M,
     OPEN_M,
     MountFit,
     describe_motion,
@@ -28,6 +29,7 @@ from robocal_ros.hand_eye.mount_fit import (
     first_look,
     fit_mount,
     leave_one_out,
+    minima,
     misfit,
     noise_numbers,
     require_radius,
@@ -70,7 +72,6 @@ DOUBTFUL_M = 2e-4  # median distance from which a mistake in the data is looked 
 SHOWN = 0.5  # of the profiles
 WRONG_M = 2e-3  # the same, from which something is wrong, whatever it is
 FEWEST_TOLD = 6  # numbers that tell the noise of poses, where it is found from the data
-LARGEST_POSE_M = 2e-3  # error of a pose in space that a robot may have
 CERTAIN = 1e3  # times likelier than any other, from which a minimum is not doubted
 CONTRADICTED = 2.0  # times the given noise
 MOST_MISFITS = 0.2  # of those that show the target
@@ -379,25 +380,13 @@ def look(task: Task, view: TargetView) -> tuple[MountState, str]:
 
     Raises `TooFewSamplesError` or `RankDeficientError` when none leads anywhere.
     """
-    states: list[tuple[float, MountState]] = []
-    failure: RobocalError | None = None
-    for start in task.starts(view):
-        try:
-            state = first_look((view,), start)
-        except RobocalError as error:
-            failure = failure or error
-            if isinstance(error, RankDeficientError):
-                break  # it lies in the poses, not in the start
-            continue
-        far = np.minimum(distances((view,), state), LARGEST_POSE_M)
-        states.append((float(np.sum(far**2)), state))
-    if not states:
+    runs, failure = minima(view, task.starts(view))
+    if not runs:
         raise failure or RobocalError("no start was found")
-    states.sort(key=lambda pair: pair[0])
-    least, best = states[0]
+    least, best = runs[0]
     numbers = view.model.components * len(view.sightings.names)
     seen = in_plane(view.sightings.value)
-    for squares, state in states[1:]:
+    for squares, state in runs[1:]:
         if squares > least * np.exp(2.0 * np.log(CERTAIN) / numbers):
             break
         off_m = apart(best.T_flange_sensor, state.T_flange_sensor, seen)
@@ -419,9 +408,7 @@ def _name_mistake(
         return task.read(other).view if read is None else task.posed(read.view, other)
 
     def of_target(other: Task) -> TargetView:
-        if read is None or task.read_by_poses:
-            return other.read(data).view
-        return other.posed(read.view, data)
+        return other.read(data).view if read is None else other.posed(read.view, data)
 
     def undoing() -> Iterator[tuple[str, Task, Callable[[], TargetView]]]:
         for words, poses in undone(data.T_base_flange):

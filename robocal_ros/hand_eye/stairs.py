@@ -30,6 +30,7 @@ from robocal_ros.hand_eye.tasks import (
     Read,
     SphereTask,
     Task,
+    fitted,
     sightings_of,
     straightened,
     usable,
@@ -42,6 +43,7 @@ NO_STRETCH = 2e-3  # of their length: corners that lie on one line but for so mu
 CLEAR = 1.5  # times better than the next, from which a place along the target is sure
 NEAR = 0.35  # of the distance between neighbours: farther than this is another corner
 TURNED_M, TURNED = 5e-4, 0.3  # the order of the target file is kept unless it misses by so much
+HOPELESS_M = 2e-3  # misfit of the closed form that no place of the sensor makes one of right data
 PROFILES = 256  # whose corners are remembered
 SMALLEST_SIGMA = 1e-7  # m, rad: of a teaching error that is not zero in the other
 
@@ -69,10 +71,7 @@ class StepTask(Task):
         linearity: SensorLinearity | None = None,
     ) -> Read:
         """Corners, each with its mark."""
-        known = self.target.corners
-        marks = data.marks or (next(iter(known)),) * len(data.names)
-        self.target.require_marks(marks)
-        corners = [known[mark] for mark in marks]
+        corners = self._told(data)
         data, (fits, errors), linearity = straightened(
             data, lambda profile: _corners(profile, self.rule), _on_surfaces, self,
             self.rule.towards, linearity,
@@ -107,21 +106,11 @@ class StepTask(Task):
 
         Where corners are nearly in line the closed form alone may be far off.
         """
-        matches = {}
-        for i, fit in fits.items():
-            if (match := _match_along(fit, corners[i])) is not None:
-                matches[i] = match
-        if not matches:
-            shown = ", ".join(f"{len(fit.points)}" for fit in fits.values())
-            raise ResidualError(
-                f"no profile shows all {len(corners[0])} corners of the target alone (they show "
-                f"{shown} corners, concave ones too): check the target file and the field of view"
-            )
+        matches = _along(fits, corners)
         view = self._view(data, fits, corners, matches)
         near = first_look((view,), self.starts(view)[0])
         if (miss := misfit((view,), near)) > TURNED_M:
-            turned = {i: (rows, order[::-1]) for i, (rows, order) in matches.items()}
-            view = self._view(data, fits, corners, turned)
+            view = self._view(data, fits, corners, _turned(matches))
             other = first_look((view,), self.starts(view)[0])
             near = other if misfit((view,), other) < TURNED * miss else near
         return near.T_flange_sensor
@@ -151,16 +140,31 @@ class StepTask(Task):
         return TargetView(self.model(np.array(shown).reshape(-1, 3)), sightings)
 
     def posed(self, view: TargetView, data: HandEyeData) -> TargetView:
-        """Which corner is which depends on the poses."""
-        return self.read(data).view
+        """Which corner is which depends on the poses; hopeless ones are not followed to tell it.
+
+        Raises `ResidualError` where the closed form leaves corners `HOPELESS_M` from their places.
+        """
+        fits, _ = fitted(data, lambda profile: _corners(profile, self.rule))
+        corners = self._told(data)
+        matches = _along(fits, corners)
+        for each in (matches, _turned(matches)):
+            one = self._view(data, fits, corners, each)
+            if misfit((one,), self.starts(one)[0]) < HOPELESS_M:
+                return self.read(data).view
+        raise ResidualError("the corners do not fit these poses")
+
+    def _told(self, data: HandEyeData) -> list[Array]:
+        """Places (k, 3) of the corners that each shot shows, user frame, by its mark."""
+        known = self.target.corners
+        marks = data.marks or (next(iter(known)),) * len(data.names)
+        self.target.require_marks(marks)
+        return [known[mark] for mark in marks]
 
     def starts(self, view: TargetView) -> list[MountState]:
         """The closed form of the part of corners that agrees best, then of those near them."""
         value, p_flange = view.sightings.value, _in_flange(view)
         best = closed_corners(value, p_flange)
-        rng = np.random.default_rng(SEED)
-        m = len(value)
-        rows = np.array([rng.permutation(m)[: max(4, m // 3)] for _ in range(PARTS)])
+        rows = _parts(len(value))
         X, seen = _closed(value[rows], p_flange[rows])
         median = np.median(_corners_apart(X, value, p_flange), axis=1)
         median[~seen] = np.inf
@@ -220,6 +224,13 @@ def _on_surfaces(fit: CornerFit, profile: Profile) -> list[SeenLine]:
 def _corners(profile: Profile, rule: CornerRule) -> CornerFit:
     """Corners of a profile: they do not depend on poses, which may be tried in many ways."""
     return fit_corners(profile.points, rule)
+
+
+@lru_cache
+def _parts(m: int) -> Index:
+    """Rows (50, k) of m corners: parts of which one holds no wrong corner, very likely."""
+    rng = np.random.default_rng(SEED)
+    return np.array([rng.permutation(m)[: max(4, m // 3)] for _ in range(PARTS)])
 
 
 def _in_flange(view: TargetView) -> Array:
@@ -282,17 +293,38 @@ def _corners_apart(X: Array, value: Array, p_flange: Array) -> Array:
     return np.asarray(np.linalg.norm(found - p_flange, axis=-1))
 
 
-def _match_along(fit: CornerFit, target: Array) -> Match | None:
-    """Lay a profile's corners along all corners (k, 3) of a target; None where it is not clear."""
-    k = len(target)
-    spacing = np.linalg.norm(np.diff(target, axis=0), axis=1)
+def _along(fits: Mapping[int, CornerFit], corners: Sequence[Array]) -> dict[int, Match]:
+    """Profiles that show the whole target, and only in one way, laid along it."""
+    matches = {}
+    for i, fit in fits.items():
+        apart = np.linalg.norm(np.diff(corners[i], axis=0), axis=1)
+        if (match := _match_along(fit, tuple(apart.tolist()))) is not None:
+            matches[i] = match
+    if not matches:
+        shown = ", ".join(f"{len(fit.points)}" for fit in fits.values())
+        raise ResidualError(
+            f"no profile shows all {len(corners[0])} corners of the target alone (they show "
+            f"{shown} corners, concave ones too): check the target file and the field of view"
+        )
+    return matches
+
+
+def _turned(matches: Mapping[int, Match]) -> dict[int, Match]:
+    """The same, the corners in the other order."""
+    return {i: (rows, order[::-1]) for i, (rows, order) in matches.items()}
+
+
+@lru_cache(maxsize=PROFILES)
+def _match_along(fit: CornerFit, spacing: tuple[float, ...]) -> Match | None:
+    """Lay a profile's corners along all of a target, so far apart; None where it is not clear."""
+    k, apart = len(spacing) + 1, np.array(spacing)
     every = np.arange(len(fit.points))
     found: list[tuple[float, Index]] = []
     for rows in (every, every[fit.convex], every[~fit.convex]):
         for first in range(len(rows) - k + 1):
             window = rows[first : first + k]
             own = np.linalg.norm(np.diff(fit.points[window], axis=0), axis=1)
-            off = min(_unlike(own, spacing), _unlike(own, spacing[::-1]))
+            off = min(_unlike(own, apart), _unlike(own, apart[::-1]))
             if not any(np.array_equal(window, other) for _, other in found):
                 found.append((off, window))
     found.sort(key=lambda pair: pair[0])

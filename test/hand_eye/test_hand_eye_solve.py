@@ -45,7 +45,7 @@ from robocal_ros.ground.errors import (
     ResidualError,
     RobocalError,
 )
-from robocal_ros.hand_eye.mount_fit import fit_mount
+from robocal_ros.hand_eye.mount_fit import LARGEST_POSE_M, distances, first_look, fit_mount
 from robocal_ros.hand_eye.mount_problem import in_plane
 from robocal_ros.hand_eye.result import HandEyeSettings, apart, point_covariance
 from robocal_ros.hand_eye.solve import (
@@ -267,6 +267,27 @@ class TestLine:
         across = away - (away @ found.place[1]) * found.place[1]
         sigma = np.sqrt(np.trace(point_covariance(found, np.array([[0.0, 0.0, 0.2]]))[0]))
         assert np.linalg.norm(across) < 4.0 * sigma + 1e-4  # and what the robot repeats to
+
+    @pytest.mark.parametrize("known", [True, False])
+    def test_starts_that_are_given_up_lead_to_no_better_place(self, known):
+        """Nor to another that is nearly as good: each start followed to its end."""
+        task = line_task(LINE if known else None)
+        for seed in range(amount(2, 10)):
+            shots = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng([4, seed])))
+            view = features(task, shots).view
+            squares = []
+            for start in task.starts(view):
+                end = first_look((view,), start)
+                squares.append((float(np.sum(distances((view,), end) ** 2)), end))
+            least, best = min(squares, key=lambda pair: pair[0])
+            near, doubt = look(task, view)
+            seen = in_plane(view.sightings.value)
+            rms_m = np.sqrt(least / len(seen))
+            assert apart(near.T_flange_sensor, best.T_flange_sensor, seen) < 0.01 * rms_m
+            places = [apart(end.T_flange_sensor, best.T_flange_sensor, seen)
+                      for far, end in squares if far < 1.1 * least]  # fmt: skip
+            assert max(places) < LARGEST_POSE_M
+            assert not doubt
 
     @pytest.mark.parametrize(
         ("most_deg", "words"),
