@@ -2,9 +2,8 @@
 """The house rules that a reader relies on: who may import whom, and how large a file may be."""
 
 import ast
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 PACKAGE = Path(__file__).parents[1] / "robocal_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -53,14 +52,24 @@ LONGEST_FILE = 700
 LONGEST_FUNCTION = 60  # without its docstring
 
 
-def imported(tree: ast.AST) -> set[str]:
-    names = set()
+@cache
+def written(path: Path) -> tuple[set[str], list[ast.ImportFrom], list[str], dict[str, int]]:
+    """Names that a file imports anywhere, its imports and classes at the top, and how many lines
+    each of its functions has without its docstring; it is parsed once.
+    """
+    names, functions, tree = set(), {}, ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             names.add(node.module)
-    return names
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            docstring = ast.get_docstring(node, clean=False) or ""
+            lines = node.end_lineno - node.lineno + 1 - len(docstring.splitlines())
+            functions[f"{node.name}, line {node.lineno}"] = lines
+    top = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    return names, top, classes, functions
 
 
 def room(path: Path) -> str:
@@ -71,30 +80,36 @@ def room(path: Path) -> str:
 def imports_of_ours(path: Path) -> set[Path]:
     """Files of the package that a file needs when it is imported."""
     found = set()
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("robocal_ros"):
+    for node in written(path)[1]:
+        if (node.module or "").startswith("robocal_ros"):
             base = PACKAGE.parent.joinpath(*(node.module or "").split("."))
             files = [base / f"{alias.name}.py" for alias in node.names]
             found |= {file if file.exists() else base.with_suffix(".py") for file in files}
     return {file for file in found if file.exists()}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_run_one_way(path):
-    own = room(path)
+def wrong_imports(path: Path) -> list[str]:
+    own, wrong = room(path), []
     for_ros = own == "ros" or path.stem in ROS_FILES
-    for name in imported(ast.parse(path.read_text())):
+    for name in written(path)[0]:
         parts = name.split(".")
-        if parts[0] in ROS:
-            assert for_ros, f"{path} imports {name}: only what a node is made of may"
+        if parts[0] in ROS and not for_ros:
+            wrong.append(f"{path} imports {name}: only what a node is made of may")
         if parts[0] == "robocal_ros" and len(parts) > 1 and own:
             allowed = MAY_IMPORT[own] | {own}
             # A room's commands; the command line loads them by name, and nobody else.
             if path.stem in COMMANDS:
                 allowed |= {"cli", "report"}
-            elif own in CAPABILITIES:
-                assert parts[2:3] == [] or parts[2] not in COMMANDS, f"{path} imports {name}"
-            assert parts[1] in allowed, f"{own} imports {name}"
+            elif own in CAPABILITIES and parts[2:3] and parts[2] in COMMANDS:
+                wrong.append(f"{path} imports {name}")
+            if parts[1] not in allowed:
+                wrong.append(f"{own} imports {name}, in {path}")
+    return wrong
+
+
+def test_imports_run_one_way():
+    wrong = [words for path in MODULES for words in wrong_imports(path)]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_rules_name_files_that_are_there():
@@ -116,24 +131,22 @@ def test_no_file_needs_itself():
         walk(path, ())
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_files_and_functions_stay_small(path):
-    text = path.read_text()
-    assert len(text.splitlines()) <= LONGEST_FILE
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            docstring = ast.get_docstring(node, clean=False) or ""
-            body = node.end_lineno - node.lineno + 1 - len(docstring.splitlines())
-            assert body <= LONGEST_FUNCTION, f"{path.name}: {node.name} has {body} lines"
+def test_files_and_functions_stay_small():
+    large = []
+    for path in MODULES:
+        lines = len(path.read_text().splitlines())
+        large += [f"{path} has {lines} lines"] * (lines > LONGEST_FILE)
+        for name, body in written(path)[3].items():
+            large += [f"{path}: {name}, has {body} lines"] * (body > LONGEST_FUNCTION)
+    assert not large, "\n".join(large)
 
 
 def test_a_class_name_occurs_once():
     seen: dict[str, Path] = {}
     twice = []
     for path in MODULES:
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ClassDef):
-                if node.name in seen:
-                    twice.append(f"{node.name}: {seen[node.name]} and {path}")
-                seen[node.name] = path
+        for name in written(path)[2]:
+            if name in seen:
+                twice.append(f"{name}: {seen[name]} and {path}")
+            seen[name] = path
     assert not twice, "\n".join(twice)
