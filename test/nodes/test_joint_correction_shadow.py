@@ -151,7 +151,7 @@ def test_as_a_process_it_passes_a_stream_on(graph: Any) -> None:
         return len(outputs) > 20
 
     graph.spin_until(arrives, "the stream")
-    first = sent.index(outputs[0])
-    assert outputs == sent[first : first + len(outputs)]
+    rest = iter(sent)  # each once, in order; what waited while the machine was busy is dropped
+    assert all(output in rest for output in outputs)
     assert process.stop() == 0
     assert "Traceback" not in process.output

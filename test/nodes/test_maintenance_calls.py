@@ -35,6 +35,11 @@ from robocal_ros.ros.session_node import EVENTS
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 PERIOD_S = 0.05
 NODE = "/maintenance_node"
+SETTINGS = {
+    "serial": "K7",
+    "home_deg": str(HOME_DEG),
+    "motion_silence_s": 0.5,  # nothing moves, and the machine has other work too
+}
 ROOT = Path(__file__).parents[2]
 
 
@@ -89,14 +94,15 @@ class Plc:
 
 def process(graph: Any) -> Any:
     """The node as its own process."""
-    node = graph.start("maintenance_node", {"serial": "K7", "home_deg": str(HOME_DEG)})
+    node = graph.start("maintenance_node", SETTINGS)
     graph.spin_until(lambda: graph.probe.count_subscribers("gap_open"), "the node", 30.0)
     return node
 
 
 @pytest.fixture
 def plc(graph: Any) -> Plc:
-    return Plc(graph, lambda: graph.add(MaintenanceNode, {"serial": "K7", "home_deg": HOME_DEG}))
+    settings = SETTINGS | {"home_deg": HOME_DEG}
+    return Plc(graph, lambda: graph.add(MaintenanceNode, settings))
 
 
 def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
@@ -437,9 +443,7 @@ def test_a_bool_is_told_and_counts_only_where_the_parameter_says_so(graph):
     node = process(graph)
     graph.spin_until(lambda: statuses and statuses[-1].doing == words, "it is told", 30.0)
     node.stop()
-    node = graph.start(
-        "maintenance_node", {"serial": "K7", "home_deg": str(HOME_DEG), "gap_bool": True}
-    )
+    node = graph.start("maintenance_node", SETTINGS | {"gap_bool": True})
     graph.spin_until(lambda: statuses[-1].doing == "", "it counts", 30.0)
     assert "gap_bool: gap_open is taken as std_msgs/Bool, which bears no echo" in node.output
 
