@@ -31,7 +31,7 @@ from robocal_ros.cli.main import (
 )
 from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
-from robocal_ros.ground.files import nearest, quoted, write_text
+from robocal_ros.ground.files import nearest, quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.full_model import FullIdentification
@@ -329,11 +329,11 @@ def run_identify(args: argparse.Namespace) -> CliResult:
             )
     result = judged.identification
     if args.figures is not None and isinstance(result, FullIdentification):
-        from robocal_ros.report.figures import joint_functions_figure, svg
+        from robocal_ros.report.figures import joint_functions_figure
+        from robocal_ros.report.measured_figures import keep_figure
 
-        args.figures.mkdir(parents=True, exist_ok=True)
-        document["figures"] = str(args.figures / "joints.svg")
-        write_text(args.figures / "joints.svg", svg(joint_functions_figure(result.known)))
+        figure = joint_functions_figure(result.known)
+        document["figures"] = keep_figure(args.figures, "joints", figure)
     status = DONE
     if verdict.code is Code.TOO_FEW_SAMPLES:
         document |= refusal(verdict.code, verdict.reason)

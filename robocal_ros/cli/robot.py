@@ -218,11 +218,10 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
         "warnings": warnings,
     }
     if args.figures is not None and known is not None:
-        from robocal_ros.report.figures import joint_functions_figure, svg
+        from robocal_ros.report.figures import joint_functions_figure
+        from robocal_ros.report.measured_figures import keep_figure
 
-        args.figures.mkdir(parents=True, exist_ok=True)
-        document["figures"] = str(args.figures / "joints.svg")
-        write_text(args.figures / "joints.svg", svg(joint_functions_figure(known)))
+        document["figures"] = keep_figure(args.figures, "joints", joint_functions_figure(known))
     return CliResult(document, _show_joint_functions)
 
 

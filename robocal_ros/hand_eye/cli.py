@@ -29,7 +29,7 @@ from robocal_ros.cli.recording import BagOverview, open_recording
 from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.files import quoted
-from robocal_ros.ground.frames import transform_document
+from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.ground.samples import StandstillRule
 from robocal_ros.hand_eye.data import (
     FEATURES,
@@ -52,6 +52,7 @@ from robocal_ros.hand_eye.files import (
 from robocal_ros.hand_eye.profiles import PRESETS, Z_GROWS, Profile, SensorDescription, sensor_of
 from robocal_ros.hand_eye.result import (
     METHODS,
+    HandEyeResult,
     HandEyeSettings,
     by_shot,
     hand_eye_document,
@@ -472,6 +473,7 @@ def add_target_action(kind: str, parser: argparse.ArgumentParser) -> None:
         help="shots of the same target, as --poses or --bag, that judge the result and are not "
         "used to find it",
     )
+    add_figures(parser)
     if kind == "sphere":
         add_target(parser)
     elif kind == "step":
@@ -502,7 +504,43 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
         X, linearity = result.T_flange_sensor, result.linearity
         seen = held_out(task, judges.data, X, result.place, linearity)
         result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
-    return CliResult(hand_eye_document(result), show_mount)
+    read = None if args.figures is None else task.read(shots.data, result.T_flange_sensor)
+    return CliResult(drawn_document(result, args, {} if read is None else read.points), show_mount)
+
+
+def add_figures(parser: argparse.ArgumentParser) -> None:
+    """Offer the figure of a result."""
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        metavar="DIR",
+        help="write hand_eye.svg there: residuals, how well the sensor's place is known, and of "
+        "profiles the points on the target",
+    )
+
+
+def drawn_document(
+    result: HandEyeResult, args: argparse.Namespace, seen: Mapping[str, Array]
+) -> Document:
+    """The result's document; its figure is drawn where one is asked for.
+
+    ``seen``: points (n, 2), m, of the sensor's plane that each sample rests on.
+    """
+    document = hand_eye_document(result)
+    if args.figures is None:
+        return document
+    from robocal_ros.report.measured_figures import keep_figure, result_figure
+
+    left = document["residual_mm"]
+    covariance = document["covariance"]
+    figure = result_figure(
+        {name: [value] for name, value in left["per_sample"].items()},
+        None if covariance is None else np.array(covariance)[:3, :3],
+        place=f"the sensor's origin, axes of the {result.parent}",
+        rms_mm=left["rms"],
+        seen=seen,
+    )
+    return document | {"figures": keep_figure(args.figures, "hand_eye", figure)}
 
 
 add_sphere, add_step, add_line = (partial(add_target_action, kind) for kind in KINDS)
@@ -529,6 +567,7 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
         help="table in the folders, such as check.csv: other shots of the same targets, of one or "
         "more, that judge the result and are not used to find it",
     )
+    add_figures(parser)
 
 
 def run_joint(args: argparse.Namespace) -> CliResult:
@@ -552,7 +591,7 @@ def run_joint(args: argparse.Namespace) -> CliResult:
     if args.check is not None and not checks:
         raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
     result = solve_joint(parts, settings, checks)
-    return CliResult(hand_eye_document(result), show_mount)
+    return CliResult(drawn_document(result, args, {}), show_mount)
 
 
 def add_verify(parser: argparse.ArgumentParser) -> None:

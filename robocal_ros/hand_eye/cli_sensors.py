@@ -46,6 +46,7 @@ from robocal_ros.hand_eye.camera_fit import GivenNoise
 from robocal_ros.hand_eye.cli import (
     LIMIT_MM,
     add_description,
+    add_figures,
     add_limit,
     add_limits,
     add_robot,
@@ -54,6 +55,7 @@ from robocal_ros.hand_eye.cli import (
     add_target_kind,
     arm_of,
     described,
+    drawn_document,
     given_target,
     require_unused,
     robot_sigma_of,
@@ -82,7 +84,7 @@ from robocal_ros.hand_eye.planning import (
     planned_target,
 )
 from robocal_ros.hand_eye.profiles import Profile
-from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise, hand_eye_document
+from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise
 from robocal_ros.hand_eye.targets import (
     FARTHEST_MM,
     BoardTarget,
@@ -268,6 +270,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
         metavar="CSV",
         help="poses as --poses that judge the result and are not used to find it",
     )
+    add_figures(parser)
 
 
 def run_camera(args: argparse.Namespace) -> CliResult:
@@ -286,7 +289,7 @@ def run_camera(args: argparse.Namespace) -> CliResult:
         )
     else:
         result = _from_images(args, settings)
-    return CliResult(hand_eye_document(result), _show_camera)
+    return CliResult(drawn_document(result, args, {}), _show_camera)
 
 
 def _board(value: str) -> tuple[int, int] | Path:
@@ -359,6 +362,7 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
     ):  # fmt: skip
         noise.add_argument(f"--{option}", type=positive, metavar="S", help=f"default {default}")
     add_limit(parser, TRACKER_WHERE, 1e3 * LIMIT_M)
+    add_figures(parser)
 
 
 def run_tracker(args: argparse.Namespace) -> CliResult:
@@ -378,7 +382,7 @@ def run_tracker(args: argparse.Namespace) -> CliResult:
     result = solve_tracker(data, target, noise, args.method, args.limit_mm * 1e-3)
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
-    return CliResult(hand_eye_document(result), _show_tracker)
+    return CliResult(drawn_document(result, args, {}), _show_tracker)
 
 
 def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[str, str]]:

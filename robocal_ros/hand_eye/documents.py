@@ -110,6 +110,7 @@ class HandEyeResultDocument(TypedDict):
     rejected: Names
     rejected_because: dict[str, Words]
     unobservable: Names
+    figures: NotRequired[Annotated[str, "The figure, with --figures."]]
     verdict: VerdictDocument
 
 

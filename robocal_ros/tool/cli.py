@@ -207,6 +207,7 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
     path, origin_ns = read_joint_path(args.joints, arm)
     edges, names = read_step_edges(args.events, rule.sigma_s, origin_ns)
     steps = named_steps(edges, names, rule.debounce_s)
+    figure = None
     if args.method == "classic":
         tool = classic_run_document(classic_from_path(laser, path, steps, taught))
     else:
@@ -214,8 +215,36 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
         found = estimate_tool(laser, path, steps, taught)
         known = KnownTool.measured(found)
         tool = run_document(known, found, circles, judge_run(found, ToolLimits()))
-    document: ToolRunDocument = {**tool, "warnings": warnings}
+        if args.figures is not None:
+            left: dict[str, list[float]] = {step.name: [] for step in steps}
+            for step, value in zip(found.edge_step, 1e3 * found.edge_m, strict=True):
+                left[steps[step].name].append(float(value))
+            figure = _drawn(args.figures, left, found.covariance[:3, :3], found.misfit_m)
+    document: ToolRunDocument = {**tool, "figures": figure, "warnings": warnings}
     return CliResult(document, _show_tool)
+
+
+def add_figures(parser: argparse.ArgumentParser) -> None:
+    """Offer the figure of a result."""
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        metavar="DIR",
+        help="write tool.svg there: residuals, and how well the tip is known",
+    )
+
+
+def _drawn(
+    folder: Path,
+    residual_mm: dict[str, list[float]],
+    covariance: NDArray[np.float64],
+    rms_m: float,
+) -> str:
+    from robocal_ros.report.measured_figures import keep_figure, result_figure
+
+    place = "the tip, axes of the flange"
+    figure = result_figure(residual_mm, covariance, place=place, rms_mm=1e3 * rms_m)
+    return keep_figure(folder, "tool", figure)
 
 
 def _show_tool(console: "Console", document: Document) -> None:
@@ -242,7 +271,7 @@ METHODS = ("best", "classic")
 DIRECTIONS = {"ccw": 1, "cw": -1}
 JITTER_S = 20e-6
 OF_CIRCLE = ("radius_mm", "period_s", "start_deg", "direction", "beam_angle_deg", "latency_s")
-OF_RUN = ("joints", "robot", "laser", "tool", "xyz_mm", "rpy_deg")
+OF_RUN = ("joints", "robot", "laser", "tool", "xyz_mm", "rpy_deg", "figures")
 
 
 def add_crossed(parser: argparse.ArgumentParser) -> None:
@@ -262,6 +291,7 @@ def add_crossed(parser: argparse.ArgumentParser) -> None:
         metavar="P",
         help="of an input that is read every so often; default 0: stamped by interrupt",
     )
+    add_figures(parser)
     add_run_options(parser.add_argument_group("a whole run"))
     circle = parser.add_argument_group("one circle at constant speed")
     circle.add_argument("--radius-mm", type=positive, metavar="R")
@@ -346,13 +376,18 @@ def add_points(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sigma-mm", type=positive, metavar="S", help="of one touch; default: from the residuals"
     )
+    add_figures(parser)
 
 
 def run_points(args: argparse.Namespace) -> CliResult:
     fit = {"four": fit_four, "seven": fit_seven}[args.method]
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3
-    touched = touch_document(fit(read_flange_poses(args.data), sigma_m))
-    document: TouchesDocument = {"method": args.method, **touched}
+    found = fit(read_flange_poses(args.data), sigma_m)
+    document: TouchesDocument = {"method": args.method, **touch_document(found), "figures": None}
+    if args.figures is not None:
+        far_mm = 1e3 * np.linalg.norm(found.residual, axis=1)
+        left = {str(i): [float(far)] for i, far in enumerate(far_mm, start=1)}
+        document["figures"] = _drawn(args.figures, left, found.covariance, found.rms_m)
     return CliResult(document, _show_tool)
 
 

@@ -335,7 +335,8 @@ class ToolEstimate:
     a step against the others, m. ``turn_rad``, ``turn_sigma_rad``: of both beams about the laser's
     z since they were placed; None of a run with something held. Taken out where the edges are not
     explained without. ``estimate``: with the covariance that all sigmas here are of: wider where
-    the given noise does not explain edges, shifts or what was held.
+    the given noise does not explain edges, shifts or what was held. ``edge_m``, ``edge_step`` (e,):
+    residual of each edge, m, and the place of its step among the steps.
     """
 
     T_flange_tool: Array
@@ -349,6 +350,8 @@ class ToolEstimate:
     turn_rad: float | None
     turn_sigma_rad: float
     estimate: Estimate[ToolState]
+    edge_m: Array
+    edge_step: NDArray[np.int64]
 
     @property
     def tip(self) -> Array:
@@ -429,6 +432,8 @@ def estimate_tool(
         turn_rad=turn_rad,
         turn_sigma_rad=turn_sigma_rad,
         estimate=found,
+        edge_m=solved.residual[:, 0] * problem.sigma_m,
+        edge_step=problem.step,
     )
 
 

@@ -139,6 +139,7 @@ class FoundToolDocument(ToolFrameDocument):
 class ToolRunDocument(FoundToolDocument):
     """A whole run."""
 
+    figures: Annotated[str | None, "The figure; null without --figures."]
     warnings: Texts
 
 
@@ -160,6 +161,7 @@ class TouchedToolDocument(TypedDict):
 @printed("tool.points")
 class TouchesDocument(TouchedToolDocument):
     method: Literal["four", "seven"]
+    figures: Annotated[str | None, "The figure; null without --figures."]
 
 
 @printed("tool.parallel")

@@ -228,13 +228,13 @@ CASES = {
     ),
     "tool points": (
         "tool.points.json",
-        ["tool", "points", "--data", "touches.csv"],
+        ["tool", "points", "--data", "touches.csv", "--figures", "drawn"],
         ["tool", "points", "--data", "few_touches.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
     "hand-eye sphere": (
         "hand-eye.sphere.json",
-        ["hand-eye", "sphere", *SPHERE, "--check", "sphere/check.csv"],
+        ["hand-eye", "sphere", *SPHERE, "--check", "sphere/check.csv", "--figures", "drawn"],
         ["hand-eye", "sphere", *FEW_SPHERE],
         (3, "TOO_FEW_SAMPLES"),
     ),
@@ -276,7 +276,7 @@ CASES = {
     ),
     "hand-eye camera": (
         "hand-eye.camera.json",
-        [*CAMERA, "--poses", "camera_poses.csv", "--check", "camera_check.csv"],
+        [*CAMERA, "--poses", "camera_poses.csv", "--check", "camera_check.csv", "--figures", "f"],
         [*CAMERA, "--poses", "few_camera_poses.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
