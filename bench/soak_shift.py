@@ -33,6 +33,7 @@ WARM = 2  # gaps until caches are full
 MOST_GROWTH_MB = 10.0
 LEAST_WITHIN = 0.95  # of the coordinates of the error, within 0.1 mm
 RIGHT_AGAIN = 2  # gaps after a collision
+LONGEST_CALL_S = 0.5  # docs/plc.md
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class LiveShift:
         self.passes: list[Pass] = []
         self.gaps: list[Gap] = []
         self.memory_mb: list[dict[str, float]] = []
+        self.called_s: list[float] = []
         self._bent = False
         self._right_from = 1  # so many gaps on
 
@@ -67,6 +69,7 @@ class LiveShift:
             pids = self._controller.pids
             self.memory_mb.append({node: resident_mb(pid) for node, pid in pids.items()})
         self._produce(bends=False)
+        self.called_s = self._plc.called_s()
 
     def _work_until(self, end_s: float, bends_s: float) -> None:
         while time.monotonic() < end_s:
@@ -115,6 +118,9 @@ def _judged(shift: LiveShift, report: dict[str, Any], seconds: float) -> Table:
     )
     _add_errors(table, shift)
     _add_gaps(table, shift.gaps)
+    called_s = shift.called_s
+    table.add("calls of the PLC, by OPC UA", len(called_s), None)
+    table.add("the longest took, s", max(called_s), Goal(max(called_s), LONGEST_CALL_S))
     sessions = [session for bag in report["bags"] for session in bag["sessions"]]
     differ = sum(bool(session["differs"]) or not session["as_recorded"] for session in sessions)
     table.add("recorded sessions, replayed", len(sessions), None)

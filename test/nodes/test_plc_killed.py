@@ -187,6 +187,22 @@ def test_killed_while_the_robot_stands_nothing_moves(line: KilledBridge, is_open
     assert line.call("Run", "closed", GAP_S)[:2] == [False, Code.CONFLICT]
 
 
+def test_killed_while_a_cycle_is_broken_off_the_robot_stops_or_is_at_home(
+    line: KilledBridge,
+) -> None:
+    cycle = line.begins("cancelled", MEASURES)
+    assert line.call("Cancel")[0]
+    busy = (MaintenanceStatus.RUNNING, MaintenanceStatus.BREAKING_OFF)
+    line.graph.spin_until(lambda: line.status.state != busy[0], "it is broken off")
+    line.killed(moves=True)
+    line.graph.spin_until(lambda: line.status.state not in busy, "it is over", 5.0)
+    status = line.status
+    assert status.at_home or status.state == MaintenanceStatus.FAULT
+    assert (status.last.cycle_id, status.last.code) == (cycle, Code.CONFLICT)
+    line.start()
+    line.says_the_truth()
+
+
 @pytest.mark.parametrize("motions", [MEASURES, *more(ON_ITS_WAY)])
 def test_killed_while_the_robot_moves_it_stops_and_a_person_looks(
     line: KilledBridge, motions: int
@@ -204,6 +220,10 @@ def test_killed_while_the_robot_moves_it_stops_and_a_person_looks(
         assert away[:2] == [False, Code.LIMIT_EXCEEDED]
         assert "robot is not at home: " in away[2]
     assert refused(lambda: line.call("Acknowledge")) == "BadUserAccessDenied"
+    line.killed(moves=False)  # and in the fault: it is there still
+    line.start()
+    line.says_the_truth()
+    assert (line.status.state, line.status.fault) == (status.state, status.fault)
     line.made_good()
     again = line.call("Run", cycle, GAP_S)  # a cycle that has ended is not run again
     assert again[:2] == [True, Code.ACCEPT]

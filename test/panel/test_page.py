@@ -2,16 +2,20 @@
 """The page in a real browser, as a person at the line uses it; pictures in ``out/panel``."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from histories import BY
 from history_workers import proposal
+from long_form import amount
 from panel_page import CHROMIUM, Browser, Cell, accuracy, ended, status
 
 from bench.live.opc_ua import ENGINEER, OPERATOR, free_port, security_folder
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.panel import server as panel_server
 from robocal_ros.panel.state import ACCURACY, STATUS
 
 pytestmark = pytest.mark.skipif(
@@ -20,6 +24,7 @@ pytestmark = pytest.mark.skipif(
 PICTURES = Path(__file__).parents[2] / "out" / "panel"
 PHONE, DESK = (390, 844), (1280, 900)
 SMALLEST_PX = 48  # of what a gloved finger meets
+LEAST_KEPT_BYTES = 100  # of an object, or a closure, that each event leaves
 LEAST_CONTRAST = 4.5  # WCAG 2.1, 1.4.3
 GREY = "document.getElementById('state').dataset.level === 'SILENT'"
 
@@ -273,6 +278,66 @@ def test_a_shift_is_drawn(browser, cell):
     assert "NaN" not in browser.run("document.getElementById('chart').innerHTML")
     assert browser.run("document.documentElement.scrollWidth") <= DESK[0]
     browser.picture(PICTURES / "desk.png", whole=True)
+
+
+def played(server, events, begin_s, sent):
+    """Eight hours from a time on in so many events: a gap each five minutes, told step by step."""
+
+    def tell(source, values, wall_s):
+        server._loop.call_soon_threadsafe(
+            server._show, source, values, round(wall_s * 1e9), time.monotonic(), wall_s
+        )
+
+    for k in range(events):
+        wall_s = begin_s + 8.0 * 3600.0 * k / events
+        gap, step = divmod(k * 96 * 10 // events, 10)  # ten steps of each gap
+        told = {"cycle_id": f"gap-{gap}", "doing": f"on its way to measuring pose {step} of 9"}
+        if step:
+            said = status("RUNNING", **told)
+        else:
+            last = ended(f"gap-{gap - 1}", stamp_ns=round(wall_s * 1e9), left=[f"pose {gap}"])
+            said = status(last=last)
+        before = sent["state"]
+        tell(ACCURACY, accuracy(bound_mm=0.1 + 0.1 * (gap % 7) / 7.0, due_in_s=float(k)), wall_s)
+        tell(STATUS, said, wall_s)
+        server._loop.call_soon_threadsafe(server._wake)
+        until_s = time.monotonic() + 20.0
+        while sent["state"] == before:
+            assert time.monotonic() < until_s, f"event {k} is not sent"
+            time.sleep(0.001)
+
+
+def test_the_events_of_eight_hours_leave_the_heap_as_it_was(browser, cell, monkeypatch):
+    """Played fast, after eight hours that fill curve and lists and eight in which code is compiled.
+
+    What is kept once an event shows.
+    """
+    sent, event = Counter(), panel_server._event
+
+    def counted(name, shown):
+        sent[name] += 1
+        return event(name, shown)
+
+    monkeypatch.setattr(panel_server, "_event", counted)
+    monkeypatch.setattr(panel_server, "SOONEST_S", 0.0)
+    cell.silence()
+    events = amount(960, 28_800)  # two of a minute, or each second's
+    browser.go(cell.url)
+    begin_s, held = time.time(), []
+    browser.command("Performance.enable")
+    for lap in range(3):
+        played(cell.server, events, begin_s + 28_800.0 * lap, sent)
+        browser.until("document.body.innerText.includes('pose 95')")  # the last gap's
+        browser.command("HeapProfiler.collectGarbage")
+        metrics = browser.command("Performance.getMetrics")["metrics"]
+        found = {one["name"]: one["value"] for one in metrics}
+        held.append([found[name] for name in ("JSHeapUsedSize", "Nodes", "JSEventListeners")])
+    assert sent["curve"] > 3 * 400  # a point a minute
+    grown = np.subtract(held[2], held[1])
+    print(f"{sent['state']} events; heap, nodes, listeners: {held}")
+    assert grown[0] < LEAST_KEPT_BYTES * events
+    assert grown[1] < 0.1 * events
+    assert grown[2] < 0.1 * events
 
 
 def test_the_first_paint_comes_within_a_second(browser, cell):

@@ -101,9 +101,13 @@ class Cell:
         if (answer := self.answers(call)) is not None:
             call.answer.set_result(answer)
 
-    def close(self) -> None:
+    def silence(self) -> None:
+        """Its nodes say nothing any more."""
         self._ended.set()
         self._nodes.join()
+
+    def close(self) -> None:
+        self.silence()
         self.server.stop()
 
 
