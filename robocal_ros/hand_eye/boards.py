@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.ground.frames import Array
-from robocal_ros.ground.samples import image_array
+from robocal_ros.ground.samples import MOST_PIXELS, image_array
 from robocal_ros.hand_eye.camera_data import Mount, PosePairs, Shared
 from robocal_ros.kinematics.robots import read_fields
 
@@ -138,10 +138,14 @@ class Chessboard:
 def decode_image(data: bytes, name: str) -> Image:
     """Grey image (h, w) from the bytes of a file of any usual format.
 
-    Raises `InputError` when it is no image.
+    Raises `InputError` when it is no image, and before it is decoded when the header of a PNG or
+    JPEG tells more pixels than are read.
     """
     import cv2
 
+    width, height = header_size(data)
+    if width * height > MOST_PIXELS:
+        raise InputError(f"{name} has {width}x{height} px: {MOST_PIXELS} at most are read")
     image = None
     if data:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
@@ -150,6 +154,26 @@ def decode_image(data: bytes, name: str) -> Image:
     if image is None:
         raise InputError(f"{name} is no image that can be read")
     return np.asarray(image, dtype=np.uint8)
+
+
+def header_size(data: bytes) -> tuple[int, int]:
+    """Width and height, px, as the header of a PNG or JPEG tells them; (0, 0) of what tells none.
+
+    PNG: ISO/IEC 15948, 11.2.2 (IHDR comes first). JPEG: ITU-T T.81, B.1.1 and B.2.2.
+    """
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and data[12:16] == b"IHDR" and len(data) >= 24:
+        return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+    place = 2 if data[:2] == b"\xff\xd8" else len(data)
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF:  # a fill byte
+            place += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a frame begins
+            height, width = data[place + 5 : place + 7], data[place + 7 : place + 9]
+            return int.from_bytes(width), int.from_bytes(height)
+        else:
+            place += 2 + int.from_bytes(data[place + 2 : place + 4])
+    return 0, 0
 
 
 def message_image(message: Any) -> Image:

@@ -220,7 +220,7 @@ class HandEyeNode(SessionNode[HandEyeSession]):
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
         ask, session = self._desk.ask, self._running
         self._files = HandEyeFiles(self, ask, session, history)
-        self._camera = CameraTopic(self)
+        self._camera = CameraTopic(self, self._config.sensor_frame)
         HandEyeServices(self, settings, ask, self._files, session, history, self._camera)
         DecisionServices(self.add_service, self._ask_decision, history, self._kind)
         self.add_timer(WATCH_S, self._watch, steady=True)
@@ -369,7 +369,9 @@ class HandEyeNode(SessionNode[HandEyeSession]):
             health.worsen(ERROR, taken)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        if data is not None and (told := self._camera.doubt(data.target)):
+        if data is not None and "columns" in data.target and (told := self._camera.other_frame()):
+            health.worsen(ERROR, told)
+        elif data is not None and (told := self._camera.doubt(data.target)):
             health.worsen(WARN, told)
 
 

@@ -362,8 +362,9 @@ class CameraTopic:
     A session knows them from the command that begins a set: a replay does not need the topic.
     """
 
-    def __init__(self, node: EndpointNode) -> None:
+    def __init__(self, node: EndpointNode, sensor_frame: str) -> None:
         self._message: Any = None
+        self._frame = sensor_frame  # of every image that is taken
         node.add_input(CameraInfo, CAMERA_INFO, self._take, endpoints.SENSOR)
 
     def _take(self, message: Any) -> None:
@@ -375,7 +376,19 @@ class CameraTopic:
                 "no camera_info has come yet, and the target file takes the intrinsics from it: "
                 "does the camera publish it, in this namespace?"
             )
+        if other := self.other_frame():
+            raise InputError(other)
         return told_intrinsics(self._message, target.rectified)
+
+    def other_frame(self) -> str:
+        """Say that the topic is of another camera than the images; empty where it is of theirs."""
+        told = self._frame if self._message is None else self._message.header.frame_id
+        if told == self._frame:
+            return ""
+        return (
+            f"camera_info in frame '{told}', the images' frame is '{self._frame}': it is another "
+            "camera's, or the driver names one of both wrongly; remap camera_info"
+        )
 
     def given(self, document: Mapping[str, Any]) -> Mapping[str, Any]:
         """A target's document with the camera of the topic, where its file takes that.

@@ -24,6 +24,8 @@ from board_driver import (
 )
 from camera_pairs import BOARD, sound
 from hand_eye_driver import namespace
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import RegionOfInterest
 
@@ -35,6 +37,7 @@ from robocal_ros.hand_eye.boards import (
     Markers,
     boards_of_corners,
     find_corners,
+    header_size,
     message_image,
     pixels_apart,
     read_intrinsics,
@@ -351,10 +354,35 @@ def test_a_compressed_image_that_was_cut_is_refused() -> None:
         message_image(SimpleNamespace(format="jpeg", data=b"\xff\xd8\xff"))
 
 
-def test_an_image_that_says_it_is_huge_is_refused() -> None:
-    """A PNG of a few bytes whose header tells 10^10 pixels."""
-    small = bytearray(cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1].tobytes())
-    small[16:24] = struct.pack(">II", 100_000, 100_000)
-    small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
-    with pytest.raises(InputError, match="is no image that can be read"):
-        message_image(SimpleNamespace(format="png", data=bytes(small)))
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(1, 3000),
+    st.integers(1, 40),
+    st.sampled_from(
+        [(".png", []), (".jpg", []), (".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]),
+         (".jpg", [cv2.IMWRITE_JPEG_RST_INTERVAL, 3, cv2.IMWRITE_JPEG_OPTIMIZE, 1])]
+    ),
+    st.binary(max_size=40),
+)  # fmt: skip
+def test_a_header_tells_the_size(width: int, height: int, how: tuple, remark: bytes) -> None:
+    suffix, options = how
+    data = cv2.imencode(suffix, np.zeros((height, width), np.uint8), options)[1].tobytes()
+    assert header_size(data) == (width, height)
+    if suffix == ".jpg":  # with a comment, as cameras write Exif there, and a fill byte
+        comment = b"\xff\xff\xfe" + (len(remark) + 2).to_bytes(2) + remark
+        assert header_size(data[:2] + comment + data[2:]) == (width, height)
+    assert header_size(data[:12]) == (0, 0)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_an_image_that_says_it_is_huge_is_refused_before_it_is_decoded(suffix: str) -> None:
+    """Of a few bytes, whose header tells more pixels than are read."""
+    small = bytearray(cv2.imencode(suffix, np.zeros((2, 2), np.uint8))[1].tobytes())
+    if suffix == ".png":
+        small[16:24] = struct.pack(">II", 10_000, 10_001)
+        small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
+    else:
+        begin = small.index(b"\xff\xc0")
+        small[begin + 5 : begin + 9] = struct.pack(">HH", 10_001, 10_000)
+    with pytest.raises(InputError, match="has 10000x10001 px: 100000000 at most are read"):
+        message_image(SimpleNamespace(format=suffix[1:], data=bytes(small)))

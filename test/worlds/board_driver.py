@@ -139,9 +139,11 @@ def compressed(
 def camera_info(**changed: Any) -> "CameraInfo":
     """What the driver of the lens tells."""
     from sensor_msgs.msg import CameraInfo
+    from std_msgs.msg import Header
 
     K = [LENS.fx, 0.0, LENS.cx, 0.0, LENS.fy, LENS.cy, 0.0, 0.0, 1.0]
     message = CameraInfo(
+        header=Header(frame_id=FRAME),
         width=LENS.width,
         height=LENS.height,
         distortion_model="plumb_bob",
