@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make the golden tool bag: ``python bags/make_tool_runs.py``, ``tool_runs.mcap``.
 
-Simulated: a UR10 with a pin, two crossed beams, an input that is read every 2 ms and lags by 4 ms.
+Simulated: a UR10 with a pin, its gears as a real one's, with backlash, two crossed beams, an input
+that is read every 2 ms and lags by 4 ms.
 The healthy tool is measured as reference and passes a quick check; somebody bumps it; the quick
 check says so; in the next run an edge is lost, which is refused; the one after it measures the bent
 tool, which is accepted and passes. The bag holds:
@@ -15,6 +16,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +36,13 @@ from bench.measured_runs import (
     ToolCell,
     laser_of,
 )
+from bench.tool_erring import ErringStation, geared
 from robocal_ros import __version__
 from robocal_ros.bags.bags import BagWriter
-from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, beams_of, bent
+from robocal_ros.cell_sim.cell import rigid_robot
+from robocal_ros.cell_sim.gears import ur10_gears
+from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
@@ -71,9 +77,16 @@ class Recorder:
         self, bag: BagWriter, history: CalibrationHistory, mandrel: np.ndarray | None = None
     ) -> None:
         arm = load_robot("ur10")
-        station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), INPUT, NOISE)
+        true = rigid_robot(arm, 0.0, np.random.default_rng(SEED))
+        effects = replace(true.effects, gears=True)
+        robot = geared(replace(true, gears=ur10_gears(), effects=effects))
+        beams = beams_of(T_BASE_LASER, BETA_RAD, GAP_M)
+        station = ErringStation(beams, INPUT, NOISE, robot)
+        # Where the robot, which found them near the station, takes the beams to be.
+        T_taken_true = arm.fk(Q_NEAR) @ frames.invert(robot.true(Q_NEAR[None])[0])
+        points = frames.apply(T_taken_true, laser_of(station).points)
         # To the bits that come back from a laser file, which is in millimetres.
-        laser = LaserFrame(1e-3 * (laser_of(station).points * 1e3))
+        laser = LaserFrame(1e-3 * (points * 1e3))
         cell = ToolCell(arm, station, laser, Q_NEAR)
         config = ToolConfig(
             points_m=rows_of(laser.points),

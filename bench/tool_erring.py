@@ -2,9 +2,11 @@
 """The source's experiment with crossed beams, counted as there, on a UR10 that errs as a real one.
 
 The truth is the arm identified from 5961 poses of a real UR10, with the functions of its joints
-and its compliances; the controller and the estimators have the nominal model.
+and its compliances; the controller and the estimators have the nominal model. `geared` is a robot
+of the simulator, with backlash.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +35,8 @@ from robocal_ros.cell_sim.beams import (
     joints_at,
     laser_points,
 )
+from robocal_ros.cell_sim.gears import BacklashPlay
+from robocal_ros.cell_sim.robot import TrueRobot, Warmth
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
@@ -74,10 +78,13 @@ def about_mean_mm(tip: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ErringRobot:
-    """Drives where its controller's model has a pose; truly it is elsewhere."""
+    """Drives where its controller's model has a pose; truly it is elsewhere.
+
+    ``true``: flange poses (m, 4, 4) at readings (m, n), which it passes in this order.
+    """
 
     nominal: SerialArm
-    true: SerialArm
+    true: Callable[[Array], Array]
 
     def poses(self, wanted: Poses, window: tuple[float, float]) -> Poses:
         """True flange poses by time of a motion in a window.
@@ -87,7 +94,7 @@ class ErringRobot:
         time = np.linspace(*window, TIMES)
         T = wanted(time)
         q = joints_at(self.nominal, T, self.joints(T[0]))
-        off = self.true.fk(q) @ frames.invert(T)
+        off = self.true(q) @ frames.invert(T)
 
         def poses(time_s: Array) -> Array:
             i = np.clip(np.searchsorted(time, time_s), 1, TIMES - 1)
@@ -109,6 +116,20 @@ class ErringRobot:
         for T in way:
             q = joints_at(self.nominal, T[None], q)[0]
         return q
+
+
+def geared(true: TrueRobot) -> ErringRobot:
+    """A cold robot with gears, whose joints begin each way in the middle of their play."""
+    gears, cold = true.backlash, Warmth.cold(true.nominal.n)
+    if gears is None:
+        raise ValueError("a robot without gears")
+
+    def flange(q: Array) -> Array:
+        play, order = BacklashPlay(gears, q[0]), np.arange(len(q), dtype=np.float64)
+        play.follow(order, q)
+        return true.flange(q, cold, behind=play.at(order))
+
+    return ErringRobot(true.nominal, flange)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +175,7 @@ def experiment(
 ) -> tuple[float, float, float]:
     """The tip's spread as the source counts it, its error in the flange, mm; motion of a run, s."""
     nominal, rng = load_robot("ur10"), np.random.default_rng([61, seed])
-    robot, axis_m = ErringRobot(nominal, true), condition.axis_m
+    robot, axis_m = ErringRobot(nominal, true.fk), condition.axis_m
     noise = TrueNoise(axis_m, axis_m / 3.0)
     station = ErringStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), INPUT, noise, robot)
     points = laser_points(station, T_BASE_LASER, rng)

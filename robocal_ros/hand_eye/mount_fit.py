@@ -151,7 +151,7 @@ def fit_mount(
     """
     rejected: dict[str, str] = {}
     state = start
-    found = _noise_of(misfit(views, start)) if noise is None else noise
+    found = noise_of(misfit(views, start)) if noise is None else noise
     found = replace(found, aim_m=FIRST_NOISE.aim_m, repeat_m=FIRST_NOISE.repeat_m)
     poses = np.concatenate([view.sightings.pose for view in views])
     if len(np.unique(poses)) < len(poses):  # one sighting of a profile may be wrong, not all of it
@@ -185,7 +185,7 @@ def first_look(views: tuple[TargetView, ...], start: MountState) -> MountState:
 
 def _looked_nearer(views: tuple[TargetView, ...], state: MountState) -> MountState:
     """One of the rounds of `first_look`."""
-    noise = _noise_of(misfit(views, state))
+    noise = noise_of(misfit(views, state))
     return _solved(MountProblem(views, noise, state, together=False), state).state
 
 
@@ -218,7 +218,7 @@ def minima(
     return sorted(runs, key=lambda pair: pair[0]), failure
 
 
-def _noise_of(misfit_m: float) -> PoseNoise:
+def noise_of(misfit_m: float) -> PoseNoise:
     """Noise of poses that explains a misfit."""
     off_m = max(misfit_m, FIRST_NOISE.sigma_m)
     return PoseNoise(off_m, off_m / ARM_M, FIRST_NOISE.aim_m)

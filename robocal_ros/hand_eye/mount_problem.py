@@ -115,9 +115,8 @@ class TargetModel(ABC):
     def names(self) -> tuple[str, ...]:
         """Names (k) of the unknowns."""
 
-    @property
-    def prior(self) -> Array:
-        """Information (k, k) about the unknowns beforehand."""
+    def prior(self, noise: PoseNoise) -> Array:
+        """Information (k, k) about the unknowns beforehand, where poses err by so much."""
         return np.zeros((len(self.names), len(self.names)))
 
     @abstractmethod
@@ -263,25 +262,31 @@ class CornerModel(TargetModel):
     What the eye missed is a shift of the light along the edges and a turn across them.
 
     ``corner_user`` (m, 3) mark that each sighting shows, user frame, m. ``edge_user`` (3,) unit
-    direction of the edges. ``T_base_user`` (4, 4) as taught; ``information`` (6, 6) about its error
+    direction of the edges. ``T_base_user`` (4, 4) as taught; ``taught_sigma`` (6,) of its error
     (v, w), user axes, or None where it is exact. Place (4, 4) = the user frame.
     """
 
     corner_user: Array
     edge_user: Array
     T_base_user: Array
-    information: Array | None = None
+    taught_sigma: Array | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
         """None for an exact user frame."""
         turns = ("user frame x", "user frame y", "user frame z")
-        return () if self.information is None else (*turns, *(f"{name} turn" for name in turns))
+        return () if self.taught_sigma is None else (*turns, *(f"{name} turn" for name in turns))
 
-    @property
-    def prior(self) -> Array:
-        """About the teaching error."""
-        return np.zeros((0, 0)) if self.information is None else self.information
+    def prior(self, noise: PoseNoise) -> Array:
+        """About the teaching error, and that of the robot where it taught.
+
+        Joints that turn little from shot to shot err alike in all of them, and otherwise where the
+        frame was taught: by as much, as far as one can tell, as those that turn.
+        """
+        if self.taught_sigma is None:
+            return np.zeros((0, 0))
+        robot = np.repeat([noise.sigma_m, noise.sigma_rad], 3)
+        return np.diag(1.0 / (self.taught_sigma**2 + robot**2))
 
     @cached_property
     def _across(self) -> Array:
@@ -298,7 +303,7 @@ class CornerModel(TargetModel):
         u = np.einsum("mji,j->mi", T_base_sensor[:, :3, :3], R @ self.edge_user)
         p, along, slope = _pierce(s, u)
         spread = np.zeros((len(s), 3, len(self.names)))
-        if self.information is not None:
+        if self.taught_sigma is not None:
             at_user = self.corner_user + along[:, None] * self.edge_user
             spread[:, :, :3] = R
             spread[:, :, 3:] = -R @ frames.skew(at_user)
@@ -309,11 +314,11 @@ class CornerModel(TargetModel):
 
     def moved(self, place: Array, step: Array) -> Array:
         """The user frame after a step along its own axes."""
-        return place if self.information is None else moved(place, step)
+        return place if self.taught_sigma is None else moved(place, step)
 
     def deviation(self, place: Array) -> Array:
         """How far the user frame is from the taught one."""
-        if self.information is None:
+        if self.taught_sigma is None:
             return np.zeros(0)
         T = frames.invert(self.T_base_user) @ place
         return np.concatenate([T[:3, 3], frames.log_rotation(T[:3, :3])])
@@ -499,7 +504,7 @@ class MountProblem:
         """Information (k, k) about the unknowns beforehand; zero where nothing is known."""
         information = np.zeros((len(self.names), len(self.names)))
         for view, columns in zip(self.views, self._columns, strict=True):
-            information[columns, columns] = view.model.prior
+            information[columns, columns] = view.model.prior(self.noise)
         return information
 
 

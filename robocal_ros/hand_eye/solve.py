@@ -32,6 +32,7 @@ from robocal_ros.hand_eye.mount_fit import (
     minima,
     misfit,
     noise_numbers,
+    noise_of,
     require_radius,
     require_seen,
     robot_numbers,
@@ -41,7 +42,6 @@ from robocal_ros.hand_eye.mount_fit import (
     without,
 )
 from robocal_ros.hand_eye.mount_problem import (
-    FIRST_NOISE,
     SENSOR_UNKNOWNS,
     MountProblem,
     MountState,
@@ -521,7 +521,8 @@ def verify(
     read = read_with(task, data, linearity)
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
     rejected = dict(read.rejected)
-    view, state = _fit_place(read.view, start, settings.noise() or FIRST_NOISE, rejected)
+    noise = settings.noise() or noise_of(misfit((read.view,), start))
+    view, state = _fit_place(read.view, start, noise, rejected)
     fit = distances((view,), state)
     rms = float(np.sqrt(np.mean(fit**2)))
     words, code = f"{len(fit)} samples are off by {rms * 1e3:.3f} mm rms", Code.ACCEPT
@@ -548,9 +549,8 @@ def _fit_place(
     if not view.model.names:
         return view, start
     problem = MountProblem((view,), noise, start)
-    estimate = solve(
-        _PlaceProblem(problem), start, prior_information=view.model.prior, sizes=problem.sizes
-    )
+    known = problem.prior()[HELD:, HELD:]
+    estimate = solve(_PlaceProblem(problem), start, prior_information=known, sizes=problem.sizes)
     kept = without((view,), estimate.rejected[problem.sample], rejected)
     return kept[0], estimate.settled()
 

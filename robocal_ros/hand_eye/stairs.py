@@ -208,10 +208,8 @@ class StepTask(Task):
         """Corners (m, 3), user frame, with what is known of that frame."""
         target = self.target
         sigma = np.repeat([target.user_sigma_m, target.user_sigma_rad], 3)
-        information = None
-        if np.any(sigma):
-            information = np.diag(np.maximum(sigma, SMALLEST_SIGMA) ** -2.0)
-        return CornerModel(corner_user, target.edge_user, target.T_base_user, information)
+        taught = np.maximum(sigma, SMALLEST_SIGMA) if np.any(sigma) else None
+        return CornerModel(corner_user, target.edge_user, target.T_base_user, taught)
 
 
 def _on_surfaces(fit: CornerFit, profile: Profile) -> list[SeenLine]:

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is told of a mount where the robot's joints err as a real UR10's do, with backlash.
+
+Each draw has another robot, its gears set elsewhere, other poses and other noise. The model in
+force knows nothing of the gears.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from long_form import amount
+from scipy.stats import chi2
+
+from bench.hand_eye_cell import HandEyeCell
+from bench.hand_eye_profiles import EXACT, with_gears
+from bench.hand_eye_worlds import Calibration, X, edge_set, sphere_set, step_set
+from robocal_ros.hand_eye.mount_fit import fit_mount
+from robocal_ros.hand_eye.mount_problem import pivot_of
+from robocal_ros.hand_eye.result import PoseNoise, increment
+from robocal_ros.hand_eye.solve import features, look
+
+Make = Callable[[HandEyeCell, np.random.Generator], Calibration]
+DRAWS: dict[Make, int] = {
+    step_set: amount(30, 200),
+    sphere_set: amount(30, 200),
+    edge_set: amount(10, 60),
+}
+
+
+def squared_error(made: Calibration) -> float:
+    task = made.task()
+    view = features(task, made.data).view
+    fit = fit_mount((view,), look(task, view)[0])
+    step = increment(fit.state.T_flange_sensor, X, pivot_of(fit.views))
+    return float(step @ np.linalg.solve(fit.covariance[:6, :6], step))
+
+
+@pytest.mark.parametrize(
+    ("make", "factor"),
+    [(step_set, 1.0), (sphere_set, 1.0), (edge_set, 1.3)],
+    ids=["stairs", "sphere", "unknown edge"],
+)
+def test_sigmas_of_a_mount_hold_with_gears(make: Make, factor: float):
+    """By chi-square of six numbers a draw; docs/simulation.md tells the factor of an unknown edge.
+
+    Poses far apart show the gears as scatter. The frame of stairs is known as well as that scatter
+    allows. Along an edge a few joints turn slowly, and what they err by is not all scatter.
+    """
+    squared = []
+    for seed in range(DRAWS[make]):
+        rng = np.random.default_rng([80, seed])
+        cell = HandEyeCell(sensor=EXACT, robot=with_gears(rng))
+        squared.append(squared_error(make(cell, rng)))
+    numbers = 6 * DRAWS[make]
+    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], numbers) / numbers
+    print(f"{make.__name__}: {np.sum(squared) / numbers:.2f} ({low:.2f} to {high:.2f})")
+    assert low < np.sum(squared) / numbers / factor**2 < high
+
+
+def test_a_taught_frame_is_no_better_than_the_robot_that_taught_it():
+    """The told sigma of its place is not below that of the robot's poses, as found or as given."""
+    rng = np.random.default_rng(1)
+    made = step_set(HandEyeCell(sensor=EXACT, robot=with_gears(rng)), rng)
+    alone = PoseNoise(1e-6, 1e-6)
+    model = features(made.task(), made.data).view.model
+    for sigma_m in (1e-6, 1e-4, 5e-4):
+        known = np.sqrt(1.0 / np.diag(model.prior(PoseNoise(sigma_m, sigma_m / 3.0))))
+        told = np.sqrt(1.0 / np.diag(model.prior(alone)))
+        assert known[:3] == pytest.approx(np.hypot(told[:3], sigma_m), rel=1e-3)
+    exact = step_set(HandEyeCell(sensor=EXACT), rng)  # a frame that is told to be exact stays it
+    assert features(exact.task(), exact.data).view.model.names == ()
