@@ -33,6 +33,7 @@ SECONDS = 60.0  # of each stream
 BLOCK_S = 2.0  # each in its turn
 DRIFT_M = 0.5e-3
 POINTS, PATHS, PATH_S = 10_000, 10, 3.0
+OWN_HZ, BLOCK, BLOCKS = 500, 100, 50
 NODE, RELAY, BYTES, SINGLE = "corrected", "relayed", "relayed_bytes", "relayed_single"
 IN_WORDS = {
     NODE: "joint_correction_node",
@@ -98,12 +99,21 @@ def in_tables(found: dict[str, Any]) -> Sequence[Table]:
         ("through", "sent", "lost", "goal", "median, ms", "longest, ms", "median / relay"),
         "Positions, velocities and accelerations of six joints: 1.9 MB.",
     )
+    own = Table(
+        "correction_own",
+        "What joint_correction_node itself takes for a message",
+        ("topic", "n", "refused", "callback, µs", "of it publishing, µs"),
+        f"In process at {OWN_HZ} Hz, nobody subscribed: processor time, the median of blocks of "
+        f"{BLOCK}. What rclpy takes to wake up and to take a message comes on top.",
+    )
+    for topic, figures in found["own"].items():
+        own.add(topic, *figures)
     middle = {name: float(np.median(times)) for name, times in found["paths"].items() if times}
     for name, times in found["paths"].items():
         lost = PATHS - len(times)
         figures = (middle[name], max(times), middle[name] / middle[RELAY]) if times else 3 * (None,)
         paths.add(IN_WORDS[name], PATHS, lost, Goal(lost, 0), *figures)
-    return [streams, beside, paths]
+    return [streams, beside, own, paths]
 
 
 def _targets(rows: list[dict[str, Any]], through: str, rate: int) -> dict[str, Any]:
@@ -120,7 +130,61 @@ def measure(seconds: float) -> dict[str, Any]:
         rows = [row for rate in RATES_HZ for row in _stream(probe, streams, rate, seconds)]
         paths = _paths(probe, streams)
     load.append(os.getloadavg()[0])
-    return {"load": load, "streams": rows, "paths": paths}
+    return {"load": load, "streams": rows, "paths": paths, "own": _own()}
+
+
+def _own() -> dict[str, tuple[float, ...]]:
+    """Of each topic: messages, those refused, processor time of a callback and of publishing."""
+    import rclpy
+    from robocal_msgs.msg import KinematicModel
+
+    from bench.stream_probe import LEAD_S, SERIAL, STATES, TARGETS, Buffer, drifted, offered, path
+    from robocal_ros.correction.node import JointCorrectionNode
+
+    given = {"robot": "kr150_r3100", "serial": SERIAL, "enable_on_start": "true"}
+    words = (word for name, value in given.items() for word in ("-p", f"{name}:={value}"))
+    rclpy.init(args=["--ros-args", *words])
+    node = JointCorrectionNode()
+    try:
+        node.autostart()
+        arm, take = node.robot.arm, {topic: act for topic, _, act in node._takers}
+        take["kinematic_model"](offered(arm, drifted(arm, DRIFT_M), 1, KinematicModel.ACCEPTED))
+        buffer, still = Buffer(arm.joint_names), np.zeros(arm.n)
+        begin_s, out = time.monotonic(), node._session.output.out
+        while time.monotonic() - begin_s < LEAD_S:
+            take[STATES](buffer.filled(time.time_ns(), path(0.0)[0], still))
+            time.sleep(1e-3)
+        take[TARGETS](buffer.filled(time.time_ns(), *path(0.0)))
+        begin_s, took = time.monotonic(), defaultdict[str, list[float]](list)
+        due_s = begin_s
+        for _ in range(BLOCKS):
+            used = dict.fromkeys((STATES, TARGETS), 0.0)
+            for _ in range(BLOCK):
+                for topic in used:
+                    due_s = max(due_s + 0.5 / OWN_HZ, time.monotonic())
+                    time.sleep(max(due_s - time.monotonic(), 0.0))
+                    joints = (out, still) if topic == STATES else path(time.monotonic() - begin_s)
+                    data = buffer.filled(time.time_ns(), *joints)
+                    before = time.thread_time()
+                    take[topic](data)
+                    used[topic] += time.thread_time() - before
+            for topic, cpu_s in used.items():
+                before = time.thread_time()
+                for _ in range(BLOCK):
+                    node._outputs[topic].publish(data)
+                took[f"{topic} out"].append((time.thread_time() - before) / BLOCK * 1e6)
+                took[topic].append(cpu_s / BLOCK * 1e6)
+        return {
+            topic: (
+                BLOCKS * BLOCK,
+                node.inputs[topic].invalid,
+                *(float(np.median(took[of])) for of in (topic, f"{topic} out")),
+            )
+            for topic in used
+        }
+    finally:
+        node.close()
+        rclpy.try_shutdown()
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ What becomes of a correction beyond its bounds says the policy; the limiter come
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -323,6 +324,7 @@ class DesiredOffset:
         self._bounds = np.array(bounds, dtype=np.float64)
         self._nothing = np.zeros(reference.n)
         self._tcp = np.array([config.thermal.tcp_m, config.thermal.tcp_rad])
+        self._whole_step: tuple[Any, ...] | None = None  # the last arguments of `step_out`
 
     def want(self, actual: SerialArm, on: bool) -> None:
         """Correct for an arm with its tool from the next command on, or for nothing."""
@@ -333,7 +335,11 @@ class DesiredOffset:
             self.known = None
             if not same:
                 self.known = correction_between(self._reference, packed, self._arm, self._config)
-        self.stage = self.known if on else None
+        self.stage, self._whole_step = self.known if on else None, None
+        if self.stage is not None and self._config.policy is Policy.REFUSE:
+            stage = self.stage
+            given = stage.largest, stage.free_axis, stage.works, stage.reports, self.figures
+            self._whole_step = self._span, self._bounds, self._tcp, *given
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
@@ -378,15 +384,13 @@ class DesiredOffset:
 
         In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`.
         """
-        stage, memory, limits, span = self.stage, limiter.memory, limiter.limits, self._span
-        if stage is not None and self._config.policy is Policy.REFUSE:
-            share = step_out(
-                q, velocity, elapsed, longest, memory, limits, active, speeds, span, self._bounds,
-                self._tcp, stage.largest, stage.free_axis, stage.works, stage.reports, self.figures,
-            )  # fmt: skip
+        memory, limits, given = limiter.memory, limiter.limits, self._whole_step
+        if given is not None:
+            share = step_out(q, velocity, elapsed, longest, memory, limits, active, speeds, *given)
             if share != NOT_WITHIN:
                 self.made = True
                 return share
+        stage, span = self.stage, self._span
         if stage is None:
             self.made, desired = False, self._nothing
             self.figures[SHIFT : REMAINING + 1] = 0.0

@@ -249,13 +249,13 @@ class CommandSources:
         last, before_s = self._topic, self._heard_s
         self._topic, self._heard_s, self._gone = topic, now_s, ""
         if now_s - before_s <= self._at_once_s:
-            rivals, count = "", self.inputs[topic].get_publisher_count()
+            count = self.inputs[topic].get_publisher_count()
             if topic != last:
-                rivals = f"commands come on {last} and {topic} at once: stop one of them"
+                self._rivals = f"commands come on {last} and {topic} at once: stop one of them"
+                self._rivals_s = now_s
             elif count > 1:
-                rivals = f"{topic} has {count} publishers: stop all but one"
-            if rivals:
-                self._rivals, self._rivals_s = rivals, now_s
+                self._rivals = f"{topic} has {count} publishers: stop all but one"
+                self._rivals_s = now_s
         return self._rivals if now_s - self._rivals_s <= self._at_once_s else ""
 
     def look(self) -> None:

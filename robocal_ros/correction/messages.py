@@ -101,8 +101,9 @@ class _Layout:
     places: tuple[int, ...]
     parts: Callable[[bytes], tuple[bytes, ...]]  # that are the same in all messages laid out so
     same: tuple[bytes, ...]
-    numbers: struct.Struct  # all of them, from the first position on
-    velocity: slice | None  # where the velocities are among the numbers; None where it has none
+    numbers: struct.Struct  # all of them, after the stamp's two
+    doubles: int  # from the first position to the end of the last number, counts among them
+    velocity: slice | None  # where the velocities are among these; None where it has none
     size: int
 
 
@@ -130,13 +131,13 @@ class JointWire:
             layout = self._layout = _layout(data)
             if layout is None:
                 return None
-        first, k = layout.places[0], len(layout.names)
-        numbers = np.frombuffer(data, np.float64, layout.numbers.size // 8, first).copy()
-        position = numbers[:k]
+        numbers = np.frombuffer(data, np.float64, layout.doubles, layout.places[0]).copy()
+        position = numbers[: layout.counts[0]]
         velocity = None if layout.velocity is None else numbers[layout.velocity]
         self._efforts = layout.counts[2]
         # for so few numbers this takes a tenth of the time of NumPy's isfinite
-        self.is_finite = math.isfinite(sum(layout.numbers.unpack_from(data, first)))
+        given = layout.numbers.unpack_from(data, STAMP)
+        self.is_finite = math.isfinite(sum(given))
         if not self.is_finite:
             if not (self.is_reading and np.isfinite(position).all()):
                 return None
@@ -144,27 +145,28 @@ class JointWire:
                 velocity = None
             if not np.isfinite(numbers[len(numbers) - self._efforts :]).all():
                 self._efforts = 0
-        sec, nanosec = STAMPS.unpack_from(data, STAMP)
-        return JointCommand(layout.names, position, velocity, sec * NS + nanosec, layout.frame_id)
+        stamp_ns = given[0] * NS + given[1]
+        return JointCommand(layout.names, position, velocity, stamp_ns, layout.frame_id)
 
     def written(self, data: bytes, command: JointCommand) -> bytes:
         """The message read last, ``data``, with the command's values and mark."""
-        layout, moves, efforts = self._layout, command.velocity is not None, self._efforts
+        layout, velocity, efforts = self._layout, command.velocity, self._efforts
         if layout is None:
             raise ValueError("no message was read")
-        if self._made_for != (layout, command.mark, moves, efforts):
-            self._make(layout, command.mark, moves)
+        wanted = layout, command.mark, velocity is not None, efforts
+        if self._made_for != wanted:
+            self._make(layout, command.mark, moves=velocity is not None)
         out = self._out
         out[STAMP:FRAME] = data[STAMP:FRAME]
         self._position[:] = command.position
-        if moves:
-            self._velocity[:] = command.velocity
+        if velocity is not None:
+            self._velocity[:] = velocity
         if efforts:
             place, size = layout.places[2], 8 * efforts
             out[self._effort_at : self._effort_at + size] = data[place : place + size]
         return bytes(out)
 
-    def _make(self, layout: _Layout, mark: str, moves: bool) -> None:
+    def _make(self, layout: _Layout, mark: str, *, moves: bool) -> None:
         """Lay the outgoing message out."""
         out, places, k = bytearray(HEAD + bytes(8) + _string_bytes(mark)), [], len(layout.names)
         out += layout.named
@@ -204,6 +206,7 @@ def _layout(data: bytes) -> _Layout | None:
     counted = [slice(begin, begin + 4) for begin in begins[1:]]
     parts = itemgetter(slice(0, len(HEAD)), slice(FRAME, begins[0] + 4), *counted)
     fields = [f"{c}d" for c in counts if c]  # each begins a number after the end of that before
+    numbers, before = "8x".join(fields), places[0] - FRAME
     return _Layout(
         frame_id=frame_id,
         names=names,
@@ -212,7 +215,8 @@ def _layout(data: bytes) -> _Layout | None:
         places=tuple(places),
         parts=parts,
         same=parts(data),
-        numbers=struct.Struct("<" + "8x".join(fields)),
+        numbers=struct.Struct(f"<iI{before}x{numbers}"),
+        doubles=struct.calcsize(f"<{numbers}") // 8,
         velocity=slice(k + 1, 2 * k + 1) if counts[1] else None,
         size=len(data),
     )
@@ -267,7 +271,7 @@ class JointMessage:
 
     def command(self) -> JointCommand:
         """Build the session's command; raises `RefusedError` as `finite_command`."""
-        if self._command is not None:
+        if self._command:
             return self._command
         build = joint_command if self._wire.is_reading else finite_command
         return build(self._message)

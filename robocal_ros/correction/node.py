@@ -42,7 +42,7 @@ from robocal_ros.correction.messages import (
     read_message,
     tail_message,
 )
-from robocal_ros.correction.report import LOOK_S, CorrectionReport
+from robocal_ros.correction.report import LOOK_S, STREAM, CorrectionReport
 from robocal_ros.correction.robot_state import DECELERATION
 from robocal_ros.correction.sent_path import SentPath
 from robocal_ros.correction.session import CorrectionSession, load_kernels
@@ -98,12 +98,6 @@ class JointCorrectionNode(RobotNode):
     SETTINGS = SETTINGS
     _made_for = ""  # serial of the model in use
     _proxy: TrajectoryProxy | None = None
-    _ending = False
-
-    @property
-    def is_active(self) -> bool:
-        """True while the node acts; it does so until it has stopped what it moves."""
-        return self._ending or super().is_active
 
     def configure(self) -> None:
         """Load the models, then open the topics."""
@@ -225,7 +219,8 @@ class JointCorrectionNode(RobotNode):
     def deactivate(self) -> None:
         """Bring the robot to rest, for half a second at most; goals under way are stopped."""
         why = "the joint correction is deactivated"
-        self._ending, until_s = True, time.monotonic() + ENDING_S
+        until_s = time.monotonic() + ENDING_S
+        self.is_active = True  # until what it moves stands
         try:
             self._session.hold(Reason.STOPPED, why, time.monotonic())
             self._stop(why)
@@ -239,7 +234,7 @@ class JointCorrectionNode(RobotNode):
             self._stopping.forget()  # what moves the robot when it is active again is another one
         finally:
             self._session.release(Reason.STOPPED)
-            self._ending = False
+            self.is_active = False
 
     def cleanup(self) -> None:
         """Take no goals any more."""
@@ -343,7 +338,7 @@ class JointCorrectionNode(RobotNode):
             self._put_out(topic, message, command, self._session.target(command, now))
         finally:
             self._arm_tail()
-        self._tell_offset(JointOffset.STREAM, now)
+        self._tell_offset(STREAM, now)
 
     def _on_states(self, message: JointMessage, now: float) -> None:
         session = self._session

@@ -39,6 +39,7 @@ FIGURES = (
 )  # fmt: skip
 # Fields of the message that are those of the session.
 SAME = ("enabled", "stale", "mismatch", "lag_s", "overtaken", "reduced", "last_refusal")
+STREAM = int(JointOffset.STREAM)
 RETRY_S = 5.0
 CLOSE_S = 5.0  # the end of the node waits so long for what is not yet written
 MOST_WAITING = 1000  # then the oldest are lost
@@ -136,6 +137,7 @@ class CorrectionReport:
             "taught_tool": transform_message(reference.T_flange_tool),
             "shadow": bool(settings["shadow"]),
         }
+        self._subscribed, self._look_s = False, 0.0
         self._refusals = 0
         self._told: list[str] = []
         self._damage = ""  # as the last status told it
@@ -154,8 +156,14 @@ class CorrectionReport:
         self.log = CorrectionLog(settings, robot)
 
     def offset(self, cause: int, now_s: float) -> None:
-        """Publish what is added to the taught joints, while somebody subscribes."""
-        if not self._offsets.get_subscription_count():
+        """Publish what is added to the taught joints, while somebody subscribes.
+
+        Of a stream's the subscribers are those of the last `LOOK_S`.
+        """
+        if cause != STREAM or now_s >= self._look_s:
+            self._look_s = now_s + LOOK_S
+            self._subscribed = self._offsets.get_subscription_count() > 0
+        if not self._subscribed:
             return
         offset = self._session.offset(now_s)
         message = JointOffset(

@@ -44,6 +44,9 @@ MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
 AHEAD_S = 0.1
 MOST_LAYOUTS = 16  # of readings, by their joints' names, that are remembered
+# Numbers or columns of joints; all of them in the arm's own order, which NumPy takes faster so.
+Joints = Index | slice
+EVERY = slice(None)
 # A velocity is of readings of the last so many seconds, of five at least: a wild one is outvoted.
 VELOCITY_S, LEAST = 0.05, 5
 LEAST_TRACK_S = 0.02  # readings that span less tell no speed
@@ -72,7 +75,7 @@ class RobotState:
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
         self._all = np.arange(arm.n, dtype=np.int64)
-        self._columns: dict[tuple[str, ...], tuple[tuple[str, ...], Index, Index]] = {}
+        self._columns: dict[tuple[str, ...], tuple[tuple[str, ...], Index, Joints, Joints]] = {}
         self._age_limit_s, self._near = age_limit_s, near
         self._strays = np.maximum(near, np.where(arm.prismatic, STRAYS[True], STRAYS[False]))
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
@@ -113,8 +116,6 @@ class RobotState:
         if position.shape[1] != len(names):
             detail = f"{len(names)} names but {position.shape[1]} positions"
             raise RefusedError(Reason.WRONG_SIZE, detail)
-        if len(position) == 1 and ordinary(plain(position[0]), self._doubtful, index):
-            return
         require_finite(names, position)
         size = np.abs(position)
         if not (size > self._doubtful[index]).any():
@@ -128,8 +129,10 @@ class RobotState:
 
     def require_target(self, command: JointCommand, index: Index) -> None:
         """As `require_positions`, and velocities that are not finite, or of another number."""
-        names, velocity = command.names, command.velocity
-        self.require_positions(names, index, command.position[None])
+        names, position, velocity = command.names, command.position, command.velocity
+        usual = len(position) == len(names) and ordinary(plain(position), self._doubtful, index)
+        if not usual:
+            self.require_positions(names, index, position[None])
         if velocity is None:
             return
         if len(velocity) != len(names):
@@ -158,8 +161,11 @@ class RobotState:
         q[..., index] = position
         return q
 
-    def find(self, state: JointCommand) -> tuple[Index, Index]:
-        """Numbers of the arm's joints in readings, and their columns; joints of others are left."""
+    def find(self, state: JointCommand) -> tuple[Joints, Joints]:
+        """Numbers of the arm's joints in readings, and their columns; joints of others are left.
+
+        Raises `RefusedError` as `require_positions`, and for a joint that is named twice.
+        """
         if len(state.position) != len(state.names):
             detail = f"{len(state.names)} names but {len(state.position)} positions"
             raise RefusedError(Reason.WRONG_SIZE, detail)
@@ -169,17 +175,21 @@ class RobotState:
             columns = [i for i, name in enumerate(state.names) if name in self._number]
             names = tuple(state.names[i] for i in columns)
             index = np.array([self._number[name] for name in names], dtype=np.int64)
-            known = names, index, np.array(columns, dtype=np.int64)
+            known = names, index, index, np.array(columns, dtype=np.int64)
+            if state.names == self.names:
+                known = names, index, EVERY, EVERY
             if len(self._columns) >= MOST_LAYOUTS:
                 self._columns.clear()
             self._columns[state.names] = known
-        names, index, column = known
-        self.require_positions(names, index, state.position[column][None])
-        return index, column
+        names, index, joints, column = known
+        position = state.position[column]
+        if not ordinary(plain(position), self._doubtful, index):
+            self.require_positions(names, index, position[None])
+        return joints, column
 
     def read(
         self,
-        index: Index,
+        index: Joints,
         position: Array,
         now_s: float,
         age_s: float = 0.0,
@@ -464,10 +474,11 @@ class Output:
     def note_place(self, now_s: float) -> None:
         """Keep where the controller is sent now, for robots that lag."""
         track = self._track
+        if track and 0.0 <= now_s - track[-1][0] < TRACK_S:
+            return
         while len(track) > 1 and track[1][0] <= now_s - RESPONSE_S:
             track.popleft()
-        if not track or now_s - track[-1][0] >= TRACK_S or now_s < track[-1][0]:
-            track.append((now_s, self._sent(now_s)))
+        track.append((now_s, self._sent(now_s)))
 
     def _sent(self, now_s: float) -> Array:
         """Where the controller was sent by now (n,); NaN where nothing was."""

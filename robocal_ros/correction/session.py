@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from typing import NoReturn, TypeVar
 
 import numpy as np
@@ -36,11 +37,11 @@ from robocal_ros.correction.limiter import (
     WORST,
     WORST_OUT,
 )
-from robocal_ros.correction.robot_state import Output, RobotState
+from robocal_ros.correction.robot_state import EVERY, Joints, Output, RobotState
 from robocal_ros.correction.sent_path import WITHHELD, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
-from robocal_ros.ground.frames import Array, Index
+from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.kinematics import SerialArm
@@ -214,7 +215,8 @@ class CorrectionSession:
         """
         try:
             self._require_order("target", command, (), now_s)
-            self._require_released()
+            for reason, detail in self._held.items():
+                raise RefusedError(reason, detail)
             index = self.robot.index(command.names)
             self.robot.require_target(command, index)
             q = self.robot.complete(index, command.position, self._taught, now_s)
@@ -247,7 +249,8 @@ class CorrectionSession:
         waiting = self._gate.tools.waiting, self._gate.tools.in_use
         try:
             self._require_order("trajectory", replace(command, stamp_ns=0), (), now_s)
-            self._require_released()
+            for reason, detail in self._held.items():
+                raise RefusedError(reason, detail)
             require_times(command)
             index = self.robot.index(command.names)
             self.robot.require_positions(command.names, index, command.position)
@@ -307,10 +310,6 @@ class CorrectionSession:
             self.counted(lambda: self._desired.at(q))
         self.output.stage = self._desired.stage
 
-    def _require_released(self) -> None:
-        for reason, detail in self._held.items():
-            raise RefusedError(reason, detail)
-
     def reading(self, state: JointCommand, now_s: float, age_s: float = 0.0) -> JointCommand:
         """Un-correct joint readings with what is being put out at ``now_s``.
 
@@ -321,13 +320,12 @@ class CorrectionSession:
             self._require_order("reading", state, state.names, now_s)
             index, column = self.robot.find(state)
             late_s = self._late_by(state, now_s, age_s)
-            velocity = state.velocity
+            robot, velocity = self.robot, state.velocity
             if velocity is not None:
-                whole = len(velocity) == len(state.names)
-                velocity = velocity[column] if whole else None
-            self.robot.read(index, state.position[column], now_s, age_s, velocity, late_s)
+                velocity = velocity[column] if len(velocity) == len(state.names) else None
+            robot.read(index, state.position[column], now_s, age_s, velocity, late_s)
             self.output.note_place(now_s)
-            q, position, velocity = self._uncorrected(state, index, column, now_s)
+            q, position, velocity = self._uncorrected(state, robot.measured, index, column, now_s)
         except RefusedError as error:
             raise self._count(error) from None
         self._taught[:] = q
@@ -357,14 +355,15 @@ class CorrectionSession:
         """
         state = JointCommand(names, position, velocity)
         index, column = self.robot.find(state)
-        return self._uncorrected(state, index, column, now_s)[1:]
+        measured = self.robot.measured.copy()
+        measured[index] = position[column]
+        return self._uncorrected(state, measured, index, column, now_s)[1:]
 
     def _uncorrected(
-        self, state: JointCommand, index: Index, column: Index, now_s: float
+        self, state: JointCommand, measured: Array, index: Joints, column: Joints, now_s: float
     ) -> tuple[Array, Array, Array | None]:
-        """All taught joints (n,), and the state's positions and velocities, un-corrected."""
-        measured, velocity = self.robot.measured.copy(), state.velocity
-        measured[index] = state.position[column]
+        """All taught joints (n,) of ``measured`` ones, and the state's positions and velocities."""
+        velocity = state.velocity
         if velocity is not None and not (
             len(velocity) == len(state.names) and math.isfinite(sum(velocity.tolist()))
         ):
@@ -375,7 +374,11 @@ class CorrectionSession:
         taught = self.output.uncorrected(measured, (stage, withheld))
         position = state.position.copy()
         position[column] = taught[index]
-        if velocity is not None and stage is not None and len(column):
+        if (
+            velocity is not None
+            and stage is not None
+            and (column is EVERY or len(position[column]))
+        ):
             speed, velocity = np.zeros(self._reference.n), velocity.copy()
             speed[index] = velocity[column]
             velocity[column] = stage.taught_velocity_one(measured, speed, taught)[index]
@@ -464,20 +467,22 @@ class CorrectionSession:
         Readings have one order in time for each driver, by its joints. A stamp that went ahead by
         more than the time that passed does not bar those after it.
         """
-        if came.mark == CORRECTED or (came.mark == TAUGHT and kind == "reading"):
+        mark, stamp = came.mark, came.stamp_ns
+        if mark and (mark == CORRECTED or (mark == TAUGHT and kind == "reading")):
             raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{came.mark}'")
-        stamp = came.stamp_ns
         if not stamp:
             return
-        key = kind, tuple(sorted(names)) if names else names
-        if key not in self._stamps and len(self._stamps) >= MOST_SOURCES:
-            key = kind, ()
-        last, came_s = self._stamps.get(key, (stamp, now_s))
+        key, stamps = (kind, _driver(names) if names else names), self._stamps
+        known = stamps.get(key)
+        if known is None:
+            key = key if len(stamps) < MOST_SOURCES else (kind, ())
+            known = stamps.get(key, (stamp, now_s))
+        last, came_s = known
         if stamp < last and last - stamp <= CLOCK_RESET_NS:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
             raise RefusedError(Reason.TIME_BACKWARDS, detail)
         if stamp <= last + (now_s - came_s + AHEAD_S) * 1e9:
-            self._stamps[key] = stamp, now_s
+            stamps[key] = stamp, now_s
 
     def status(self, now_s: float | None = None) -> CorrectionStatus:
         """What the session does; ``now_s``: while a trajectory is under way, at which instant."""
@@ -532,6 +537,12 @@ class CorrectionSession:
         return float(np.linalg.norm(tips[1] - tips[0]))
 
 
+@lru_cache(MOST_SOURCES)
+def _driver(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Who publishes readings, by their joints."""
+    return tuple(sorted(names))
+
+
 def load_kernels(arm: SerialArm) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
     config, n = CorrectionConfig(), arm.n
@@ -548,7 +559,7 @@ def load_kernels(arm: SerialArm) -> None:
     stage.taught_velocity_one(zeros, zeros, stage.uncorrect_one(zeros))
     offsets.limiter.follow(q, np.arange(2.0), np.zeros(2), ones)
     state = RobotState(arm, config.joint_state_age_s, config.start_near(arm))
-    state.require_positions(arm.joint_names, np.arange(n), q[:1])
+    state.require_target(JointCommand(arm.joint_names, q[0]), np.arange(n))
     doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
     point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
     gather_rows(doubles, places[:, 0], np.empty((1, 1)))

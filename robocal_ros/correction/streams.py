@@ -31,6 +31,7 @@ RESUME_S = 1.0  # after a longer silence a stream is over
 # The period is that of the last intervals between messages. Those that follow one within a share of
 # it came in a burst with it; so many may be stalls, which are no period, however long they are.
 INTERVALS, BURST, STALLS = 16, 0.125, 2
+SAME_PERIOD = INTERVALS // 2  # it is found anew after so many intervals that agree with it
 # How fast what was held up is caught up with: at so much more than the stream's own speed, but at
 # no less than this share of the joints' speeds, which counts where the stream stands.
 CATCH_UP, LEAST = 1.05, 0.1
@@ -38,6 +39,7 @@ RATE_S = 1e-3  # so far ahead on a path it is looked at how fast its offset chan
 SPEED_S = 0.2  # in which the stream's own speed is looked at
 # The same of what goes out, for how it is slowed down; at least so many periods, and outputs.
 SENT_S, SENT_PERIODS, SENT = 0.1, 8.0, 4
+MOST_KEPT = 1000  # of either: 0.2 s of messages that come faster than anybody sends
 END_S = 0.5  # a joint without limits slows down so long from its full speed
 SPARE = 1.0  # rad/s (prismatic: m/s): so much faster than its stream a joint without a limit may be
 LATE = 0.8  # of `CATCH_UP_S`: one that lags more catches up at the joints' speeds
@@ -86,8 +88,8 @@ class TargetStream:
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used
         # targets of the last `SPEED_S`, and what went out lately, but for the last
-        self._way: deque[tuple[float, Array]] = deque()
-        self._sent: deque[tuple[float, Array]] = deque()
+        self._way: deque[tuple[float, Array]] = deque(maxlen=MOST_KEPT)
+        self._sent: deque[tuple[float, Array]] = deque(maxlen=MOST_KEPT)
         self._step_s = 0.0  # time that the last output used
         self._before = np.full(arm.n, np.nan)  # what was put out before it
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
@@ -106,13 +108,13 @@ class TargetStream:
         So it is the time from burst to burst, messages that are lost do not make it longer, and of
         a stream that slows down a few long intervals count at once.
         """
-        interval, intervals = now_s - self._beat_s, self._intervals
-        if interval <= 0.0 or interval < BURST * self.period_s:
+        interval, intervals, period = now_s - self._beat_s, self._intervals, self.period_s
+        if interval <= 0.0 or interval < BURST * period:
             return
         self._beat_s = now_s
         intervals.append(interval)
         self._as_usual += 1
-        if self._as_usual < INTERVALS // 2 and abs(interval - self.period_s) < 0.2 * self.period_s:
+        if self._as_usual < SAME_PERIOD and abs(interval - period) < 0.2 * period:
             return
         self._as_usual = 0
         lengths = sorted(intervals)
@@ -145,10 +147,11 @@ class TargetStream:
         """
         if self.phase is StreamPhase.ENDING and self._why is not None:
             raise RefusedError(self._why.reason, f"the stream is ended for: {self._why.detail}")
-        if self._output.mismatch:
-            raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
+        output = self._output
+        if output.mismatch:
+            raise RefusedError(Reason.START_MISMATCH, output.mismatch)
         pause = now_s - self._came_s
-        if self.phase is StreamPhase.RUNNING and pause > self._gap_s():
+        if pause > self._config.stream_gap_s and self.phase is StreamPhase.RUNNING:
             self._look_after_pause(q, pause, now_s)
         if begins := self.phase is StreamPhase.IDLE:
             self._active[:] = 0.0
@@ -164,13 +167,14 @@ class TargetStream:
             self._active[:] = 0.0
             self._active[index] = 1.0
             self._index = index
-        self._goal = q
-        self._note(self._way, q, now_s, SPEED_S)
-        if command.velocity is None or len(index) < len(q):
+        self._goal, velocity = q, command.velocity
+        self._note(self._way, q, now_s)
+        if velocity is not None and len(index) == len(q):
+            self._velocity[index] = velocity
+        else:
             self._velocity[:] = 0.0
-        if command.velocity is not None:
-            self._velocity[index] = command.velocity
-        self._output.path = None
+            self._velocity[index] = 0.0 if velocity is None else velocity
+        output.path = None
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self._advance(now_s)
         return self._message(command)
@@ -180,6 +184,8 @@ class TargetStream:
 
         Else it is a new begin.
         """
+        if pause_s <= self._gap_s():
+            return
         chosen = self._active > 0.0
         self._state.require_fresh(np.flatnonzero(chosen), now_s)
         output, near = self._output, self._config.start_near(self._arm)[chosen]
@@ -218,13 +224,13 @@ class TargetStream:
         output, period_s = self._output, self._step_period_s
         elapsed = longest = max(now_s - output.out_s, 0.0)
         before, held_up = output.out.copy(), self._held_up
-        if self._holds(elapsed):  # a robot that stands makes no longer step
+        if elapsed > HELD_PERIODS * period_s:  # a robot that stands makes no longer step
             output.limiter.state[OFFSET_RATE] = 0.0
             longest, self._held_up = period_s, True
             self._sent.clear()  # the time in which it stood is no part of its motion
         elif self.lag_s == 0.0:
             self._held_up = False
-        self._note(self._sent, before, now_s - longest, max(SENT_S, SENT_PERIODS * period_s))
+        self._note(self._sent, before, now_s - longest)
         if self._held_up:
             late = self.lag_s >= LATE * CATCH_UP_S
             self._speeds[0] = self._pace() if late else self._catching_up(elapsed, longest)
@@ -252,20 +258,16 @@ class TargetStream:
         if fraction < 1.0:
             self.lag_s = self._ahead_s()
 
-    def _note(
-        self, way: deque[tuple[float, Array]], q: Array, now_s: float, window_s: float
-    ) -> None:
+    def _note(self, way: deque[tuple[float, Array]], q: Array, now_s: float) -> None:
         """Keep places (n,); of several in a burst the last one, at the time of the first."""
         if way and now_s - way[-1][0] < 0.5 * self._step_period_s:
             way[-1] = way[-1][0], q
         else:
             way.append((now_s, q))
-        while len(way) > 2 and way[1][0] <= now_s - window_s:
-            way.popleft()
 
     def _own_speed(self) -> Array:
         """How fast its targets moved lately (n,), but for the last, which may begin a burst."""
-        way = self._way
+        way = _lately(self._way, SPEED_S)
         (begin_s, begin), (end_s, end) = way[0], way[-2 if len(way) > 2 else -1]
         return np.abs(end - begin) / (end_s - begin_s) if end_s > begin_s else 0.0 * end
 
@@ -276,9 +278,11 @@ class TargetStream:
         messages are uneven.
         """
         output, index = self._output, self._index
-        self._note(self._sent, output.out.copy(), output.out_s, np.inf)
-        t = np.array([t for t, _ in self._sent])
-        way = np.array([out[index] for _, out in self._sent]) - output.out[index]
+        window_s = max(SENT_S, SENT_PERIODS * self._step_period_s)
+        self._note(self._sent, output.out.copy(), output.out_s)
+        sent = _lately(self._sent, window_s)
+        t = np.array([t for t, _ in sent])
+        way = np.array([out[index] for _, out in sent]) - output.out[index]
         lasts = t[-1] - t[0]
         if lasts <= 0.0:
             return np.zeros(len(index))
@@ -324,12 +328,13 @@ class TargetStream:
 
     def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""
-        output, index, velocity = self._output, self._index, command.velocity
+        index, velocity = self._index, command.velocity
         if velocity is not None:
             velocity = self._velocity_out()
         if self.lag_s == 0.0 and not self._desired.figures[ADDS]:
             return command
-        return JointCommand(command.names, output.out[index], velocity, command.stamp_ns, CORRECTED)
+        position = self._output.out[index]
+        return JointCommand(command.names, position, velocity, command.stamp_ns, CORRECTED)
 
     def _velocity_out(self) -> Array:
         """Velocities (k,) that go out for those of the last target.
@@ -384,7 +389,7 @@ class TargetStream:
             return None
         if self.phase is StreamPhase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
             command = replace(self._command, position=self._goal[self._index], velocity=None)
-            self._note(self._way, self._goal, now_s, SPEED_S)
+            self._note(self._way, self._goal, now_s)
             try:
                 self._advance(now_s)
                 return self._message(command)
@@ -412,3 +417,10 @@ class TargetStream:
         if t >= self._lasts_s:
             self.phase = StreamPhase.IDLE
         return replace(command, position=place, velocity=velocity, mark=CORRECTED)
+
+
+def _lately(way: deque[tuple[float, Array]], window_s: float) -> deque[tuple[float, Array]]:
+    """What was kept in the last ``window_s``, and one from before it; at least two."""
+    while len(way) > 2 and way[1][0] <= way[-1][0] - window_s:
+        way.popleft()
+    return way

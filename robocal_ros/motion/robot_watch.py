@@ -48,7 +48,7 @@ class SpeedScaling:
 
     def at(self, now_s: float) -> float | None:
         """The scaling, 0 to 1; None where nobody told it lately."""
-        for source in (CONTROLLER, SLIDER):
+        for source in (CONTROLLER, SLIDER) if self._told else ():
             factor, told_s = self._told.get(source, (0.0, -math.inf))
             if now_s - told_s <= TOLD_S:
                 return factor

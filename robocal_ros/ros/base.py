@@ -126,6 +126,7 @@ class HouseNode(EndpointNode):
         super().on_activate(state)
         result = self._attempt("activate", self.activate)
         if result == TransitionCallbackReturn.SUCCESS:
+            self.is_active = True
             self._log_identity("active")
         else:
             super().on_deactivate(state)
@@ -133,8 +134,10 @@ class HouseNode(EndpointNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """`deactivate`, then close the outputs."""
+        self.is_active = False
         result = self._attempt("deactivate", self.deactivate)
-        if result == TransitionCallbackReturn.SUCCESS:
+        self.is_active = result != TransitionCallbackReturn.SUCCESS
+        if not self.is_active:
             super().on_deactivate(state)
         return result
 
@@ -173,6 +176,7 @@ class HouseNode(EndpointNode):
         return TransitionCallbackReturn.FAILURE
 
     def _stop_acting(self) -> None:
+        self.is_active = False
         try:
             self.deactivate()
         except Exception as error:

@@ -14,7 +14,6 @@ from typing import Any
 
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from lifecycle_msgs.msg import State
 from rclpy.action import ActionServer
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -121,7 +120,12 @@ class LogLimit:
 
 
 class EndpointNode(LifecycleNode):
-    """A lifecycle node whose endpoints act only while it is active and go at its cleanup."""
+    """A lifecycle node whose endpoints act only while it is active and go at its cleanup.
+
+    ``is_active``: while it acts; kept here, for rclpy makes a tuple at each look at its state.
+    """
+
+    is_active = False
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
@@ -136,11 +140,6 @@ class EndpointNode(LifecycleNode):
     def state(self) -> str:
         """Label of the lifecycle state."""
         return str(self._state_machine.current_state[1])
-
-    @property
-    def is_active(self) -> bool:
-        """True while the node acts."""
-        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
 
     def now_ns(self) -> int:
         """ROS time, ns (simulated when ``use_sim_time``)."""
