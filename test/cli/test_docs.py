@@ -19,6 +19,20 @@ SHOWN = ("replay", "validate")
 REPLAY = ("replay", "bags/demo_shift.mcap", "--robot", "kr150_r3100", "--auto")
 
 
+def test_tests_that_pages_name_are_there() -> None:
+    """Who looks for what shows a promise finds it."""
+    named = [
+        (page.name, *found)
+        for page in (ROOT / "docs").glob("*.md")
+        for found in re.findall(r"`(test/[\w/]+\.py)(?:::(\w+))?`", page.read_text())
+    ]
+    assert len(named) > 20
+    for page, path, name in named:
+        file = ROOT / path
+        assert file.is_file(), f"{page}: {path}"
+        assert not name or f"def {name}(" in file.read_text(), f"{page}: {path}::{name}"
+
+
 def commands(page: str) -> list[list[str]]:
     text = (ROOT / page).read_text().replace("\\\n", " ")
     blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)

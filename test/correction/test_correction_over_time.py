@@ -487,6 +487,40 @@ def test_a_stream_of_some_joints_then_of_all_moves_no_other_joint_at_once() -> N
         assert np.abs(robot.at - before).max() <= REST * DT + ROUNDING
 
 
+@pytest.mark.parametrize("streams", [True, False])
+@pytest.mark.parametrize("beside_deg", [1.0, 11.5, -11.5])
+def test_a_trajectory_that_begins_at_once_beside_a_moving_robot_does_not_go_out(
+    streams: bool, beside_deg: float
+) -> None:
+    """A controller steps to a point at time 0 from one cycle to the next, whatever its speed."""
+    speed, robot = np.array([np.radians(60.0), 0.0, 0.0, 0.0, 0.0, 0.0]), Robot()
+    if streams:
+        robot, _ = under_way(speed[0])
+    else:
+        robot.at = BEGIN
+        robot.rest()
+        way = BEGIN + np.arange(2)[:, None] * speed
+        path = TrajectoryCommand(NAMES, way, np.array([0.0, 1.0]))
+        out = robot.session.trajectory(path, robot.now)
+        for part in np.linspace(0.0, 0.5, 51)[1:]:
+            robot.now += 0.01
+            robot.at = out.position[0] + part * (out.position[1] - out.position[0])
+            robot.read(robot.at)
+    before, stream = robot.session.output.path, robot.session.stream.phase
+    at = robot.at + np.radians(beside_deg) * np.eye(6)[0]
+    for velocity in (None, np.stack([speed, 0.0 * speed])):
+        elsewhere = TrajectoryCommand(
+            NAMES, np.stack([at, at + 0.2 * speed]), np.array([0.0, 1.0]), velocity
+        )
+        refused(Reason.START_MISMATCH, robot.session.trajectory, elsewhere, robot.now)
+        robot.session.acknowledge(robot.now)
+    assert robot.session.output.path is before
+    assert robot.session.stream.phase is stream
+    on = TrajectoryCommand(NAMES, np.stack([robot.at, robot.at + 0.5 * speed]), np.arange(2.0))
+    out = robot.session.trajectory(on, robot.now).position
+    assert np.abs(out[0] - robot.at).max() <= ROUNDING
+
+
 def test_refused_messages_leave_nothing_to_jump_to() -> None:
     """Twenty-three refused, then one that could be taken: the robot is no longer there."""
     speed, held = np.radians(60.0), []

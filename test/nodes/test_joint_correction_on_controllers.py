@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jumps import no_jump
+from long_form import amount
 from robocal_msgs.msg import CorrectionStatus
 from std_srvs.srv import SetBool
 from test_joint_correction_killed import CORRECTION, Stream
@@ -154,7 +155,7 @@ def test_a_corrected_motion_follows_the_speed_scaling(program):
     controller = program.controller
     speed, end = program.drives()
     began_s = controller.now_s
-    for factor, for_s in ((0.5, 0.5), (0.0, 1.5), (0.2, 0.5)):
+    for factor, for_s in ((0.5, 0.3), (0.1, 0.5), (0.0, amount(1.5, 10.0)), (0.2, 0.5)):
         controller.scale(factor)
         controller.graph.spin_for(for_s)
     controller.scale(1.0)
