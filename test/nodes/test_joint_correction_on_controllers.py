@@ -185,7 +185,6 @@ def test_a_point_at_time_0_goes_out_only_where_the_robot_is(program):
     program.says((0.0, taught, 0.0 * SPEED), (1.0, taught, 0.0 * SPEED))
     assert controller.stands() == pytest.approx(end, abs=1e-4)
     program._planner.publish(trajectory([(0.0, HOME), (1.0, HOME)]))
-    program.wait(CorrectionStatus.ON)
     controller.graph.spin_until(lambda: program.status[-1].mismatch, "it is refused")
     assert len(program.sent) == count + 1
     _, found = controller.speeds(began_s)
