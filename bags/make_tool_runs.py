@@ -48,7 +48,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
-from robocal_ros.tool.edges import BREAK, EDGES, RESTORE, BeamEdge, InputRule
+from robocal_ros.tool.edges import BREAK, EDGES, RESTORE, BeamEdge, InputRule, ParallelStation
 from robocal_ros.tool.laser_frame import LaserFrame
 from robocal_ros.tool.run import PlannedStep, ToolConfig, rows_of
 from robocal_ros.tool.session import ToolSession, configuration
@@ -74,7 +74,11 @@ class Recorder:
     """A cell, its tool session, and the bag in which all of it is written."""
 
     def __init__(
-        self, bag: BagWriter, history: CalibrationHistory, mandrel: np.ndarray | None = None
+        self,
+        bag: BagWriter,
+        history: CalibrationHistory,
+        mandrel: np.ndarray | None = None,
+        parallel: ParallelStation | None = None,
     ) -> None:
         arm = load_robot("ur10")
         true = rigid_robot(arm, 0.0, np.random.default_rng(SEED))
@@ -95,6 +99,7 @@ class Recorder:
             input=InputRule(sample_period_s=INPUT.sample_period_s),
             mandrel=None if mandrel is None else rows_of(mandrel),
             mandrel_radius_m=RADIUS_M,
+            parallel=parallel,
         )
         self.session = ToolSession(arm, history, config, __version__)
         healthy = RoundTool.cylinder(TAUGHT, RADIUS_M)
@@ -110,9 +115,9 @@ class Recorder:
         self.rest(0.5)
         outcome = self.command(events.MEASURE_TOOL, mode=mode, cycle_id=cycle_id, by=BY)
         while outcome.done and (step := self.session.awaited) is not None:
-            taken = self._give(self.program.drive(step))
+            taken = self.give(self.program.drive(step))
             while taken is None:  # a program waits for the next step
-                taken = self._give(self.program.rest(0.25))
+                taken = self.give(self.program.rest(0.25))
             outcome = taken
         print(f"{cycle_id}: {outcome.status.name} {outcome.message}")
         return outcome
@@ -123,7 +128,7 @@ class Recorder:
 
     def rest(self, seconds: float) -> None:
         """Stand still."""
-        self._give(self.program.rest(seconds))
+        self.give(self.program.rest(seconds))
 
     def truth(self, tool: np.ndarray) -> None:
         """Mount another tool."""
@@ -131,7 +136,8 @@ class Recorder:
         told = {"simulated": True, "T_flange_tool": tool.tolist(), "time_s": self.program.now_s}
         self._write(TRUTH, "std_msgs/msg/String", {"data": json.dumps(told)})
 
-    def _give(self, samples: list[Sample]) -> Outcome | None:
+    def give(self, samples: list[Sample]) -> Outcome | None:
+        """Samples, each written and given to the session; what followed from the last of them."""
         last = None
         for sample in samples:
             self._now_ns = max(self._now_ns, sample.stamp_ns)

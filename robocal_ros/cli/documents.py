@@ -379,7 +379,7 @@ class ReplayToolDocument(ReplayedBagDocument):
 @rules(additionalProperties=True)
 class ReplayedSensorDocument(TypedDict):
     stamp: Annotated[float, "Time of the data, s."]
-    kind: Literal["sphere", "step", "line", "camera"]
+    kind: Literal["sphere", "step", "line", "tracker", "camera"]
     method: Literal["best", "classic"]
     working_error_mm: NotRequired[
         Annotated[

@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration by laser tracker from captures: each point and profile at its own standstill."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
+from command import robocal_json
 from hand_eye_driver import ARM, FRAME, Driver, tracker_point
 from scipy.stats import chi2
 from tracked_robot import CELL, START, captures, marks, scans_of_marks
 
-from robocal_ros.bags.bags import read_data_set, write_data_set
+from robocal_ros.bags.bags import read_bag, read_data_set, write_data_set
 from robocal_ros.estimation.edge import EdgeRule
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.files import SensorMount
 from robocal_ros.hand_eye.profiles import Profile
@@ -116,3 +121,20 @@ def test_marked_points_judge_a_mount_and_find_none(driver):
     # The edge of 37 um profiles is found to some 0.02 mm along the line and across; nothing else
     # errs here.
     assert found.accuracy.max_m < 1e-4
+
+
+def test_the_golden_bag_gives_its_session_again():
+    """`bags/make_tracker.py`, where one capture does not see the tracker; its truth is found."""
+    bag = Path(__file__).parents[2] / "bags" / "hand_eye_tracker.mcap"
+    document = robocal_json("replay.hand_eye.json", "replay", bag)
+    assert (document["recorded"], document["differs"]) == (True, [])
+    codes = [c["code"] for c in document["commands"] if c["command"] == events.BREAK_OFF]
+    assert codes == ["TOO_FEW_SAMPLES"]
+    (found,), seen = document["calibrations"], document["final_sensor"]
+    assert found["kind"] == "tracker"
+    (told,) = [m.message for m in read_bag(bag) if m.topic == "/truth/hand_eye"]
+    truth = np.array(json.loads(told.data)["T_flange_sensor"])
+    T = frames.transform_from_quat(1e-3 * np.array(seen["xyz_mm"]), np.array(seen["quat_xyzw"]))
+    off = increment(T, truth, np.zeros(3))
+    spread = np.array(found["covariance_at_pivot"])
+    assert off @ np.linalg.solve(spread, off) < chi2.ppf(0.9999, 6)

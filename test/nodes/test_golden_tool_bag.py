@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The golden tool bag: replayed, and played through the live node, with the same results."""
+"""The golden tool bags: replayed, and played through the live node, with the same results."""
 
 import json
-import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,15 @@ from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.session_node import EVENTS
-from robocal_ros.session.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
+from robocal_ros.session.events import (
+    ACCEPT,
+    CONFIGURE,
+    MEASURE_TOOL,
+    SOLVE_SWEEPS,
+    SWEEP,
+    TOOL_STEP,
+    Command,
+)
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 from robocal_ros.tool.node import TcfNode
 from robocal_ros.tool.run import ToolConfig
@@ -23,16 +31,16 @@ from robocal_ros.tool.run import ToolConfig
 BAGS = Path(__file__).parents[2] / "bags"
 EVENT_TOPIC = "/tcf_node/session_events"
 INPUTS = ("/joint_states", "/beam_events")
+CALLED = (MEASURE_TOOL, SWEEP, SOLVE_SWEEPS, ACCEPT)
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: Any) -> Path:
-    """The bag made anew: only on the machine that made it are results equal to the last bit."""
-    sys.path.insert(0, str(BAGS))
-    from make_tool_runs import record
-
-    path = tmp_path_factory.mktemp("bag") / "made.mcap"
-    record(path)
+@pytest.fixture(scope="module", params=["tool_runs", "sweeps"])
+def bag(request: Any, tmp_path_factory: Any) -> Path:
+    """A bag made anew: only on the machine that made it are results equal to the last bit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BAGS))
+        path = tmp_path_factory.mktemp("bag") / f"{request.param}.mcap"
+        import_module(f"make_{request.param}").record(path)
     return path
 
 
@@ -50,6 +58,10 @@ def node(graph: Any, tmp_path: Path, bag: Path) -> TcfNode:
     write_laser(path, LaserFile(config.laser, config.station, arm.name, arm.model_hash))
     taught_mm = (config.T_flange_taught[:3, 3] * 1e3).tolist()
     settings = {"laser": str(path), "input_period_ms": 2.0, "taught_xyz_mm": taught_mm}
+    if (beams := config.parallel) is not None:
+        settings |= {
+            f"parallel_{k}_mm": 1e3 * getattr(beams, f"{k}_m") for k in ("up", "down", "x")
+        }
     return graph.add(TcfNode, settings | {"joint_silence_s": 10.0})
 
 
@@ -64,7 +76,7 @@ def test_live_equals_replay_bit_for_bit(
     with BagReader(bag) as reader:
         for m in reader.messages([*INPUTS, EVENT_TOPIC]):
             if m.topic not in INPUTS:
-                if m.message.command in (MEASURE_TOOL, ACCEPT):
+                if m.message.command in CALLED:
                     _wait(graph, node, sent, 0)
                     arguments = json.loads(m.message.arguments)["arguments"]
                     graph.executor.spin_once(timeout_sec=0.0)
@@ -80,8 +92,8 @@ def test_live_equals_replay_bit_for_bit(
     _write(bag, live, again)
     document = robocal_json("replay.tool.json", "replay", again)
     assert document["differs"] == []
-    steps = [c for c in document["commands"] if c["command"] == TOOL_STEP]
-    assert len(steps) == 17
+    taken = [c for c in document["commands"] if c["command"] in (TOOL_STEP, SWEEP)]
+    assert len(taken) == {"tool_runs": 17, "sweeps": 6}[bag.stem]
 
 
 def _told(event: SessionEvent) -> Any:
@@ -128,6 +140,7 @@ def _copy(kind: Any, message: Any) -> Any:
 
 
 def test_the_recording_holds_each_ending(bag: Path) -> None:
-    ends = [json.loads(e.outcome) for e in recorded(bag) if e.command == TOOL_STEP]
+    ends = [json.loads(e.outcome) for e in recorded(bag) if e.command in (TOOL_STEP, SWEEP)]
     codes = {Code(end["status"]) for end in ends}
-    assert codes == {Code.ACCEPT, Code.LIMIT_EXCEEDED, Code.BEAM_EDGES_WRONG}
+    beyond = {Code.LIMIT_EXCEEDED} if bag.stem == "tool_runs" else set()  # no sweep judges a tool
+    assert codes == {Code.ACCEPT, Code.BEAM_EDGES_WRONG} | beyond

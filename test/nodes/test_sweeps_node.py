@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from beam_cell import make_cell
 from command import robocal_json
-from parallel_cell import STATION, STRAIGHT, SweepProgram, plunge_at, upright_of
 from robocal_msgs.msg import CalibrationQuality, SessionEvent, ToolFrame
 from robocal_msgs.srv import Decide
 from scipy.stats import chi2
@@ -15,6 +14,7 @@ from std_srvs.srv import Trigger
 from tool_cell_live import LiveCell
 from tool_driver import NOISE, START_NS, TAUGHT
 
+from bench.parallel_sweeps import STATION, STRAIGHT, SweepProgram, plunge_at, upright_of
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim.beams import RoundTool, TrueInput, bent

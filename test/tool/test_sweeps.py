@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A tool from sweeps through parallel beams that the session records: found, judged, kept."""
 
+from pathlib import Path
+
 import numpy as np
 from beam_cell import make_cell
-from parallel_cell import STATION, STRAIGHT, SweepProgram, plunge_at, upright_of
+from command import robocal_json
 from scipy.stats import chi2
 from tool_driver import NOISE, START_NS, TAUGHT, Driver, config_of
 
+from bench.parallel_sweeps import STATION, STRAIGHT, SweepProgram, plunge_at, upright_of
 from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
@@ -22,6 +25,7 @@ TRUTH = bent(TAUGHT, [0.0015, -0.001, 0.0006], [0.012, 0.018, 0.0])
 POLLED = TrueInput(latency_s=0.004, sample_period_s=0.002)
 RADIUS_M = 0.0025
 RUNS = 20
+ROOT = Path(__file__).parents[2]
 
 
 def made(tmp_path, seed=1, noise=NOISE, source=POLLED, tool=TRUTH):
@@ -179,3 +183,12 @@ def test_the_stated_sigma_is_the_scatter(tmp_path):
     total = float(np.sum(squared))
     low, high = chi2.ppf([1e-3, 1.0 - 1e-3], 5 * RUNS)
     assert low < total < high, total / (5 * RUNS)
+
+
+def test_the_golden_bag_gives_its_session_again():
+    """Its tool too: `bags/make_sweeps.py`, where an edge of the first sweep is lost."""
+    document = robocal_json("replay.tool.json", "replay", ROOT / "bags" / "sweeps.mcap")
+    assert (document["recorded"], document["differs"]) == (True, [])
+    statuses = [c["code"] for c in document["commands"] if c["command"] == SWEEP]
+    assert statuses == ["BEAM_EDGES_WRONG"] + 5 * ["ACCEPT"]
+    assert document["final_tool"]["revision"] == 1
