@@ -18,10 +18,12 @@ import pytest
 import rclpy
 from rclpy.action import ActionClient, ActionServer
 from rclpy.context import Context
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
@@ -130,6 +132,22 @@ class Executable:
         self._log.close()
 
 
+class Probe(Node):
+    """Nobody reads what the middleware warns of at its endpoints, and each look for it costs time:
+    rclpy adds two entities of each to every wait.
+    """
+
+    def create_publisher(self, *given: Any, **named: Any) -> Publisher:
+        """Without callbacks for its events."""
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(*given, **({"event_callbacks": quiet} | named))
+
+    def create_subscription(self, *given: Any, **named: Any) -> Subscription:
+        """Without callbacks for its events."""
+        quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+        return super().create_subscription(*given, **({"event_callbacks": quiet} | named))
+
+
 class Graph:
     """One ROS graph: nodes in this process, executables beside it, and a probe that talks to them.
 
@@ -142,7 +160,7 @@ class Graph:
         self.state = state
         self.context = Context()
         rclpy.init(args=[], context=self.context, domain_id=domain)
-        self.probe = Node("probe", context=self.context, start_parameter_services=False)
+        self.probe = Probe("probe", context=self.context, start_parameter_services=False)
         self.executor = OneThreadExecutor(context=self.context)
         self.executor.add_node(self.probe)
         self._environment = os.environ | {

@@ -13,6 +13,9 @@ from importlib import import_module
 gc.disable()
 # The command first: it sets the threads of what NumPy loads.
 READ = ["robocal_ros.cli.main", "rich.table", "scipy.optimize", "scipy.spatial.transform"]
+# Commands load these when they are called: 0.4 s of a core each time, most of it scipy.signal.
+READ += [f"robocal_ros.{name}" for name in ("hand_eye.solve", "hand_eye.cli", "thermal.cli")]
+READ += [f"robocal_ros.{name}" for name in ("tool.cli", "cli.replay", "cli.identify")]
 # What forks are to do is in these; the modules that hold it are read with all that they import.
 READ += ["forked", "command"]
 NODES = ["thermal.node", "tool.node", "hand_eye.node", "correction.node", "maintenance.node"]
