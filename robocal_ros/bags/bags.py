@@ -303,13 +303,19 @@ _BYTES = 24  # of a point
 
 
 def write_data_set(
-    path: Path, document: Mapping[str, Any], topic: str, frame: str, arm: SerialArm
+    path: Path,
+    document: Mapping[str, Any],
+    topic: str,
+    frame: str,
+    arm: SerialArm,
+    tracker_frame: str = "tracker",
 ) -> None:
     """Write a data set; the file appears whole or not at all.
 
     ``document``: of the data set, with its ``samples`` in SI.
     ``topic``: ``profile``, ``target_pose``, ``image`` or ``tracker_point``, of samples that name
-    none of their own; ``frame``: the sensor's.
+    none of their own; ``frame``: the sensor's, ``tracker_frame``: that of a tracker's points. The
+    file names those that it is referred to.
 
     Raises `InputError` when the file is there already, or cannot be written.
     """
@@ -321,6 +327,8 @@ def write_data_set(
     apart = ("q", "values")  # messages of their own
     rows = [{name: row[name] for name in row if name not in apart} for row in samples]
     made_with = {"robot": arm.name, "model_hash": arm.model_hash, "sensor_frame": frame}
+    if any(row.get("topic", topic) == TRACKER_POINT for row in samples):
+        made_with["tracker_frame"] = tracker_frame
     text = json.dumps({**document, **made_with, "samples": rows}, allow_nan=False)
     draft = draft_beside(path)
     try:
@@ -329,14 +337,15 @@ def write_data_set(
             writer.write(DATA_SET, "std_msgs/msg/String", {"data": text}, start_ns)
             for row in samples:
                 at_ns = row["stamp_ns"]
-                header = {"stamp": ros_time(at_ns), "frame_id": frame}
+                own, stamp = row.get("topic", topic), ros_time(at_ns)
+                of = tracker_frame if own == TRACKER_POINT else frame
+                header = {"stamp": stamp, "frame_id": of}
                 joints = {
-                    "header": header | {"frame_id": ""},
+                    "header": {"stamp": stamp, "frame_id": ""},
                     "name": list(arm.joint_names),
                     "position": row["q"],
                 }
                 writer.write(JOINTS, "sensor_msgs/msg/JointState", joints, at_ns)
-                own = row.get("topic", topic)
                 writer.write(own, _TYPE[own], _shot(own, header, row["values"]), at_ns)
         draft.replace(path)
     except OSError as error:

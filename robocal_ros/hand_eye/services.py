@@ -308,9 +308,11 @@ class HandEyeFiles:
         from robocal_ros.bags.bags import write_data_set
 
         session = self._session()
-        document = session.document()
+        document, config = session.document(), session.config
         topic = data_set_begun(document).topic
-        write_data_set(path, document, topic, session.config.sensor_frame, session.nominal)
+        write_data_set(
+            path, document, topic, config.sensor_frame, session.nominal, config.tracker_frame
+        )
         self._mark_saved()
         rows = document["samples"]
         words = f"{len(rows)} samples saved in {path}"

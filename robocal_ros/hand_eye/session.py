@@ -582,6 +582,13 @@ class HandEyeSession(SessionBase):
     def _load(self, command: Command, wall_ns: int) -> Outcome:
         arguments = command.arguments
         data = data_set_of(arguments["set"], self.current.arm)
+        for name in ("sensor_frame", "tracker_frame"):
+            mine = getattr(self.config, name)
+            if (told := arguments["set"].get(name, mine)) != mine:
+                raise InputError(
+                    f"the data set is referred to {name} '{told}', this node's is '{mine}': load "
+                    f"it where {name} is '{told}'"
+                )
         require_known(data, data.method)
         self.data = data
         self._handle = max(self._handle, *data.samples, 0)

@@ -11,7 +11,7 @@ from hand_eye_driver import ARM, FRAME, Driver, tracker_point
 from scipy.stats import chi2
 from tracked_robot import CELL, START, captures, marks, scans_of_marks
 
-from robocal_ros.bags.bags import read_bag, read_data_set, write_data_set
+from robocal_ros.bags.bags import DATA_SET, read_bag, read_data_set, write_data_set
 from robocal_ros.estimation.edge import EdgeRule
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
@@ -67,6 +67,12 @@ def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
     path = tmp_path / "set.mcap"
     write_data_set(path, data.document(), data.topic, FRAME, ARM)
     again = read_data_set(path, ARM)
+    shots = {m.topic: m.message.header.frame_id for m in read_bag(path) if m.topic != DATA_SET}
+    assert shots == {"tracker_point": "tracker", "profile": FRAME, "joint_states": ""}
+    for name in ("tracker_frame", "sensor_frame"):
+        refused = driver.ask(events.LOAD, set=again | {name: "another"}, path=str(path))
+        assert refused.status is Code.BAD_INPUT
+        assert f"referred to {name} 'another'" in refused.message
     assert driver.ask(events.LOAD, set=again, path=str(path)).done
     repeated = driver.ask(events.CALIBRATE)
     assert repeated.document == document
