@@ -7,10 +7,12 @@ the commands, definitions of the messages. Run with the nodes' Python and ROS (t
 
 import contextlib
 import io
+import json
 import os
 import re
 import shutil
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -94,13 +96,62 @@ def interfaces() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def documents() -> str:
+    """What each command prints as JSON, field by field, of the schemas."""
+    parts = [
+        "# JSON documents",
+        "Of `--json`, as the [schemas](../docs/schemas/common.json) tell programs. "
+        "A field that may be missing has a `?`; [parts](#common) are told once.",
+    ]
+    for path in sorted((ROOT / "docs" / "schemas").glob("*.json")):
+        schema = json.loads(path.read_text())
+        parts += [f"## {path.stem}", schema["title"]]
+        told = schema if "properties" in schema else schema.get("else", {})
+        for name, part in {"": told, **schema.get("$defs", {})}.items():
+            if rows := [*fields(part)]:
+                parts += [f"**{name}**: {part.get('description', '')}"] if name else []
+                parts.append("\n".join(["| field | type | meaning |", "|---|---|---|", *rows]))
+    return "\n\n".join(parts) + "\n"
+
+
+def fields(schema: dict[str, Any], before: str = "") -> Iterator[str]:
+    """A row of each field of an object and of those within it."""
+    needed = {*schema.get("required", ()), *schema.get("else", {}).get("required", ())}
+    for name, told in schema.get("properties", {}).items():
+        inner, path = told, f"{before}{name}{'' if name in needed else '?'}"
+        cells = [f"`{path}`", type_of(told), told.get("description", "")]
+        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        while isinstance(deeper := inner.get("items", inner.get("additionalProperties")), dict):
+            inner, path = deeper, path + ("[]" if "items" in inner else ".*")
+        yield from fields(inner, f"{path}.")
+
+
+def type_of(schema: dict[str, Any]) -> str:
+    """A type in words."""
+    if "$ref" in schema:
+        file, _, name = schema["$ref"].partition("#/$defs/")
+        return f"[{name}](#{'common' if file == 'common.json' else ''})" if file else name
+    if values := schema.get("enum", [schema["const"]] if "const" in schema else []):
+        return ", ".join(f"`{json.dumps(value)}`" for value in values)
+    if "anyOf" in schema:
+        return " or ".join(map(type_of, schema["anyOf"]))
+    types = schema.get("type", "any")
+    plain, *null = [types] if isinstance(types, str) else types
+    if plain == "array":
+        size = f"{schema['minItems']} " if "maxItems" in schema else ""
+        plain = f"array of {size}({type_of(schema['items'])})"
+    bounds = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    plain += "".join(f" {sign} {schema[key]}" for key, sign in bounds.items() if key in schema)
+    return " or ".join((plain, *null))
+
+
 def numeric(room: str) -> str:
     """What a room computes with, file by file, as its docstrings say; mkdocstrings reads them.
 
     Not its commands, nor what knows ROS: `parameters`, `commands` and `interfaces` have these.
     """
     files = sorted((ROOT / "robocal_ros" / room).glob("*.py"))
-    texts = {path: path.read_text() for path in files if path.stem != "__init__"}
+    texts = {path: path.read_text() for path in files if path.stem not in ("__init__", "documents")}
     of_ros = re.compile(r"^\s*(?:from|import) (?:\w+_msgs|rclpy|robocal_ros\.(?:ros|cli))\b", re.M)
     shown = [path.stem for path, text in texts.items() if not of_ros.search(text)]
     parts = [f"# robocal_ros.{room}", *(f"::: robocal_ros.{room}.{stem}" for stem in shown)]
@@ -123,6 +174,7 @@ def main() -> None:
     (reference / "api").mkdir(parents=True)
     for name, text in (
         ("parameters", parameters()), ("commands", commands()), ("interfaces", interfaces()),
+        ("documents", documents()),
         *((f"api/{room}", numeric(room)) for room in NUMERIC),
     ):  # fmt: skip
         (reference / f"{name}.md").write_text(text, encoding="utf-8")
