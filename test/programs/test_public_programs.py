@@ -24,15 +24,17 @@ MAKERS = [dialect for dialect in DIALECTS if dialect.maker != "ur"]  # of which 
 
 
 def texts(dialect: Dialect) -> list[tuple[Path, str]]:
-    """Programs of a maker with points, spread over the folder."""
-    found = []
+    """Programs of a maker with points, spread over the folder; long ones where few are short."""
+    found, short = [], []
     for path in sorted(p for p in Path(FOLDER).rglob("*") if p.suffix.lower() in dialect.suffixes):
         data = path.read_bytes()
         if b"\0" in data:  # of two bytes a character, or none
             continue
         text = data.decode("latin-1")
-        if 0 < len(dialect.read(text).points) <= MOST_POINTS:
+        if count := len(dialect.read(text).points):
             found.append((path, text))
+            short += found[-1:] if count <= MOST_POINTS else []
+    found = short if len(short) >= LEAST_FILES else found
     return found[:: max(1, len(found) // MOST_FILES)][:MOST_FILES]
 
 
