@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import conforms
 from history_workers import SERIAL, proposal
 from robot_programs import (
     KUKA_FRAMES,
@@ -42,7 +43,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def command(capsys, *words: str, name: str = "correct-program") -> tuple[int, dict]:
     robot = ["--robot", "kr150_r3100"]
     status = main([name, *words, *robot, "--json"])
-    return status, json.loads(capsys.readouterr().out)
+    document = json.loads(capsys.readouterr().out)
+    conforms(document, f"{name}.json")
+    return status, document
 
 
 MODEL = ("--model", "identified.yaml")
@@ -68,6 +71,20 @@ def test_a_program_is_corrected_into_another_file(folder: Path, capsys):
     status, document = command(capsys, "weld.dat", *MODEL, *KNOWN, "--output", "weld.dat")
     assert status == 2
     assert (folder / "weld.dat").read_bytes() == before
+
+
+def test_joint_targets_of_kawasaki_are_corrected(folder: Path, capsys):
+    rows = "\n".join(
+        f"#p{i} " + " ".join(f"{x:.4f}" for x in np.degrees(q))
+        for i, q in enumerate(postures(2, 5))
+    )
+    moves = "  JMOVE #p0\n  JMOVE #p1\n"
+    text = f".PROGRAM main()\n{moves}.END\n.JOINTS\n{rows}\n.END\n"
+    (folder / "cell.as").write_text(text)
+    status, document = command(capsys, "cell.as", *MODEL, "--output", "new.as")
+    assert (status, document["maker"]) == (0, "kawasaki")
+    assert document["count"]["corrected"] == 2
+    assert (folder / "new.as").read_text() != text
 
 
 def test_a_program_that_is_corrected_in_part_is_written_when_asked(folder: Path, capsys):
