@@ -47,6 +47,8 @@ GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
 INNER, INNER_SQUARES = 0.99, 2.894  # mean of chi-square of 3 below its quantile of 0.99
 FOLDS = 5  # of few poses, each of which the others must foretell
 SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
+# A half of a logarithm for each number that is chosen (Wilks 1938): amplitude and length.
+GAINED_BY_CHANCE = 1.0
 _FREE_ROUNDS = 2  # in which a rejected sample may come back
 _ROUNDS, SETTLED = 12, 0.05  # of solving and judging the samples anew; share of the noise
 MOST_LEVERAGE = 1.0 - SETTLED**2  # so that what is not settled is one sigma of an error left out
@@ -438,13 +440,14 @@ def _round(
 def _unwanted(at: _Solution) -> tuple[Mask, Mask]:
     """Joints (n,) whose function, and whose compliance, the evidence does not want.
 
-    No compliance is below zero. Functions must show together that there are any; then of each it
-    suffices that it is more likely there than not.
+    No compliance is below zero. Functions must show together that there are any, less what their
+    amplitudes and lengths, being the likeliest, gain by chance; then of each it suffices that it is
+    more likely there than not.
     """
     assert at.posterior is not None
     posterior, terms = at.posterior, at.terms
     gain = posterior.gain
-    shown = float(np.sum(gain[gain > 0.0])) >= EVIDENCE_NEEDED
+    shown = float(np.sum(np.maximum(gain - GAINED_BY_CHANCE, 0.0))) >= EVIDENCE_NEEDED
     bent = posterior.mean[terms.before : terms.before + len(posterior.bend_gain)]
     stiff = np.ones(len(terms.count), dtype=np.bool_)
     stiff[terms.bends] = (posterior.bend_gain < EVIDENCE_NEEDED) | (bent <= 0.0)
