@@ -3,7 +3,8 @@
 
 Simulated: the UR10 of ``make_tool_runs``, beside whose crossed beams two parallel ones stand,
 sweeps a bent tool through these: straight, turned, twice upright as the session says, and a plunge.
-The first sweep loses an edge, is refused and driven again; the tool is accepted. Topics as there.
+The first sweep loses an edge, is refused and driven again; the tool is accepted. Topics as there;
+the gears, which err there, do not in these sweeps.
 """
 
 import tempfile
