@@ -25,7 +25,7 @@ from correction_robot import (
     still,
     swing,
 )
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_correction_over_time import Watch
 
@@ -327,6 +327,16 @@ PART = st.one_of(
     st.lists(st.tuples(PART, st.integers(5, 60)), min_size=1, max_size=6),
     st.floats(0.05, 0.8),
     st.integers(0, 1000),
+)
+@example(  # two messages at one instant
+    [
+        (("lost", 0.008, 2.225073858507e-311), 29),
+        (("bursts", 6, 2e-05), 49),
+        (("lost", 0.008, 0.037751995091581815), 43),
+        (("bursts", 6, 2e-05), 35),
+    ],
+    0.7992498799344213,
+    835,
 )
 def test_an_honest_program_is_followed(
     parts: list[tuple[tuple[str, float, float], int]], share: float, seed: int
