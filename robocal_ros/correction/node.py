@@ -434,7 +434,7 @@ class JointCorrectionNode(RobotNode):
             assert path is not None
             assert speeds is not None
             plan = on_its_path(path, planned, now)
-            sent = self._send_stop(plan, planned.names, why, at_s=AHEAD_S)
+            sent = self._send_stop(plan, planned.names, why, now - AHEAD_S)
             self._stop_why, self._stop_fault, measured = why, "", robot.speed(now)
             fastest = np.append(np.nan_to_num(measured), np.abs(speeds).max(axis=1))
             lasts = max(SHORTEST_STOP_S / times[-1], 1.0) * times
@@ -463,21 +463,38 @@ class JointCorrectionNode(RobotNode):
                 )
             return False
         self._astray, self._stop_why, self._stop_fault = self._stop_path, why, ""
-        self._send_plan(self._stopping.begin(state, now_s))
+        self._send_plan(self._stopping.begin(state, now_s), now_s)
         self._stop_timer.reset()
         return True
 
-    def _send_plan(self, plan: JointPlan) -> None:
+    def _send_plan(self, plan: JointPlan, begin_s: float) -> None:
         trusted = self._stopping.sent <= TRUSTED
         going_on = plan.going_on(REACTION_S)
-        self._send_stop(going_on, self._arm_names, self._stop_why, trusted=trusted)
+        self._send_stop(going_on, self._arm_names, self._stop_why, begin_s, trusted=trusted)
 
-    def _send_stop(self, plan: JointPlan, names: Sequence[str], why: str, **how: Any) -> bool:
-        """Send it, worded by what the controller says, else what the joint states do."""
+    def _send_stop(
+        self,
+        plan: JointPlan,
+        names: Sequence[str],
+        why: str,
+        begin_s: float,
+        *,
+        trusted: bool = True,
+    ) -> bool:
+        """Send it, worded by what the controller says, else what the joint states do.
+
+        ``begin_s``: when the plan begins; on a busy computer planning itself takes its time.
+        """
         now = time.monotonic()
         self._controller.hear(self._session.robot.velocity, len(self._arm_names), now)
         message = self._controller.stop_message(
-            plan, names, now, self._scaling, first_s=FIRST_S, **how
+            plan,
+            names,
+            now,
+            self._scaling,
+            at_s=now - begin_s,
+            first_s=FIRST_S,
+            trusted=trusted,
         )
         if self._by_action and self._proxy is not None:
             return self._proxy.stop(message, why)
@@ -497,7 +514,7 @@ class JointCorrectionNode(RobotNode):
         if self._session.output.path is not self._stop_path:
             self._stopping.forget()
         if (plan := self._stopping.look(self._session.robot, now)) is not None:
-            self._send_plan(plan)
+            self._send_plan(plan, now)
         if self._stopping.under_way:
             if self._stopping.failed and not self._stop_fault:
                 self._stop_fault = f"{self._stop_why}: {self._stopping.failed}"

@@ -28,6 +28,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from robocal_ros.correction.trajectories import on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.ros import conversions, endpoints
 
@@ -42,6 +43,7 @@ SLOWING = SPEED[0] / np.max(SPEED / ROBOT.max_acceleration)
 FASTEST = ROBOT.max_velocity[0]
 # Between the instant for which something is computed and its stamp, s.
 BUSY_S = 0.01
+HEARD_S = 0.03  # three times what stops reckon with
 OUTPUT = f"{NODE}/joint_targets"
 PATH = f"{NODE}/joint_trajectory"
 # A machine that is busy stops all of it now and then: what went out is judged over its own time.
@@ -66,14 +68,12 @@ class Moving(Line):
         self._ticks = 0
         self._spline: Any = None
         self._spline_s = 0.0
+        self._late_s = 0.0  # by which this process heard a plan after it was sent
         graph.probe.create_subscription(
             JointState, OUTPUT, self._obey, endpoints.own(endpoints.RELIABLE)
         )
         graph.probe.create_subscription(
-            JointTrajectory,
-            PATH,
-            lambda message: self._plan(message),
-            endpoints.own(endpoints.RELIABLE),
+            JointTrajectory, PATH, self._hear, endpoints.own(endpoints.RELIABLE)
         )
         graph.probe.create_timer(PERIOD_S, self._tick)
         taught = graph.collect(JointState, f"{NODE}/joint_states")
@@ -99,6 +99,10 @@ class Moving(Line):
         self.out.append((stamp * 1e-9, self.at))
         if stamp not in self.stamps and message.velocity:
             self.slowed.append((stamp * 1e-9, message.position[0], message.velocity[0]))
+
+    def _hear(self, message: JointTrajectory, info: dict[str, int]) -> None:
+        self._late_s = max(self._late_s, time.time() - 1e-9 * info["source_timestamp"])
+        self._plan(message)
 
     def _plan(self, message: JointTrajectory) -> None:
         """By cubics from the stamp on; on from where it is to a first point that is ahead."""
@@ -170,13 +174,21 @@ class Moving(Line):
         q = np.array([q[0] for _, q in self.out])
         moves = np.flatnonzero(np.diff(q) > 1e-7)
         assert times[moves[-1] + 1] - began_s < within_s
-        no_jump(np.diff(q) > -1e-9, "nothing turns back")
+        self._no_jump(np.diff(q) > -1e-9, "nothing turns back")
         if self._spline is None:
             self._slows_down(times, q)
             return
         q, times = q[times > began_s], times[times > began_s]
-        no_jump(np.diff(q) <= 1.15 * SPEED[0] * np.diff(times) + 1e-9, "no faster than the stream")
+        self._no_jump(
+            np.diff(q) <= 1.15 * SPEED[0] * np.diff(times) + 1e-9, "no faster than the stream"
+        )
         assert q[-1] - q[0] > 0.25 * SPEED[0] ** 2 / SLOWING  # half of the way: not cut off
+
+    def _no_jump(self, is_so: np.ndarray, words: str) -> None:
+        """Never again what jumped; a robot that heard its plan late jumped itself."""
+        if self._late_s > HEARD_S:
+            assert np.all(is_so), f"{words}: a plan was heard {self._late_s:.3f} s late"
+        no_jump(is_so, words)
 
     def _slows_down(self, times: np.ndarray, q: np.ndarray) -> None:
         """What went out of a stream without its planner: evenly, as the joints may, to rest."""
@@ -367,6 +379,24 @@ def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> 
     line.wait(line.paths, count + 1)
     line.comes_to_rest(began_s)
     assert all(len(message.points) for message in line.paths)
+
+
+def test_a_stop_that_takes_its_time_to_be_planned_turns_nothing_back(
+    line: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding: on a busy machine its first point lay where the robot had long been."""
+
+    def slowly(*given: Any) -> Any:
+        planned = on_its_path(*given)
+        time.sleep(0.08)
+        return planned
+
+    monkeypatch.setattr("robocal_ros.correction.node.on_its_path", slowly)
+    line.drives()
+    began_s, count = time.time(), len(line.paths)
+    line.to_path.publish(JointTrajectory(joint_names=NAMES))
+    line.wait(line.paths, count + 1)
+    line.comes_to_rest(began_s - 0.1)  # the robot ticks in this thread, not while it plans
 
 
 @pytest.mark.parametrize("how", ["streams", "drives"])
