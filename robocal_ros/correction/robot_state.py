@@ -2,6 +2,7 @@
 """Where the robot was read, where its controller is, and what was put out last."""
 
 import math
+import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -81,7 +82,8 @@ class RobotState:
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
-        self._doubtful = np.minimum(self._turns, self._tenfold)
+        # finite, so that infinity is beyond it for a joint without limits too
+        self._doubtful = np.minimum(np.minimum(self._turns, self._tenfold), sys.float_info.max)
         self._continuous = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
         changes = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
         self._turned = 0.5 * VELOCITY_S * changes + near / LEAST_TRACK_S

@@ -282,7 +282,6 @@ class TestOutcomes:
 SLOW = """
 import sys, time
 from types import SimpleNamespace
-from typing import Annotated, Literal, NotRequired, TypedDict
 from robocal_ros.cli import main as frame
 from robocal_ros.cli.main import CliResult
 def run(args):

@@ -9,6 +9,7 @@ import pytest
 from correction_robot import (
     DT,
     HOME,
+    LIMITS,
     NAMES,
     NOMINAL,
     REST,
@@ -28,6 +29,7 @@ from correction_robot import (
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.interface import JointCommand, Reason, TrajectoryCommand
 from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 
@@ -210,6 +212,22 @@ def test_values_that_are_not_finite(warm: Robot, bad: float) -> None:
         refused(Reason.NOT_FINITE, session.trajectory, trajectory, now)
     assert session.status().refused[Reason.NOT_FINITE] == 6
     assert np.all(np.isfinite(warm.read(HOME).position))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_values_of_a_joint_without_limits_that_are_not_finite(bad: float) -> None:
+    free = np.arange(6) == 5
+    arm = replace(
+        NOMINAL,
+        lower=np.where(free, -np.inf, NOMINAL.lower),
+        upper=np.where(free, np.inf, NOMINAL.upper),
+    )
+    session, q = CorrectionSession(arm, arm, "s1", CorrectionConfig(**LIMITS)), HOME.copy()
+    session.reading(JointCommand(NAMES, HOME), 100.0)
+    q[free] = bad
+    refused(Reason.NOT_FINITE, session.reading, JointCommand(NAMES, q), 100.0)
+    refused(Reason.NOT_FINITE, session.target, JointCommand(NAMES, q), 100.0)
+    refused(Reason.NOT_FINITE, session.taught, NAMES, q, None, 100.0)
 
 
 def test_doubled_and_misfitting_joints(warm: Robot) -> None:
