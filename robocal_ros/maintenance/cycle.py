@@ -11,8 +11,8 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
+from robocal_ros.maintenance.fixture_part import JUDGED, FixturePart, FixtureVisits
 from robocal_ros.maintenance.fixture_part import MEASUREMENT as FIXTURE_MEASUREMENT
-from robocal_ros.maintenance.fixture_part import FixturePart, FixtureVisits
 from robocal_ros.maintenance.mover import HOME, STATION, FaultError
 from robocal_ros.maintenance.robot_interface import (
     BeginCycle,
@@ -635,8 +635,9 @@ class CycleRun:
             self._leave(left)
         if answer is None:
             return
-        found = answer.code, answer.candidate_id
-        self.result = replace(self.result, fixture_code=found[0], fixture_id=found[1])
+        if answer.code in JUDGED:
+            found, code = answer.candidate_id, answer.code
+            self.result = replace(self.result, fixture_code=code, fixture_id=found)
         waits = f"; candidate {answer.candidate_id} waits for a decision"
         self._messages.append(f"fixture: {answer.message}{waits if answer.done else ''}")
 

@@ -72,6 +72,7 @@ def test_it_comes_after_drift_and_tool_each_pose_as_often_as_set(cell):
     moves = len(WAYS) + 1
     assert fixture_log(cell) == ["BeginFixture", *["Move"] * moves, "MeasureFixture"]
     np.testing.assert_allclose(ends(cell)[-moves:], [*WAYS, HOME], atol=1e-9)
+    assert (result.fixture_code, result.fixture_id) == (Code.ACCEPT, 9)
     said = "fixture: plate moved by 0.50 mm; candidate 9 waits for a decision"
     assert said in result.message
     assert not result.accepted
@@ -138,6 +139,7 @@ def test_a_node_that_does_not_answer_leaves_it_with_the_robot_at_home(cell, how)
     result = cell.ran("c1")
     assert (result.code, result.complete) == (Code.ACCEPT, False), result.message
     assert "fixture measurement" in result.left
+    assert result.fixture_code is Code.NONE
     assert cell.at_home()
     assert fixture_log(cell) == ["BeginFixture"]  # and nothing was driven for it
     over(cell)
@@ -157,6 +159,7 @@ def test_one_that_is_not_taught_is_left_with_what_to_do(cell):
     result = cell.ran("c1")
     assert result.left == ("fixture measurement",)
     assert "teach it first" in result.message
+    assert result.fixture_code is Code.NONE
     assert "waits" not in result.message
 
 
