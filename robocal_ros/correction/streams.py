@@ -209,7 +209,7 @@ class TargetStream:
         limiter.begin(new, offset, begins[0, new])
         limiter.state[OFFSET_RATE, new] = rate
         output.taught[new], output.out[new] = q[new], q[new] + offset
-        for _, out in self._sent:
+        for _, out in self._sent_lately():
             out[new] = output.out[new]
         if self.phase is StreamPhase.IDLE:
             output.out_s = now_s
@@ -271,6 +271,9 @@ class TargetStream:
         (begin_s, begin), (end_s, end) = way[0], way[-2 if len(way) > 2 else -1]
         return np.abs(end - begin) / (end_s - begin_s) if end_s > begin_s else 0.0 * end
 
+    def _sent_lately(self) -> deque[tuple[float, Array]]:
+        return _lately(self._sent, max(SENT_S, SENT_PERIODS * self._step_period_s))
+
     def _sent_speed(self) -> Array:
         """How fast the joints are sent now (k,), but none the other way than lately.
 
@@ -278,9 +281,8 @@ class TargetStream:
         messages are uneven.
         """
         output, index = self._output, self._index
-        window_s = max(SENT_S, SENT_PERIODS * self._step_period_s)
         self._note(self._sent, output.out.copy(), output.out_s)
-        sent = _lately(self._sent, window_s)
+        sent = self._sent_lately()
         t = np.array([t for t, _ in sent])
         way = np.array([out[index] for _, out in sent]) - output.out[index]
         lasts = t[-1] - t[0]
