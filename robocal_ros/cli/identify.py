@@ -46,6 +46,7 @@ from robocal_ros.identification.judged import (
 )
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.tables import (
     beyond_limits,
@@ -102,7 +103,9 @@ def show_identification(console: "Console", document: Document) -> None:
     _show_doubts(console, document)
     if number := document.get("calibration_id"):
         accept = verdict["accept"]
-        then = f"'robocal history accept {number}' brings it into force" if accept else "refused"
+        then = "refused"
+        if accept:
+            then = f"'robocal history accept {number}', for the same serial, brings it into force"
         print_words(console, f"Kept as calibration {number} of the history: {then}.")
     print_output(console, document)
 
@@ -299,10 +302,11 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     in_force = None
     if args.keep:
         from robocal_ros.cli.programs import model_history
-        from robocal_ros.thermal.proposing import commissioned_in_force, keep_identified
+        from robocal_ros.thermal.proposing import head_without_reference, keep_identified
 
         with model_history(args, robot.arm, create=True) as history:
-            in_force = commissioned_in_force(history, robot.arm)
+            head = head_without_reference(history)
+        in_force = None if head.model is None else arm_of(head.model, robot.arm)
     judged, data, document = _identified(robot.arm, args, warnings, in_force)
     verdict = judged.verdict
     document["output"] = None
@@ -322,11 +326,6 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     if words := contradicted(judged.identification):
         warnings.append(f"{args.data}: {words}")
     document |= {"figures": None, "calibration_id": None, "warnings": warnings}
-    if args.keep:
-        with model_history(args, robot.arm) as history:
-            document["calibration_id"] = keep_identified(
-                history, robot.arm, judged, data, args.method, time.time_ns()
-            )
     result = judged.identification
     if args.figures is not None and isinstance(result, FullIdentification):
         from robocal_ros.report.figures import joint_functions_figure
@@ -334,6 +333,11 @@ def run_identify(args: argparse.Namespace) -> CliResult:
 
         figure = joint_functions_figure(result.known)
         document["figures"] = keep_figure(args.figures, "joints", figure)
+    if args.keep:
+        with model_history(args, robot.arm) as history:
+            document["calibration_id"] = keep_identified(
+                history, judged, data, args.method, head.revision, time.time_ns()
+            )
     status = DONE
     if verdict.code is Code.TOO_FEW_SAMPLES:
         document |= refusal(verdict.code, verdict.reason)

@@ -165,6 +165,7 @@ class JudgementDocument(TypedDict):
     nominal: JudgedErrorsDocument
     in_force: Annotated[
         JudgedErrorsDocument,
-        "The model that the new one must beat; for `robocal identify` the nominal one.",
+        "The model that the new one must beat; for `robocal identify` the nominal one, with --keep "
+        "that of the history.",
     ]
     calibrated: CalibratedErrorsDocument

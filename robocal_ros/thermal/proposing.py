@@ -15,7 +15,7 @@ from robocal_ros.ground.errors import Code, ConflictError, InputError, TooFewSam
 from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import FRAME_SHIFT, REFERENCE, THERMAL, Proposal
+from robocal_ros.history.history_records import FRAME_SHIFT, REFERENCE, THERMAL, Head, Proposal
 from robocal_ros.identification import Method, identify_and_hold_out
 from robocal_ros.identification.judged import (
     JudgedIdentification,
@@ -23,7 +23,7 @@ from robocal_ros.identification.judged import (
     identified_model_document,
 )
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of, model_document
+from robocal_ros.kinematics.arm import model_document
 from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import FrameShift, given_shift
 from robocal_ros.session.events import Command, Outcome
@@ -436,36 +436,42 @@ def shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -
     }
 
 
-def commissioned_in_force(history: CalibrationHistory, nominal: SerialArm) -> SerialArm | None:
-    """The arm that a model identified from tables is judged against; None: the nominal one.
+def head_without_reference(history: CalibrationHistory) -> Head:
+    """What a model identified from tables is judged against.
 
     Raises `ConflictError` where a cold reference is in force: drifts are told against its model.
     """
-    head, reference = history.head(THERMAL), history.head(REFERENCE)
+    reference = history.head(REFERENCE)
     if reference.model is not None:
         raise ConflictError(
             f"a cold reference is in force (calibration {reference.calibration_id}), and drifts "
             "count from its model: return to none with 'robocal history rollback --kind reference "
             "--to nominal', accept the new model, then capture a new reference"
         )
-    return None if head.model is None else arm_of(head.model, nominal)
+    return history.head(THERMAL)
 
 
 def keep_identified(
     history: CalibrationHistory,
-    nominal: SerialArm,
     judged: JudgedIdentification,
     data: Measurements,
     method: Method,
+    based_on: int,
     wall_ns: int,
 ) -> int:
-    """Put a model identified from tables into the history as a candidate; its number there."""
+    """Put a model identified from tables into the history as a candidate; its number there.
+
+    ``based_on``: revision that it was judged against, though another one may be in force by now.
+
+    Raises `ConflictError` as `head_without_reference`.
+    """
+    head_without_reference(history)
     document: Document = {**identification_document(judged), "stamp_ns": wall_ns, "cycle_id": ""}
     return history.propose(
         Proposal(
             kind=THERMAL,
-            model_hash=nominal.model_hash,
-            based_on=history.head(THERMAL).revision,
+            model_hash=document["model_hash"],
+            based_on=based_on,
             cycle_id="",
             stamp_ns=wall_ns,
             created_ns=wall_ns,

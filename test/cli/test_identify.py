@@ -11,12 +11,15 @@ from campaign import NOISE_M, ROBOT, edited, measured, renamed, table, true_arm,
 from command import conforms, robocal, robocal_json
 
 from robocal_ros.cli.main import main
+from robocal_ros.ground.errors import ConflictError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import REFERENCE
+from robocal_ros.history.history_records import REFERENCE, THERMAL
+from robocal_ros.identification import identify_and_judge
 from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics.arm import arm_of, model_document
 from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.session.events import bring_into_force
+from robocal_ros.thermal.proposing import head_without_reference, keep_identified
 
 
 @pytest.fixture(scope="module")
@@ -349,6 +352,27 @@ class TestOutput:
         )
         assert (status, document["error"]["code"]) == (3, "CONFLICT")
         assert "--kind reference --to nominal" in document["error"]["message"]
+
+    def test_what_came_into_force_meanwhile_makes_a_kept_model_stale(self, tmp_path: Path) -> None:
+        """It was judged against the model before; and a reference may have been captured."""
+        nominal, used = load_robot(ROBOT), measured(60, 9)
+        judged = identify_and_judge(nominal, used, measured(40, 8))
+        with CalibrationHistory.open(
+            "R1", model_hash=nominal.model_hash, state_dir=tmp_path
+        ) as history:
+            head = head_without_reference(history)
+            bring_into_force(history, THERMAL, nominal, model_document(nominal), "test")
+            kept = keep_identified(history, judged, used, "map", head.revision, 0)
+            assert history.get(kept).state == "stale"
+            with pytest.raises(StaleError):
+                history.accept(kept, by="Ada", reason="", wall_ns=0)
+            again = head_without_reference(history).revision
+            kept = keep_identified(history, judged, used, "map", again, 0)
+            assert history.get(kept).state == "pending"
+            bring_into_force(history, REFERENCE, nominal, model_document(nominal), "test")
+            with pytest.raises(ConflictError, match="cold reference is in force"):
+                keep_identified(history, judged, used, "map", again, 0)
+            assert history.list()[0].kind == REFERENCE
 
     def test_no_folder_for_it(self, data: Path, folder: Path, identify) -> None:
         status, document = identify("--data", data, "--output", folder / "no" / "m.yaml")
