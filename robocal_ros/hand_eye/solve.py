@@ -42,6 +42,7 @@ from robocal_ros.hand_eye.mount_fit import (
     without,
 )
 from robocal_ros.hand_eye.mount_problem import (
+    FIRST_NOISE,
     SENSOR_UNKNOWNS,
     MountProblem,
     MountState,
@@ -521,8 +522,10 @@ def verify(
     read = read_with(task, data, linearity)
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
     rejected = dict(read.rejected)
-    noise = settings.noise() or noise_of(misfit((read.view,), start))
-    view, state = _fit_place(read.view, start, noise, rejected)
+    given = settings.noise()
+    noise = given or noise_of(misfit((read.view,), start))
+    known = read.view.model.prior(given or FIRST_NOISE)  # the misfit may be the mount's
+    view, state = _fit_place(read.view, start, noise, known, rejected)
     fit = distances((view,), state)
     rms = float(np.sqrt(np.mean(fit**2)))
     words, code = f"{len(fit)} samples are off by {rms * 1e3:.3f} mm rms", Code.ACCEPT
@@ -543,13 +546,15 @@ def verify(
 
 
 def _fit_place(
-    view: TargetView, start: MountState, noise: PoseNoise, rejected: dict[str, str]
+    view: TargetView, start: MountState, noise: PoseNoise, known: Array, rejected: dict[str, str]
 ) -> tuple[TargetView, MountState]:
-    """The target's most likely place with the sensor held; outliers are named in ``rejected``."""
+    """The target's most likely place with the sensor held; outliers are named in ``rejected``.
+
+    ``known`` (k, k): information about it beforehand.
+    """
     if not view.model.names:
         return view, start
     problem = MountProblem((view,), noise, start)
-    known = problem.prior()[HELD:, HELD:]
     estimate = solve(_PlaceProblem(problem), start, prior_information=known, sizes=problem.sizes)
     kept = without((view,), estimate.rejected[problem.sample], rejected)
     return kept[0], estimate.settled()

@@ -15,10 +15,11 @@ from scipy.stats import chi2
 from bench.hand_eye_cell import HandEyeCell
 from bench.hand_eye_profiles import EXACT, with_gears
 from bench.hand_eye_worlds import Calibration, X, edge_set, sphere_set, step_set
+from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.mount_problem import pivot_of
-from robocal_ros.hand_eye.result import PoseNoise, increment
-from robocal_ros.hand_eye.solve import features, look
+from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, increment
+from robocal_ros.hand_eye.solve import features, look, verify
 
 Make = Callable[[HandEyeCell, np.random.Generator], Calibration]
 DRAWS: dict[Make, int] = {
@@ -70,3 +71,16 @@ def test_a_taught_frame_is_no_better_than_the_robot_that_taught_it():
         assert known[:3] == pytest.approx(np.hypot(told[:3], sigma_m), rel=1e-3)
     exact = step_set(HandEyeCell(sensor=EXACT), rng)  # a frame that is told to be exact stays it
     assert features(exact.task(), exact.data).view.model.names == ()
+
+
+@pytest.mark.parametrize("seed", range(amount(2, 20)))
+def test_a_taught_frame_shows_a_mount_that_is_off(seed: int):
+    """What a mount is off by is not taken for the robot's scatter, by which the frame may move."""
+    rng = np.random.default_rng([81, seed])
+    made = step_set(HandEyeCell(sensor=EXACT, robot=with_gears(rng)), rng)
+    assert verify(made.task(), made.data, X, HandEyeSettings()).verdict.accept
+    for axis in np.eye(3):
+        off = X.copy()
+        off[:3, 3] += 3e-3 * axis  # three times the limit; the gears are half of it
+        found = verify(made.task(), made.data, off, HandEyeSettings())
+        assert found.verdict.code is Code.RESIDUAL_TOO_LARGE
