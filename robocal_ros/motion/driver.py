@@ -162,7 +162,8 @@ class StatedController:
             message.header.stamp = Time(sec=begin_ns // NS, nanosec=begin_ns % NS)
             return message
         since_s = at_s + REACTION_S
-        last_s = plan.duration_s - since_s
+        # one that is over, or nearly, ends no sooner: a controller would be there in one cycle
+        last_s = max(plan.duration_s - since_s, LEAD_S)
         first_s = min(first_s, last_s)
         if self.velocities:
             ahead = plan.time_s - since_s

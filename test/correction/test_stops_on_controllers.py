@@ -23,7 +23,7 @@ from robocal_ros.correction.trajectories import AHEAD_S, on_its_path
 from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPIES, COPY_S, StatedController
-from robocal_ros.motion.plan import MotionLimits, stop
+from robocal_ros.motion.plan import LEAD_S, MotionLimits, stop
 from robocal_ros.motion.robot_watch import STANDS_S, Lateness, RobotWatch
 from robocal_ros.motion.stopping import WatchedStop
 
@@ -211,6 +211,23 @@ def own_stop(driven: Driven, deceleration: float, taken: Any) -> tuple[float, np
         driven.takes(messages[min(number, len(messages) - 1)], 0.008 + number * COPY_S)
     last = messages[min(taken[-1], len(messages) - 1)]
     return planned.duration_s, driven.obeys(last, 0.008 + taken[-1] * COPY_S)
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("over_s", [-0.02, 0.0, 0.3])
+def test_a_stop_that_is_sent_when_it_should_be_over_is_no_step(over_s, velocities):
+    """Finding: what is at time 0 or before, a controller takes in one cycle."""
+    driven = Driven(velocities, 0.0, told=False)
+    q, qd = driven.motion.last()[1][4:6]
+    plan = stop(NOMINAL, MotionLimits(stop_deceleration=5.0), q, qd).going_on(REACTION_S)
+    at_s = plan.duration_s + over_s
+    message = driven.stated.stop_message(plan, NAMES, driven.robot.now, 1.0, at_s=at_s)
+    points = message.points
+    assert points[0].time_from_start.nanosec * 1e-9 == pytest.approx(LEAD_S)
+    assert points[-1].positions == pytest.approx(plan.q[-1])
+    # a cubic that begins at the robot's speed and ends at rest
+    most = max(SPEED, 1.5 * np.max(np.abs(plan.q[-1] - q)) / LEAD_S)
+    assert np.max(np.abs(driven.obeys(message, 0.0))) <= most * 1.01
 
 
 @pytest.mark.parametrize("velocities", [True, False])
