@@ -33,7 +33,7 @@ ENOUGH = "by 20 deg or more"
 # a Gaussian's; a shot of another pose or target is off by far more than this asks for.
 FALSE_REJECTION = 1e-4
 LOOKS = 3
-HOPELESS = 10.0  # times the least sum of squares, from which a start leads to a false minimum
+HOPELESS = 100.0  # times the least sum of squares, from which a start leads to a false minimum
 LARGEST_POSE_M = 2e-3  # error of a pose in space that a robot may have
 ROUNDS = 8
 POSE_NUMBERS = 6
