@@ -11,6 +11,7 @@ from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.correction.trajectories import AHEAD_S
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import WARN
 
@@ -110,7 +111,7 @@ def test_a_stop_while_readings_come_late_lies_ahead_on_the_way(graph: Any) -> No
     stopped_s = time.monotonic()
     line.to_path.publish(JointTrajectory(joint_names=NAMES))
     stop = line.wait(line.paths, 2)
-    assert stop.points[0].positions[0] > path.place(stopped_s)[0]
+    assert stop.points[0].positions[0] > path.place(stopped_s + AHEAD_S)[0]
     assert "joint states come up to" in line.report(WARN, "ms late").message
 
 
