@@ -434,11 +434,14 @@ class JointCorrectionNode(RobotNode):
             assert path is not None
             assert speeds is not None
             plan = on_its_path(path, planned, now)
-            sent = self._send_stop(plan, planned.names, why, now - AHEAD_S)
-            self._stop_why, self._stop_fault, measured = why, "", robot.speed(now)
-            fastest = np.append(np.nan_to_num(measured), np.abs(speeds).max(axis=1))
-            lasts = max(SHORTEST_STOP_S / times[-1], 1.0) * times
-            self._stopping.watch(np.append(0.0, lasts), fastest, now)
+            if time.monotonic() - now > AHEAD_S:  # too busy: the robot is past where it was to slow
+                sent = self._stop_lost(why)
+            else:
+                sent = self._send_stop(plan, planned.names, why, now - AHEAD_S)
+                self._stop_why, self._stop_fault, measured = why, "", robot.speed(now)
+                fastest = np.append(np.nan_to_num(measured), np.abs(speeds).max(axis=1))
+                lasts = max(SHORTEST_STOP_S / times[-1], 1.0) * times
+                self._stopping.watch(np.append(0.0, lasts), fastest, now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
             sent = self._stop_by_readings(why, now)
         self._arm_tail()

@@ -381,14 +381,15 @@ def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> 
     assert all(len(message.points) for message in line.paths)
 
 
+@pytest.mark.parametrize("planning_s", [0.05, 0.3])
 def test_a_stop_that_takes_its_time_to_be_planned_turns_nothing_back(
-    line: Moving, monkeypatch: pytest.MonkeyPatch
+    line: Moving, monkeypatch: pytest.MonkeyPatch, planning_s: float
 ) -> None:
     """Finding: on a busy machine its first point lay where the robot had long been."""
 
     def slowly(*given: Any) -> Any:
         planned = on_its_path(*given)
-        time.sleep(0.08)
+        time.sleep(planning_s)
         return planned
 
     monkeypatch.setattr("robocal_ros.correction.node.on_its_path", slowly)
@@ -396,7 +397,7 @@ def test_a_stop_that_takes_its_time_to_be_planned_turns_nothing_back(
     began_s, count = time.time(), len(line.paths)
     line.to_path.publish(JointTrajectory(joint_names=NAMES))
     line.wait(line.paths, count + 1)
-    line.comes_to_rest(began_s - 0.1)  # the robot ticks in this thread, not while it plans
+    line.comes_to_rest(began_s - planning_s)  # the robot ticks in this thread, not while it plans
 
 
 @pytest.mark.parametrize("how", ["streams", "drives"])
