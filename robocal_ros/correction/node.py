@@ -434,9 +434,8 @@ class JointCorrectionNode(RobotNode):
             assert path is not None
             assert speeds is not None
             plan = on_its_path(path, planned, now)
-            if time.monotonic() - now > AHEAD_S:  # too busy: the robot is past where it was to slow
-                sent = self._stop_lost(why)
-            else:
+            late = time.monotonic() - now > AHEAD_S  # the robot is past where it was to slow down
+            if not (late and self._stop_lost(why)):
                 sent = self._send_stop(plan, planned.names, why, now - AHEAD_S)
                 self._stop_why, self._stop_fault, measured = why, "", robot.speed(now)
                 fastest = np.append(np.nan_to_num(measured), np.abs(speeds).max(axis=1))

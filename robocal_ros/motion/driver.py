@@ -169,7 +169,9 @@ class StatedController:
             ahead = plan.time_s - since_s
             times = np.append(first_s, ahead[ahead > first_s + 1e-4])
         else:
-            times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / LINES_S)) + 1)
+            left_s = last_s - first_s  # in two lines at least, which slow down
+            lines = max(int(np.ceil(left_s / LINES_S)), 2 if left_s > 1e-3 else 0)
+            times = np.linspace(first_s, last_s, lines + 1)
         q, qd = plan.at(times + since_s)
         qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest
         return joint_trajectory(names, times, q, qd if self.velocities else None)

@@ -124,6 +124,7 @@ class HouseNode(EndpointNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the outputs, then `activate`."""
         super().on_activate(state)
+        self.is_active = False  # before `activate` has done its part nothing is taken
         result = self._attempt("activate", self.activate)
         if result == TransitionCallbackReturn.SUCCESS:
             self.is_active = True

@@ -19,7 +19,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.lifecycle import LifecycleNode
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
@@ -140,6 +140,17 @@ class EndpointNode(LifecycleNode):
     def state(self) -> str:
         """Label of the lifecycle state."""
         return str(self._state_machine.current_state[1])
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the outputs."""
+        result = super().on_activate(state)
+        self.is_active = result == TransitionCallbackReturn.SUCCESS
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close the outputs."""
+        self.is_active = False
+        return super().on_deactivate(state)
 
     def now_ns(self) -> int:
         """ROS time, ns (simulated when ``use_sim_time``)."""
