@@ -104,7 +104,10 @@ class KilledBridge:
         raise AssertionError(self.status)
 
     def made_good(self) -> None:
-        """A person drives the robot home, an engineer acknowledges."""
+        """A person drives the robot home, an engineer acknowledges, and decides on what waits."""
+        if waiting := self.status.tool_pending:  # while one waits no tool is measured
+            self.call("Reject", waiting, "it is measured anew", client=self.ada)
+            self.graph.spin_until(lambda: not self.status.tool_pending, "nothing waits")
         if self.status.state == MaintenanceStatus.FAULT:
             self.graph.spin_until(lambda: self.cell.stands(0.5), "the robot rests")
             self.cell.drive_between(self.cell.q, np.radians(HOME_DEG))
