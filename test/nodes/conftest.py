@@ -54,6 +54,13 @@ GONE_WITHIN_S = 0.25  # of another one
 LEAVES_WITHIN_S = 3.0
 
 
+# All nodes of a cell at once, which take more than a core: first, so that xdist gives them to one
+# process, one after the other, and none starves another.
+WHOLE_CELLS = {
+    "test_demo", "test_fault_matrix", "test_fixture_cell", "test_plc_killed", "test_tool_cell",
+}  # fmt: skip
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here, missing = Path(__file__).parent, missing_packages()
     no_controller = pytest.mark.skip(
@@ -68,6 +75,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             # other examples in a second try would hide what was found
             if isinstance(item, pytest.Function) and hasattr(item.module, "given"):
                 item.add_marker(pytest.mark.flaky(reruns=0))
+    items.sort(key=lambda item: item.path.stem not in WHOLE_CELLS)
 
 
 class Executable:
