@@ -42,15 +42,17 @@ class Story:
 
 def _gap(gap: Gap) -> dict[str, object]:
     result = gap.result
-    codes = {
-        name: Code(getattr(result, name)).name for name in ("code", "tool_found_code", "tool_code")
-    }
+    codes = {name: Code(getattr(result, name)).name for name in ("code", "tool_code")}
+    # a try that was broken off may have found it bent, and mended it
+    bent = any(tried.tool_found_code == Code.LIMIT_EXCEEDED for tried in gap.results)
+    found = Code.LIMIT_EXCEEDED if bent else Code(result.tool_found_code)
     thermal = [Code(r.thermal_code).name for r in gap.results if r.thermal_code != Code.NONE]
     return {
         "gap": gap.name,
         "length_s": gap.length_s,
         "used_s": gap.used_s,
         **codes,
+        "tool_found_code": found.name,
         "thermal_codes": thermal,
         "complete": result.complete,
         "accepted": accepted(gap),
