@@ -133,8 +133,8 @@ def later_table() -> Table:
             "verdict",
         ),
         "The tracker stood elsewhere and the T-Mac was mounted anew, so those are fitted to the "
-        "later data, for both models; the geometry is held. A's grid fills the workspace, "
-        "C's poses a part of it.",
+        "later data, for both models; the geometry is held. A's grid is a box of 0.4 x 1.3 x 0.5 m "
+        "on one side, B and C lie in one of 0.8 x 0.5 x 0.5 m elsewhere, D on all sides.",
     )
     for (source, series), model in product(("AB", "AC", "AD", "CB", "CD"), MODELS):
         judged = carried_over(source, series, model)
