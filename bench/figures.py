@@ -4,6 +4,7 @@
 - ``ur10_campaigns.png``: real measurements (see ``ur10_campaigns``), mean error at poses that were
   held out;
 - ``ur10_joints.png``: what the joints of that robot turn besides what is read, of series A;
+- ``ur10_errors.png``: where in the workspace it errs, before and after, of series A;
 - ``beam_circle.png``: one simulated circle through two crossed beams;
 - ``demo_shift.png``: the simulated shift of ``bags/demo_shift.mcap``, as ``robocal validate`` draws
   it.
@@ -34,6 +35,7 @@ from robocal_ros.report.figures import (
     joint_functions_figure,
     png,
 )
+from robocal_ros.report.measured_figures import errors_figure
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -120,7 +122,11 @@ def main() -> None:
     found = campaign_errors()
     print(json.dumps(found, indent=1))
     (IMAGES / "ur10_campaigns.png").write_bytes(png(campaign_figure(found)))
-    joints = own_half("A").identification
+    judged = own_half("A")
+    joints, errors = judged.identification, judged.errors
+    shown = {"nominal model": errors["nominal"], "identified model": errors["calibrated"]}
+    figure = errors_figure(joints.nominal.fk(judged.q)[:, :3, 3], shown)
+    (IMAGES / "ur10_errors.png").write_bytes(png(figure, dpi=110))
     if isinstance(joints, FullIdentification):
         (IMAGES / "ur10_joints.png").write_bytes(png(joint_functions_figure(joints.known)))
     (IMAGES / "beam_circle.png").write_bytes(png(circle_figure()))

@@ -147,6 +147,14 @@ def _show_joints(console: "Console", document: Document) -> None:
         away = f"{row['check_outside']:.1%}" if row["check_outside"] else ""
         rows.append([row["name"], f"{lower:.0f}", f"{upper:.0f} {unit}", away, *shown, load])
     print_table(console, "Joints", _JOINT_HEADS, rows)
+    gaps = [
+        f"{row['name']} {', '.join(f'{a:.0f} to {b:.0f}' for a, b in row[key])} {key[5:]}"
+        for row in document["joints"]
+        for key in ("gaps_deg", "gaps_mm")
+        if row.get(key)
+    ]
+    if gaps:
+        print_words(console, f"In between not measured: {'; '.join(gaps)}.")
     if part := document["coverage"]["not_covered"]:
         there = ", and its function is zero there" if document["model"] == "full" else ""
         after, before = (part[name]["mean_mm"] for name in ("calibrated", "in_force"))
@@ -241,7 +249,8 @@ def add_identify(parser: argparse.ArgumentParser) -> None:
         "--figures",
         type=Path,
         metavar="DIR",
-        help="write joints.svg there: each joint's function with its band",
+        help="write errors.svg there, the error over the workspace before and after, and "
+        "joints.svg, each joint's function with its band",
     )
     parser.add_argument(
         "--output",
@@ -326,13 +335,14 @@ def run_identify(args: argparse.Namespace) -> CliResult:
     if words := contradicted(judged.identification):
         warnings.append(f"{args.data}: {words}")
     document |= {"figures": None, "calibration_id": None, "warnings": warnings}
-    result = judged.identification
-    if args.figures is not None and isinstance(result, FullIdentification):
-        from robocal_ros.report.figures import joint_functions_figure
-        from robocal_ros.report.measured_figures import keep_figure
-
-        figure = joint_functions_figure(result.known)
-        document["figures"] = keep_figure(args.figures, "joints", figure)
+    if isinstance(judged.identification, FullIdentification):
+        known = judged.identification.known
+        for joint, row in enumerate(document["joints"]):
+            unit, factor = ("deg", np.degrees(1.0)) if "measured_deg" in row else ("mm", 1e3)
+            row[f"gaps_{unit}"] = (known.gaps(joint) * factor).tolist()
+    if args.figures is not None:
+        before = "nominal model" if in_force is None else "model in force"
+        document["figures"] = _drawn(args.figures, judged, before)
     if args.keep:
         with model_history(args, robot.arm) as history:
             document["calibration_id"] = keep_identified(
@@ -343,6 +353,20 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         document |= refusal(verdict.code, verdict.reason)
         status = NO_ANSWER
     return CliResult(document, show_identification, status)
+
+
+def _drawn(folder: Path, judged: JudgedIdentification, before: str) -> str:
+    """Draw errors over the workspace, and the joints' functions where there are any: their file."""
+    from robocal_ros.report.figures import joint_functions_figure
+    from robocal_ros.report.measured_figures import errors_figure, keep_figure
+
+    result = judged.identification
+    errors = {before: judged.errors["in_force"], "identified model": judged.errors["calibrated"]}
+    figure = errors_figure(result.nominal.fk(judged.q)[:, :3, 3], errors)
+    path = keep_figure(folder, "errors", figure)
+    if isinstance(result, FullIdentification) and np.any(result.known.terms.count):
+        path = keep_figure(folder, "joints", joint_functions_figure(result.known))
+    return path
 
 
 def _require_sense(args: argparse.Namespace) -> None:

@@ -63,6 +63,10 @@ class IdentifiedJointDocument(TypedDict):
     name: str
     measured_deg: NotRequired[Two]
     measured_mm: NotRequired[Two]
+    gaps_deg: NotRequired[
+        Annotated[list[Two], "In between, where its function was not measured; of a full model."]
+    ]
+    gaps_mm: NotRequired[list[Two]]
     check_outside: Annotated[
         Share, "Share of the check poses that have this joint where it was not measured."
     ]
@@ -180,7 +184,8 @@ class IdentifiedDocument(PlacedModelDocument):
     warnings: Texts
     figures: Annotated[
         str | None,
-        "The figure of the joints' functions; null when none was asked for or there are none.",
+        "The figure of the joints' functions, or where there are none that of the errors; null "
+        "when none was asked for.",
     ]
     calibration_id: Annotated[
         int | None, "The candidate's number in the history; null without --keep."

@@ -196,6 +196,8 @@ class JudgedIdentification(Judgement):
     away : (m, n) which check poses have which joints where these were not measured.
     parts : errors of in_force and calibrated at the check poses that are covered, and at those
         that are not, where there are such.
+    q, errors : readings (m, n) of the check poses, and the errors (m,), m, of nominal, in_force
+        and calibrated there.
     """
 
     identification: Identification
@@ -203,6 +205,8 @@ class JudgedIdentification(Judgement):
     measured: Array
     away: NDArray[np.bool_]
     parts: dict[str, dict[str, ErrorSummary]]
+    q: Array
+    errors: dict[str, Array]
 
     @property
     def check_outside(self) -> float:
@@ -252,8 +256,7 @@ def identify_and_judge(
     if isinstance(result, FullIdentification):
         away = result.known.uncovered(check.q)
     workspace_m = result.workspace_rms(result.estimate.covariance)
-    doubt = still_joints(arm, train) and still_joints(arm, check)
-    doubt = doubt or result.estimate.creeping
+    doubt = (still_joints(arm, train) and still_joints(arm, check)) or result.estimate.creeping
     if not doubt:
         change_m = result.workspace_change(in_force or arm)
         doubt = too_narrow(workspace_m, change_m, summarise(before[sound]).rms_m, SPREAD_POSES)
@@ -272,6 +275,8 @@ def identify_and_judge(
             for name, part in (("covered", inside), ("not_covered", ~inside))
             if np.any(part)
         },
+        q=check.q,
+        errors=errors,
         nominal=summarise(plain),
         current=summarise(before),
         candidate=summarise(after),

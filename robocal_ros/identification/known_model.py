@@ -108,10 +108,23 @@ class KnownModel:
             x, own, length = q[:, joint], self.readings[:, joint], self.prior.length[joint]
             at = np.clip(np.searchsorted(own, x), 1, len(own) - 1)
             away = np.minimum(np.abs(x - own[at - 1]), np.abs(x - own[at]))
-            gap = max(GAP_LENGTHS * length, GAP_SPACINGS * (own[-1] - own[0]) / len(own))
             beyond = (x < own[0] - 0.5 * length) | (x > own[-1] + 0.5 * length)
-            found[:, joint] = beyond | (away > gap)
+            found[:, joint] = beyond | (away > self._reach(int(joint)))
         return found
+
+    def _reach(self, joint: int) -> float:
+        """How far from a reading, among others, a joint's function counts as measured."""
+        own = self.readings[:, joint]
+        spacing = float(own[-1] - own[0]) / len(own)
+        return max(GAP_LENGTHS * float(self.prior.length[joint]), GAP_SPACINGS * spacing)
+
+    def gaps(self, joint: int) -> Array:
+        """Where between its readings (k, 2) a joint's function was not measured."""
+        if not self.terms.count[joint]:
+            return np.zeros((0, 2))
+        own, reach = self.readings[:, joint], self._reach(joint)
+        wide = np.flatnonzero(np.diff(own) > 2.0 * reach)
+        return np.column_stack([own[wide] + reach, own[wide + 1] - reach])
 
     def predicted_variance(self, q: Array, target: Index, without: Collection[Part] = ()) -> Array:
         """Covariance (m, 3, 3), m^2, of the predicted target positions.

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from robocal_ros.ground.files import write_text
@@ -16,6 +17,8 @@ from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE, svg
 
 HOLDS_95 = 2.4477  # Mahalanobis distance within which 95 % of a plane's Gaussian lie
 MOST_NAMED = 40
+CELLS = 24  # across the workspace
+DECADES = 3.0  # of errors, in colour
 
 
 def keep_figure(folder: Path, name: str, figure: Figure) -> str:
@@ -90,3 +93,32 @@ def _points(axes: Axes, seen: Mapping[str, Array]) -> None:
         axes.plot(*(1e3 * points.T), ".", ms=2, alpha=0.6, rasterized=True)
     axes.set(aspect="equal", xlabel="x, mm", ylabel="z, mm")
     axes.set_title("Where the target was seen, in the sensor's plane; a colour for each profile")
+
+
+def errors_figure(place: Array, errors: Mapping[str, Array]) -> Figure:
+    """Where in the workspace each model errs by how much: from above and from the side.
+
+    ``place`` (m, 3): of the flange in the base, m, at poses that were judged by. ``errors``: (m,)
+    of each model, m. Each cell has the mean of its poses, in one scale of colours for all models.
+    """
+    x, y, z = 1e3 * place.T
+    views = (x, y, "x, mm", "y, mm"), (np.hypot(x, y), z, "distance from the base's z, mm", "z, mm")
+    largest = max(1e3 * float(np.quantile(np.concatenate([*errors.values()]), 0.99)), 1e-9)
+    smallest = 1e3 * float(np.quantile(np.concatenate([*errors.values()]), 0.01))
+    norm = LogNorm(max(smallest, 10.0**-DECADES * largest), largest, clip=True)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 3.8 * len(errors)), layout="constrained")
+        panels = figure.subplots(len(errors), 2, squeeze=False)
+        for row, (name, error) in zip(panels, errors.items(), strict=True):
+            for axes, (u, v, across, up) in zip(row, views, strict=True):
+                wide, high = float(np.ptp(u)), float(np.ptp(v))
+                per_mm = CELLS / max(wide, high, 1e-9)
+                count = 1 + int(per_mm * wide), 1 + int(per_mm * high / np.sqrt(3.0))
+                cells = axes.hexbin(
+                    u, v, C=1e3 * error, gridsize=count, norm=norm, cmap="viridis", linewidths=0.2
+                )
+                axes.set(aspect="equal", xlabel=across, ylabel=up)
+            row[0].set_title(f"{name}: mean {1e3 * np.mean(error):.3f} mm")
+        words = "error at poses not used to solve, mm"
+        figure.colorbar(cells, ax=panels, label=words, format="%.2g")
+    return figure

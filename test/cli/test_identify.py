@@ -88,6 +88,14 @@ class TestAnswer:
         assert "theta3_deg" in done.stdout
         assert "Not seen in the data, left to the prior" in done.stdout
 
+    def test_errors_over_the_workspace_are_drawn(self, data: Path, folder: Path, identify) -> None:
+        asked = ("--data", data, "--model", "geometric")
+        _, plain = identify(*asked)
+        _, drawn = identify(*asked, "--figures", folder / "drawn")
+        assert Path(drawn["figures"]) == folder / "drawn/errors.svg"
+        assert (folder / "drawn/errors.svg").read_text().startswith("<svg")
+        assert drawn | {"figures": None} == plain
+
     def test_the_same_seed_gives_the_same_document(self, data: Path, identify) -> None:
         once, again = (identify("--data", data, "--seed", 5)[1] for _ in range(2))
         assert once == again

@@ -44,4 +44,5 @@ def test_a_tutorial_runs_as_typed_and_shows_what_comes(
             assert " ".join(line.split()) in lines, (line, printed)
     if section == "A robot's model":
         assert "<svg" in Path("out/ur10/joints.svg").read_text()
+        assert "<svg" in Path("out/ur10/errors.svg").read_text()
         assert "<robot" in Path("out/ur10/ur10.urdf").read_text()

@@ -301,6 +301,19 @@ def test_where_the_model_is_not_covered_is_told(bent):
     assert judged.measured[:, 1] == pytest.approx(data.q.max(axis=0))
 
 
+def test_a_gap_within_the_measured_angles_is_told(bent):
+    robot, data, *_ = bent
+    low, high = np.radians([-60.0, -10.0])
+    data = data.take((data.q[:, 0] < low) | (data.q[:, 0] > high))
+    known = identify_full(robot.nominal, data).known
+    ((begin, end),) = known.gaps(0)
+    assert low < begin < end < high
+    q = np.tile(data.q[0], (1000, 1))
+    q[:, 0] = np.linspace(data.q[:, 0].min(), data.q[:, 0].max(), 1000)
+    assert np.array_equal(known.uncovered(q)[:, 0], (q[:, 0] > begin) & (q[:, 0] < end))
+    assert all(len(known.gaps(joint)) == 0 for joint in range(1, 6))
+
+
 def evidence_of(robot, seed=0):
     """A small linear problem of two joints."""
     rng = np.random.default_rng(seed)

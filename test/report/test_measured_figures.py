@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from tool_runs import run_tables
 
-from robocal_ros.report.measured_figures import result_figure
+from robocal_ros.report.figures import svg
+from robocal_ros.report.measured_figures import CELLS, errors_figure, result_figure
 
 DRAWS = 20_000
 # Of a share of 0.95 in so many draws: five standard deviations.
@@ -52,6 +53,28 @@ def test_each_sample_has_its_residuals_above_its_name():
     assert [label.get_text() for label in axes.get_xticklabels()] == ["low", "high"]
     drawn = [line.get_xydata().tolist() for line in axes.lines[:2]]
     assert drawn == [[[0, 0.01], [0, -0.02]], [[1, 0.03]]]
+
+
+def test_each_cell_of_the_workspace_has_the_mean_error_of_its_poses():
+    place = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 3))
+    before = 1e-3 * (2.0 + place[:, 0])  # known wherever a cell is
+    figure = errors_figure(place, {"before": before, "after": 0.1 * before})
+    views = [axes.collections[0] for axes in figure.axes[:4]]
+    above = views[0]
+    x_mm = above.get_offsets()[:, 0]
+    width_mm = 2000.0 / CELLS
+    assert len(x_mm) > 0.8 * CELLS**2 / np.sqrt(3.0)  # cells in the square, nearly all with poses
+    assert np.all(np.abs(above.get_array() - 2.0 - 1e-3 * x_mm) < 1e-3 * width_mm)
+    for one, tenth in zip(views[:2], views[2:], strict=True):
+        np.testing.assert_allclose(tenth.get_array(), 0.1 * one.get_array(), rtol=1e-12)
+        assert tenth.norm is one.norm  # one scale of colours
+    assert "before: mean 2.0" in figure.axes[0].get_title(loc="left")
+
+
+def test_errors_of_one_pose_and_of_exact_data_are_drawn():
+    for errors in (np.array([1e-4]), np.zeros(5)):
+        figure = errors_figure(np.ones((len(errors), 3)), {"a": errors, "b": errors})
+        assert svg(figure).startswith("<svg")
 
 
 def test_a_run_draws_its_figure_where_it_is_asked_to(tmp_path, monkeypatch):
