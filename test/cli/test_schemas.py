@@ -424,7 +424,7 @@ def test_every_command_and_schema_has_a_case() -> None:
 def placed(folder: Path, arguments: list[str]) -> list[str]:
     """Names of files, and of folders after an option for one, become paths in the folder."""
     files = (".csv", ".mcap", ".conf", ".yaml", ".urdf", ".dat", ".urp")
-    folders = ("--state", "--report", "--profiles", "--sphere", "--step", "--line")
+    folders = ("--state", "--report", "--figures", "--profiles", "--sphere", "--step", "--line")
     return [
         str(folder / word) if word.endswith(files) or before in folders else word
         for before, word in zip(["", *arguments], arguments, strict=False)
