@@ -393,13 +393,16 @@ class ReplayedSensorDocument(TypedDict):
     verdict: VerdictDocument
 
 
-@rules(additionalProperties=True)
-class FinalSensorDocument(TypedDict):
-    parent: str
-    child: str
+class FinalFrameDocument(TypedDict):
     xyz_mm: Three
     quat_xyzw: Four
     revision: int
+
+
+@rules(additionalProperties=True)
+class FinalSensorDocument(FinalFrameDocument):
+    parent: str
+    child: str
 
 
 @printed("replay.hand_eye", "robocal replay --json, of the bag of a hand-eye node", "beside")
@@ -423,10 +426,7 @@ class ReplayedFixtureDocument(TypedDict):
 
 
 @rules(additionalProperties=True)
-class FinalFixtureDocument(TypedDict):
-    xyz_mm: Three
-    quat_xyzw: Four
-    revision: int
+class FinalFixtureDocument(FinalFrameDocument):
     name: str
 
 
