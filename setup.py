@@ -47,7 +47,8 @@ NEEDED = [
 CLUSTER = ("dask", "distributed")  # for `robocal validate --scheduler`; versions are dates
 
 DEMO_NEEDS = (
-    "__init__", "cell_samples", "demo", "measured_runs", "processes", "startup", "tables",
+    "__init__", "cell_samples", "demo", "measured_fixture", "measured_runs", "processes", "startup",
+    "tables",
     "closed_loop.__init__", "closed_loop.carrying", "closed_loop.plant", "closed_loop.setting",
     "closed_loop.suite", "closed_loop.words",
     "live.__init__", "live.cell", "live.graph", "live.lines", "live.opc_ua", "live.plc",
