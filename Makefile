@@ -45,7 +45,7 @@ demo: setup  ## a simulated cell in closed loop through the live nodes, report i
 HURRIES := $(shell [ "$$(nice -n -10 nice 2>/dev/null)" -lt 0 ] && echo nice -n -10)
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 PYTEST := $(ROS) python -m pytest -p no:cacheprovider
-AGAIN := --rerun-except '^JumpError: ' -rR
+AGAIN := --rerun-except '^JumpError: ' -rfER
 test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
@@ -58,7 +58,7 @@ test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
-	[[ $$failed -eq 0 ]] || sed -n '/short test summary/,$$p' out/test_cells.txt out/test_nodes.txt
+	[[ $$failed -eq 0 ]] || sed -n '/ test summary info/,$$p' out/test_cells.txt out/test_nodes.txt
 	exit $$failed
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries

@@ -34,6 +34,7 @@ ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another
 from domains import free_domain  # noqa: E402
 from forked import ForkedScript  # noqa: E402
+from jumps import JumpError  # noqa: E402
 from trajectory_controllers import missing_packages  # noqa: E402
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
@@ -52,6 +53,8 @@ ENDS_WITHIN_S = 10.0
 DISCOVERY_S = 0.25
 GONE_WITHIN_S = 0.25  # of another one
 LEAVES_WITHIN_S = 3.0
+TRIES = 4
+LATE_S = 0.03  # half of what stops begin ahead of now
 
 
 # All nodes of a cell at once, which take more than a core: first, so that xdist gives them to one
@@ -76,6 +79,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if isinstance(item, pytest.Function) and hasattr(item.module, "given"):
                 item.add_marker(pytest.mark.flaky(reruns=0))
     items.sort(key=lambda item: item.path.stem not in WHOLE_CELLS)
+
+
+def starved_s(pid: int | str) -> float:
+    """For how long a process's main thread was to run and had no core (kernel: sched-stats.rst)."""
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) * 1e-9
 
 
 class Executable:
@@ -113,10 +121,7 @@ class Executable:
 
         What it did itself meanwhile, a stall of its own, does not count.
         """
-        told = Path(
-            f"/proc/{self.process.pid}/schedstat"
-        ).read_text()  # sched-stats.rst of the kernel
-        return int(told.split()[1]) * 1e-9
+        return starved_s(self.process.pid)
 
     def kill(self) -> None:
         """End it as a power cut would."""
@@ -229,8 +234,25 @@ class Graph:
 
     @property
     def starved_s(self) -> float:
-        """Of all executables together."""
-        return sum(one.starved_s for one in self._executables if one.process.poll() is None)
+        """Of all executables together, and of this process, which plays what is not there."""
+        running = [one for one in self._executables if one.process.poll() is None]
+        return starved_s("self") + sum(one.starved_s for one in running)
+
+    def undisturbed(self, trial: Callable[[], None]) -> None:
+        """Try anew what jumped while a process waited for a core: once heard late, any plan jumps.
+
+        What jumps while none did is a fault.
+        """
+        for _ in range(TRIES):
+            before_s = self.starved_s
+            try:
+                return trial()
+            except JumpError as error:
+                waited_s = self.starved_s - before_s
+                if waited_s < LATE_S:
+                    raise
+                jumped = error
+        raise AssertionError(f"each of {TRIES} tries, in the last {waited_s:.3f} s") from jumped
 
     def spin_until(
         self, condition: Callable[[], object], what: str = "", within_s: float = DEADLINE_S

@@ -5,6 +5,7 @@ Simulated or real; the real one is looked for in the environment, without it tho
 skipped.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,37 +112,41 @@ def on(line: type[Program], *velocities: bool) -> pytest.MarkDecorator:
 
 @on(Program, False, True)
 def test_a_trajectory_without_points_is_a_stop_on_the_way(program):
-    for _ in range(3):  # a busy computer may hide the controller's state: then it is not stamped
-        speed, end = program.drives()
-        began_s = program.controller.now_s
-        planned = program.says()
-        stood = program.controller.stands()
-        if stamp_s := seconds(planned.header.stamp):
-            break
-    assert stamp_s > 0.0
-    assert stood == pytest.approx(planned.points[-1].positions, abs=1e-6)
-    assert np.abs(stood - end)[0] > SPEED[0]
-    at_s, found = program.controller.speeds(began_s - 0.05)
-    found = found * np.sign(speed)
-    no_jump(found > -1e-3, "nothing goes back")
-    no_jump(found < 1.05 * np.abs(speed) + 1e-3, "no faster than the program")
-    harder = np.diff(found, axis=0) / np.diff(at_s)[:, None]
-    no_jump(np.abs(harder) < 2.5 * np.abs(speed) / SLOWS_S, "as the joints may")
+    def stops() -> None:
+        for _ in range(3):  # a busy computer may hide the state: then it is not stamped
+            speed, end = program.drives()
+            began_s = program.controller.now_s
+            planned = program.says()
+            stood = program.controller.stands()
+            if stamp_s := seconds(planned.header.stamp):
+                break
+        assert stamp_s > 0.0
+        assert stood == pytest.approx(planned.points[-1].positions, abs=1e-6)
+        assert np.abs(stood - end)[0] > SPEED[0]
+        at_s, found = program.controller.speeds(began_s - 0.05)
+        found = found * np.sign(speed)
+        no_jump(found > -1e-3, "nothing goes back")
+        no_jump(found < 1.05 * np.abs(speed) + 1e-3, "no faster than the program")
+        harder = np.diff(found, axis=0) / np.diff(at_s)[:, None]
+        no_jump(np.abs(harder) < 2.5 * np.abs(speed) / SLOWS_S, "as the joints may")
+
+    program.graph.undisturbed(stops)
 
 
 @on(Lossy, False)
 def test_a_stop_that_is_lost_is_sent_again_in_time(program):
-    controller = program.controller
-    for lost in (1, 2):
+    graph, controller = program.graph, program.controller
+
+    def stops(lost: int) -> None:
         speed, _ = program.drives()
         program.lost, began_s = lost, controller.now_s
-        starved_s = controller.graph.starved_s
+        starved_s = graph.starved_s
         planned = program.says()
         planned_s = seconds(planned.points[-1].time_from_start)
         if stamp_s := seconds(planned.header.stamp):
             planned_s += stamp_s - began_s
         controller.stands()
-        starved_s = controller.graph.starved_s - starved_s
+        starved_s = graph.starved_s - starved_s
         assert program.lost == 0
         at_s, found = controller.speeds(began_s - 0.05)
         found = found * np.sign(speed)
@@ -149,29 +154,39 @@ def test_a_stop_that_is_lost_is_sent_again_in_time(program):
         stood_s = at_s[np.max(found, axis=1) > 1e-3][-1] - began_s
         assert stood_s < 1.5 * planned_s + starved_s
 
+    for lost in (1, 2):
+        graph.undisturbed(partial(stops, lost))
+
 
 @on(Program, False)
 def test_a_corrected_motion_follows_the_speed_scaling(program):
     controller = program.controller
-    speed, end = program.drives()
-    began_s = controller.now_s
-    for factor, for_s in ((0.5, 0.3), (0.1, 0.5), (0.0, amount(1.5, 10.0)), (0.2, 0.5)):
-        controller.scale(factor)
-        controller.graph.spin_for(for_s)
-    controller.scale(1.0)
-    assert controller.stands() == pytest.approx(end, abs=1e-6)
-    _, found = controller.speeds(began_s)
-    no_jump(found * np.sign(speed) > -1e-6, "nothing goes back")
-    assert program.status[-1].state == CorrectionStatus.ON
 
-    speed, end = program.drives()
-    controller.scale(0.5)
-    began_s = controller.now_s
-    program.says()
-    stands = controller.stands()
-    assert np.abs(stands - end)[0] > 0.5 * SPEED[0]
-    _, found = controller.speeds(began_s)
-    no_jump(found * np.sign(speed) > -0.05, "it hardly goes back")
+    def scaled() -> None:
+        speed, end = program.drives()
+        began_s = controller.now_s
+        for factor, for_s in ((0.5, 0.3), (0.1, 0.5), (0.0, amount(1.5, 10.0)), (0.2, 0.5)):
+            controller.scale(factor)
+            controller.graph.spin_for(for_s)
+        controller.scale(1.0)
+        assert controller.stands() == pytest.approx(end, abs=1e-6)
+        _, found = controller.speeds(began_s)
+        no_jump(found * np.sign(speed) > -1e-6, "nothing goes back")
+        assert program.status[-1].state == CorrectionStatus.ON
+
+    def stops() -> None:
+        controller.scale(1.0)
+        speed, end = program.drives()
+        controller.scale(0.5)
+        began_s = controller.now_s
+        program.says()
+        stands = controller.stands()
+        assert np.abs(stands - end)[0] > 0.5 * SPEED[0]
+        _, found = controller.speeds(began_s)
+        no_jump(found * np.sign(speed) > -0.05, "it hardly goes back")
+
+    program.graph.undisturbed(scaled)
+    program.graph.undisturbed(stops)
 
 
 @on(Program, False)
