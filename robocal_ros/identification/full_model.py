@@ -29,6 +29,7 @@ from robocal_ros.identification.known_model import (
     FREE,
     KnownModel,
     Rows,
+    centred,
     gravity_torque,
     identified_from,
     sparse,
@@ -500,17 +501,22 @@ class _Solved:
 
 
 def _known(problem: _FullProblem, at: _Solution, weight: Array, stretch: float) -> KnownModel:
-    """How well it is known, sigmas ``stretch`` times as large; the arm keeps why."""
+    """How well it is known, sigmas ``stretch`` times as large; the arm keeps why.
+
+    Functions are of mean zero where theta0 is free: else any constant could be in either.
+    """
     assert at.posterior is not None
     start, data, layout = problem.start, problem.data, problem.layout
-    functions, prior = at.cell.arm.functions, at.prior
+    prior, to_centred = at.prior, centred(layout, at.terms, at.cell.arm)
+    cell = problem.moved(at.cell, at.terms, to_centred @ problem.values(at.cell, at.terms))
+    functions = cell.arm.functions
     assert functions is not None
     given = np.ones(len(data)) if data.sigma is None else data.sigma
     scale = 1.0 if data.sigma is None else float(np.sqrt(np.mean(given**2)))
     noise = stretch * scale * prior.noise
     prior = FunctionPrior(prior.length, stretch * prior.amplitude, noise)
-    covariance, readings = stretch**2 * at.posterior.covariance, np.sort(data.q, axis=0)
-    known = KnownModel(layout, at.cell, at.terms, prior, covariance, readings)
+    covariance = stretch**2 * to_centred @ at.posterior.covariance @ to_centred.T
+    known = KnownModel(layout, cell, at.terms, prior, covariance, np.sort(data.q, axis=0))
     sigma = np.full(at.terms.before, FREE)
     if start.prior_covariance is not None:
         spread = np.sqrt(np.diag(start.prior_covariance))
@@ -520,11 +526,10 @@ def _known(problem: _FullProblem, at: _Solution, weight: Array, stretch: float) 
     told = identified_from(
         known,
         data.q,
-        data.target_index(at.cell.targets),
+        data.target_index(cell.targets),
         weight * (scale / given) ** 2,
         0.0 if data.rotation is None else problem.problem.lever_m,
         sigma,
     )
-    arm = at.cell.arm
-    arm = arm.with_model(arm.mdh, replace(functions, identified_from=told), arm.load)
-    return replace(known, cell=replace(at.cell, arm=arm))
+    arm = cell.arm.with_model(cell.arm.mdh, replace(functions, identified_from=told), cell.arm.load)
+    return replace(known, cell=replace(cell, arm=arm))

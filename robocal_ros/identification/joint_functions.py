@@ -118,6 +118,19 @@ class JointTerms:
         own = np.broadcast_to(self.before + np.arange(by_load.shape[2]), (m, by_load.shape[2]))
         return np.concatenate([by_load, J], axis=2), np.concatenate([own, column], axis=1)
 
+    def mean_weights(self, joint: int) -> Array:
+        """What each coefficient of a joint counts in its function's mean over the measured range.
+
+        The range ends at the first knot beyond the last reading.
+        """
+        begin, count = MARGIN + 3, int(self.count[joint])
+        end = count - MARGIN
+        integral = np.array([0.0, 1.0, 12.0, 23.0, 24.0]) / 24.0  # of a spline, up to its knots
+        upto_end, upto_begin = (
+            integral[np.clip(knot - np.arange(count), 0, 4)] for knot in (end, begin)
+        )
+        return np.asarray((upto_end - upto_begin) / (end - begin))
+
     def share_outside(self, q: Array) -> Array:
         """Share (m, n) of the splines at readings (m, n) that no table has."""
         cell, weight = _splines((q - self.first) / self.step)

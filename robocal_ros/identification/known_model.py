@@ -56,6 +56,23 @@ def with_turns(layout: UnknownLayout, arm: SerialArm) -> tuple[UnknownLayout, In
     return replace(layout, slots=slots, names=names), slots[range(arm.n), kinds]
 
 
+def centred(layout: UnknownLayout, terms: JointTerms, arm: SerialArm) -> Array:
+    """What (k, k) makes of all unknowns those that predict the same, with functions of mean zero.
+
+    Where theta0 (of a joint that slides d0) is free, a function's mean over the measured range is
+    the same as a shift of it: that is where it goes. Elsewhere, beyond the table, predictions move
+    with it: what is measured of the joint as a whole holds there, too.
+    """
+    T = np.eye(terms.size)
+    for joint in np.flatnonzero(terms.count):
+        place = layout.slots[joint, D if arm.prismatic[joint] else THETA]
+        if place >= 0:
+            block, mean = terms.block(int(joint)), terms.mean_weights(int(joint))
+            T[block, block] -= mean
+            T[place, block] = arm.sign[joint] * mean
+    return T
+
+
 def sparse_rows(
     layout: UnknownLayout, cell: CellModel, terms: JointTerms, q: Array, target: Index
 ) -> Rows:
@@ -261,5 +278,6 @@ def known_model(arm: SerialArm) -> KnownModel:
     fixed = np.diag(sigma[sigma < FREE])
     evidence = JointEvidence(terms, normal, unused, 0.0, 0.0, flat, fixed, 0.0)
     prior = FunctionPrior(told.length, told.amplitude, told.noise)
-    covariance = evidence.posterior(prior).covariance
+    to_centred = centred(layout, terms, arm)
+    covariance = to_centred @ evidence.posterior(prior).covariance @ to_centred.T
     return KnownModel(layout, cell, terms, prior, covariance, np.sort(q, axis=0))

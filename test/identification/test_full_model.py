@@ -80,6 +80,55 @@ def test_function_is_the_joints_error_within_its_band(bent):
     assert np.sqrt(np.mean(difference**2)) < 0.3 * robot.own_error(q)[:, 2].std()
 
 
+@pytest.mark.parametrize("method", ["map", "lsq"])
+def test_a_function_has_mean_zero_where_its_zero_is_free(method):
+    """A mean that goes into theta0 changes no prediction where joints were measured, nor its sigma.
+
+    What `lsq` holds stays as it is, function and zero.
+    """
+    robot = BentRobot(5)
+    data, check = robot.measured(robot.poses(250)), robot.measured(robot.poses(200), 0.0)
+    arm = replace(robot.nominal, load=None)
+    lower, upper = data.q.min(axis=0), data.q.max(axis=0)
+    check = check.take(np.all((check.q > lower) & (check.q < upper), axis=1))
+    solved, _ = full_model._solved(arm, data, ("base", "tool", "geometry"), method)
+    at, found = solved.at, solved.reported(1.0)
+    target = np.zeros(len(check), dtype=np.int64)
+    before = at.cell.predict(check.q, target)
+    assert found.cell.predict(check.q, target) == pytest.approx(before, abs=1e-12)
+    known = replace(found.known, cell=at.cell, covariance=at.posterior.covariance)
+    told = found.predicted_variance(check.q, target)
+    assert told == pytest.approx(known.predicted_variance(check.q, target), rel=1e-6, abs=1e-18)
+
+    functions, terms = found.cell.arm.functions, found.known.terms
+    free = np.array([f"theta{joint}_deg" in found.layout.names for joint in range(1, 7)])
+    assert free.tolist() == [method == "map", True, True, True, True, method == "map"]
+    measured = terms.count - 9  # three splines beyond either end
+    for joint in np.flatnonzero(terms.count):
+        step = terms.step[joint]
+        edges = lower[joint] + step * np.arange(measured[joint] + 1)
+        assert edges[-2] < upper[joint] <= edges[-1] + 1e-12
+        node, weight = np.polynomial.legendre.leggauss(4)
+        q = np.zeros((4 * measured[joint], 6))
+        q[:, joint] = (edges[:-1, None] + 0.5 * step * (1.0 + node)).ravel()
+        mean = np.tile(weight, measured[joint]) @ functions.delta(q)[:, joint] / 2.0
+        mean /= measured[joint]
+        was = at.cell.arm.functions
+        if free[joint]:
+            assert mean == pytest.approx(0.0, abs=1e-15)
+        else:
+            assert functions.coefficients[joint] == pytest.approx(was.coefficients[joint])
+
+
+def test_a_mean_that_moves_takes_the_torques_along(bent):
+    """Torques are of the arm as it stands: less than a micrometre, where noise is tens of them."""
+    robot, data, check, _ = bent
+    solved, _ = full_model._solved(robot.nominal, data, ("base", "tool", "geometry"), "map")
+    target = np.zeros(len(check), dtype=np.int64)
+    places = [cell.predict(check.q, target) for cell in (solved.at.cell, solved.reported(1.0).cell)]
+    assert places[1][:, :3, 3] == pytest.approx(places[0][:, :3, 3], abs=1e-6)
+
+
 def test_outside_of_what_was_measured_the_prior_is_left(bent):
     robot, _, _, found = bent
     far = robot.poses(200, UPPER + 0.5, UPPER + 0.9)
