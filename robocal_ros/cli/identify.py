@@ -357,15 +357,14 @@ def run_identify(args: argparse.Namespace) -> CliResult:
 
 def _drawn(folder: Path, judged: JudgedIdentification, before: str) -> str:
     """Draw errors over the workspace, and the joints' functions where there are any: their file."""
-    from robocal_ros.report.figures import joint_functions_figure
-    from robocal_ros.report.measured_figures import errors_figure, keep_figure
+    from robocal_ros.report.measured_figures import keep_figure, model_figures
 
-    result = judged.identification
+    result, path = judged.identification, ""
     errors = {before: judged.errors["in_force"], "identified model": judged.errors["calibrated"]}
-    figure = errors_figure(result.nominal.fk(judged.q)[:, :3, 3], errors)
-    path = keep_figure(folder, "errors", figure)
-    if isinstance(result, FullIdentification) and np.any(result.known.terms.count):
-        path = keep_figure(folder, "joints", joint_functions_figure(result.known))
+    known = result.known if isinstance(result, FullIdentification) else None
+    figures = model_figures(result.nominal.fk(judged.q)[:, :3, 3], errors, known)
+    for name, figure in figures.items():
+        path = keep_figure(folder, name, figure)
     return path
 
 

@@ -44,6 +44,8 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Action, Entry
+from robocal_ros.identification.judged import held_out_errors
+from robocal_ros.identification.known_model import known_model
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.report.figures import (
@@ -55,6 +57,7 @@ from robocal_ros.report.figures import (
     thermal_figures,
     tool_figures,
 )
+from robocal_ros.report.measured_figures import MODEL_CAPTIONS, model_figures
 from robocal_ros.report.page import figures_of
 from robocal_ros.session import events
 from robocal_ros.session.events import ACCEPT, Command, session_kind
@@ -235,7 +238,7 @@ class _SessionReplay:
                 made = calibrations(replayed, self._truth.transforms(HAND_EYE, namespace))
                 final = replayed["final_sensor"]
                 return common | {"kind": "hand_eye", "calibrations": made, "final": final}, []
-            document, figures = self._thermal(Path(folder), common["settings"]["sigma_m"])
+            document, figures = self._thermal(Path(folder), common["settings"])
             return common | document, figures
 
     def _robot(self, configured: Command | None) -> SerialArm:
@@ -248,16 +251,17 @@ class _SessionReplay:
         self._arm = find_robot(name, self._warnings, configured)
         return self._arm
 
-    def _thermal(self, folder: Path, sigma_m: float) -> tuple[Document, list[Drawn]]:
+    def _thermal(self, folder: Path, settings: Document) -> tuple[Document, list[Drawn]]:
         arm, serial = self._arm, Path(self._job.path).resolve().stem
         if arm is None:
             raise ValueError("replayed without a robot")
         with CalibrationHistory.open(serial, state_dir=folder, create=False) as history:
             made = ThermalHistory(history, arm, self._recording.start_ns)
             points = self._truth.check_points(self._namespace)
-            cycles = made.cycles(self._forecasts, points, float(sigma_m))
+            cycles = made.cycles(self._forecasts, points, float(settings["sigma_m"]))
+            models = made.model_figures(settings["hold_out"], settings["seed"], self._mark)
         document = thermal_document(cycles, arm)
-        figures = thermal_figures(document["cycles"], shift_errors(cycles), self._mark)
+        figures = thermal_figures(document["cycles"], shift_errors(cycles), self._mark) + models
         return {"kind": "thermal", **document}, figures
 
     def _common(self, replayed: Document) -> Document:
@@ -464,6 +468,25 @@ class ThermalHistory:
             self._cycle(entry, after, forecasts, truth, sigma_m)
             for entry, after in zip(self._candidates, following, strict=True)
         ]
+
+    def model_figures(self, share: float, seed: int, mark: str) -> list[Drawn]:
+        """Of each full model that was identified: errors before and after, and its joints."""
+        found = []
+        for entry in self._candidates:
+            model, document = self._history.model(entry.id), self._history.document(entry.id)
+            if document.get("model") != "full":
+                continue
+            arm, before = arm_of(model, self._nominal), self._model(entry.based_on)
+            data = Measurements.of_arrays(self._history.inputs(entry.id))
+            q, *errors = held_out_errors(document, before, arm, data, share=share, seed=seed)
+            names = "in force before", "identified model"
+            figures = model_figures(
+                self._nominal.fk(q)[:, :3, 3],
+                dict(zip(names, errors, strict=True)),
+                known_model(arm),
+            )
+            found += [Drawn.of(n, MODEL_CAPTIONS[n] + mark, f) for n, f in figures.items()]
+        return found
 
     def _cycle(
         self,

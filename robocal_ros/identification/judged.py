@@ -27,7 +27,14 @@ from robocal_ros.estimation.assessment import (
     verdict_document,
 )
 from robocal_ros.ground.errors import Code, InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.ground.frames import Array, Document, invert, log_rotation, transform_document
+from robocal_ros.ground.frames import (
+    Array,
+    Document,
+    invert,
+    log_rotation,
+    transform_document,
+    transform_from_quat,
+)
 from robocal_ros.ground.samples import DEFAULT_TARGET, Measurements
 from robocal_ros.identification.cell_model import (
     CellModel,
@@ -372,6 +379,32 @@ def identify_and_hold_out(
     require_match(arm, data, base=True, tool=True, hold=True)
     train, check = data.take(~held), data.take(held)
     return identify_and_judge(arm, train, check, method=method, model=model, in_force=in_force)
+
+
+def held_out_errors(
+    document: Document,
+    before: SerialArm,
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    share: float,
+    seed: int,
+) -> tuple[Array, Array, Array]:
+    """Readings (m, n) of the poses that judged an identification, errors (m,), m, before and after.
+
+    Found again from what is kept of `identify_and_hold_out`: its ``document``, the model in force
+    ``before`` it and its own, ``arm``, and ``data``, what it was identified and judged by.
+    """
+    held = hold_out(pose_groups(data.q), share, seed)
+    train, check = data.take(~held), data.take(held)
+    poses = document["T_flange_target"]
+    T_frame_base, *T_flange_target = (
+        transform_from_quat(np.array(pose["xyz_mm"]) * 1e-3, pose["quat_xyzw"])
+        for pose in (document["T_frame_base"], *poses.values())
+    )
+    cell = CellModel(arm, T_frame_base, tuple(poses), np.array(T_flange_target))
+    was = _check_error(_set_up(before, train, ("base", "tool")), check, ())
+    return check.q, was, _check_error(cell, check, ())
 
 
 def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:

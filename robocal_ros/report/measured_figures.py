@@ -13,12 +13,25 @@ from matplotlib.figure import Figure
 
 from robocal_ros.ground.files import write_text
 from robocal_ros.ground.frames import Array
-from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE, svg
+from robocal_ros.identification.known_model import KnownModel
+from robocal_ros.report.figures import (
+    AFTER,
+    BEFORE,
+    FAINT,
+    STYLE,
+    joint_functions_figure,
+    svg,
+)
 
 HOLDS_95 = 2.4477  # Mahalanobis distance within which 95 % of a plane's Gaussian lie
 MOST_NAMED = 40
 CELLS = 24  # across the workspace
 DECADES = 3.0  # of errors, in colour
+MODEL_CAPTIONS = {
+    "errors": "Errors at poses not used to solve, over the workspace, before and after",
+    "joints": "What each joint of the identified model turns besides what is read, with the band "
+    "of 95 %",
+}
 
 
 def keep_figure(folder: Path, name: str, figure: Figure) -> str:
@@ -122,3 +135,17 @@ def errors_figure(place: Array, errors: Mapping[str, Array]) -> Figure:
         words = "error at poses not used to solve, mm"
         figure.colorbar(cells, ax=panels, label=words, format="%.2g")
     return figure
+
+
+def model_figures(
+    place: Array, errors: Mapping[str, Array], known: KnownModel | None
+) -> dict[str, Figure]:
+    """Figures of an identified model by their names.
+
+    ``errors``: those of `errors_figure`. ``joints``: what each does besides what is read, where the
+    model has such functions, ``known`` as well as it says.
+    """
+    figures = {"errors": errors_figure(place, errors)}
+    if known is not None and np.any(known.terms.count):
+        figures["joints"] = joint_functions_figure(known)
+    return figures

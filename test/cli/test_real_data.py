@@ -14,6 +14,7 @@ import pytest
 from long_form import more
 
 from robocal_ros.cli.main import main
+from robocal_ros.report.measured_figures import MODEL_CAPTIONS
 
 pytestmark = pytest.mark.data
 
@@ -72,3 +73,14 @@ def test_a_model_holds_eight_months_later(campaigns, robocal) -> None:
     )  # fmt: skip
     assert document["verdict"]["accept"]
     assert document["calibrated"]["held_out"]["mean_mm"] <= CARRIED_OVER_MM
+
+
+def test_the_report_shows_what_the_joints_do_and_where_the_model_errs(
+    campaigns, tmp_path, capsys
+) -> None:
+    words = ["validate", str(campaigns / "D.mcap"), "--robot", "ur10", "--report", str(tmp_path)]
+    assert main([*words, "--jobs", "1", "--json"]) == 0
+    page = (tmp_path / "report.html").read_text()
+    for name, caption in MODEL_CAPTIONS.items():
+        assert (tmp_path / f"D-{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert page.count(f"<figcaption>{caption}</figcaption>") == 1

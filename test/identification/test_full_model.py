@@ -16,13 +16,24 @@ from robocal_ros.cell_sim.robot import Effects, Warmth
 from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import Measurements
-from robocal_ros.identification import full_model, identify, identify_and_judge, row_kernels
+from robocal_ros.identification import (
+    full_model,
+    identify,
+    identify_and_hold_out,
+    identify_and_judge,
+    row_kernels,
+)
 from robocal_ros.identification import known_model as model_knowledge
 from robocal_ros.identification.full_model import FullIdentification, identify_full
 from robocal_ros.identification.joint_functions import (
     FunctionPrior,
     JointEvidence,
     JointTerms,
+)
+from robocal_ros.identification.judged import (
+    held_out_errors,
+    identification_document,
+    identified_model_document,
 )
 from robocal_ros.identification.known_model import gravity_torque, known_model
 from robocal_ros.kinematics.arm import arm_of, model_document
@@ -348,6 +359,20 @@ def test_where_the_model_is_not_covered_is_told(bent):
     beyond = np.mean(check.q[:, 0] > data.q[:, 0].max())
     assert judged.check_outside == pytest.approx(beyond, abs=0.02)
     assert judged.measured[:, 1] == pytest.approx(data.q.max(axis=0))
+
+
+def test_errors_are_found_again_from_what_is_kept(bent):
+    """Of those that judged it, to the bit but for the JSON's millimetres and quaternions."""
+    robot, data, _, _ = bent
+    judged = identify_and_hold_out(robot.nominal, data, share=0.3, seed=4, model="full")
+    kept = json.loads(json.dumps(identification_document(judged)))
+    model = json.loads(json.dumps(identified_model_document(judged.identification)))
+    arm = arm_of(model, robot.nominal)
+    q, before, after = held_out_errors(kept, robot.nominal, arm, data, share=0.3, seed=4)
+    assert np.array_equal(q, judged.q)
+    assert before == pytest.approx(judged.errors["in_force"], abs=1e-12)
+    assert after == pytest.approx(judged.errors["calibrated"], abs=1e-12)
+    assert not np.allclose(after, before, atol=1e-5)
 
 
 def test_a_gap_within_the_measured_angles_is_told(bent):
