@@ -114,3 +114,18 @@ def test_a_sentence_has_the_range_of_the_closed_forms(page, words):
     least, most = re.search(words, (DOCS / page).read_text()).groups()
     assert shown(least, [min(found)])
     assert shown(most, [max(found)])
+
+
+def test_sentences_of_a_mount_by_a_robot_with_gears_have_the_kept_figures():
+    """Of the whole mount by the root of its squares over covariance; of the field by rms."""
+    _, rows = figures("hand_eye", "hand_eye_effects")
+    kept = {row[1]: row for row in rows if "gears" in row[0]}
+    field = [f"{kept[target][4]:.2f}" for target in ("edge", "sphere", "stairs")]
+    whole = f"{kept['edge'][5] ** 0.5:.1f}"
+    told = " ".join((DOCS / "accuracy.md").read_text().split())
+    words = r"error \(rms\) is ([\d.]+) .*?, the sphere's ([\d.]+), the stairs' ([\d.]+) \("
+    assert list(re.search(words, told).groups()) == field
+    assert re.search(r"1\.2 to ([\d.]+) \(unknown edge\)", told)[1] == whole
+    there = " ".join((DOCS / "simulation.md").read_text().split())
+    words = r"edge is at ([\d.]+) sigmas of .*? alone at ([\d.]+) of the error"
+    assert re.search(words, there).groups() == (whole, field[0])
