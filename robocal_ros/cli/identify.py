@@ -37,6 +37,7 @@ from robocal_ros.identification import JudgedIdentification, identify_and_judge
 from robocal_ros.identification.full_model import FullIdentification
 from robocal_ros.identification.judged import (
     CYCLES,
+    NO_LOAD,
     contradicted,
     explain_mismatch,
     identification_document,
@@ -316,6 +317,8 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         with model_history(args, robot.arm, create=True) as history:
             head = head_without_reference(history)
         in_force = None if head.model is None else arm_of(head.model, robot.arm)
+    if args.model == "full" and "geometry" in args.fit and robot.arm.load is None:
+        warnings.append(f"{robot.path}: {NO_LOAD} (--model geometric looks for none)")
     judged, data, document = _identified(robot.arm, args, warnings, in_force)
     verdict = judged.verdict
     document["output"] = None

@@ -189,6 +189,10 @@ CONTRADICTED = 2.0  # residuals over their sigmas: no choice of weights explains
 LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
 
 
+NO_LOAD = (
+    "the robot file has no load, so what gravity winds the joints by was not looked for: on heavy "
+    "robots that is most of the error; add the masses and centres of the links, and the payload"
+)
 Model = Literal["full", "geometric"]
 
 
@@ -269,8 +273,9 @@ def identify_and_judge(
         doubt = too_narrow(workspace_m, change_m, summarise(before[sound]).rms_m, SPREAD_POSES)
     inside = ~np.any(away, axis=1)
     verdict = _decided(result, fit, before, after, pose_groups(check.q), doubt, sound, inside)
-    if isinstance(result, FullIdentification) and (elsewhere := _not_covered(arm, away)):
-        verdict = replace(verdict, reason=f"{verdict.reason}; {elsewhere}")
+    elsewhere = _not_covered(arm, away) if isinstance(result, FullIdentification) else ""
+    no_load = NO_LOAD if model == "full" and "geometry" in fit and arm.load is None else ""
+    verdict = replace(verdict, reason="; ".join(filter(None, (verdict.reason, elsewhere, no_load))))
     errors = {"nominal": plain, "in_force": before, "calibrated": after}
     return JudgedIdentification(
         identification=result,

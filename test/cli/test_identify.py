@@ -249,8 +249,11 @@ class TestAnswer:
         q[3, 1] = 0.1
         path = table(folder / "beyond.csv", measured(60, q=q))
         _, document = identify("--data", path)
-        (words,) = document["warnings"]
-        assert "joint 2 (joint_a2): 1 of 60 readings beyond -140" in words
+        load, limits = document["warnings"]
+        assert "joint 2 (joint_a2): 1 of 60 readings beyond -140" in limits
+        assert "the robot file has no load" in load
+        _, document = identify("--data", path, "--model", "geometric")
+        assert document["warnings"] == [limits]
 
 
 class TestPlan:

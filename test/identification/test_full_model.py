@@ -31,6 +31,7 @@ from robocal_ros.identification.joint_functions import (
     JointTerms,
 )
 from robocal_ros.identification.judged import (
+    NO_LOAD,
     held_out_errors,
     identification_document,
     identified_model_document,
@@ -252,6 +253,26 @@ def test_each_term_is_there_where_a_heavy_robot_has_it(gears, sag):
         bends = known.cell.arm.functions.compliance > 0.0
         assert bends.tolist() == [False, sag, sag, sag, sag, False]
     assert wrong <= binom.ppf(0.999, draws, 0.05)
+
+
+def test_of_a_heavy_robot_without_masses_it_is_told_what_is_missing():
+    """A KR 150 with 120 kg that sags: with its masses the error falls to a fraction."""
+    rng = np.random.default_rng(44)
+    nominal, load = load_robot("kr150_r3100"), ArmLoad(kr150.BODY.mass, kr150.BODY.centre)
+    effects = replace(Effects.none(), static=True, noise=True, compliance=True)
+    robot = kr150.true_robot(nominal, rng, effects)
+    q = rng.uniform(nominal.lower, nominal.upper, (240, 6))
+    position = robot.point(q, Warmth.cold(6), TIP, rng) + 5e-5 * rng.normal(size=(240, 3))
+    data = Measurements(q, position, ("p",) * 240, tuple(map(str, range(240))))
+    unknown, known = (
+        identify_and_hold_out(arm, data, share=0.5, seed=0, model="full")
+        for arm in (nominal, replace(nominal, load=load))
+    )
+    assert unknown.verdict.reason.endswith(NO_LOAD)
+    assert NO_LOAD not in known.verdict.reason
+    assert known.candidate.mean_m < 0.1 * unknown.candidate.mean_m
+    plain = identify_and_hold_out(nominal, data, share=0.5, seed=0)
+    assert NO_LOAD not in plain.verdict.reason
 
 
 def test_gross_rows_cost_no_more_than_their_number():
