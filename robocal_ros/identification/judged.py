@@ -273,9 +273,8 @@ def identify_and_judge(
         doubt = too_narrow(workspace_m, change_m, summarise(before[sound]).rms_m, SPREAD_POSES)
     inside = ~np.any(away, axis=1)
     verdict = _decided(result, fit, before, after, pose_groups(check.q), doubt, sound, inside)
-    elsewhere = _not_covered(arm, away) if isinstance(result, FullIdentification) else ""
-    no_load = NO_LOAD if model == "full" and "geometry" in fit and arm.load is None else ""
-    verdict = replace(verdict, reason="; ".join(filter(None, (verdict.reason, elsewhere, no_load))))
+    missing = model == "full" and "geometry" in fit and arm.load is None
+    verdict = _explained(verdict, _not_covered(result, away), NO_LOAD if missing else "")
     errors = {"nominal": plain, "in_force": before, "calibrated": after}
     return JudgedIdentification(
         identification=result,
@@ -320,13 +319,21 @@ def _decided(
     return verdict
 
 
-def _not_covered(arm: SerialArm, away: NDArray[np.bool_]) -> str:
-    """Say which check poses have joints (m, n) where they were not measured; empty for few."""
-    share = float(np.mean(np.any(away, axis=1)))
-    if share <= MOST_UNCOVERED:
+def _explained(verdict: Verdict, *more: str) -> Verdict:
+    """The verdict with what else there is to say of the model, where there is something."""
+    return replace(verdict, reason="; ".join(filter(None, (verdict.reason, *more))))
+
+
+def _not_covered(result: Identification, away: NDArray[np.bool_]) -> str:
+    """Say which check poses have joints (m, n) where they were not measured; empty for few.
+
+    And empty for a geometric model, which holds everywhere alike.
+    """
+    share, names = float(np.mean(np.any(away, axis=1))), result.nominal.joint_names
+    if share <= MOST_UNCOVERED or not isinstance(result, FullIdentification):
         return ""
     shares = np.mean(away, axis=0)
-    joints = [f"{arm.joint_names[i]} ({shares[i]:.0%})" for i in np.flatnonzero(shares)]
+    joints = [f"{names[i]} ({shares[i]:.0%})" for i in np.flatnonzero(shares)]
     return (
         f"{share:.0%} of the check poses are not covered, with joints where they were not "
         f"measured: {', '.join(joints)}; there the model is geometry and compliance alone: "
