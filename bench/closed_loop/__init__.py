@@ -7,6 +7,7 @@ carrying     what the maintenance asks of them
 words        what they tell each other
 plant        robot, PLC and suite on one clock: commissioning, gaps, production
 shift        the golden shift and shorter ones, and what came of them
+trials       many shifts on all cores; those that begin alike begin once
 judging      how accurate that was, against the same shift without the suite
 earlier      shifts at the pace of the cycles, and what they teach
 drift_bound  what the stated bound of the drift is made of

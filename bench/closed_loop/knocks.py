@@ -14,8 +14,9 @@ import numpy as np
 from bench.closed_loop.checks import SEEDS
 from bench.closed_loop.faults import AFTER, CLEAN, SWEEP, Trial
 from bench.closed_loop.judging import harm
-from bench.closed_loop.shift import run_shift
+from bench.closed_loop.shift import ShiftRecord
 from bench.closed_loop.tables import FAULTY_RMS_M, MM
+from bench.closed_loop.trials import run_all
 from bench.tables import Goal, Table
 from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.errors import Code
@@ -36,9 +37,8 @@ def trials(seeds: Sequence[int]) -> list[Trial]:
     return found
 
 
-def run(trial: Trial) -> Found:
-    """A short shift with the suite and without it."""
-    on, off = (run_shift(trial.plan, trial.seed, suite) for suite in (True, False))
+def found_in(trial: Trial, on: ShiftRecord, off: ShiftRecord) -> Found:
+    """Of a short shift with the suite and without it."""
     results = [gap.result for gap in on.gaps[CLEAN:] if gap.result is not None]
     codes = {r.tool_code for r in results} | {r.tool_found_code for r in results}
     codes |= {r.thermal_code for r in results}
@@ -47,8 +47,10 @@ def run(trial: Trial) -> Found:
 
 def tables() -> Sequence[Table]:
     """The worst of each fault, on all cores."""
+    tried = trials(SEEDS)
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(run, trials(SEEDS)))
+        of = run_all(pool, [(t.plan, t.seed, suite) for t in tried for suite in (True, False)])
+    found = [found_in(t, *(of[t.plan, t.seed, suite] for suite in (True, False))) for t in tried]
     table = Table(
         "closed_loop_knocks",
         f"Knocks of station, sensor and sphere, one of each kind in {len(SEEDS)} cells",

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Robot, PLC and suite on one clock: commissioning, gaps, production."""
 
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -310,3 +311,17 @@ def equipped(
         fixture = cell.plan.fixture is not None
         plant.suite = Suite(nominal, history, laser, plant.send, record, expected, fixture)
         yield plant, plant.suite
+
+
+@contextmanager
+def own_history(suite: Suite) -> Iterator[None]:
+    """In a forked process, the history having been closed before: go on with a copy of its file.
+
+    An SQLite connection must not be carried across a fork (sqlite.org/howtocorrupt.html, 2.6).
+    """
+    history = suite.history
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(history.path, folder)
+        with CalibrationHistory.open(setting.SERIAL, state_dir=Path(folder)) as own:
+            vars(history).update(path=own.path, _file=vars(own)["_file"])
+            yield

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shifts of the cell, with and without its suite, and what came of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -147,49 +148,79 @@ def run_shift(
     watch: Watch = lambda plant: None,
 ) -> ShiftRecord:
     """A whole shift; ``watch`` is given the plant before its commissioning."""
+    with begun(plan, seed, suite, record, watch) as worker:
+        return worker.work()
+
+
+@contextmanager
+def begun(
+    plan: ShiftPlan,
+    seed: int,
+    suite: bool = True,
+    record: Record = unrecorded,
+    watch: Watch = lambda plant: None,
+) -> Iterator["Worker"]:
+    """A shift at its begin, as `run_shift`: with a suite the cell is commissioned."""
     nominal = load_robot(ROBOT)
     made = kr150_cell(nominal, seed, points=plan.points, fixture=plan.fixture)
     cell = SimulatedCell(made)
     if not suite:
         watch(plant := Plant(cell, None))
-        return Worker(plan, seed, plant).run()
+        yield Worker(plan, seed, plant)
+        return
     expected = taught(nominal, made.robot, seed) if plan.prior == "learned" else None
     with equipped(nominal, cell, record, expected) as (plant, sessions):
         watch(plant)
         plant.commission()
         sessions.enable()
-        return Worker(plan, seed, plant).run()
+        yield Worker(plan, seed, plant)
 
 
 class Worker:
     """Works through a shift."""
 
     def __init__(self, plan: ShiftPlan, seed: int, plant: Plant) -> None:
-        self._plan, self._plant = plan, plant
+        self._plan, self.plant = plan, plant
         self._record = ShiftRecord(plan, seed, refused=plant.refused)
         self._waiting = list(plan.incidents)
 
-    def run(self) -> ShiftRecord:
-        """The whole shift."""
-        plan, plant = self._plan, self._plant
+    def work(self, until_s: float = np.inf) -> ShiftRecord:
+        """The shift, or as many of its gaps, each with its production, as end by a time.
+
+        Called again it goes on from there.
+        """
+        plan, plant, record = self._plan, self.plant, self._record
+        if not np.isfinite(plant.begin_s):
+            self._begin()
+        ends_s = [*plan.begins_s[1:], plan.hours * HOUR_S]
+        for number in range(len(record.gaps) + 1, plan.cycles + 1):
+            if ends_s[number - 1] > until_s:
+                break
+            self._happens(self._now_s)
+            record.gaps.append(plant.gap(f"cycle-{number}", plan.gap_s))
+            self._produce(number, ends_s[number - 1])
+        motion = plant.cell.motion
+        record.drive_faults, record.peak_share = motion.faults, motion.peak_share
+        return record
+
+    def go_on_with(self, plan: ShiftPlan) -> None:
+        """Follow another plan from now on, which has been the same until now."""
+        self._plan = self._record.plan = plan
+        self._waiting = list(plan.incidents)
+
+    def _begin(self) -> None:
+        """What comes before the first gap."""
+        plan, plant = self._plan, self.plant
         worked_s = plant.now_s + plan.work_s
         while plant.now_s + PASS_S + REST_S < worked_s:
             plant.begin_pass()
             plant.work(plant.now_s + PASS_S + REST_S)
         plant.begin_s = plant.now_s
-        ends_s = [*plan.begins_s[1:], plan.hours * HOUR_S]
         plant.work(plant.begin_s + min(LISTEN_S, plan.first_s))  # the correction wants readings
         self._produce(0, plan.first_s)
-        for number, until_s in enumerate(ends_s, start=1):
-            self._happens(self._now_s)
-            self._record.gaps.append(plant.gap(f"cycle-{number}", plan.gap_s))
-            self._produce(number, until_s)
-        motion = plant.cell.motion
-        self._record.drive_faults, self._record.peak_share = motion.faults, motion.peak_share
-        return self._record
 
     def _produce(self, cycle: int, until_s: float) -> None:
-        plant = self._plant
+        plant = self.plant
         while self._now_s + PASS_S + REST_S < until_s and not self._pauses():
             error = self._pass()
             accuracy = None if plant.suite is None else plant.suite.accuracy()
@@ -198,7 +229,7 @@ class Worker:
 
     def _pass(self) -> Array | None:
         """Errors (k, 3) of a pass, each as things were when the robot arrived at its pose."""
-        plant, begin_s = self._plant, self._now_s
+        plant, begin_s = self.plant, self._now_s
         self._happens(begin_s)
         made = plant.begin_pass()
         end_s = begin_s + PASS_S + REST_S
@@ -216,7 +247,7 @@ class Worker:
 
     @property
     def _now_s(self) -> float:
-        return self._plant.now_s - self._plant.begin_s
+        return self.plant.now_s - self.plant.begin_s
 
     def _pauses(self) -> bool:
         return any(start <= self._now_s < end for start, end in self._plan.pauses)
@@ -224,4 +255,4 @@ class Worker:
     def _happens(self, now_s: float) -> None:
         while self._waiting and now_s >= self._waiting[0].at_s:
             incident = self._waiting.pop(0)
-            self._plant.cell.set_fault(incident.fault, incident.size)
+            self.plant.cell.set_fault(incident.fault, incident.size)

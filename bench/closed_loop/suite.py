@@ -92,6 +92,7 @@ class Suite:
 
     Attributes
     ----------
+    history : of all sessions.
     correction : None until the cold reference is there, with which the program was taught.
     """
 
@@ -106,6 +107,7 @@ class Suite:
         fixture: bool = False,
     ) -> None:
         self._nominal, self._send, self._record = nominal, send, record
+        self.history = history
         self._expected = expected
         config = replace(setting.THERMAL, prior="learned" if expected else "default")
         self.thermal = ThermalSession(nominal, history, config, __version__)

@@ -2,7 +2,7 @@
 """The tables of the closed loop."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -34,7 +34,8 @@ from bench.closed_loop.judging import (
     stated,
     within_at_worst,
 )
-from bench.closed_loop.shift import MIDWORK, ShiftPlan, ShiftRecord, run_shift
+from bench.closed_loop.shift import MIDWORK, ShiftRecord
+from bench.closed_loop.trials import Job, run_all
 from bench.tables import Goal, Table
 from robocal_ros.thermal.accuracy import AccuracyLevel
 
@@ -66,20 +67,7 @@ LONG = Amount(
     quiet=range(21, 33),
     trials=[*sweep(range(41, 51)), *unseen(range(41, 51))],
 )
-Job = tuple[ShiftPlan, int, bool]
 Pair = tuple[ShiftRecord, ShiftRecord]  # with and without the suite
-
-
-def _run(job: Job) -> ShiftRecord:
-    plan, seed, suite = job
-    return run_shift(plan, seed, suite)
-
-
-def _both(pool: ProcessPoolExecutor, jobs: Iterable[tuple[ShiftPlan, int]]) -> list[Pair]:
-    listed = list(jobs)
-    on = pool.map(_run, [(plan, seed, True) for plan, seed in listed])
-    off = pool.map(_run, [(plan, seed, False) for plan, seed in listed])
-    return list(zip(on, off, strict=True))
 
 
 def hours_table(pairs: Sequence[Pair]) -> Table:
@@ -243,12 +231,20 @@ def detection_table(reports: Sequence[Report]) -> Table:
 
 def tables(amount: Amount = SHORT) -> Sequence[Table]:
     """All of them, on all cores."""
+    trials = [(trial.plan, trial.seed) for trial in amount.trials]
+    golden_jobs = [(MIDWORK, seed) for seed in amount.golden]
+    quiet_jobs = [(QUIET, seed) for seed in amount.quiet]
+    jobs: list[Job] = [(LEARNED, seed, True) for seed in amount.quiet]
+    for plan, seed in (*trials, *golden_jobs, *quiet_jobs):
+        jobs += [(plan, seed, True), (plan, seed, False)]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         bound = pool.submit(drift_bound_table, ROBOTS)
-        golden = _both(pool, [(MIDWORK, seed) for seed in amount.golden])
-        quiet = _both(pool, [(QUIET, seed) for seed in amount.quiet])
-        learned = list(pool.map(_run, [(LEARNED, seed, True) for seed in amount.quiet]))
-        pairs = _both(pool, [(trial.plan, trial.seed) for trial in amount.trials])
+        of = run_all(pool, jobs)
+    golden, quiet, pairs = (
+        [(of[*job, True], of[*job, False]) for job in listed]
+        for listed in (golden_jobs, quiet_jobs, trials)
+    )
+    learned = [of[LEARNED, seed, True] for seed in amount.quiet]
     reports = [report_of(t, *pair) for t, pair in zip(amount.trials, pairs, strict=True)]
     learned_pairs = [(on, off) for on, (_, off) in zip(learned, quiet, strict=True)]
     found = [
