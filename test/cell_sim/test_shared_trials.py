@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trials that share their begin: each is as if run whole; one that fails, or is killed, is named."""
+"""Trials that share their begin: each is as if run whole; one that fails or is killed is named."""
 
 import os
 import pickle
