@@ -47,6 +47,7 @@ GROSS_WEIGHT = 1.0 / 3.0
 GAIN, MANY_POSES, CLEAR_GAIN, FEWEST_NUMBERS = 0.97, 100, 0.8, 1.25
 INNER, INNER_SQUARES = 0.99, 2.894  # mean of chi-square of 3 below its quantile of 0.99
 FOLDS = 5  # of few poses, each of which the others must foretell
+CHOSEN_ANEW = 200  # poses, up to which what is stated counts what was chosen for them, too
 SMALLEST_SHARE = 0.1  # of the noise that a real robot's geometry leaves: 0.15 to 0.2 are seen
 # A half of a logarithm for each number that is chosen (Wilks 1938): amplitude and length.
 GAINED_BY_CHANCE = 1.0
@@ -311,11 +312,11 @@ def identify_full(
     if full is None:
         return rival.start
     left_out, squared = full.left_out
-    many = len(data) > MANY_POSES
-    if left_out >= (GAIN if many else CLEAR_GAIN) * rival.geometric_left_out():
+    gain = GAIN if len(data) > MANY_POSES else CLEAR_GAIN
+    if left_out >= gain * rival.geometric_left_out():
         return rival.start
-    if not many:
-        foretold = _foretold(arm, data, fit, method)
+    if len(data) <= CHOSEN_ANEW:
+        foretold = _foretold(arm, data, fit, method, gain)
         if foretold is None:
             return rival.start
         squared = foretold
@@ -323,12 +324,12 @@ def identify_full(
 
 
 def _foretold(
-    arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method
+    arm: SerialArm, data: Measurements, fit: Collection[Part], method: Method, gain: float
 ) -> Array | None:
     """Squared errors (m,), over their covariances, of full models of the poses of other folds.
 
     What the evidence chooses from few poses is chosen for these, too: a pose is left out of that
-    as well. None where they do not foretell clearly better than geometric models.
+    as well. None where they do not foretell ``gain`` times as well as geometric models.
     """
     errors: list[list[Array]] = [[], []]
     squared = np.empty(len(data))
@@ -347,7 +348,7 @@ def _foretold(
         variance = chosen.predicted_variance(rest.q, rest.target_index(chosen.cell.targets))
         squared[left_out] = _squared(errors[0][-1], variance + noise[:, None, None] * np.eye(3))
     with_functions, without = (rival.rms(np.concatenate(own)) for own in errors)
-    return squared if with_functions < CLEAR_GAIN * without else None
+    return squared if with_functions < gain * without else None
 
 
 def _stretch(squared: Array, keep: Mask) -> float:
