@@ -60,8 +60,8 @@ def centred(layout: UnknownLayout, terms: JointTerms, arm: SerialArm) -> Array:
     """What (k, k) makes of all unknowns those that predict the same, with functions of mean zero.
 
     Where theta0 (of a joint that slides d0) is free, a function's mean over the measured range is
-    the same as a shift of it: that is where it goes. Elsewhere, beyond the table, predictions move
-    with it: what is measured of the joint as a whole holds there, too.
+    the same as a shift of it: that is where it goes. Beyond the table, where a function is zero,
+    predictions move with it, by less than is known of them there.
     """
     T = np.eye(terms.size)
     for joint in np.flatnonzero(terms.count):
