@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign import POINTS, ROBOT, postures, true_arm
-from command import ROOT, conforms
+from command import ROOT, beyond_rounding, conforms
 from recordings import (
     BETWEEN_S,
     EVENTS,
@@ -38,7 +38,6 @@ from recordings import (
 
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter, read_bag
-from robocal_ros.bags.replay import NOT_BITS
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validate import validated
 from robocal_ros.cli.validating import Job, require_finite
@@ -109,11 +108,6 @@ def judged(bags: Path) -> tuple[object, ...]:
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))
-
-
-def only_bits_differ(session: dict[str, Any]) -> bool:
-    """Of a kept bag: only on its maker's processor are results equal to the last bit."""
-    return all(NOT_BITS in words for words in session["differs"])
 
 
 class TestRecordedSession:
@@ -239,7 +233,7 @@ def test_tools_and_sensors(validate) -> None:
     tool, sensor = document["bags"]
     assert (tool["kind"], tool["runs"]) == ("tool", 5)
     for told in report["bags"]:
-        assert only_bits_differ(told["sessions"][0])
+        assert not beyond_rounding(told["sessions"][0])
     assert tool["largest_change_mm"] == pytest.approx(np.sqrt(3**2 + 2**2 + 1**2), abs=0.2)
     assert tool["largest_true_error_mm"] < 0.2
     assert sensor["kind"] == "hand_eye"
@@ -262,7 +256,7 @@ def test_a_bag_of_two_nodes(bags, validate, tmp_path) -> None:
     rows = {row["kind"]: row for row in document["bags"]}
     tool, thermal = report["bags"][0]["sessions"]
     assert thermal["differs"] == []
-    assert only_bits_differ(tool)
+    assert not beyond_rounding(tool)
     assert (rows["tool"]["runs"], rows["thermal"]["cycles"]) == (5, 2)
     assert {path.name for path in out.glob("*.png")} == {
         "both-tool.png", "both-cycles.png", "both-drift.png"

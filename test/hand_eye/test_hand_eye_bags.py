@@ -2,6 +2,7 @@
 """The golden hand-eye bags: what they hold, that their script makes them again, their truth."""
 
 import json
+import re
 import sys
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,7 @@ BAGS = Path(__file__).parents[2] / "bags"
 KINDS = ("sphere", "step", "line")
 UR10 = load_robot("ur10")
 FLANGE_M = 2e-3  # an arm whose lengths err by 0.1 mm and angles by 0.1 mrad, at a metre
+NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
 SPIKES = 0.02  # more of the points than are speckled (0.3 %), ragged or at ends
 
 
@@ -122,11 +124,19 @@ def test_the_session_finds_the_sensor(kind):
     assert np.linalg.norm((found - true)[:3, 3]) < FLANGE_M  # in the middle of the field
 
 
+def target_file(path: Path) -> tuple[str, list[float]]:
+    """Words and numbers of the target beside a bag: processors round these differently."""
+    text = path.with_suffix(".yaml").read_text()
+    return NUMBER.sub("#", text), [float(number) for number in NUMBER.findall(text)]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_script_makes_it_again(script, recordings, tmp_path, kind):
     again = tmp_path / "again.mcap"
     script.write_bag(recordings[kind], again)
-    assert again.with_suffix(".yaml").read_text() == bag(kind).with_suffix(".yaml").read_text()
+    (words, numbers), (kept_words, kept_numbers) = map(target_file, (again, bag(kind)))
+    assert words == kept_words
+    assert numbers == pytest.approx(kept_numbers, rel=1e-14, abs=1e-12)
     made, kept = list(read_bag(again)), read(bag(kind))
     assert [m[:3] for m in made] == [m[:3] for m in kept]
     for one, two in zip(kept, made, strict=True):

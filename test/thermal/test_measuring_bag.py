@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import robocal_json
+from command import beyond_rounding, robocal_json
 
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.bags.replay import read_events
@@ -77,7 +77,7 @@ def test_corrected_points_stay_where_the_part_stands(placed):
 
 def test_replay_gives_the_recorded_session_again(tmp_path):
     document = robocal_json("replay.json", "replay", str(BAG), "--state", str(tmp_path))
-    assert (document["recorded"], document["differs"]) == (True, [])
+    assert (document["recorded"], beyond_rounding(document)) == (True, [])
     assert len(document["candidates"]) == 4
 
 

@@ -8,11 +8,14 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from forked import become, forks
 from jsonschema import Draft202012Validator
+
+from robocal_ros.bags.replay import NOT_BITS
 
 ROOT = Path(__file__).parents[2]
 SCHEMAS = {path.name: json.loads(path.read_text()) for path in (ROOT / "docs/schemas").glob("*")}
@@ -110,3 +113,8 @@ def takes(command: str) -> None:
         assert isinstance(parser.parse_args(arguments), argparse.Namespace)
     else:
         assert words[:3] in (["ros2", "launch", "robocal_ros"], ["ros2", "run", "robocal_ros"])
+
+
+def beyond_rounding(replayed: Mapping[str, Any]) -> list[str]:
+    """What of a kept bag's replay differs by more than how its maker's processor rounds."""
+    return [words for words in replayed["differs"] if NOT_BITS not in words]
