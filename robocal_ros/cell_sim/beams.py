@@ -37,11 +37,13 @@ class RoundTool:
     ``T_flange_tool`` (4, 4): its tip, and its axis from flange to tip along z.
     ``height``, ``radius``: (k,) of spheres above the tip, m; the tool is the hull of each two in
     turn. The lowest one touches the tip: its height is its radius.
+    ``mandrel``: another one on the same flange, which breaks the beams as the tool does.
     """
 
     T_flange_tool: Array
     height: Array
     radius: Array
+    mandrel: "RoundTool | None" = None
 
     def __post_init__(self) -> None:
         if self.height[0] != self.radius[0]:
@@ -68,8 +70,13 @@ class RoundTool:
         return cls(T_flange_tool, height, np.array([wire, wire, nozzle, nozzle]))
 
     def mounted(self, T_flange_tool: Array) -> "RoundTool":
-        """The same tool, bent or shifted."""
-        return RoundTool(T_flange_tool, self.height, self.radius)
+        """The same tool, bent or shifted; the mandrel stays where it is."""
+        return replace(self, T_flange_tool=T_flange_tool)
+
+    @property
+    def bodies(self) -> tuple["RoundTool", ...]:
+        """The tool, and the mandrel where there is one."""
+        return (self,) if self.mandrel is None else (self, self.mandrel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +97,15 @@ class TrueBeam:
 
     def clearance(self, tool: RoundTool, T_base_flange: Array) -> Array:
         """Distance (m,) of the tool's surface from the beam's middle, negative inside."""
-        T = T_base_flange @ tool.T_flange_tool
-        centres = T[:, None, :3, 3] - tool.height[None, :, None] * T[:, None, :3, 2]
-        outline = (centres - self.start) @ self._across.T
-        parts = [
-            _hull_distance(outline[:, i], outline[:, i + 1], tool.radius[i], tool.radius[i + 1])
-            for i in range(len(tool.height) - 1)
-        ]
+        parts = []
+        for body in tool.bodies:
+            T = T_base_flange @ body.T_flange_tool
+            centres = T[:, None, :3, 3] - body.height[None, :, None] * T[:, None, :3, 2]
+            outline = (centres - self.start) @ self._across.T
+            parts += [
+                _hull_distance(outline[:, i], outline[:, i + 1], body.radius[i], body.radius[i + 1])
+                for i in range(len(body.height) - 1)
+            ]
         return np.asarray(np.min(parts, axis=0))
 
     @cached_property
@@ -296,9 +305,12 @@ class BeamWatch:
         (m, 4, 4) at times (m,).
         """
         middle = np.array([0.5 * (beam.start + beam.end) for beam in station.beams])
-        tip = (self._arm.fk(q) @ tool.T_flange_tool[:, 3])[:, :3]
-        away = np.min(np.linalg.norm(tip[:, None] - middle, axis=2), axis=1)
-        near = np.flatnonzero(away < np.max(tool.height) + ROOM_M)
+        T_flange, may = self._arm.fk(q), np.zeros(len(q), dtype=np.bool_)
+        for body in tool.bodies:
+            tip = (T_flange @ body.T_flange_tool[:, 3])[:, :3]
+            away = np.min(np.linalg.norm(tip[:, None] - middle, axis=2), axis=1)
+            may |= away < np.max(body.height) + ROOM_M
+        near = np.flatnonzero(may)
         if not len(near) or near[-1] == near[0]:
             return []
         first, last = int(near[0]), int(near[-1])
@@ -332,11 +344,12 @@ def _may_cross(station: BeamStation, tool: RoundTool, T: Array) -> NDArray[np.bo
 
     No surface comes nearer to a beam than the tool moves.
     """
-    T_tool = T @ tool.T_flange_tool
-    ends = (
-        T_tool[:, None, :3, 3] - np.array([0.0, tool.height[-1]])[:, None] * T_tool[:, None, :3, 2]
-    )
-    way = np.max(np.linalg.norm(np.diff(ends, axis=0), axis=2), axis=1)
+    ways = []
+    for body in tool.bodies:
+        T_tool, top = T @ body.T_flange_tool, np.array([0.0, body.height[-1]])
+        ends = T_tool[:, None, :3, 3] - top[:, None] * T_tool[:, None, :3, 2]
+        ways.append(np.max(np.linalg.norm(np.diff(ends, axis=0), axis=2), axis=1))
+    way = np.max(ways, axis=0)
     may = np.zeros(len(way), dtype=np.bool_)
     for beam in station.beams:
         clear = beam.clearance(tool, T)

@@ -166,7 +166,9 @@ class Faults:
             T = mounted.T_flange_tool @ frames.transform(np.eye(3), [0.0, 0.0, longer])
             wider, height = THICKER * max(longer, 0.0), mounted.height + longer
             height[0] = mounted.height[0] + wider
-            mounted = RoundTool(T, height, mounted.radius + wider)
+            mounted = replace(
+                mounted, T_flange_tool=T, height=height, radius=mounted.radius + wider
+            )
         if "collision" in self:
             shift = self.size("collision") * BENT
             tilt = np.array([-shift[1], shift[0], 0.0]) / LEVER_M

@@ -38,10 +38,11 @@ from robocal_ros.ground.files import write_text
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_description, load_robot
+from robocal_ros.motion.driver import MANDREL
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.endpoints import WARN, Health
-from robocal_ros.ros.parameters import Setting, number
+from robocal_ros.ros.parameters import Setting, given_pose, number
 from robocal_ros.tool.run import PlannedStep
 
 MM, MS = 1e-3, 1e-3
@@ -184,6 +185,7 @@ SETTINGS = (
         check=_numbers(2),
         live=True,
     ),
+    *MANDREL,
     number("input_latency_ms", 4.0, "Constant delay of an edge's stamp", 0.0, 1000.0),
     number("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 0.0, 10.0),
     number("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 0.0, 100.0),
@@ -213,10 +215,15 @@ def straight_arm(name: str) -> SerialArm:
 
 
 def bent_tool(settings: Mapping[str, Any], plan: CellPlan) -> RoundTool:
-    """The tool as it is mounted."""
+    """The tool as it is mounted, and the mandrel, which is where its certificate says."""
     shift = np.array(settings["tool_bend_mm"]) * MM
     tilt = np.radians([*settings["tool_tilt_deg"], 0.0])
-    return plan.tool.mounted(bent(plan.arm.T_flange_tool, shift, tilt))
+    tool = plan.tool.mounted(bent(plan.arm.T_flange_tool, shift, tilt))
+    T_flange_mandrel = given_pose(settings, "mandrel")
+    if T_flange_mandrel is None:
+        return tool
+    length_m, radius_m = (settings[f"mandrel_{of}_mm"] * MM for of in ("length", "radius"))
+    return replace(tool, mandrel=RoundTool.cylinder(T_flange_mandrel, radius_m, length_m))
 
 
 def laser_pose(settings: Mapping[str, Any]) -> Array:

@@ -150,6 +150,9 @@ class CycleResult:
     # of the fixture's measurement, where it was judged, and its candidate; NONE where it was not
     fixture_code: Code = Code.NONE
     fixture_id: int = 0
+    # of the beams that were found again, the same
+    station_code: Code = Code.NONE
+    station_id: int = 0
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""
@@ -159,7 +162,8 @@ class CycleResult:
     def of_document(cls, document: Mapping[str, Any]) -> "CycleResult":
         """Read what `document` gave, also after JSON."""
         values = dict(document)
-        for name in ("code", "thermal_code", "tool_code", "tool_found_code", "fixture_code"):
+        codes = ("thermal_code", "tool_code", "tool_found_code", "fixture_code", "station_code")
+        for name in ("code", *codes):
             values[name] = Code(values.get(name, Code.NONE))
         for name in ("left", "accepted"):
             values[name] = tuple(values[name])

@@ -182,6 +182,9 @@ class ToolOutcome:
     fault: str = ""  # why an accepted tool that failed its check is still in force; empty: none is
     mandrel: str = ""  # what it said, but for a station that has moved
     station: str = ""  # where the beams were found, the same
+    # of that measurement, where it was judged, and what it is kept as
+    station_code: Code = Code.NONE
+    station_id: int = 0
     note: str = ""  # why not, or what a person must know
     left: str = ""  # what did not fit
 
@@ -385,6 +388,7 @@ class ToolPart:
         outcome, memory = self.outcome, self._memory
         if mode == LASER and (answer.has_result or answer.code in FAILED):
             memory.note_tool(laser_ns=self.wall_ns)  # what came of it; all else is tried again
+            outcome.station_code, outcome.station_id = answer.code, answer.candidate_id
         if mode in OF_STATION and answer.code is not Code.STATION_MOVED:
             if mode == WITNESS:
                 outcome.mandrel = f"mandrel: {answer.message}"
@@ -561,6 +565,8 @@ class CycleRun:
             tool_id=tool.candidate_id,
             tool_answer=tool.checked,
             accepted=self.result.accepted + accepted,
+            station_code=tool.station_code,
+            station_id=tool.station_id,
         )
         return self.result
 

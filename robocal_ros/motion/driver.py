@@ -229,6 +229,15 @@ def _of_joints(name: str, default: float, what: str) -> Setting:
     return number(name, [default], words, 1e-3, 1e4)
 
 
+MANDREL = (
+    *pose_settings(
+        "mandrel",
+        "End of the mandrel in the flange frame; as the quaternion at its default: there is none",
+        "Its orientation: z along its axis to its end",
+    ),
+    number("mandrel_length_mm", 100.0, "Length of the mandrel along its axis", 1.0, 2e3),
+    number("mandrel_radius_mm", 10.0, "Its radius", 0.5, 500.0),
+)
 MOTION = (
     _of_joints("joint_velocity_deg_s", 57.0, "Largest velocity"),
     _of_joints("joint_acceleration_deg_s2", 286.0, "Largest acceleration"),
@@ -249,13 +258,7 @@ MOTION = (
     number("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
     number("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
     number("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
-    *pose_settings(
-        "mandrel",
-        "End of the mandrel in the flange frame; as the quaternion at its default: there is none",
-        "Its orientation: z along its axis to its end",
-    ),
-    number("mandrel_length_mm", 100.0, "Length of the mandrel along its axis", 1.0, 2e3),
-    number("mandrel_radius_mm", 10.0, "Its radius", 0.5, 500.0),
+    *MANDREL,
     number("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
     number(
         "deviation_deg",

@@ -30,7 +30,7 @@ from robocal_ros.cli.main import (
 )
 from robocal_ros.cli.programs import model_history
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.history.history_records import LASER_FRAME
 from robocal_ros.programs.conventions import Load
@@ -57,7 +57,7 @@ from robocal_ros.tool.files import (
 from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
 from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
 from robocal_ros.tool.run import alike
-from robocal_ros.tool.station import measurement_of, station_shift, station_trend
+from robocal_ros.tool.station import StationTrend, measurement_of, station_shift
 from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
 
 if TYPE_CHECKING:
@@ -503,6 +503,10 @@ def run_station(args: argparse.Namespace) -> CliResult:
     shifts = [station_shift(first, found) for _, found in later]
     stamps = [entry.stamp_ns for entry, _ in later]
     last = measurement_of(kept[-1][1])
+    trend = StationTrend().after(kept[0][0].stamp_ns, station_shift(first, first))
+    for stamp, (entry, _), shift in zip(stamps, later, shifts, strict=True):
+        if entry.code is Code.ACCEPT:  # a knock is no drift
+            trend = trend.after(stamp, shift)
     document: StationDocument = {
         "robot": robot.arm.name,
         "model_hash": robot.arm.model_hash,
@@ -513,7 +517,7 @@ def run_station(args: argparse.Namespace) -> CliResult:
             {"stamp_ns": stamp, "calibration": entry.id, **shift.document()}
             for stamp, (entry, _), shift in zip(stamps, later, shifts, strict=True)
         ],
-        "trend": station_trend(stamps, shifts),
+        "trend": trend.document(),
         "output": None,
         "warnings": warnings,
     }

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.estimation.assessment import Verdict, verdict_document
+from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError
 from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import JOINTS, JointSample, joint_sample
@@ -80,9 +80,11 @@ from robocal_ros.tool.run import (
 )
 from robocal_ros.tool.station import (
     StationMeasurement,
+    StationTrend,
     measure_station,
     measurement_document,
     measurement_of,
+    result_document,
     station_shift,
     station_verdict,
 )
@@ -152,10 +154,21 @@ class ToolInForce(HistoryFollower):
     @property
     def commissioned_station(self) -> StationMeasurement | None:
         """The first measurement of the beams with this mandrel and laser file; None before it."""
+        model = self._station_model
+        return None if model is None else measurement_of(model["first"])
+
+    @property
+    def station_trend(self) -> StationTrend:
+        """How they drift since then; none before it, or of a version that did not follow it."""
+        known = (self._station_model or {}).get("trend")
+        return StationTrend() if known is None else StationTrend.of_model(known)
+
+    @property
+    def _station_model(self) -> dict[str, Any] | None:
         model = self.station.model
         if model is None or not alike(model["made_with"], self._made_with):
             return None
-        return measurement_of(model["first"]) if alike(model["mandrel"], self._mandrel) else None
+        return model if alike(model["mandrel"], self._mandrel) else None
 
     @property
     def _healthy_model(self) -> dict[str, Any] | None:
@@ -314,20 +327,16 @@ class ToolResults:
         )
         first = self._current.commissioned_station
         shift = station_shift(first or found, found)
-        verdict = station_verdict(found, None if first is None else shift, config.check.limit_m)
-        sigma_m = found.sigma_m if first is None else shift.sigma_m
-        document: Document = {
-            "answer": "pass" if verdict.accept else "recalibrate",
-            "change": {"tip_mm": 1e3 * shift.size_m, "axis_deg": np.degrees(shift.turned_rad)},
-            "sigma_mm": [1e3 * sigma_m],
-            "misfit_mm": 1e3 * found.misfit_m,
-            "station": shift.document(),
-            "cycle_id": run.cycle_id,
-            "verdict": verdict_document(verdict),
-        }
-        measured = measurement_document(found)
-        before = measured if first is None else measurement_document(first)
-        model = measured | {"mandrel": mandrel.tolist(), "first": before}
+        limit_m, trend = config.check.limit_m, self._current.station_trend
+        verdict = station_verdict(found, None if first is None else shift, limit_m)
+        if verdict.accept:  # a knock is no drift
+            trend = trend.after(command.stamp_ns or 0, shift)
+        if told := trend.words(limit_m):
+            verdict = replace(verdict, reason=f"{verdict.reason}; {told}")
+        document = result_document(found, shift, trend, verdict, commissioned=first is not None)
+        document["cycle_id"] = run.cycle_id
+        measured, before = measurement_document(found), measurement_document(first or found)
+        model = measured | {"mandrel": mandrel.tolist(), "first": before, "trend": trend.model()}
         kept = self._keep(LASER_FRAME, run, command, wall_ns, verdict, document, model)
         if verdict.accept:
             self._accept(kept, command, verdict, wall_ns)

@@ -9,12 +9,12 @@ alike: it is not in the sigma, and cancels in a change.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robocal_ros.estimation.assessment import Verdict
+from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.estimation.estimation import SOUND_FIT, chi2_quantile, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, ResidualError
@@ -262,27 +262,110 @@ def measurement_of(document: Document) -> StationMeasurement:
     return StationMeasurement(laser, C, document["misfit_m"])
 
 
-def station_trend(
-    stamp_ns: Sequence[int], shifts: Sequence[StationShift]
-) -> "StationTrendDocument":
-    """Straight line through the crossing's shifts: mm a day (3), and its sigma; none of one.
+@dataclass(frozen=True, eq=False)
+class StationTrend:
+    """Straight line through the crossing's shifts over time, in the station's axes at first.
 
-    Weighted by the covariance of each later measurement; what the first one is off by is in all
-    shifts alike: it moves the line, and is neither in its slope nor in the slope's sigma.
+    Weighted by each measurement's own covariance. What the first one is off by is in all shifts
+    alike: it moves the line, and is neither in its slope nor in the slope's sigma. Of a station
+    that drifts; one that was knocked is another one from then on.
+
+    ``from_ns``, ``to_ns``: stamps of the first and the last measurement, of ``count``.
+    ``information`` (6, 6), ``right`` (6,): normal equations of the line's height at ``from_ns``, m,
+    and of its slope, m a day.
     """
-    days = np.array([(stamp - stamp_ns[0]) / DAY_NS for stamp in stamp_ns])
-    if len(days) < 2 or float(np.ptp(days)) <= 0.0:
-        return {"per_day_mm": None, "sigma_mm": None, "days": 0.0}
-    information, right = np.zeros((6, 6)), np.zeros(6)
-    for day, one in zip(days, shifts, strict=True):
-        rows = np.concatenate([np.eye(3), day * np.eye(3)], axis=1)
+
+    from_ns: int = 0
+    to_ns: int = 0
+    count: int = 0
+    information: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    right: Array = field(default_factory=lambda: np.zeros(6))
+
+    def after(self, stamp_ns: int, one: StationShift) -> "StationTrend":
+        """With one measurement more; of the first one the shift is none."""
+        from_ns = self.from_ns if self.count else stamp_ns
+        rows = np.concatenate([np.eye(3), (stamp_ns - from_ns) / DAY_NS * np.eye(3)], axis=1)
         weight = np.linalg.inv(one.own[:3, :3])
-        information += rows.T @ weight @ rows
-        right += rows.T @ weight @ one.shift
-    C = np.linalg.inv(information)
-    slope = (C @ right)[3:]
+        return StationTrend(
+            from_ns,
+            max(self.to_ns, stamp_ns),
+            self.count + 1,
+            self.information + rows.T @ weight @ rows,
+            self.right + rows.T @ weight @ one.shift,
+        )
+
+    @property
+    def days(self) -> float:
+        """From the first measurement to the last."""
+        return (self.to_ns - self.from_ns) / DAY_NS
+
+    @property
+    def line(self) -> tuple[Array, Array] | None:
+        """Slope (3,), m a day, and its covariance (3, 3); None of measurements at one time."""
+        if self.count < 2 or self.days <= 0.0:
+            return None
+        C = np.asarray(np.linalg.inv(self.information))
+        return (C @ self.right)[3:], C[3:, 3:]
+
+    def document(self) -> "StationTrendDocument":
+        """For people: mm and days; null where there is no line."""
+        if (line := self.line) is None:
+            return {"per_day_mm": None, "sigma_mm": None, "days": self.days}
+        slope, C = line
+        return {
+            "per_day_mm": (1e3 * slope).tolist(),
+            "sigma_mm": (1e3 * np.sqrt(np.diag(C))).tolist(),
+            "days": self.days,
+        }
+
+    def words(self, limit_m: float) -> str:
+        """Whether it drifts, and when that is ``limit_m`` from where it was; empty of no line."""
+        if (line := self.line) is None:
+            return ""
+        slope, C = line
+        over = f"over {self.count} measurements in {self.days:.2g} days"
+        if slope @ np.linalg.solve(C, slope) <= chi2_quantile(1.0 - NEVER, 3):
+            worst_m = self.days * float(np.sqrt(np.linalg.eigvalsh(C)[-1]))
+            return f"no drift is seen {over} (sigma {1e3 * worst_m:.3f} mm)"
+        rate = float(np.linalg.norm(slope))
+        sigma = float(np.sqrt(slope @ C @ slope)) / rate
+        return (
+            f"it drifts by {1e3 * rate:.3g} mm a day (sigma {1e3 * sigma:.2g}, {over}): "
+            f"{1e3 * limit_m:.2f} mm in {limit_m / rate:.2g} days"
+        )
+
+    def model(self) -> Document:
+        """In SI, for keeping; `of_model` reads it back."""
+        return {
+            "from_ns": self.from_ns,
+            "to_ns": self.to_ns,
+            "count": self.count,
+            "information": self.information.tolist(),
+            "right": self.right.tolist(),
+        }
+
+    @classmethod
+    def of_model(cls, model: Document) -> "StationTrend":
+        """Read what `model` gave, also after JSON."""
+        matrix, right = (np.array(model[name]) for name in ("information", "right"))
+        return cls(model["from_ns"], model["to_ns"], model["count"], matrix, right)
+
+
+def result_document(
+    found: StationMeasurement,
+    shift: StationShift,
+    trend: StationTrend,
+    verdict: Verdict,
+    *,
+    commissioned: bool,
+) -> Document:
+    """What a run's caller is told; ``commissioned``: whether there was a first one before it."""
     return {
-        "per_day_mm": (1e3 * slope).tolist(),
-        "sigma_mm": (1e3 * np.sqrt(np.diag(C)[3:])).tolist(),
-        "days": float(days[-1]),
+        "answer": "pass" if verdict.accept else "recalibrate",
+        "change": {"tip_mm": 1e3 * shift.size_m, "axis_deg": np.degrees(shift.turned_rad)},
+        "sigma_mm": [1e3 * (shift.sigma_m if commissioned else found.sigma_m)],
+        "misfit_mm": 1e3 * found.misfit_m,
+        "station": shift.document(),
+        "trend": trend.document(),
+        "verdict": verdict_document(verdict),
     }

@@ -444,6 +444,9 @@ def test_the_beams_are_found_again_in_gaps_and_a_knock_is_told(tmp_path):
         due = cell.maintain("due", gap_s)
         assert (due.code, due.complete) == (Code.ACCEPT, True), due.message
         assert "beam station: " in due.message
+        assert "no drift is seen over 2 measurements" in due.message
+        kept = history.head(LASER_FRAME)
+        assert (due.station_code, due.station_id) == (Code.ACCEPT, kept.calibration_id)
         assert history.head(LASER_FRAME).revision == 2
         again = cell.maintain("again", gap_s)
         assert again.message == "nothing was due"
@@ -458,6 +461,7 @@ def test_the_beams_are_found_again_in_gaps_and_a_knock_is_told(tmp_path):
         found = next(e for e in history.list(10) if e.kind == LASER_FRAME)
         shift_mm = history.document(found.id)["change"]["tip_mm"]
         sigma_mm = history.document(found.id)["sigma_mm"][0]
+        assert (moved.station_code, moved.station_id) == (Code.STATION_MOVED, found.id)
         assert abs(shift_mm - 0.3) < 3.3 * sigma_mm  # one in a thousand
         assert cell.maintenance.memory.tool.answer == "failed"  # checks of before hold no more
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The laser frame from a mandrel's run: found with the scatter that is told; a knock is seen."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -27,11 +28,11 @@ from robocal_ros.tool.station import (
     NEVER,
     StationMeasurement,
     StationShift,
+    StationTrend,
     measure_station,
     measurement_document,
     measurement_of,
     station_shift,
-    station_trend,
 )
 
 RADIUS_M = 2.5e-3
@@ -214,6 +215,9 @@ def test_a_station_is_commissioned_and_followed(driver, tmp_path):
     assert driver.measure("laser", cycle_id="c1").repeated  # nothing runs twice
     second = driver.measure("laser", cycle_id="c2")
     assert (second.status, second.document["answer"]) == (Code.ACCEPT, "pass"), second.message
+    standing = second.document["trend"]
+    assert standing["days"] > 0.0
+    assert "no drift is seen over 2 measurements" in second.message
     shift = 5e-4 * np.array([0.6, -0.4, 0.7])
     driver.program.cell.station = knocked(driver.cell, shift).station
     third = driver.measure("laser", cycle_id="c3")
@@ -221,6 +225,7 @@ def test_a_station_is_commissioned_and_followed(driver, tmp_path):
     told = third.document["station"]
     away = 1e-3 * np.array(told["shift_mm"]) - shift
     assert np.all(np.abs(away) < 4.0 * 1e-3 * np.array(told["shift_sigma_mm"]))
+    assert third.document["trend"] == standing  # a knock is no drift
     again = ToolSession(driver.cell.arm, driver.history, driver.session.config, "test")
     assert np.array_equal(  # the first one stays what all are compared with
         again.current.commissioned_station.laser.points,
@@ -232,6 +237,7 @@ def test_a_station_is_commissioned_and_followed(driver, tmp_path):
         "--state", tmp_path, "--output", laser,
     )  # fmt: skip
     assert [row["moved"] for row in document["measured"]] == [False, True]
+    assert document["trend"] == standing
     placed = read_laser_for(laser, driver.cell.arm)
     assert (placed.station, placed.serial) == ("s", "K1")
     truth = laser_of(driver.program.cell.station).T_base_laser
@@ -287,13 +293,34 @@ def test_a_trend_is_a_line_with_its_sigma():
         drawn -= sigma * rng.standard_normal(3)  # of the first one, in all alike
         C = np.diag([sigma**2] * 6)
         shifts = [StationShift(s, np.zeros(3), 2.0 * C, C, True) for s in drawn]
-        found = station_trend(stamps, shifts)
+        trend = StationTrend()
+        for stamp, shift in zip(stamps, shifts, strict=True):
+            trend = trend.after(stamp, shift)
+        found = StationTrend.of_model(json.loads(json.dumps(trend.model()))).document()
         slopes.append(found["per_day_mm"])
         told = found["sigma_mm"][0]
     assert np.mean(slopes, axis=0) == pytest.approx(
         [0.02, 0.0, -0.01], abs=4.0 * told / np.sqrt(RUNS)
     )
     assert np.std(slopes, axis=0) == pytest.approx([told] * 3, rel=4.0 / np.sqrt(2 * RUNS))
+
+
+def test_a_drift_is_told_with_the_day_on_which_it_matters():
+    C, axis = np.diag([4e-10] * 6), np.array([0.6, 0.0, -0.8])
+
+    def drifted(per_day_m: float) -> StationTrend:
+        trend = StationTrend()
+        for day in range(10):
+            shift = StationShift(day * per_day_m * axis, np.zeros(3), 2.0 * C, C, False)
+            trend = trend.after(day * DAY_NS, shift)
+        return trend
+
+    assert StationTrend().words(1e-4) == ""
+    assert drifted(0.0).after(0, StationShift(np.zeros(3), np.zeros(3), C, C, False)).count == 11
+    assert drifted(0.0).words(1e-4).startswith("no drift is seen over 10 measurements in 9 days")
+    # slope of a line through 0 ... 9 with 0.02 mm each: 0.02 / sqrt(82.5)
+    told = "it drifts by 0.02 mm a day (sigma 0.0022, over 10 measurements in 9 days)"
+    assert drifted(2e-5).words(1e-4) == f"{told}: 0.10 mm in 5 days"
 
 
 def test_a_beam_is_what_the_simulation_says():
