@@ -90,7 +90,7 @@ def test_a_tool_and_limits_are_told(tmp_path: Path, capsys: pytest.CaptureFixtur
         ("ur10", "--joints", "1deg,2deg,3deg,4deg,5deg,6", "'6' needs the unit deg or rad"),
         ("ur10", "--joints", "1deg,2deg,3deg,4deg,5deg,6mm", "'6mm' needs the unit deg or rad"),
         ("p1r2p3", "--joints-deg", "1,2,3", "prismatic joints: use --joints"),
-        ("ur01", "--joints-deg", "1,2,3,4,5,6", "did you mean 'ur10'"),
+        ("bx20l", "--joints-deg", "1,2,3,4,5,6", "did you mean 'bx200l'"),
     ],
 )
 def test_refusals(
