@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled solution of the joint correction: one point, a point through all stages, or many.
 
-Nearly all points of six turning joints are solved by `six_axis`; the others, and all other arms,
-here.
+Nearly all points of six turning joints are solved by `six_axis`, with joint functions by
+`six_functions`; the others, and all other arms, here.
 ``work`` holds `work_size` numbers, so that a point allocates nothing; `prepare` puts the models and
 the constants of a correction there, once. Equations: see `joint_correction`.
 """
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction import damping, six_axis
+from robocal_ros.correction import damping, six_axis, six_functions
 from robocal_ros.correction.damping import (
     CONVERGED,
     ITERATIONS,
@@ -25,10 +25,12 @@ from robocal_ros.correction.damping import (
     Nine,
     Six,
 )
-from robocal_ros.correction.six_axis import CONSTANTS, LANES, N
+from robocal_ros.correction.six_axis import LANES, N
+from robocal_ros.correction.six_functions import CAME, CONSTANTS, GIVEN, GOES, ROWS, TRIED
 from robocal_ros.ground.compiled import lean
 from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.kernels import (
+    PER_STEP,
     SCRATCH,
     TURNED,
     read_joints,
@@ -55,7 +57,7 @@ STEP_AHEAD_S = 5e-7
 VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
 MOST_STEPS = 20
 POSES, TWISTS = 6, 4
-STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
+STEEPNESS, PER_ERROR, IS_STRAIGHT, TAUGHT_TURNS, SETTINGS = 0, 1, 2, 3, 4
 
 
 class Workspace(NamedTuple):
@@ -82,20 +84,22 @@ class Workspace(NamedTuple):
     spare: Array
     order: Array
     x: Array  # (n,) shift of the joints
-    settings: Array  # steepness, its rise, whether `six_axis` serves; see `joint_correction` (3)
-    constants: Array  # of `six_axis`, for sixteen points
-    came: Array
-    goes: Array
+    settings: (
+        Array  # steepness and its rise, see `joint_correction` (3); whether `six_axis` serves,
+    )
+    # and whether the reference model has joint functions
+    constants: Array  # of `six_axis` and `six_functions`
+    rows: Array  # sixteen points
     taught_layer: Array  # (n + 1, w) joint functions of both models; w is 0 where neither has some
     layer: Array
     scratch: Array  # (n, SCRATCH) of `turn_joints`
-    turned: Array  # (n,) what rigid arms would read
+    turned: Array  # (n,) what rigid arms would read: the reference one, the actual one
     back: Array
 
 
 def work_size(n: int, w: int) -> int:
     """How many scratch numbers a solution needs: n joints, w columns of their functions."""
-    many = CONSTANTS + LANES * (2 * N + REPORT)
+    many = CONSTANTS + LANES * ROWS
     small = 16 * POSES + 24 * (n // 8 + 1) + 36 + 6 * TWISTS + SETTINGS
     return (18 + 18 + 1 + SCRATCH + 2) * n + small + many + 2 * (n + 1) * w
 
@@ -113,15 +117,14 @@ def room_in(work: Array, n: int) -> Workspace:
     x, at = work[at : at + n], at + n
     settings, at = work[at : at + SETTINGS], at + SETTINGS
     constants, at = work[at : at + CONSTANTS], at + CONSTANTS
-    came, at = work[at : at + LANES * N], at + LANES * N
-    goes, at = work[at : at + LANES * (N + REPORT)], at + LANES * (N + REPORT)
+    rows, at = work[at : at + LANES * ROWS], at + LANES * ROWS
     scratch, at = work[at : at + SCRATCH * n].reshape(n, SCRATCH), at + SCRATCH * n
     both, at = work[at : at + 2 * n].reshape(2, n), at + 2 * n
     layers = work[at:].reshape(2, n + 1, (work.shape[0] - at) // (2 * (n + 1)))
     return Workspace(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
         turns, frames, J[0], J[1], B, twists[0], twists[1], twists[2], twists[3], x, settings,
-        constants, came, goes, layers[0], layers[1], scratch, both[0], both[1],
+        constants, rows, layers[0], layers[1], scratch, both[0], both[1],
     )  # fmt: skip
 
 
@@ -146,6 +149,10 @@ def prepare(
     newton.pose(models[1, n], room.root)
     newton.pose(models[1, n + 1], room.tool)
     room.settings[STEEPNESS], room.settings[PER_ERROR] = steepness, per_error
+    room.settings[TAUGHT_TURNS] = 0.0
+    for i in range(n):
+        if _is_turned(room) and room.taught_layer[i, PER_STEP] > 0.0:
+            room.settings[TAUGHT_TURNS] = 1.0
     turning = not free and n == N
     for i in range(n):
         turning = turning and room.links[i, 8] < 0.5
@@ -159,6 +166,10 @@ def prepare(
     six_axis.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
     six_axis.constants(room.links, room.root, tool, taught, six_axis.ACTUAL, room.constants)
     room.settings[IS_STRAIGHT] = 1.0 if six_axis.serves(room.constants) else 0.0
+    if _is_turned(room):
+        at, actual = six_functions.LOADS, six_functions.LOADS + six_functions.LOAD
+        six_functions.loads(room.taught_layer, taught, at, room.constants)
+        six_functions.loads(room.layer, tool, actual, room.constants)
 
 
 @lean
@@ -283,7 +294,7 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
 def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
     """A point of `six_axis`, with its report; False where it must be solved here."""
     for r in range(N + REPORT):
-        out[r] = room.goes[r * lanes + lane]
+        out[r] = room.rows[(GOES + r) * lanes + lane]
     out[N + ITERATIONS] = six_axis.ITERATIONS + room.constants[six_axis.LARGE]
     return bool(out[N + CONVERGED] > 0.5)
 
@@ -327,35 +338,49 @@ def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> N
 
 
 @lean
-def _put(q: Array, lane: int, lanes: int, room: Workspace) -> None:
-    """A point becomes one of ``lanes``: what a rigid reference arm would read there."""
-    if _is_turned(room):
-        turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
-    for i in range(q.shape[0]):
-        room.came[i * lanes + lane] = room.scratch[i, TURNED] if _is_turned(room) else q[i]
+def _solve(lanes: int, room: Workspace) -> None:
+    """Solve the points given in ``lanes`` rows."""
+    constants, rows = room.constants, room.rows
+    came, goes = rows[CAME * lanes : GOES * lanes], rows[GOES * lanes : TRIED * lanes]
+    if _is_turned(room) and room.settings[TAUGHT_TURNS] > 0.5:
+        six_functions.turn(constants, room.taught_layer, rows, lanes)
+    else:
+        for k in range(N * lanes):
+            came[k] = rows[GIVEN * lanes + k]
+    if lanes == 1:
+        six_axis.correct_one(constants, came, goes)
+    else:
+        six_axis.correct_lanes(constants, came, goes)
+    if _is_turned(room) and lanes == 1:
+        six_functions.read_one(constants, room.layer, rows)
+    elif _is_turned(room):
+        six_functions.read_lanes(constants, room.layer, rows)
 
 
 @lean
-def _take(
-    q: Array, lane: int, lanes: int, largest: Array, free: bool, room: Workspace, out: Array
-) -> None:
-    """Take a point from where `six_axis` has solved it, else solve it here."""
-    solved = room.settings[IS_STRAIGHT] > 0.5 and _take_over(room, lane, lanes, out)
+def _correct_alone(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
+    """A point (n,) of any arm, by `_correct`."""
+    if not _is_turned(room):
+        _correct(q, largest, free, room, out)
+        return
+    turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
     for i in range(q.shape[0]):
-        room.turned[i] = room.came[i * lanes + lane]
-    if not solved:
-        _correct(room.turned, largest, free, room, out)
-    if _is_turned(room):
-        _read(q, room.turned, free, room, out)
+        room.turned[i] = room.scratch[i, TURNED]
+    _correct(room.turned, largest, free, room, out)
+    _read(q, room.turned, free, room, out)
 
 
 @lean
 def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
     """A point (n,) of any arm."""
-    _put(q, 0, 1, room)
+    solved = False
     if room.settings[IS_STRAIGHT] > 0.5:
-        six_axis.correct_one(room.constants, room.came, room.goes)
-    _take(q, 0, 1, largest, free, room, out)
+        for i in range(N):
+            room.rows[i] = q[i]
+        _solve(1, room)
+        solved = _take_over(room, 0, 1, out)
+    if not solved:
+        _correct_alone(q, largest, free, room, out)
 
 
 @lean
@@ -378,10 +403,12 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
     room, first = room_in(work, q.shape[1]), 0
     while room.settings[IS_STRAIGHT] > 0.5 and q.shape[0] - first >= LANES:
         for lane in range(LANES):
-            _put(q[first + lane], lane, LANES, room)
-        six_axis.correct_lanes(room.constants, room.came, room.goes)
+            for i in range(N):
+                room.rows[(GIVEN + i) * LANES + lane] = q[first + lane, i]
+        _solve(LANES, room)
         for lane in range(LANES):
-            _take(q[first + lane], lane, LANES, largest, free, room, out[first + lane])
+            if not _take_over(room, lane, LANES, out[first + lane]):
+                _correct_alone(q[first + lane], largest, free, room, out[first + lane])
         first += LANES
     for i in range(first, q.shape[0]):
         _correct_one(q[i], largest, free, room, out[i])
@@ -394,9 +421,10 @@ def uncorrect_staged(
 ) -> bool:  # fmt: skip
     """Taught joints ``q`` (n,) of corrected ones, by q <- q' - shift(q); whether that is exact.
 
-    ``out``: as of `correct_staged`, at ``q``.
+    The last step is the one behind which, at the slowest rate so far, no more than ``exact`` is
+    left. ``out`` (k, n + 7) is scratch.
     """
-    n = corrected.shape[0]
+    n, before, slowest = corrected.shape[0], 0.0, 0.0
     for i in range(n):
         q[i] = corrected[i]
     for _ in range(steps):
@@ -407,8 +435,11 @@ def uncorrect_staged(
             size = max(size, abs(miss))
             if abs(miss) > exact:
                 q[i] += miss
-        if not size > exact:
-            return size <= exact
+        if before > 0.0:
+            slowest = max(slowest, size / before)
+        if size <= exact or (before > 0.0 and slowest * size <= exact):
+            return True
+        before = size
     return False
 
 

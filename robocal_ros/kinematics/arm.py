@@ -206,19 +206,21 @@ class SerialArm:
 
     @cached_property
     def layer(self) -> Array:
-        """Constants of the joint functions (n + 1, 7 + m) for the kernels; of an arm with some.
+        """Constants of the joint functions (n + 1, 15 + m) for the kernels; of an arm with some.
 
-        Of a joint: first knot, 1 / spacing, compliance, mass and its centre, the coefficients. The
-        last row: gravity (base), mass of the payload and its centre.
+        Of a joint: the knot before the first, 1 / spacing, compliance, mass and its centre, the
+        coefficients between four zeros and four. The last row: gravity (base), mass of the payload
+        and its centre.
         """
-        from robocal_ros.kinematics.kernels import CENTRE, COMPLIANCE, MASS, PER_STEP, TABLE
+        from robocal_ros.kinematics.kernels import BESIDE, CENTRE, COMPLIANCE, MASS, PER_STEP, TABLE
 
         functions, load = self.functions, self.load
         assert functions is not None
         n, m = functions.coefficients.shape
-        packed = np.zeros((n + 1, TABLE + m))
-        packed[:n, 0], packed[:n, PER_STEP] = functions.first, 1.0 / functions.step
-        packed[:n, COMPLIANCE], packed[:n, TABLE:] = functions.compliance, functions.coefficients
+        packed = np.zeros((n + 1, TABLE + BESIDE + m + BESIDE))
+        packed[:n, 0], packed[:n, PER_STEP] = functions.first - functions.step, 1.0 / functions.step
+        packed[:n, COMPLIANCE] = functions.compliance
+        packed[:n, TABLE + BESIDE : TABLE + BESIDE + m] = functions.coefficients
         if load is not None:
             packed[:n, MASS], packed[:n, CENTRE:TABLE] = load.mass, load.centre
             packed[n, :MASS], packed[n, MASS] = load.gravity, load.payload_mass

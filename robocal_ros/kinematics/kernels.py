@@ -405,10 +405,12 @@ def parameter_batch(
 
 # ---- joint functions and winding under load: what the joints turn besides what is read ----------
 #
-# ``layer`` (n + 1, 7 + k), see `SerialArm.layer`: all about a joint in a row, then the payload.
+# ``layer`` (n + 1, 15 + m), see `SerialArm.layer`: all about a joint in a row, then the payload.
+# Four zeros stand on either side of a table's m coefficients: beyond it a function is zero.
 
 
 PER_STEP, COMPLIANCE, MASS, CENTRE, TABLE = 1, 2, 3, 4, 7
+BESIDE = 4
 # A joint's row of scratch: axis, a point of it, what of the arm it moves; turned value, its slope.
 MOVED, TURNED, SLOPE, SCRATCH = 6, 9, 10, 11
 MOST_ROUNDS = 20
@@ -416,21 +418,17 @@ EXACT_TURN = 1e-13  # rad, m
 
 
 @lean
-def _spline(row: Array, q: float) -> tuple[float, float]:
-    """Value and slope of a joint's cubic B-spline; zero outside its table."""
-    count = row.shape[0] - TABLE
-    u = (q - row[0]) * row[PER_STEP]
-    if not (u >= 0.0 and u < count + 3):
-        return 0.0, 0.0
-    cell = int(u)
-    s = u - cell
+def spline(row: Array, q: float) -> tuple[float, float]:
+    """Value and slope of a joint's cubic B-spline, without a branch; zero outside its table."""
+    u, last = (q - row[0]) * row[PER_STEP], row.shape[0] - TABLE - 4
+    cell = np.floor(u)
+    cell = cell if cell > 0.0 else 0.0  # as for NaN
+    cell = cell if cell < last else float(last)
+    s, k = u - cell, TABLE + int(cell)
     r = 1.0 - s
-    c0 = row[TABLE + cell - 3] if 3 <= cell < count + 3 else 0.0
-    c1 = row[TABLE + cell - 2] if 2 <= cell < count + 2 else 0.0
-    c2 = row[TABLE + cell - 1] if 1 <= cell < count + 1 else 0.0
-    c3 = row[TABLE + cell] if cell < count else 0.0
+    c0, c1, c2, c3 = row[k], row[k + 1], row[k + 2], row[k + 3]
     b1, b2 = 4.0 - 3.0 * s * s * (1.0 + r), 4.0 - 3.0 * r * r * (1.0 + s)
-    value = (c0 * r * r * r + c1 * b1 + c2 * b2 + c3 * s * s * s) / 6.0
+    value = (c0 * r * r * r + c1 * b1 + c2 * b2 + c3 * s * s * s) * (1.0 / 6.0)
     rise = 0.5 * ((c3 - c2) * s * s + (c1 - c0) * r * r) + (c2 - c1) * (0.5 + s * r)
     return value, rise * row[PER_STEP]
 
@@ -487,7 +485,7 @@ def turn_joints(q: Array, links: Array, T_root: Array, layer: Array, scratch: Ar
     """What a rigid arm would read at joints ``q`` (n,), and slopes 1 + delta', into ``scratch``."""
     n, bends = links.shape[0], False
     for i in range(n):
-        value, slope = _spline(layer[i], q[i])
+        value, slope = spline(layer[i], q[i])
         scratch[i, TURNED], scratch[i, SLOPE] = q[i] + value, 1.0 + slope
         bends = bends or layer[i, COMPLIANCE] > 0.0
     if bends:

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled joint functions and winding under load of six turning joints, as in `six_axis`.
+
+``rows`` (ROWS * lanes,) hold so many points, row by row, from the joints given to those corrected:
+`turn` puts a reference model's functions on before `six_axis`, and `read` takes those of the actual
+model off behind. A model's load stands in the constants behind those of `six_axis`. See
+`kinematics.kernels` for the equations, which these are without a branch.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.correction import six_axis
+from robocal_ros.correction.damping import (
+    CONVERGED,
+    REPORT,
+    TCP_ROTATION,
+    TCP_SHIFT,
+    Six,
+    Three,
+    dot,
+    more,
+)
+from robocal_ros.correction.six_axis import ACTUAL, LANES, Frame, Frames, N
+from robocal_ros.ground.compiled import kernel, lean
+from robocal_ros.kinematics.kernels import CENTRE, COMPLIANCE, MASS, spline
+
+Array = NDArray[np.float64]
+Vectors = tuple[Three, Three, Three, Three, Three, Three]
+
+# of a model's load: gravity, then six for each joint: what its link weighs, that times its centre
+# in the frame that `six_axis` walks to, what all from there on weighs, and the compliance
+CARRIED, PLIES, EACH = 4, 5, 6
+LOAD = 3 + EACH * N
+LOADS = six_axis.CONSTANTS
+CONSTANTS = LOADS + 2 * LOAD
+
+# Rows: joints given; what a rigid reference arm reads there; what `six_axis` makes of it, with its
+# report; joints tried, with value and slope of their functions; what a rigid actual arm reads
+# there, and how far load winds it; squares of the last two steps.
+GIVEN, CAME, GOES = 0, N, 2 * N
+TRIED, VALUE, SLOPE, TURNED, WOUND, STEPS = (k * N + REPORT for k in range(3, 9))
+ROWS = STEPS + 2
+ROUNDS = 2
+# Squares (rad^2) of the last step, of which a thousandth is left, as how load changes, and of the
+# one before, of which the square of that is: together 1e-11 rad.
+LAST, BEFORE = 1e-9**2, 1e-5**2
+
+
+@lean
+def loads(layer: Array, tool: Array, at: int, out: Array) -> None:
+    """A model's load from its ``layer`` (see `SerialArm.layer`), with the tool walked to."""
+    carried = layer[N, MASS]
+    for r in range(3):
+        out[at + r] = layer[N, r]
+    for i in range(N - 1, -1, -1):
+        each, mass = at + 3 + EACH * i, layer[i, MASS]
+        for r in range(3):
+            out[each + 1 + r] = mass * layer[i, CENTRE + r]
+        if i == N - 1:
+            mass += layer[N, MASS]
+            for r in range(3):
+                out[each + 1 + r] += layer[N, MASS] * layer[N, CENTRE + r] - mass * tool[r, 3]
+        carried += layer[i, MASS]
+        out[each], out[each + CARRIED], out[each + PLIES] = mass, carried, layer[i, COMPLIANCE]
+
+
+@lean
+def splines(layer: Array, rows: Array, at: int, lanes: int) -> None:
+    """Values and slopes of the functions at the joints from row ``at`` on."""
+    for i in range(N):
+        for k in range(lanes):
+            value, slope = spline(layer[i], rows[(at + i) * lanes + k])
+            rows[(VALUE + i) * lanes + k], rows[(SLOPE + i) * lanes + k] = value, 1.0 + slope
+
+
+@lean
+def _six(rows: Array, at: int, k: int, lanes: int) -> Six:
+    first = at * lanes + k
+    return (
+        rows[first], rows[first + lanes], rows[first + 2 * lanes],
+        rows[first + 3 * lanes], rows[first + 4 * lanes], rows[first + 5 * lanes],
+    )  # fmt: skip
+
+
+@lean
+def _put(x: Six, rows: Array, at: int, k: int, lanes: int) -> None:
+    first = at * lanes + k
+    rows[first], rows[first + lanes], rows[first + 2 * lanes] = x[0], x[1], x[2]
+    rows[first + 3 * lanes], rows[first + 4 * lanes] = x[3], x[4]
+    rows[first + 5 * lanes] = x[5]
+
+
+@lean
+def _cross(a: Three, b: Three) -> Three:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@lean
+def _along(a: Three, s: float, b: Three) -> Three:
+    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
+
+
+@lean
+def _product(a: Three, b: Three) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@lean
+def _with_link(moment: Three, c: Array, each: int, f: Frame) -> Three:
+    """Add the moment of a link, in the frame behind its joint."""
+    m, x, y, z = c[each], c[each + 1], c[each + 2], c[each + 3]
+    return (
+        moment[0] + (m * f[9] + x * f[0] + y * f[3] + z * f[6]),
+        moment[1] + (m * f[10] + x * f[1] + y * f[4] + z * f[7]),
+        moment[2] + (m * f[11] + x * f[2] + y * f[5] + z * f[8]),
+    )
+
+
+@lean
+def _swept(moment: Three, mass: float, sign: float, f: Frame) -> tuple[Three, Three]:
+    """A joint's axis, and how the moment of all that it carries moves with it."""
+    axis = sign * f[6], sign * f[7], sign * f[8]
+    return axis, _cross(axis, _along(moment, -mass, (f[9], f[10], f[11])))
+
+
+@lean
+def _carried(c: Array, at: int, load: int, f: Frames) -> tuple[Vectors, Vectors]:
+    """Each joint's axis, and how the moment of what it carries moves with it."""
+    i, s = load + 3, at + 7
+    g, h, j, k, m = i + EACH, i + 2 * EACH, i + 3 * EACH, i + 4 * EACH, i + 5 * EACH
+    moment = _with_link((0.0, 0.0, 0.0), c, m, f[6])
+    a5, w5 = _swept(moment, c[m + CARRIED], c[s + 45], f[5])
+    moment = _with_link(moment, c, k, f[5])
+    a4, w4 = _swept(moment, c[k + CARRIED], c[s + 36], f[4])
+    moment = _with_link(moment, c, j, f[4])
+    a3, w3 = _swept(moment, c[j + CARRIED], c[s + 27], f[3])
+    moment = _with_link(moment, c, h, f[3])
+    a2, w2 = _swept(moment, c[h + CARRIED], c[s + 18], f[2])
+    moment = _with_link(moment, c, g, f[2])
+    a1, w1 = _swept(moment, c[g + CARRIED], c[s + 9], f[1])
+    moment = _with_link(moment, c, i, f[1])
+    a0, w0 = _swept(moment, c[i + CARRIED], c[s], f[0])
+    return (a0, a1, a2, a3, a4, a5), (w0, w1, w2, w3, w4, w5)
+
+
+@lean
+def _yields(c: Array, load: int, torque: Six) -> Six:
+    """Turns of the joints under torques."""
+    i = load + 3 + PLIES
+    return (
+        c[i] * torque[0], c[i + EACH] * torque[1], c[i + 2 * EACH] * torque[2],
+        c[i + 3 * EACH] * torque[3], c[i + 4 * EACH] * torque[4], c[i + 5 * EACH] * torque[5],
+    )  # fmt: skip
+
+
+@lean
+def _wound(c: Array, load: int, w: Vectors) -> Six:
+    """How far gravity winds each joint."""
+    g = c[load], c[load + 1], c[load + 2]
+    torque = (
+        _product(g, w[0]), _product(g, w[1]), _product(g, w[2]),
+        _product(g, w[3]), _product(g, w[4]), _product(g, w[5]),
+    )  # fmt: skip
+    return _yields(c, load, torque)
+
+
+@lean
+def _wound_by(c: Array, load: int, a: Vectors, w: Vectors, x: Six) -> Six:
+    """How that changes with a small shift of the joints: what a joint carries turns with all."""
+    g = c[load], c[load + 1], c[load + 2]
+    b0 = _along((0.0, 0.0, 0.0), x[0], a[0])
+    b1 = _along(b0, x[1], a[1])
+    b2 = _along(b1, x[2], a[2])
+    b3 = _along(b2, x[3], a[3])
+    b4 = _along(b3, x[4], a[4])
+    b5 = _along(b4, x[5], a[5])
+    v4 = _along((0.0, 0.0, 0.0), x[5], w[5])
+    v3 = _along(v4, x[4], w[4])
+    v2 = _along(v3, x[3], w[3])
+    v1 = _along(v2, x[2], w[2])
+    v0 = _along(v1, x[1], w[1])
+    torque = (
+        _product(g, _cross(b0, w[0])) + _product(g, _cross(a[0], v0)),
+        _product(g, _cross(b1, w[1])) + _product(g, _cross(a[1], v1)),
+        _product(g, _cross(b2, w[2])) + _product(g, _cross(a[2], v2)),
+        _product(g, _cross(b3, w[3])) + _product(g, _cross(a[3], v3)),
+        _product(g, _cross(b4, w[4])) + _product(g, _cross(a[4], v4)),
+        _product(g, _cross(b5, w[5])),
+    )
+    return _yields(c, load, torque)
+
+
+@lean
+def _over(x: Six, y: Six) -> Six:
+    return x[0] / y[0], x[1] / y[1], x[2] / y[2], x[3] / y[3], x[4] / y[4], x[5] / y[5]
+
+
+@lean
+def _turn(c: Array, rows: Array, k: int, lanes: int) -> None:
+    """What a rigid reference arm would read."""
+    q = _six(rows, GIVEN, k, lanes)
+    _, w = _carried(c, 0, LOADS, six_axis.walk(c, 0, q))
+    turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, _wound(c, LOADS, w))
+    _put(turned, rows, CAME, k, lanes)
+
+
+@lean
+def _step(c: Array, rows: Array, k: int, lanes: int) -> None:
+    """A step towards the joints of which a rigid arm reads what is wanted, and the load there."""
+    q, load = _six(rows, TRIED, k, lanes), LOADS + LOAD
+    a, w = _carried(c, ACTUAL, load, six_axis.walk(c, ACTUAL, q))
+    wound = _wound(c, load, w)
+    turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, wound)
+    step = more(_six(rows, GOES, k, lanes), -1.0, turned)
+    step = _over(step, _six(rows, SLOPE, k, lanes))
+    change = _wound_by(c, load, a, w, step)
+    _put(turned, rows, TURNED, k, lanes)
+    _put(more(more(q, 1.0, step), -1.0, change), rows, TRIED, k, lanes)
+    _put(more(wound, 1.0, change), rows, WOUND, k, lanes)
+    rows[STEPS * lanes + k] = dot(step, step)
+
+
+@lean
+def _refine(rows: Array, k: int, lanes: int) -> None:
+    """A step with the functions alone, which the load does not notice."""
+    q, slope = _six(rows, TRIED, k, lanes), _six(rows, SLOPE, k, lanes)
+    turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, _six(rows, WOUND, k, lanes))
+    step = _over(more(_six(rows, GOES, k, lanes), -1.0, turned), slope)
+    _put(more(q, 1.0, step), rows, TRIED, k, lanes)
+    rows[(STEPS + 1) * lanes + k] = dot(step, step)
+
+
+@lean
+def _shift(c: Array, rows: Array, k: int, lanes: int) -> None:
+    """The error at the tool without a correction: that of the true arms."""
+    aim = six_axis.goal(c, _six(rows, CAME, k, lanes))
+    e, near = six_axis.residual(aim, six_axis.walk(c, ACTUAL, _six(rows, TURNED, k, lanes))[6])
+    at = (GOES + N) * lanes + k
+    rows[at + TCP_SHIFT * lanes] = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    rows[at + TCP_ROTATION * lanes] = np.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
+    rows[at + CONVERGED * lanes] = rows[at + CONVERGED * lanes] if near else 0.0
+
+
+@lean
+def _end(rows: Array, k: int, lanes: int) -> None:
+    """The joints found, if they are."""
+    at, steps = (GOES + N + CONVERGED) * lanes + k, STEPS * lanes + k
+    small = (rows[steps] <= BEFORE) & (rows[steps + lanes] <= LAST)
+    rows[at] = rows[at] if small else 0.0
+    _put(_six(rows, TRIED, k, lanes), rows, GOES, k, lanes)
+
+
+@kernel
+def turn(c: Array, layer: Array, rows: Array, lanes: int) -> None:
+    """What a rigid reference arm would read at the joints given."""
+    if lanes == 1:
+        splines(layer, rows, GIVEN, 1)
+        _turn(c, rows, 0, 1)
+        return
+    splines(layer, rows, GIVEN, LANES)
+    for k in range(LANES):
+        _turn(c, rows, k, LANES)
+
+
+@kernel
+def read_one(c: Array, layer: Array, rows: Array) -> None:
+    """Make joints of what a rigid arm would read, and of the tool's shift that of the true arms."""
+    _put(_six(rows, GIVEN, 0, 1), rows, TRIED, 0, 1)
+    for n in range(ROUNDS):
+        splines(layer, rows, TRIED, 1)
+        _step(c, rows, 0, 1)
+        if n == 0:
+            _shift(c, rows, 0, 1)
+        splines(layer, rows, TRIED, 1)
+        _refine(rows, 0, 1)
+    _end(rows, 0, 1)
+
+
+@kernel
+def read_lanes(c: Array, layer: Array, rows: Array) -> None:
+    """`read_one` for sixteen points."""
+    for k in range(N * LANES):
+        rows[TRIED * LANES + k] = rows[GIVEN * LANES + k]
+    for n in range(ROUNDS):
+        splines(layer, rows, TRIED, LANES)
+        for k in range(LANES):
+            _step(c, rows, k, LANES)
+        if n == 0:
+            for k in range(LANES):
+                _shift(c, rows, k, LANES)
+        splines(layer, rows, TRIED, LANES)
+        for k in range(LANES):
+            _refine(rows, k, LANES)
+    for k in range(LANES):
+        _end(rows, k, LANES)
