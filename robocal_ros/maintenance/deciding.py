@@ -75,7 +75,7 @@ class Decider:
     def newest(self, kind: str) -> Entry | None:
         """The first of them, however many there are; None where nothing waits.
 
-        Where the newest tool is outdated, those measured before it are too: revisions only grow.
+        Where the newest is outdated, those measured before it are too: revisions only grow.
         """
         found = self._history.pending(kind, 1)
         return found[0] if found and not self._outdated(found[0]) else None
@@ -241,8 +241,10 @@ class Decider:
         if words := self.decided(calibration_id):
             return words
         entry = self._history.get(calibration_id)
+        if words := self._outdated(entry):
+            return words
         if entry.kind != THERMAL:
-            return self._outdated(entry) or self._tool_withheld(calibration_id)
+            return self._tool_withheld(calibration_id)
         allowed_m, shift_m = bounds.thermal_m, self.thermal_shift_m(calibration_id)
         if not shift_m <= allowed_m:
             return (

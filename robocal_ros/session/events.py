@@ -20,6 +20,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     BEFORE_ANY,
     FRAME_SHIFT,
+    REFERENCE,
     THERMAL,
     TOOL,
     Decision,
@@ -299,11 +300,15 @@ def measured_with(history: CalibrationHistory, entry: Entry) -> dict[str, int]:
     """Revisions, by kind, beside which alone a calibration may come into force.
 
     A tool's flange poses came from a thermal model: with another one, what the drift did to the
-    flange would stay in the tool, and be corrected a second time. Frames were shifted for one.
+    flange would stay in the tool, and be corrected a second time. Frames were shifted for one. A
+    drift is counted from a cold reference: the one in force from then on knows another cold robot.
     """
-    if entry.kind not in (TOOL, FRAME_SHIFT):
-        return {}
-    return {THERMAL: int(history.model(entry.id)["thermal_revision"])}
+    model = history.model(entry.id)
+    if entry.kind in (TOOL, FRAME_SHIFT):
+        return {THERMAL: int(model["thermal_revision"])}
+    if entry.kind == THERMAL and "reference_revision" in model:  # older ones do not tell
+        return {REFERENCE: int(model["reference_revision"])}
+    return {}
 
 
 def named(history: CalibrationHistory, command: Command, kind: str) -> Command:

@@ -178,7 +178,8 @@ class InForce(HistoryFollower):
     """The thermal model (``head``) and the cold reference in force, as of the last look.
 
     ``reference``, ``reference_id``, ``reference_model``: the cold reference, its calibration, and
-    what is kept of it; or None. ``nominal``: the arm without any calibration.
+    what is kept of it; or None. ``reference_revision``: its, counted up where it goes too.
+    ``nominal``: the arm without any calibration.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm) -> None:
@@ -191,6 +192,7 @@ class InForce(HistoryFollower):
         reference = None if head.model is None else reference_of(head.model, self.nominal)
         self.reference: ColdReference | None = reference
         self.reference_id, self.reference_model = head.calibration_id, head.model
+        self.reference_revision = head.revision
 
     @property
     def arm(self) -> SerialArm:

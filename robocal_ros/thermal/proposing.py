@@ -195,6 +195,7 @@ class Proposer:
     ) -> Outcome:
         cycle_id = str(command.arguments.get("cycle_id", ""))
         document = document | {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
+        model = model | {"reference_revision": self._current.reference_revision}
         inputs = data.arrays() | beside
         chosen = self._propose(THERMAL, command, wall_ns, method, verdict, document, model, inputs)
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
@@ -466,6 +467,7 @@ def keep_identified(
     Raises `ConflictError` as `head_without_reference`.
     """
     head_without_reference(history)
+    beside = {"reference_revision": history.head(REFERENCE).revision}
     document: Document = {**identification_document(judged), "stamp_ns": wall_ns, "cycle_id": ""}
     return history.propose(
         Proposal(
@@ -481,7 +483,7 @@ def keep_identified(
             reason=judged.verdict.reason,
             candidate_rms_mm=document["calibrated"]["held_out"]["rms_mm"],
             document=document,
-            model=identified_model_document(judged.identification),
+            model=identified_model_document(judged.identification) | beside,
             inputs=data.arrays(),
         )
     )

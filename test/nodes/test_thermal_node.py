@@ -199,6 +199,25 @@ def test_bad_samples_are_counted_and_never_used(graph, visits):
     assert "not finite" in answer.message
 
 
+def test_a_candidate_of_an_earlier_reference_is_refused_by_node_and_command(graph, visits):
+    """No drift is in force: what the cold robot shows now is another beginning."""
+    cell = Cell(graph)
+    found = candidate(cell, visits)
+    cell.play(visits[2])
+    captured = cell.call("capture_reference")
+    assert captured.success, captured.message
+    answer = cell.call("accept", id=found)
+    assert (answer.success, answer.status) == (False, Code.STALE), answer.message
+    words = "measured with reference revision 1, in force is 2: measure it again"
+    assert words in answer.message
+    command = ["history", "accept", str(found), "--robot-serial", "s1", "--json"]
+    done = robocal(*command, ROBOCAL_STATE=str(graph.state))
+    assert done.returncode == 3
+    refused = json.loads(done.stdout)["error"]
+    assert (refused["code"], words in refused["message"]) == ("STALE", True), refused
+    assert cell.models[-1].revision == 0
+
+
 def test_what_the_command_line_decides_is_in_force_within_a_second(graph, visits):
     cell = Cell(graph)
     found = candidate(cell, visits)

@@ -8,9 +8,11 @@ import pytest
 from maintenance_cell import config_of
 from shift import BALL, KNOCK, NOISE_M, DriftingRobot, knocked, postures, warmed
 
-from robocal_ros.ground.errors import Code
+from robocal_ros.ground.errors import Code, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.accuracy import AcceptBounds
 from robocal_ros.maintenance.deciding import Decider
 from robocal_ros.session import events
 from robocal_ros.session.events import Outcome
@@ -33,7 +35,8 @@ class Robot(DriftingRobot):
         super().__init__(folder, ThermalConfig(sigma_m=NOISE_M, **work), POSES)
         self.T_sensor = STILL
         self.known_m = 0.0  # how well the model in force is known
-        bounds = config_of(home=self.q[0], poses=self.q[1:], T_flange_tool=TAUGHT)
+        poses = {"home": self.q[0], "poses": self.q[1:]}
+        bounds = config_of(**poses, T_flange_tool=TAUGHT, bounds=AcceptBounds(automatic=True))
         self.decider = Decider(self.nominal, self.history, bounds)
 
     def visit(self, command: str, kelvin: float, after_h: float, q=None, rounds=1) -> Outcome:
@@ -98,6 +101,35 @@ def test_a_robot_that_cooled_has_not_yesterdays_drift(robot, T_sensor):
     told = robot.session.accuracy(robot.session.newest_joints_ns)
     assert told.level is AccuracyLevel.OK
     assert told.error.rms_m < drift_m
+
+
+def test_a_candidate_of_an_earlier_reference_is_stale(robot):
+    """Finding: yesterday's drift could be accepted after the cold capture of the morning."""
+    found = robot.visit(events.IDENTIFY, 2.0 * KELVIN, 1.0)
+    assert found.status is Code.ACCEPT, found.message
+    old = found.calibration_id
+    assert robot.decider.newest(THERMAL).id == old
+    assert robot.capture(0.0, NIGHT_H, rounds=3).done
+    words = "measured with reference revision 1, in force is 2"
+    refused = robot.ask(events.ACCEPT, id=old)
+    assert refused.status is Code.STALE, refused.message
+    assert words in refused.message
+    with pytest.raises(StaleError, match=words):
+        robot.decider.decide(events.ACCEPT, old, "plc", "", 0)
+    assert words in robot.decider.withheld(old)
+    assert robot.decider.newest(THERMAL) is None
+    assert robot.history.head(THERMAL).revision == 1
+    robot.work(0.0, 0.1)  # what is measured since the capture is accepted
+
+
+def test_a_candidate_of_before_any_reference_is_stale(tmp_path):
+    """A reference counts its drifts from the model that was in force, not from that one."""
+    robot = Robot(tmp_path)
+    calibrated = robot.visit(events.IDENTIFY, 0.0, 0.0, q=postures(robot.nominal, 40))
+    assert calibrated.status is Code.ACCEPT, calibrated.message
+    assert robot.capture(0.0, 0.5).done
+    refused = robot.ask(events.ACCEPT, id=calibrated.calibration_id)
+    assert refused.status is Code.STALE, refused.message
 
 
 def test_a_warm_robot_keeps_its_drift_when_the_sensor_was_knocked(robot):
