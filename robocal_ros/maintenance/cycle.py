@@ -11,9 +11,9 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
-from robocal_ros.maintenance.fixture_part import JUDGED, FixturePart, FixtureVisits
+from robocal_ros.maintenance.fixture_part import EACH_POSE, JUDGED, FixturePart, FixtureVisits
 from robocal_ros.maintenance.fixture_part import MEASUREMENT as FIXTURE_MEASUREMENT
-from robocal_ros.maintenance.mover import HOME, STATION, FaultError
+from robocal_ros.maintenance.mover import STATION, FaultError
 from robocal_ros.maintenance.robot_interface import (
     BeginCycle,
     CellInterface,
@@ -70,8 +70,12 @@ class ThermalPart:
         self._times = cell.config.times
 
     def worst_s(self) -> float:
-        """The longest first step of a gap: one pose, with its way home."""
-        return self._first_s(self._cell.ways.first_s())
+        """The longest first step of a gap: the cycle begins, one pose, its way home.
+
+        A gap that has less does not begin: it would never come to the last pose.
+        """
+        way_s = self._cell.ways.first_s()
+        return 2.0 * self._times.answer_s + STANDS_S + self._step_s(way_s)
 
     def drop_old(self) -> str:
         """Give up an open cycle whose last pose is too old, and say so; empty: there is none."""
@@ -95,19 +99,19 @@ class ThermalPart:
         cell, thermal = self._cell, self._thermal
         todo = [i for i in range(1, cell.ways.count + 1) if i not in thermal.visited]
         if todo:
-            way = cell.ways.onward((HOME, HOME), cell.config.home, todo[0]).plan
-            if not cell.fits(self._first_s(way.duration_s + cell.ways.home_s(todo[0]))):
-                return None, f"{MEASUREMENT}, {len(todo)} poses"
+            left = f"{MEASUREMENT}, {len(todo)} poses"
+            if words := cell.too_short(self.worst_s()):
+                return DriverAnswer(Code.LIMIT_EXCEEDED, f"{words}: {EACH_POSE}"), left
             cell.doing = "thermal cycle begins"
             name = thermal.id or cycle_id
             begun = yield from cell.ask(self._times.answer_s, NODE, BeginCycle, name)
             if not begun.done:
                 return begun, MEASUREMENT
             thermal.id, thermal.last_s = name, cell.now_s
-            left = yield from self._visit(todo)
+            unvisited = yield from self._visit(todo)
             yield from cell.go_home()
-            if left:
-                return None, f"{MEASUREMENT}, {left} poses"
+            if unvisited:
+                return None, f"{MEASUREMENT}, {unvisited} poses"
         if not cell.fits(self._times.solve_s):
             return None, "end of the thermal cycle"
         places: list[Array] = []  # the thermal node takes near poses for one
@@ -156,10 +160,6 @@ class ThermalPart:
             return DriverAnswer(Code.CONFLICT, str(error))
         self._thermal.moved = answer.code is Code.SENSOR_OR_ROBOT_MOVED
         return answer
-
-    def _first_s(self, ways_s: float) -> float:
-        """The cycle begins before it."""
-        return 2.0 * self._times.answer_s + STANDS_S + self._step_s(ways_s)
 
     def _step_s(self, ways_s: float) -> float:
         """At the most: a rest at each arrival, before the measurement and after it.

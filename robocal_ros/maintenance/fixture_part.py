@@ -21,6 +21,7 @@ from robocal_ros.tool.driving import STANDS_S
 
 NODE = "fixture node"
 MEASUREMENT = "fixture measurement"
+EACH_POSE = "each pose is reached through those before it"
 JUDGED = (  # verdicts of a measurement; any other code says that there was none
     Code.ACCEPT,
     Code.NO_SIGNIFICANT_GAIN,
@@ -62,8 +63,9 @@ class FixturePart:
             return None, ""
         cell.robot.ways = ways  # from home, where both rings begin
         poses = np.tile(np.arange(1, ways.count + 1), cell.config.fixture_visits).tolist()
-        if not cell.fits(self.worst_s()):
-            return None, f"{MEASUREMENT}, {len(poses) - visits.done} poses"
+        if words := cell.too_short(self.worst_s()):
+            left = f"{MEASUREMENT}, {len(poses) - visits.done} poses"
+            return DriverAnswer(Code.LIMIT_EXCEEDED, f"{words}: {EACH_POSE}"), left
         if not visits.done or cell.now_s - visits.last_s > cell.config.resume_within_s:
             self._forget()
             begun = yield from cell.ask(self._times.answer_s, NODE, BeginFixture)
@@ -71,8 +73,8 @@ class FixturePart:
                 return begun, MEASUREMENT
         yield from self._visit(poses)
         yield from cell.go_home()
-        if left := len(poses) - visits.done:
-            return None, f"{MEASUREMENT}, {left} poses"
+        if unvisited := len(poses) - visits.done:
+            return None, f"{MEASUREMENT}, {unvisited} poses"
         if not cell.fits(self._times.solve_s):
             return None, f"end of the {MEASUREMENT}"
         return (yield from self._judged())

@@ -281,7 +281,8 @@ DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stop
 class CellInterface(Asking):
     """Robot, gap and the requests to other nodes; times of a steady clock.
 
-    ``tool``: whether the tool's driver may move the robot. ``left_home``: whether something may
+    ``tool``: whether the tool's driver may move the robot. ``gap_s``: length of the gap as it was
+    called. ``left_home``: whether something may
     have moved the robot since the run began. ``measured``: stamps of measurements of the flange's
     target, on the joints' clock, newest last; ``features``: of the fixture. ``doing``: what goes
     on, in words. ``tool_home_s``: for the way home from the beams; the longest so far where that
@@ -297,6 +298,7 @@ class CellInterface(Asking):
         self.robot = Mover(config, ways)
         self.gap = Gap(config.times.stale_s)
         self.tool = Disarming()
+        self.gap_s = 0.0
         self.left_home = False
         self.measured: list[float] = []
         self.features: list[float] = []
@@ -312,6 +314,15 @@ class CellInterface(Asking):
         lasts_s = self.robot.lasts_s(worst_s)
         return lasts_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
 
+    def too_short(self, worst_s: float) -> str:
+        """By how much the gap is too short for something, and which would do; empty: it fits."""
+        if self.fits(worst_s):
+            return ""
+        needs_s = self.robot.lasts_s(worst_s) + self.config.times.reserve_s
+        short_s = needs_s - self.gap.left_s(self.now_s)
+        would_s = np.ceil(self.gap_s + short_s + 0.5)  # with what went before in this one
+        return f"the gap is {short_s:.1f} s too short, one of {would_s:.0f} s would do"
+
     def run_s(self, mode: str) -> float:
         """How long a tool measurement may take at the most."""
         times = self.config.times
@@ -326,6 +337,7 @@ class CellInterface(Asking):
     def begin(self, gap_s: float) -> None:
         """A run is to begin, with the robot at home."""
         self.gap.begin(gap_s, self.now_s)
+        self.gap_s = gap_s
         self.robot.place, self.left_home, self.robot.ways = (HOME, HOME), False, self.ways
 
     def not_handed_over(self) -> bool:

@@ -14,6 +14,7 @@ from maintenance_cell import (
     HOME,
     HOUSING,
     LONG_S,
+    MANY_POSES,
     POSES,
     REFUSED,
     SILENT,
@@ -107,23 +108,74 @@ def test_no_gap_is_overrun(cell, gap_s):
     over(cell)
 
 
-def test_what_did_not_fit_is_resumed_in_the_next_gap(cell):
-    first = cell.ran("c1", 15.0)
+@pytest.fixture
+def drift_only(history):
+    """A cell that measures its drift alone, at more poses than fit a short gap."""
+    cell = Cell(history, config_of(poses=MANY_POSES, T_base_laser=None, resume_within_s=60.0))
+    cell.open_gap()
+    return cell
+
+
+def would_do_s(result):
+    """Length of the gap that a result says would do."""
+    found = re.search(r"([\d.]+) s too short, one of (\d+) s would do", result.message)
+    assert found, result.message
+    assert float(found[1]) > 0.0
+    return float(found[2])
+
+
+def test_a_gap_in_which_no_cycle_would_end_begins_none_and_says_which_would_do(drift_only):
+    """Finding: it measured the poses that it reached, and began anew in each such gap for ever."""
+    cell = drift_only
+    short_s = cell.session.worst_cases()["the first measuring pose"]  # but for the reserve
+    result = cell.ran("c0", short_s)
+    assert (result.code, result.thermal_code) == (Code.ACCEPT, Code.LIMIT_EXCEEDED)
+    assert result.left == (f"thermal measurement, {len(MANY_POSES)} poses",)
+    assert not cell.log, "nothing is driven in vain"
+    gap_s, gaps = would_do_s(result), []
+    assert short_s < gap_s <= short_s + TIMES.reserve_s + 2.0
+    while not gaps or not gaps[-1].complete:
+        cell.log.clear()
+        gaps.append(cell.ran(f"c{len(gaps) + 1}", gap_s))
+        over(cell)
+        assert kinds(cell).count("Move") >= 2, "each such gap brings the cycle on"
+    assert 1 < len(gaps) < len(MANY_POSES)
+    assert [gap.thermal_code for gap in gaps[:-1]] == [Code.NONE] * (len(gaps) - 1)
+    assert gaps[-1].thermal_code is cell.thermal.code
+
+
+def test_a_cycle_that_is_open_waits_for_a_gap_that_is_long_enough(drift_only):
+    cell = drift_only
+    gap_s = would_do_s(cell.ran("c0", 10.0))
+    first = cell.ran("c1", gap_s)
+    assert "thermal measurement" in first.left[0]
+    measured = kinds(cell).count("Move") - 1
+    cell.log.clear()
+    assert would_do_s(cell.ran("c2", 12.0)) == gap_s
+    assert not cell.log
+    assert cell.ran("c3").complete
+    assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c1"]
+    assert kinds(cell).count("Move") == len(MANY_POSES) - measured + 1
+
+
+def test_what_did_not_fit_is_resumed_in_the_next_gap(drift_only):
+    cell = drift_only
+    first = cell.ran("c1", 24.0)
     assert "thermal measurement" in first.left[0]
     visited = sum(isinstance(r, ask.Move) for r in cell.log) - 1
-    assert 0 < visited < len(POSES)
+    assert 0 < visited < len(MANY_POSES)
     cell.pass_time(20.0)
     cell.log.clear()
     assert cell.ran("c2").complete
     assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c1"]
     thermal = kinds(cell)[: kinds(cell).index("EndCycle")]
-    assert thermal.count("Move") == len(POSES) - visited + 1
+    assert thermal.count("Move") == len(MANY_POSES) - visited + 1
 
 
 def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
     cell = Cell(history, config_of(resume_within_s=5.0))
     cell.open_gap()
-    cell.ran("c1", 15.0)
+    cell.broken_off("c1", 2)
     cell.pass_time(6.0)
     cell.log.clear()
     words = cell.ran("c2").message
@@ -283,7 +335,8 @@ def test_a_pose_takes_its_worst_case_and_no_more(history):
     """The way, a rest there, the measurement, a rest before the next, which does not fit, home."""
     cell = Cell(history, config_of(poses=POSES[:2], T_base_laser=None), services={"sensor": SILENT})
     cell.open_gap()
-    cell.run("c1", cell.session.worst_cases()["the first measuring pose"])
+    least_s = cell.session.worst_cases()["the first measuring pose"] + TIMES.reserve_s
+    cell.run("c1", least_s + TICK_S)
     sent: list[tuple[float, ask.Move]] = []
     while cell.state is MaintenanceState.RUNNING:
         if sent:

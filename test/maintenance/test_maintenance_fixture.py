@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fixture as the last step of a maintenance run: its ring of ways, its gaps, its node."""
 
+import re
+
 import numpy as np
 import pytest
 from maintenance_cell import (
@@ -92,6 +94,17 @@ def test_what_does_not_fit_goes_on_in_the_next_gap_and_is_asked_for_once(lone):
     assert kinds(lone).count("MeasureFixture") == 1
     at = [q for q in ends(lone) if min(np.max(np.abs(FIXTURE_POSES - q), axis=1)) < 1e-9]
     np.testing.assert_allclose(at, WAYS, atol=1e-9)
+
+
+def test_a_gap_that_is_too_short_for_any_pose_says_which_would_do(lone):
+    """And drives nothing; that one brings the measurement on."""
+    result = lone.ran("c1", 10.0)
+    assert result.left == (f"fixture measurement, {len(WAYS)} poses",)
+    assert not lone.log
+    found = re.search(r"fixture: the gap is [\d.]+ s too short, one of (\d+) s", result.message)
+    assert found, result.message
+    lone.ran("c2", float(found[1]))
+    assert kinds(lone).count("Move") >= 2
 
 
 @pytest.mark.parametrize("step", ["fixture", "thermal"])

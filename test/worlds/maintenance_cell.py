@@ -52,6 +52,7 @@ def _above(height_m: float) -> np.ndarray:
 
 HOME, AT_BEAMS = _above(0.10), _above(0.004)
 POSES = HOME + np.radians([[20.0, 5, 0, 0, 0, 0], [25.0, 0, 10, 0, 5, 0], [10.0, 0, 10, 0, 0, 8]])
+MANY_POSES = np.tile(POSES, (3, 1))  # more than fit the shortest gap that does
 FIXTURE_POSES = HOME + np.radians([[-15.0, 4, 0, 0, 0, 0], [-25.0, 0, 8, 0, 5, 0]])
 TIMES = Times(
     answer_s=0.5,
@@ -205,6 +206,14 @@ class Cell:
     def ran(self, cycle_id: str, gap_s: float = LONG_S) -> Any:
         """A whole run; its result."""
         self.run(cycle_id, gap_s)
+        return self.finish()
+
+    def broken_off(self, cycle_id: str, pose: int) -> Any:
+        """A run that is cancelled on the robot's way to a measuring pose; its result."""
+        self.run(cycle_id, LONG_S)
+        while f"way to measuring pose {pose}" not in self.session.status(self.now_s).doing:
+            self.step()
+        self.session.cancel("by hand")
         return self.finish()
 
     @property
