@@ -169,6 +169,27 @@ def test_a_file_is_whole_and_says_where_its_numbers_are_from(name):
     np.testing.assert_allclose([float(x) for x in told], at_zero, atol=1e-6)
 
 
+def test_no_limit_is_above_its_sheets_for_digits_of_radians():
+    """Sheets have whole degrees; a hundredth above them, a controller refuses the motion.
+
+    (ros-industrial/motoman issue 102.) The M-20iA's joint 3 is a sum of two of the controller's.
+    """
+    for name in PUBLIC:
+        arm, speed = load_description(name).arm, load_description(name).max_velocity
+        degrees = np.degrees([arm.lower, arm.upper, speed])
+        if name == "m20ia":
+            degrees = np.delete(degrees, 2, axis=1)
+        np.testing.assert_allclose(degrees, np.round(degrees), atol=1e-9, err_msg=name)
+
+
+def test_an_irb_2600_leans_forward_further_than_back():
+    """ABB's sheet ROB0142EN: axis 2 from -95 to 155 deg, which moves the arm down in front."""
+    arm = load_description("irb2600_12_165").arm
+    np.testing.assert_allclose(np.degrees([arm.lower[1], arm.upper[1]]), [-95.0, 155.0])
+    leant = arm.fk(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]))
+    assert leant[0, 3] > arm.fk(np.zeros(6))[0, 3]
+
+
 @pytest.mark.parametrize("name", [*UR_LINKS, "irb120_3_58"])
 def test_masses_lie_where_the_description_has_them(name):
     """The centre of each link at any joints: by the description's frames and by the file's."""
