@@ -7,6 +7,7 @@ With ``--keep`` it writes docs/figures/soak_shift.md too. The cell is the demo's
 
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -88,6 +89,8 @@ class LiveShift:
 def soak(seconds: float) -> Table:
     """Let the cell live, replay what was recorded, and judge both.
 
+    A recording that is replayed otherwise than live is kept, with its report.
+
     Raises
     ------
     ValueError
@@ -95,14 +98,33 @@ def soak(seconds: float) -> Table:
     """
     if seconds < LEAST_S:
         raise ValueError(f"{seconds:g} s are too short: {LEAST_S:g} s or more")
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    folder = Path(tempfile.mkdtemp(prefix="soak_shift-"))
+    kept = False
+    try:
         recordings = folder / "recordings"
         with live_cell(folder, recordings, print) as (controller, plc):
             shift = LiveShift(controller, plc)
             shift.run(seconds)
-        report = validate(recordings, folder / "report").with_suffix(".json")
-        return _judged(shift, json.loads(report.read_text()), seconds)
+        report = json.loads(
+            validate(recordings, folder / "report").with_suffix(".json").read_text()
+        )
+        for words in (differing := _differing(report)):
+            print(f"replayed otherwise than live: {words}; kept in {folder}")
+        kept = bool(differing)
+        return _judged(shift, report, seconds)
+    finally:
+        if not kept:
+            shutil.rmtree(folder)
+
+
+def _differing(report: dict[str, Any]) -> list[str]:
+    """Each recorded session that is replayed otherwise than live, with what differs."""
+    return [
+        f"{session['node']}: {'; '.join(session['differs']) or 'not replayed as recorded'}"
+        for bag in report["bags"]
+        for session in bag["sessions"]
+        if session["differs"] or not session["as_recorded"]
+    ]
 
 
 def _judged(shift: LiveShift, report: dict[str, Any], seconds: float) -> Table:
@@ -122,7 +144,7 @@ def _judged(shift: LiveShift, report: dict[str, Any], seconds: float) -> Table:
     table.add("calls of the PLC, by OPC UA", len(called_s), None)
     table.add("the longest took, s", max(called_s), Goal(max(called_s), LONGEST_CALL_S))
     sessions = [session for bag in report["bags"] for session in bag["sessions"]]
-    differ = sum(bool(session["differs"]) or not session["as_recorded"] for session in sessions)
+    differ = len(_differing(report))
     table.add("recorded sessions, replayed", len(sessions), None)
     table.add("of them otherwise than live", differ, Goal(differ, 0))
     first, last = shift.memory_mb[min(WARM, len(shift.memory_mb)) - 1], shift.memory_mb[-1]

@@ -223,6 +223,10 @@ class EdgeLog:
         order = (*BEAMS, *PARALLEL)
         return sorted(found, key=lambda sample: (sample.stamp_ns, order.index(sample.beam)))
 
+    def forget_marked(self, marks: Mapping[str, int]) -> None:
+        """Forget edges up to the marks: a recording may bring later ones sooner than they came."""
+        self.take(-1, marks)
+
     def forget(self, before_ns: int) -> None:
         """Forget edges from before a stamp."""
         self._edges = [sample for sample in self._edges if sample.stamp_ns >= before_ns]

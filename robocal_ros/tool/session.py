@@ -610,7 +610,7 @@ class ToolSession(SessionBase):
         self.run = ToolRun(
             self._runs, mode, cycle_id, plan, config, arm, revision, begun_ns, begun_ns, healthy
         )
-        self._edges.clear()
+        self._edges.forget_marked(command.marks or {})
         self._over, self._strays = None, 0
         words = f"run {self._runs} ({mode}): {', '.join(plan.names)}"
         return Outcome(command, Code.ACCEPT, words)

@@ -293,6 +293,24 @@ def test_a_clock_that_jumps_back_ends_the_run(history):
     assert driver.session.run is None
 
 
+@pytest.mark.parametrize("sooner", [False, True])
+def test_a_recording_may_bring_an_edge_of_the_run_before_the_runs_begin(history, sooner):
+    """A recorder gets topics in another order than the node: the marks tell what was there."""
+    driver = driver_of(history)
+    driver.rest(0.1)
+    session, before = driver.session, driver.session.marks
+    edge = EdgeSample(session.newest_joints_ns + 1_000_000, "", "x", True, 1e-4)
+    if sooner:
+        session.add(edge)
+    session.submit(Command("measure_tool", {"mode": "full"}, session.newest_joints_ns, before))
+    assert session.step(wall_ns=1)[-1].done
+    if not sooner:
+        session.add(edge)
+    driver.rest(0.1)
+    session.submit(Command(TOOL_STEP, {}, session.newest_joints_ns, session.marks))
+    assert session.step(wall_ns=2)[-1].samples == 1
+
+
 def test_settings_survive_json():
     config = config_of(noisy_cell(), station="north")
     assert ToolConfig.of_document(json.loads(json.dumps(config.document()))) == config
