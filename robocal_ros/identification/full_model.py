@@ -319,7 +319,7 @@ def identify_full(
         foretold = _foretold(arm, data, fit, method, gain)
         if foretold is None:
             return rival.start
-        squared = foretold
+        squared = np.where(np.isnan(foretold), squared, foretold)
     return full.reported(_stretch(squared, full.keep))
 
 
@@ -329,12 +329,16 @@ def _foretold(
     """Squared errors (m,), over their covariances, of full models of the poses of other folds.
 
     What the evidence chooses from few poses is chosen for these, too: a pose is left out of that
-    as well. None where they do not foretell ``gain`` times as well as geometric models.
+    as well. None where they do not foretell ``gain`` times as well as geometric models. NaN of
+    targets of which the other folds have no pose: nothing foretells those.
     """
     errors: list[list[Array]] = [[], []]
-    squared = np.empty(len(data))
-    fold = pose_groups(data.q) % FOLDS
-    for left_out in (fold == i for i in range(FOLDS)):
+    squared = np.full(len(data), np.nan)
+    fold, target = pose_groups(data.q) % FOLDS, data.target_index(data.targets)
+    for of_target in (target == i for i in range(len(data.targets))):
+        if np.ptp(fold[of_target]) == 0:
+            fold[of_target] = FOLDS
+    for left_out in (fold == i for i in np.unique(fold[fold < FOLDS])):
         rest = data.take(left_out)
         try:
             full, rival = _solved(arm, data.take(~left_out), fit, method)

@@ -373,6 +373,20 @@ def test_without_a_load_there_are_functions_alone(bent):
     assert np.any(found.known.terms.count)
 
 
+@pytest.mark.parametrize("visits", [1, 2])
+def test_a_target_of_a_single_pose_is_foretold_by_nothing(bent, visits):
+    """The folds of few poses leave out none of it, and it costs the others nothing."""
+    robot, _, check, _ = bent
+    q = robot.poses(150)
+    q[:visits] = q[0]
+    data = robot.measured(q)
+    plain = identify_full(robot.nominal, data)
+    other = replace(data, target=("other",) * visits + data.target[visits:])
+    found = identify_full(robot.nominal, other)
+    assert isinstance(found, FullIdentification)
+    assert rms_mm(found, check) == pytest.approx(rms_mm(plain, check), rel=0.05)
+
+
 def test_where_the_model_is_not_covered_is_told(bent):
     robot, data, _, _ = bent
     check = robot.measured(robot.poses(300, LOWER, UPPER + np.radians([60.0, 0, 0, 0, 0, 0])))
