@@ -37,14 +37,15 @@ CONSTANTS = LOADS + 2 * LOAD
 
 # Rows: joints given; what a rigid reference arm reads there; what `six_axis` makes of it, with its
 # report; joints tried, with value and slope of their functions; what a rigid actual arm reads
-# there, and how far load winds it; squares of the last two steps.
+# there, and how far load winds it; squares of the last step under load, of how that changed the
+# load, and of the step behind it.
 GIVEN, CAME, GOES = 0, N, 2 * N
 TRIED, VALUE, SLOPE, TURNED, WOUND, STEPS = (k * N + REPORT for k in range(3, 9))
-ROWS = STEPS + 2
+ROWS = STEPS + 3
 ROUNDS = 2
-# Squares (rad^2) of the last step, of which a thousandth is left, as how load changes, and of the
-# one before, of which the square of that is: together 1e-11 rad.
-LAST, BEFORE = 1e-9**2, 1e-5**2
+# Squares (rad^2): the longest last steps, whose own squares are rounding, and what load may leave
+# of them: of a step the square of the share by which it changed the load, of that behind it that.
+UNDER_LOAD, BEHIND, LEFT = 1e-5**2, 1e-9**2, 1e-12**2
 
 
 @lean
@@ -219,6 +220,7 @@ def _step(c: Array, rows: Array, k: int, lanes: int) -> None:
     _put(more(more(q, 1.0, step), -1.0, change), rows, TRIED, k, lanes)
     _put(more(wound, 1.0, change), rows, WOUND, k, lanes)
     rows[STEPS * lanes + k] = dot(step, step)
+    rows[(STEPS + 1) * lanes + k] = dot(change, change)
 
 
 @lean
@@ -228,7 +230,7 @@ def _refine(rows: Array, k: int, lanes: int) -> None:
     turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, _six(rows, WOUND, k, lanes))
     step = _over(more(_six(rows, GOES, k, lanes), -1.0, turned), slope)
     _put(more(q, 1.0, step), rows, TRIED, k, lanes)
-    rows[(STEPS + 1) * lanes + k] = dot(step, step)
+    rows[(STEPS + 2) * lanes + k] = dot(step, step)
 
 
 @lean
@@ -246,7 +248,9 @@ def _shift(c: Array, rows: Array, k: int, lanes: int) -> None:
 def _end(rows: Array, k: int, lanes: int) -> None:
     """The joints found, if they are."""
     at, steps = (GOES + N + CONVERGED) * lanes + k, STEPS * lanes + k
-    small = (rows[steps] <= BEFORE) & (rows[steps + lanes] <= LAST)
+    step, change, behind = rows[steps], rows[steps + lanes], rows[steps + 2 * lanes]
+    small = (step <= UNDER_LOAD) & (behind <= BEHIND)
+    small &= change * (change + behind) <= LEFT * step
     rows[at] = rows[at] if small else 0.0
     _put(_six(rows, TRIED, k, lanes), rows, GOES, k, lanes)
 

@@ -84,10 +84,9 @@ class Workspace(NamedTuple):
     spare: Array
     order: Array
     x: Array  # (n,) shift of the joints
-    settings: (
-        Array  # steepness and its rise, see `joint_correction` (3); whether `six_axis` serves,
-    )
-    # and whether the reference model has joint functions
+    # steepness and its rise, see `joint_correction` (3); whether `six_axis` serves, and whether the
+    # reference model has joint functions
+    settings: Array
     constants: Array  # of `six_axis` and `six_functions`
     rows: Array  # sixteen points
     taught_layer: Array  # (n + 1, w) joint functions of both models; w is 0 where neither has some
@@ -437,7 +436,7 @@ def uncorrect_staged(
                 q[i] += miss
         if before > 0.0:
             slowest = max(slowest, size / before)
-        if size <= exact or (before > 0.0 and slowest * size <= exact):
+        if size <= exact or (before > 0.0 and slowest * size <= exact * (1.0 - slowest)):
             return True
         before = size
     return False
