@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """True edges against distances that can be written down."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,20 @@ def test_clearance_agrees_with_points_of_the_surface():
         least = min(least, float(np.min(distance - radius)))
     assert X_BEAM.clearance(tool, T)[0] == pytest.approx(least, abs=1e-7)
     assert X_BEAM.clearance(tool, T)[0] <= least + 1e-15
+
+
+def test_a_mandrel_breaks_a_beam_as_the_tool_does():
+    beside = TOOL @ frames.transform(np.eye(3), [0.0, 0.004, 0.0])
+    tool = replace(RoundTool.cylinder(TOOL, 0.001), mandrel=RoundTool.cylinder(beside, 0.001))
+    start = UPRIGHT.copy()
+    start[:3, 3] += [0.003, -0.01, -0.02]
+    sweep = Sweep(start, np.array([0.0, 0.02, 0.0]), 1.0)
+    edges = [e for e in station().edges(tool, sweep, sweep.window, rng()) if e.beam == "x"]
+    assert [e.blocked for e in edges] == [True, False, True, False]
+    apart_s = edges[2].time_s - edges[0].time_s
+    assert apart_s == pytest.approx(0.2, abs=1e-12)  # 4 mm at 20 mm/s
+    bent_tool = tool.mounted(TOOL @ frames.transform(np.eye(3), [0.0, 0.001, 0.0]))
+    assert bent_tool.mandrel is tool.mandrel
 
 
 def test_edges_of_a_sweep_are_where_the_tool_touches():
