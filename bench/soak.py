@@ -101,6 +101,8 @@ def endurance(amount: Amount) -> Table:
         lambda: not _pytest("test/nodes/soak_maintenance.py"))  # fmt: skip
     add("sensor, sphere or robot knocked in a live cell, each told in the next gap", 1,
         lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
+    add("a beam station found again in a live gap, and knocked; replayed as live", 1,
+        lambda: not _pytest("test/nodes/soak_laser_frame.py"))  # fmt: skip
     add("a node that is stopped for 50 to 500 ms in a fast stream: largest step against direct", 1,
         lambda: not _pytest("test/nodes/soak_stalls.py"))  # fmt: skip
     add("hostile requests to a live bridge and a live page", HOSTILE, lambda: not _hostile())

@@ -329,12 +329,13 @@ class ToolPart:
         if every_s <= 0.0 or cell.config.driving.mandrel is None or outcome.left or outcome.fault:
             return
         recent = 0.0 <= self._age_s(self._memory.tool.laser_ns) < every_s
-        if (
-            not recent
-            and self._decider.revision(LASER_FRAME)
-            and cell.fits(cell.tool_worst_s(LASER))
-        ):
-            yield from self._measured(LASER, f"{cycle_id}/laser frame")
+        if recent or not self._decider.revision(LASER_FRAME):
+            return
+        if words := cell.too_short(cell.tool_worst_s(LASER)):
+            outcome.left, outcome.station = f"tool measurement ({LASER})", f"beam station: {words}"
+            outcome.station_code = Code.LIMIT_EXCEEDED
+            return
+        yield from self._measured(LASER, f"{cycle_id}/laser frame")
 
     def _check(self, name: str, *, goes_on: bool = False) -> Script[bool]:
         """A quick check; whether it gave an answer."""

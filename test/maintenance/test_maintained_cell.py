@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The maintenance of a cell in closed loop, in one process: real sessions, simulated cell."""
 
+import re
 import shutil
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -452,7 +453,11 @@ def test_the_beams_are_found_again_in_gaps_and_a_knock_is_told(tmp_path):
         assert again.message == "nothing was due"
         cell.maintenance.memory.note_tool(laser_ns=1)  # long ago
         short = cell.maintain("short", 60.0)
-        assert short.message == "nothing was due"  # with time only
+        assert (short.code, short.station_code) == (Code.ACCEPT, Code.LIMIT_EXCEEDED)
+        assert (short.complete, short.left) == (False, ("tool measurement (laser)",))
+        would_do = re.search(r"beam station: .* s too short, one of (\d+) s", short.message)
+        assert would_do, short.message
+        gap_s = float(would_do[1])  # in which it is found
         side = 3e-4 * cell.cell.laser.T_base_laser[:3, 0]
         x, y = (replace(b, start=b.start + side, end=b.end + side) for b in cell.cell.station.beams)
         cell.cell.station = replace(cell.cell.station, beams=(x, y))

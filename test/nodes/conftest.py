@@ -60,8 +60,7 @@ LATE_S = 0.03  # half of what stops begin ahead of now
 # All nodes of a cell at once, which take more than a core: first, so that xdist gives them to one
 # process, one after the other, and none starves another.
 WHOLE_CELLS = {
-    "test_demo", "test_fault_matrix", "test_fixture_cell", "test_laser_frame_cell",
-    "test_plc_killed", "test_tool_cell",
+    "test_demo", "test_fault_matrix", "test_fixture_cell", "test_plc_killed", "test_tool_cell",
 }  # fmt: skip
 
 

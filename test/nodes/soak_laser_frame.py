@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A cell over DDS whose beams are found again in the PLC's gaps, by the mandrel on the flange: the
 first time by a person, then as a gap's own step, and after a knock. All is simulated.
+
+Not of ``make test``, as it takes minutes: a part of ``make soak``, or
+
+    tools/with_ros python -m pytest -s test/nodes/soak_laser_frame.py
 """
 
 import json
