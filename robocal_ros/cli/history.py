@@ -8,10 +8,17 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.main import CliResult, Document, count, print_table, print_words, text
+from robocal_ros.cli.main import (
+    CliResult,
+    Document,
+    add_state,
+    count,
+    print_table,
+    print_words,
+    text,
+)
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -196,12 +203,7 @@ def add_history(parser: argparse.ArgumentParser) -> None:
             metavar="S",
             help="robot serial; may be left out where only one robot has a history",
         )
-        action.add_argument(
-            "--state",
-            type=Path,
-            metavar="DIR",
-            help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-        )
+        add_state(action)
         return action
 
     for name, words in (

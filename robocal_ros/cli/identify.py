@@ -18,6 +18,7 @@ from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
     Document,
+    add_state,
     count,
     describe_robot,
     parts,
@@ -275,9 +276,7 @@ def _add_keeping(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="serial of the robot as its nodes name it, for --keep",
     )
-    parser.add_argument(
-        "--state", type=Path, metavar="DIR", help="folder of the histories, for --keep"
-    )
+    add_state(parser)
 
 
 def _add_judging(parser: argparse.ArgumentParser) -> None:

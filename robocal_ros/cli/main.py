@@ -24,6 +24,7 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from robocal_ros import __version__
@@ -212,6 +213,12 @@ def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
         metavar="S",
         help=f"noise of a coordinate of one visit{more}; default {SIGMA_MM}",
     )
+
+
+def add_state(parser: argparse.ArgumentParser) -> None:
+    """Offer ``--state``, where the histories are."""
+    words = "folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal"
+    parser.add_argument("--state", type=Path, metavar="DIR", help=words)
 
 
 def describe_robot(name: str) -> "tuple[RobotDescription, list[str]]":

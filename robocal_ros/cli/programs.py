@@ -14,6 +14,7 @@ from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
     Document,
+    add_state,
     describe_robot,
     positive,
     print_output,
@@ -108,12 +109,7 @@ def add_given_model(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="take the model in force in this robot's history",
     )
-    parser.add_argument(
-        "--state",
-        type=Path,
-        metavar="DIR",
-        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-    )
+    add_state(parser)
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:

@@ -17,7 +17,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array, fixed
 
-Maker = Literal["kuka", "abb", "fanuc", "ur", "kawasaki"]
+Maker = Literal["abb", "fanuc", "kawasaki", "kuka", "ur"]
 COUNT: dict[Maker, int] = {"kuka": 6, "abb": 7, "fanuc": 6, "ur": 6, "kawasaki": 6}
 MM, DEGREE = 1e-3, np.pi / 180.0
 QUATERNION_TOLERANCE = 1e-3

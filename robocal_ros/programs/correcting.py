@@ -15,7 +15,7 @@ the robot as it was when it was taught for one that was taught by hand.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from robocal_ros.programs.rapid import RapidDialect
 from robocal_ros.programs.urscript import UrScriptDialect
 
 if TYPE_CHECKING:
-    from robocal_ros.programs.documents import ProgramPointDocument, ProgramReportDocument, State
+    from robocal_ros.programs.documents import ProgramPointDocument, ProgramReportDocument
 
 DIALECTS: tuple[Dialect, ...] = (
     KrlDialect(),
@@ -284,7 +284,8 @@ def report(done: CorrectedProgram) -> "ProgramReportDocument":
     }
 
 
-STATES = ("corrected", "unchanged", "not_corrected")
+State = Literal["corrected", "unchanged", "not_corrected"]
+STATES: tuple[State, ...] = get_args(State)
 
 
 def _point_document(one: CorrectedPoint) -> "ProgramPointDocument":

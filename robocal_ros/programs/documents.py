@@ -17,9 +17,8 @@ from robocal_ros.ground.documents import (
     keywords,
     printed,
 )
-
-Maker = Literal["abb", "fanuc", "kawasaki", "kuka", "ur"]
-State = Literal["corrected", "unchanged", "not_corrected"]
+from robocal_ros.programs.conventions import Maker
+from robocal_ros.programs.correcting import State
 
 
 class ProgramPointDocument(TypedDict):

@@ -17,6 +17,7 @@ from robocal_ros.cli.main import (
     SIGMA_MM,
     CliResult,
     Document,
+    add_state,
     describe_robot,
     positive,
     print_output,
@@ -477,12 +478,7 @@ def add_station(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robot-serial", required=True, type=text, metavar="S", help="whose history is read"
     )
-    parser.add_argument(
-        "--state",
-        type=Path,
-        metavar="DIR",
-        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-    )
+    add_state(parser)
     parser.add_argument(
         "--output", type=Path, metavar="FILE", help="write the last measurement as a laser file"
     )
