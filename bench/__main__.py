@@ -34,6 +34,7 @@ PARTS = {
     "speed": "times",
     "correction": "correction",
     "startup": "startup",
+    "packages": "packages",
     "demo": "demo",
     "correction_stream": "correction_stream",
     "closed_loop": "closed_loop.tables",
