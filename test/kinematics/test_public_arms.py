@@ -24,7 +24,7 @@ UR_LENGTHS = {
     "ur20": (0.2363, -0.862, -0.7287, 0.201, -0.1593, 0.1543),
     "ur30": (0.2363, -0.637, -0.5037, 0.201, -0.1593, 0.1543),
 }
-UR_LENGTHS |= {"ur7e": UR_LENGTHS["ur5e"], "ur12e": UR_LENGTHS["ur10e"]}  # by its pull request 266
+UR_LENGTHS |= {"ur7e": UR_LENGTHS["ur5e"], "ur12e": UR_LENGTHS["ur10e"]}  # pull requests 333, 266
 
 # config/*/physical_parameters.yaml there: mass in kg and centre in m of each link, in its frame.
 _WRISTS_5 = ((0, -0.01634, -0.0018), (0, 0.01634, -0.0018), (0, 0, -0.001159))
@@ -105,6 +105,38 @@ IRB120 = (
      (0.2247, 0.00015, 0.00041), (-0.00109, 3.68e-05, 6.22e-05), (-0.00706, -0.00017, -1.32e-06)),
 )  # fmt: skip
 
+# Of each joint lower and upper limit and speed in deg as the same descriptions have them: of
+# Universal Robots config/*/joint_limits.yaml (UR12e at 49d2ca2), else *_macro.xacro; None: none.
+_UR5E = 2 * [(-360, 360, 180)] + [(-180, 180, 180)] + 3 * [(-360, 360, 180)]
+_UR10E = 2 * [(-360, 360, 120)] + [(-180, 180, 180)] + 3 * [(-360, 360, 180)]
+LIMITS = {
+    "ur3e": [*_UR5E[:3], (-360, 360, 360), (-360, 360, 360), (None, None, 360)],
+    "ur5e": _UR5E,
+    "ur10e": _UR10E,
+    "ur12e": _UR10E,
+    "ur20": 2 * [(-360, 360, 120)] + [(-180, 180, 150)] + 3 * [(-360, 360, 210)],
+    "kr10_r1100": [
+        (-170, 170, 300), (-190, 45, 225), (-120, 156, 225),
+        (-185, 185, 381), (-120, 120, 311), (-350, 350, 492)],
+    "kr10_r1420": [
+        (-170, 170, 220), (-185, 65, 210), (-137, 163, 270),
+        (-185, 185, 381), (-120, 120, 311), (-350, 350, 492)],
+    "lrmate200id": [
+        (-170, 170, 450), (-100, 145, 380), (-70, 205, 520),
+        (-190, 190, 550), (-125, 125, 545), (-360, 360, 1000)],
+}  # fmt: skip
+LIMITS_RAD = {
+    "irb120_3_58": [
+        (-2.87979, 2.87979, 4.36332), (-1.91986, 1.91986, 4.36332), (-1.91986, 1.22173, 4.36332),
+        (-2.79253, 2.79253, 5.58505), (-2.094395, 2.094395, 5.58505), (-6.98132, 6.98132, 7.33038)],
+    "gp7": [
+        (-2.9670, 2.9670, 6.5448), (-1.1344, 2.5307, 5.4977), (-1.2217, 3.3161, 7.1558),
+        (-3.3161, 3.3161, 9.5993), (-2.3561, 2.3561, 9.5993), (-6.2944, 6.2944, 17.4845)],
+}  # fmt: skip
+LAST_DIGIT_RAD = {"irb120_3_58": 1e-5, "gp7": 1e-4}
+# Range and speed of joint 6 are there 0.18 % above a whole turn and 1000 deg/s; here they are so.
+ROUNDED = {"gp7": (-360, 360, 1000)}
+
 
 def described(name: str) -> Chain:
     """The links from base to tool0 that the public description of a type has."""
@@ -167,6 +199,35 @@ def test_a_file_is_whole_and_says_where_its_numbers_are_from(name):
     at_zero = robot.arm.fk(np.zeros(6))[:3, 3] * 1e3
     told = comment.split("the flange is at (")[1].split(")")[0].split(",")
     np.testing.assert_allclose([float(x) for x in told], at_zero, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*LIMITS, *LIMITS_RAD])
+def test_limits_and_speeds_are_those_of_the_public_description(name):
+    robot = load_description(name)
+    ours = np.degrees([robot.arm.lower, robot.arm.upper, robot.max_velocity]).T
+    if name in LIMITS:
+        theirs, digit = np.array(LIMITS[name], dtype=float), 1e-9
+    else:
+        theirs, digit = np.degrees(LIMITS_RAD[name]), np.degrees(LAST_DIGIT_RAD[name])
+    if name in ROUNDED:
+        np.testing.assert_allclose(theirs[5], ROUNDED[name], rtol=0.002)
+        theirs[5] = ROUNDED[name]
+    if name in UR_LENGTHS:
+        theirs[2, :2] *= 2.0  # "half its actual joint position limit", for planners
+    limited = np.isfinite(theirs)
+    assert limited.all() or name == "ur3e"
+    np.testing.assert_allclose(ours[limited], theirs[limited], rtol=0, atol=digit)
+
+
+def test_a_ur7e_is_a_ur5e():
+    """Pull request 333 of Universal_Robots_ROS2_Description makes the files of both equal."""
+    one, other = load_description("ur7e"), load_description("ur5e")
+    np.testing.assert_array_equal(one.arm.mdh, other.arm.mdh)
+    for name in ("lower", "upper"):
+        np.testing.assert_array_equal(getattr(one.arm, name), getattr(other.arm, name))
+    np.testing.assert_array_equal(one.max_velocity, other.max_velocity)
+    np.testing.assert_array_equal(one.arm.load.centre, other.arm.load.centre)
+    np.testing.assert_array_equal(one.arm.load.mass, other.arm.load.mass)
 
 
 def test_no_limit_is_above_its_sheets_for_digits_of_radians():

@@ -318,8 +318,13 @@ def test_prefixes_of_ros_are_searched(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_an_unknown_name_lists_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no robot 'bx20l' \(did you mean 'bx200l'\?\)"):
+    known = r"or one of bx200l, .*kr150_r3100, .*ur10, .*ur5e, "
+    words = rf"no robot 'bx20l' \(did you mean 'bx200l'\?\): .*{known}"
+    with pytest.raises(InputError, match=words) as refused:
         load_robot("bx20l")
+    shipped = find_robot("ur10").parent.glob("*.yaml")
+    listed = str(refused.value).split("or one of ")[1].split(", ")
+    assert {file.stem for file in shipped} <= set(listed)
     with pytest.raises(InputError, match="no such robot file"):
         load_robot(tmp_path / "ur10.yaml")
     with pytest.raises(InputError, match="no such robot file"):
