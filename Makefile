@@ -40,7 +40,7 @@ demo: setup  ## a simulated cell in closed loop through the live nodes, report i
 # the machine. They mostly wait: what all others compute fills their pauses, and gives way at once.
 # What failed is shown last. A node test that failed is run once again, twice where time judges, as
 # others on the machine may have starved it, and named; never one whose examples chance picks, nor
-# one whose output jumped (test/worlds/jumps.py), whatever was starved. So is one that Fast DDS took
+# one whose output jumped (test/worlds/jumps.py says when it may). So is one that Fast DDS took
 # along as it crashed: each runs in a process of xdist's.
 HURRIES := $(shell [ "$$(nice -n -10 nice 2>/dev/null)" -lt 0 ] && echo nice -n -10)
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)

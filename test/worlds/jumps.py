@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What fails as an output jumped is never run again: a second try would hide what comes at times.
+"""What fails as an output jumped is not run again: a second try would hide what comes at times.
 
-`make test` reruns node tests, which others on the machine may have starved, except for these.
+`make test` reruns node tests, which others on the machine may have starved, except for these. A
+test may try anew what jumped while a process is known to have waited for a core
+(``Graph.undisturbed``).
 """
 
 import numpy as np
