@@ -7,7 +7,7 @@ import pytest
 from robocal_ros.ground.frames import exp_rotation, transform
 from robocal_ros.kinematics.robots import load_description, robot_folders
 from robocal_ros.kinematics.universal_robots import link_transform
-from robocal_ros.kinematics.urdf import Chain, chain, read_urdf, ur_chain
+from robocal_ros.kinematics.urdf import Chain, arm_of, chain, read_urdf, ur_chain, urdf_of
 
 EXACT = 1e-9  # m and rad
 
@@ -24,12 +24,24 @@ UR_LENGTHS = {
     "ur20": (0.2363, -0.862, -0.7287, 0.201, -0.1593, 0.1543),
     "ur30": (0.2363, -0.637, -0.5037, 0.201, -0.1593, 0.1543),
 }
-UR_LENGTHS |= {"ur7e": UR_LENGTHS["ur5e"], "ur12e": UR_LENGTHS["ur10e"]}  # pull requests 333, 266
+# The maker's description for ROS 1, ros-industrial/universal_robot: ur_description/config/ur7e is a
+# link to ur5e (3be8136); default_kinematics.yaml of ur12e is from 2f33925, of ur15 from 499e728, of
+# ur18 from 34b1371.
+UR_LENGTHS |= {
+    "ur7e": UR_LENGTHS["ur5e"],
+    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, -0.11985, 0.11655),
+    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, -0.1361, 0.1434),
+    "ur18": (0.2186, -0.475, -0.3389, 0.1824, -0.1361, 0.1434),
+}
 
 # config/*/physical_parameters.yaml there: mass in kg and centre in m of each link, in its frame.
 _WRISTS_5 = ((0, -0.01634, -0.0018), (0, 0.01634, -0.0018), (0, 0, -0.001159))
 _WRISTS_10 = ((0, -0.018, 0.007), (0, 0.018, -0.007), (0, 0, -0.026))
+_WRISTS_15 = (
+    (2.5e-05, -0.016413, -0.019695), (2.5e-05, 0.015886, -0.01996), (-1.8e-05, -0.000112, -0.053397)
+)  # fmt: skip
 _SHOULDER_5, _SHOULDER_10 = (0, -0.00193, -0.02561), (0.021, -0.027, 0)
+_SHOULDER_15 = (2.4e-05, -0.025304, -0.033309)
 UR_LINKS = {
     "ur3e": (
         (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
@@ -52,6 +64,16 @@ UR_LINKS = {
         (7.369, 10.45, 4.321, 2.18, 2.033, 0.907),
         ((0, -0.03, -0.016), (-0.1764, 0, 0.16), (-0.166, 0, 0.065), (0, -0.011, -0.009),
          (0, 0.012, -0.018), (0, 0, -0.044)),
+    ),
+    "ur15": (  # at 2cb0bf1
+        (9.9883, 14.9255, 6.1015, 2.089, 2.0869, 1.0666),
+        (_SHOULDER_15, (-0.228491, -8.3e-05, 0.192787), (-0.210929, 1.9e-05, 0.070552),
+         *_WRISTS_15),
+    ),
+    "ur18": (  # at 6ffee81
+        (9.9883, 14.2009, 5.52, 2.089, 2.0869, 1.0666),
+        (_SHOULDER_15, (-0.166336, -8.8e-05, 0.190204), (-0.139248, 2.1e-05, 0.073101),
+         *_WRISTS_15),
     ),
     "ur20": (
         (16.343, 29.632, 7.879, 3.054, 3.126, 0.926),
@@ -106,7 +128,8 @@ IRB120 = (
 )  # fmt: skip
 
 # Of each joint lower and upper limit and speed in deg as the same descriptions have them: of
-# Universal Robots config/*/joint_limits.yaml (UR12e at 49d2ca2), else *_macro.xacro; None: none.
+# Universal Robots config/*/joint_limits.yaml (UR12e at 49d2ca2, UR15 in the description for ROS 1,
+# UR18 at 272bddd), else *_macro.xacro; None: none.
 _UR5E = 2 * [(-360, 360, 180)] + [(-180, 180, 180)] + 3 * [(-360, 360, 180)]
 _UR10E = 2 * [(-360, 360, 120)] + [(-180, 180, 180)] + 3 * [(-360, 360, 180)]
 LIMITS = {
@@ -114,6 +137,10 @@ LIMITS = {
     "ur5e": _UR5E,
     "ur10e": _UR10E,
     "ur12e": _UR10E,
+    **dict.fromkeys(
+        ("ur15", "ur18"),
+        2 * [(-360, 360, 180)] + [(-180, 180, 240)] + 3 * [(-360, 360, 300)],
+    ),
     "ur20": 2 * [(-360, 360, 120)] + [(-180, 180, 150)] + 3 * [(-360, 360, 210)],
     "kr10_r1100": [
         (-170, 170, 300), (-190, 45, 225), (-120, 156, 225),
@@ -183,6 +210,18 @@ def test_the_flange_is_where_the_public_description_has_it(name):
 
 
 @pytest.mark.parametrize("name", [*UR_LENGTHS, *PUBLIC])
+def test_a_public_description_becomes_a_model_and_a_description_again(name):
+    links = described(name)
+    model = arm_of(links).arm
+    again = chain(read_urdf(urdf_of(model), name))
+    q = np.random.default_rng(2).uniform(-np.pi, np.pi, (1000, 6))
+    there = np.array([links.fk(row) for row in q])
+    assert len(model.parameters) == 24
+    assert np.abs(model.fk(q) - there).max() < EXACT
+    assert np.abs(np.array([again.fk(row) for row in q]) - there).max() < EXACT
+
+
+@pytest.mark.parametrize("name", [*UR_LENGTHS, *PUBLIC])
 def test_a_file_is_whole_and_says_where_its_numbers_are_from(name):
     robot = load_description(name)
     assert robot.notes == ()  # all limits are there
@@ -236,8 +275,12 @@ def test_no_limit_is_above_its_sheets_for_digits_of_radians():
 
 
 def test_an_irb_2600_leans_forward_further_than_back():
-    """ABB's sheet ROB0142EN: axis 2 from -95 to 155 deg, which moves the arm down in front."""
+    """ABB's sheet ROB0142EN: axis 2 from -95 to 155 deg, which moves the arm down in front.
+
+    So has it the IRB 2600-12/1.85 (ros-industrial/abb at 385308a); joint 3 goes to -180 deg there.
+    """
     arm = load_description("irb2600_12_165").arm
+    np.testing.assert_allclose(np.degrees([arm.lower[2], arm.upper[2]]), [-155.0, 75.0])
     np.testing.assert_allclose(np.degrees([arm.lower[1], arm.upper[1]]), [-95.0, 155.0])
     leant = arm.fk(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]))
     assert leant[0, 3] > arm.fk(np.zeros(6))[0, 3]
