@@ -5,10 +5,9 @@ import argparse
 import getpass
 import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.main import (
     CliResult,
@@ -39,6 +38,16 @@ from robocal_ros.session.events import measured_with
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from robocal_ros.history.documents import (
+        DecisionDocument,
+        HistoryAcknowledgeDocument,
+        HistoryCorrectionsDocument,
+        HistoryDecisionDocument,
+        HistoryFileDocument,
+        HistoryListDocument,
+        HistoryShowDocument,
+    )
+
 
 _LISTED = (
     "id", "revision", "kind", "state", "verdict", "rms mm", "data (UTC)", "cycle", "last decision",
@@ -49,12 +58,12 @@ _CORRECTED = (
 _STYLES = {"in_force": "bold green", "pending": "bold yellow", "refused": "red"}
 
 
-def show_list(console: "Console", document: Document) -> None:
+def show_list(console: "Console", document: "HistoryListDocument") -> None:
     """Print the calibrations as a table, and what is in force."""
     from rich.text import Text
 
     _show_damage(console, document)
-    rows = []
+    rows: list[list[str | Text]] = []
     for entry in document["calibrations"]:
         rms = entry["candidate_rms_mm"]
         rows.append(
@@ -102,12 +111,12 @@ def show_entry(console: "Console", document: Document) -> None:
     console.print("The full document, the model and its figures: --json")
 
 
-def show_corrections(console: "Console", document: Document) -> None:
+def show_corrections(console: "Console", document: "HistoryCorrectionsDocument") -> None:
     """Print what the commands were corrected with, and since when."""
     from rich.text import Text
 
     _show_damage(console, document)
-    rows = []
+    rows: list[list[str | Text]] = []
     for record in document["corrections"]:
         asked = ("shadow" if record["shadow"] else "on") if record["enabled"] else "off"
         rows.append(
@@ -128,19 +137,21 @@ def show_corrections(console: "Console", document: Document) -> None:
         console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
 
 
-def show_done(console: "Console", document: Document) -> None:
-    """Print what was decided, or which damaged histories somebody knows of now."""
-    if "acknowledged" in document:
-        for path in document["acknowledged"]:
-            print_words(console, f"Acknowledged by {document['by']}: {path}")
-        if not document["acknowledged"]:
-            console.print("There is nothing to acknowledge")
-        return
+def show_acknowledged(console: "Console", document: "HistoryAcknowledgeDocument") -> None:
+    """Print which damaged histories somebody knows of now."""
+    for path in document["acknowledged"]:
+        print_words(console, f"Acknowledged by {document['by']}: {path}")
+    if not document["acknowledged"]:
+        console.print("There is nothing to acknowledge")
+
+
+def show_decided(console: "Console", document: "HistoryDecisionDocument") -> None:
+    """Print what was decided."""
     _show_damage(console, document)
     print_words(console, document["verdict"]["reason"].capitalize())
 
 
-def _show_damage(console: "Console", document: Document) -> None:
+def _show_damage(console: "Console", document: Mapping[str, Any]) -> None:
     if document["damaged"]:
         console.print(
             f"The history was damaged and is kept as {document['damaged']}; 'robocal history "
@@ -150,7 +161,7 @@ def _show_damage(console: "Console", document: Document) -> None:
         )
 
 
-def _words(decision: Document) -> str:
+def _words(decision: "DecisionDocument") -> str:
     number = decision["calibration_id"]
     target = ""
     if decision["action"] == "rollback":
@@ -264,21 +275,24 @@ def run_history(args: argparse.Namespace) -> CliResult:
             )
         serial = serials[0]
     with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
-        document, render = _ACTIONS[args.action](history, args)
+        return CliResult(*_ACTIONS[args.action](history, args))
+
+
+def _file(history: CalibrationHistory) -> "HistoryFileDocument":
     damaged = damaged_files(history.path)
-    place = {
-        "serial": serial,
+    return {
+        "serial": history.serial,
         "file": str(history.path),
         "damaged": str(damaged[-1]) if damaged else None,
     }
-    return CliResult(place | document, render)
 
 
-Answer = tuple[Document, Callable[..., None]]
+Answer = tuple[Mapping[str, Any], Callable[..., None]]
 
 
-def _list(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    document = {
+def _list(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
+    document: HistoryListDocument = {
+        **_file(history),
         "in_force": [
             {"kind": h.kind, "revision": h.revision, "calibration_id": h.calibration_id}
             for h in history.heads()
@@ -288,9 +302,10 @@ def _list(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     return document, show_list
 
 
-def _show_history(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+def _show_history(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
     entry = history.get(args.id)
-    document = {
+    document: HistoryShowDocument = {
+        **_file(history),
         "calibration": entry.document(),
         "document": history.document(entry.id),
         "model": history.model(entry.id),
@@ -302,22 +317,25 @@ def _show_history(history: "CalibrationHistory", args: argparse.Namespace) -> An
     return document, show_entry
 
 
-def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    document = {
-        "corrections": [
-            asdict(record) | {"taught_tool": list(record.taught_tool)}
-            for record in history.corrections(args.limit)
-        ]
+def _corrections(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
+    document: HistoryCorrectionsDocument = {
+        **_file(history),
+        "corrections": [record.document() for record in history.corrections(args.limit)],
     }
     return document, show_corrections
 
 
-def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+def _acknowledge(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
     files = acknowledge(history.path, _by(args), time.time_ns())
-    return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_done
+    document: HistoryAcknowledgeDocument = {
+        **_file(history),
+        "acknowledged": [str(path) for path in files],
+        "by": _by(args),
+    }
+    return document, show_acknowledged
 
 
-def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+def _accept(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
     head = history.accept(
         args.id,
         by=_by(args),
@@ -327,18 +345,18 @@ def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
         with_heads=measured_with(history, history.get(args.id)),
     )
     said = f"calibration {args.id} is in force as {head.kind} revision {head.revision}"
-    return _decided(args, head.kind, args.id, head.revision, said), show_done
+    return _decided(history, args, head.kind, args.id, head.revision, said), show_decided
 
 
-def _reject(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+def _reject(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
     history.reject(args.id, by=_by(args), reason=args.reason, wall_ns=time.time_ns())
     kind = history.get(args.id).kind
     revision = history.get(args.id).decisions[-1].head_after
     said = f"calibration {args.id} is rejected; {kind} revision {revision} stays in force"
-    return _decided(args, kind, args.id, revision, said), show_done
+    return _decided(history, args, kind, args.id, revision, said), show_decided
 
 
-def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+def _rollback(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
     head = history.rollback(
         args.to,
         kind=args.kind,
@@ -351,10 +369,10 @@ def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer
     start = BEFORE_ANY.get(args.kind, "nothing")
     name = start if number is None else f"calibration {number}"
     said = f"{name} is in force again, as {head.kind} revision {head.revision}"
-    return _decided(args, head.kind, number, head.revision, said), show_done
+    return _decided(history, args, head.kind, number, head.revision, said), show_decided
 
 
-_ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]] = {
+_ACTIONS: Mapping[str, Callable[[CalibrationHistory, argparse.Namespace], Answer]] = {
     "list": _list,
     "acknowledge": _acknowledge,
     "show": _show_history,
@@ -366,9 +384,15 @@ _ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]
 
 
 def _decided(
-    args: argparse.Namespace, kind: str, calibration_id: int | None, revision: int, said: str
-) -> Document:
+    history: CalibrationHistory,
+    args: argparse.Namespace,
+    kind: str,
+    calibration_id: int | None,
+    revision: int,
+    said: str,
+) -> "HistoryDecisionDocument":
     return {
+        **_file(history),
         "action": args.action,
         "kind": kind,
         "calibration_id": calibration_id,

@@ -61,7 +61,12 @@ from robocal_ros.kinematics.tables import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.identification.documents import PlannedPoseDocument, PosePlanDocument
+    from robocal_ros.identification.documents import (
+        Iso9283Document,
+        PlannedPoseDocument,
+        PoseAccuracyDocument,
+        PosePlanDocument,
+    )
 
 
 MOVED_SIGMA = 2.0
@@ -592,8 +597,8 @@ def add_iso9283(parser: argparse.ArgumentParser) -> None:
 def run_iso9283(args: argparse.Namespace) -> CliResult:
     table = read_positions(args.data)
     commanded = _by_target(args.commanded, list(table), str(args.data))
-    targets: Document = {}
-    warnings = []
+    targets: dict[str, PoseAccuracyDocument] = {}
+    warnings: list[str] = []
     if EVERY in commanded and len(table) > 1:
         warnings.append(
             "one commanded position is taken for the targets "
@@ -606,7 +611,7 @@ def run_iso9283(args: argparse.Namespace) -> CliResult:
             found = repeated(position, None if where is None else np.array(where) * 1e-3)
         except TooFewSamplesError as error:
             raise TooFewSamplesError(f"{args.data}, target {quoted(name)}: {error}") from error
-        axes = (None,) * 3 if found.offset is None else (found.offset * 1e3).tolist()
+        x, y, z = (None,) * 3 if found.offset is None else (found.offset * 1e3).tolist()
         targets[name] = {
             "n": found.n,
             "AP_mm": None if found.AP_m is None else found.AP_m * 1e3,
@@ -614,14 +619,17 @@ def run_iso9283(args: argparse.Namespace) -> CliResult:
             "mean_distance_mm": found.mean_distance_m * 1e3,
             "S_mm": found.S_m * 1e3,
             "barycentre_mm": (found.barycentre * 1e3).tolist(),
-            **dict(zip(("AP_x_mm", "AP_y_mm", "AP_z_mm"), axes, strict=True)),
+            "AP_x_mm": x,
+            "AP_y_mm": y,
+            "AP_z_mm": z,
         }
         if found.n < CYCLES:
             warnings.append(
                 f"target {quoted(name)}: {found.n} cycles; ISO 9283 asks for {CYCLES}: RP is less "
                 "certain"
             )
-    return CliResult({"targets": targets, "warnings": warnings}, _show_iso9283)
+    document: Iso9283Document = {"targets": targets, "warnings": warnings}
+    return CliResult(document, _show_iso9283)
 
 
 def _commanded(value: str) -> tuple[str, Point]:

@@ -57,7 +57,11 @@ from robocal_ros.thermal.proposing import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.programs.documents import CorrectedProgramDocument
+    from robocal_ros.programs.documents import (
+        CorrectedProgramDocument,
+        FrameShiftDocument,
+        ShiftInForceDocument,
+    )
 
 _MODEL = (
     "robot file of the robot as identified, or what 'robocal history show --json' prints of a "
@@ -427,22 +431,23 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     words = "\n".join(lines)
     if args.output is not None:
         write_bytes(args.output, (words + "\n").encode())
-    document: Document = {
+    found = shift_document(shift, names, args.limit_mm)
+    was: ShiftInForceDocument | None = None
+    if in_force is not None:
+        was = {"revision": in_force.revision, **errors_of(in_force.shift.after, args.limit_mm)}
+    verdict = shift_verdict(found, was, args.in_force)
+    document: FrameShiftDocument = {
         "robot": nominal.name,
         "model_hash": nominal.model_hash,
         "maker": args.maker,
         "text": words,
-        **shift_document(shift, names, args.limit_mm),
-        "in_force": None,
+        **found,
+        "in_force": was,
         "calibration_id": None,
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
+        "verdict": verdict_document(verdict),
     }
-    if in_force is not None:
-        errors = errors_of(in_force.shift.after, args.limit_mm)
-        document["in_force"] = {"revision": in_force.revision, **errors}
-    verdict = shift_verdict(document, args.in_force)
-    document["verdict"] = verdict_document(verdict)
     if args.keep:
         with model_history(args, nominal) as history:
             document["calibration_id"] = keep_shift(

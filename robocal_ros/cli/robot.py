@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from robocal_ros.cli.documents import (
         ConvertedUrdfDocument,
         ExportUrdfDocument,
+        FkDocument,
         FunctionsOfJointsDocument,
         HayatiRowDocument,
         ImportUrdfDocument,
@@ -89,15 +90,15 @@ def run_fk(args: argparse.Namespace) -> CliResult:
         joints.append({"name": name, "value": shown, "unit": unit, "within_limits": within})
         if not within:
             warnings.append(f"{name} at {shown:g} {unit} is beyond its limits")
-    document: Document = {
+    document: FkDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "joints": joints,
         "T_base_flange": transform_document(T_base_flange),
+        "warnings": warnings,
     }
     if not np.array_equal(arm.T_flange_tool, np.eye(4)):
         document["T_base_tool"] = transform_document(T_base_flange @ arm.T_flange_tool)
-    document["warnings"] = warnings
     return CliResult(document, _show_fk)
 
 

@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ from robocal_ros.hand_eye.camera_fit import (
 )
 from robocal_ros.hand_eye.mount_problem import same_pose
 from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings, apart, judge_classic
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.documents import CameraNoiseDocument
 
 # ---- camera mistakes ----------------------------------------------------------------------------
 
@@ -388,7 +391,8 @@ def calibrate_camera(
     wrong = mistake(fit.pairs, fit.at) if rms(size_m) > LARGEST_RMS_M else ""
     if wrong := wrong or wrong_scale(fit.pairs.take(used), fit.at):
         raise InputError(wrong)
-    about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
+    noise = _noise_document(fit, how.noise)
+    about = {"mount": pairs.mount, "noise": noise, **(more or {})}
     result, state = (_classic if how.method == "classic" else _best)(fit, how)
     result = replace(result, rejected={**rejected, **result.rejected}, more=about | result.more)
     return result if check is None else _judged(result, check, state)
@@ -446,18 +450,16 @@ def _judged(result: HandEyeResult, check: CheckPairs, state: PairState) -> HandE
     return replace(result, verdict=judged, more={**result.more, "held_out": held_out})
 
 
-def _noise_document(fit: PairFit, known: GivenNoise) -> Document:
+def _noise_document(fit: PairFit, known: GivenNoise) -> "CameraNoiseDocument":
     noise, own = fit.noise, fit.pairs.covariance is not None
     return {
-        "noise": {
-            "position_mm": noise.position_m * 1e3,
-            "robot_turn_deg": float(np.degrees(noise.turn_rad)),
-            "camera_tilt_deg": None if own else float(np.degrees(noise.tilt_rad)),
-            "camera_roll_deg": None if own else float(np.degrees(noise.roll_rad)),
-            "camera_depth_mm": None if own else noise.depth_m * 1e3,
-            "camera_scale": noise.camera_scale if own else None,
-            "estimated": bool(np.any(np.isnan(known.variances(own)))),
-        }
+        "position_mm": noise.position_m * 1e3,
+        "robot_turn_deg": float(np.degrees(noise.turn_rad)),
+        "camera_tilt_deg": None if own else float(np.degrees(noise.tilt_rad)),
+        "camera_roll_deg": None if own else float(np.degrees(noise.roll_rad)),
+        "camera_depth_mm": None if own else noise.depth_m * 1e3,
+        "camera_scale": noise.camera_scale if own else None,
+        "estimated": bool(np.any(np.isnan(known.variances(own)))),
     }
 
 

@@ -4,7 +4,7 @@
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,6 +17,13 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.hand_eye.linearity import SensorLinearity
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.documents import (
+        LeaveOneOutDocument,
+        MountSigmaDocument,
+        ResidualsDocument,
+    )
 
 Method = Literal["best", "classic"]
 TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
@@ -203,7 +210,9 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     `increment` about ``pivot_mm``, a point of the sensor frame. A shot whose
     corners were all rejected is named once.
     """
-    covariance = sigma_document = left_out_document = None
+    covariance: Array | None = None
+    sigma_document: MountSigmaDocument | None = None
+    left_out_document: LeaveOneOutDocument | None = None
     if result.covariance is not None:
         turn = np.kron(np.eye(2), result.T_flange_sensor[:3, :3])
         covariance = np.asarray(turn @ at_origin(result.covariance, result.pivot) @ turn.T)
@@ -215,7 +224,10 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     if result.leave_one_out_m is not None:
         left_out = summarise(result.leave_one_out_m)
         left_out_document = {
-            name: getattr(left_out, f"{name}_m") * 1e3 for name in ("mean", "rms", "p95", "max")
+            "mean": left_out.mean_m * 1e3,
+            "rms": left_out.rms_m * 1e3,
+            "p95": left_out.p95_m * 1e3,
+            "max": left_out.max_m * 1e3,
         }
     error_m, turned_rad = result.working_error_m, result.residual_rad
     rejected = by_shot(result.rejected, result.samples)
@@ -243,7 +255,7 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     }
 
 
-def _residual_document(samples: tuple[str, ...], residual: Array) -> Document:
+def _residual_document(samples: tuple[str, ...], residual: Array) -> "ResidualsDocument":
     return {
         "rms": float(np.sqrt(np.mean(residual**2))),
         "max": float(np.max(residual)),

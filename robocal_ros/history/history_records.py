@@ -6,28 +6,26 @@ change. SQLite has no page checksums: a flipped bit in a stored model would pass
 and move a robot. So each document, model and set of inputs is compared with its SHA-256 when read.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from enum import StrEnum
-from typing import TYPE_CHECKING, Any
-
-from robocal_ros.ground.errors import Code, StaleError
-
-if TYPE_CHECKING:  # the history is listed without loading NumPy
-    from numpy.typing import NDArray
 import hashlib
 import io
 import json
 import sqlite3
-from collections.abc import Iterator
-from dataclasses import astuple, fields
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import astuple, dataclass, field, fields
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from robocal_ros.ground.errors import InputError, StorageError
+from robocal_ros.ground.errors import Code, InputError, StaleError, StorageError
 from robocal_ros.history.history_file import DamagedError
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the history is listed without loading NumPy
     from numpy.typing import NDArray
+
+    from robocal_ros.history.documents import (
+        CalibrationDocument,
+        CorrectionDocument,
+        DecisionDocument,
+    )
 
 THERMAL = "thermal"
 TOOL = "tool"
@@ -138,6 +136,20 @@ class Decision:
     head_before: int
     head_after: int
 
+    def document(self) -> "DecisionDocument":
+        """Plain values, as a person is shown them."""
+        return {
+            "seq": self.seq,
+            "kind": self.kind,
+            "action": self.action.value,
+            "calibration_id": self.calibration_id,
+            "by": self.by,
+            "reason": self.reason,
+            "wall_ns": self.wall_ns,
+            "head_before": self.head_before,
+            "head_after": self.head_after,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class Head:
@@ -165,7 +177,7 @@ class Entry(Candidate):
     revision: int
     decisions: tuple[Decision, ...]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> "CalibrationDocument":
         """Plain values, as a person is shown them."""
         return {
             "id": self.id,
@@ -182,7 +194,7 @@ class Entry(Candidate):
             "created_ns": self.created_ns,
             "software": self.software,
             "method": self.method,
-            "decisions": [asdict(made) | {"action": made.action.value} for made in self.decisions],
+            "decisions": [made.document() for made in self.decisions],
         }
 
 
@@ -328,7 +340,8 @@ def _read(connection: sqlite3.Connection, calibration_id: int, name: str) -> byt
 # ---- what a robot's commands were corrected with, from when on: records that never change -------
 
 
-NOMINAL, CALIBRATED = "nominal", "calibrated"
+NOMINAL: Final = "nominal"
+CALIBRATED: Final = "calibrated"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,11 +364,28 @@ class CorrectionRecord:
     shadow: bool
     model_revision: int
     tool_revision: int
-    reference: str
+    reference: Literal["nominal", "calibrated"]
     reference_source: str
     reference_name: str
     reference_hash: str
     taught_tool: tuple[float, ...]
+
+    def document(self) -> "CorrectionDocument":
+        """Plain values, as a person is shown them."""
+        return {
+            "wall_ns": self.wall_ns,
+            "software": self.software,
+            "model_hash": self.model_hash,
+            "enabled": self.enabled,
+            "shadow": self.shadow,
+            "model_revision": self.model_revision,
+            "tool_revision": self.tool_revision,
+            "reference": self.reference,
+            "reference_source": self.reference_source,
+            "reference_name": self.reference_name,
+            "reference_hash": self.reference_hash,
+            "taught_tool": list(self.taught_tool),
+        }
 
 
 # ---- rows of the history file that tell what a robot's commands were corrected with -------------

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the measurements of a command to a proposal in the history; of a shift of frames too."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -67,7 +67,12 @@ from robocal_ros.thermal.reference import (
 )
 
 if TYPE_CHECKING:
-    from robocal_ros.programs.documents import PoseErrorDocument, ShiftDocument, ShiftErrorsDocument
+    from robocal_ros.programs.documents import (
+        PoseErrorDocument,
+        ShiftDocument,
+        ShiftErrorsDocument,
+        ShiftInForceDocument,
+    )
 
 SENSOR = "sensor"
 SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")
@@ -489,17 +494,16 @@ def keep_identified(
     )
 
 
-def shift_verdict(document: Document, only_judged: bool) -> Verdict:
-    """Whether the shift is worth entering: against what is in force, else the frames as given."""
-    was, now = document["in_force"], document["after"]["rms_mm"]
+def shift_verdict(
+    found: "ShiftDocument", was: "ShiftInForceDocument | None", only_judged: bool
+) -> Verdict:
+    """Whether the shift is worth entering: against what was in force, else the frames as given."""
+    before, now = found["before"]["rms_mm"], found["after"]["rms_mm"]
     with_what = "without a shift" if was is None else f"with that of revision {was['revision']}"
-    rms = (document["before"] if was is None else was)["rms_mm"]
+    rms = before if was is None else was["rms_mm"]
     if only_judged:
-        gone = now <= document["before"]["rms_mm"]
-        code = Code.ACCEPT if gone else Code.WORSE_THAN_CURRENT
-        return Verdict(
-            code, f"{document['before']['rms_mm']:.3f} mm rms are {now:.3f} mm {with_what}"
-        )
+        code = Code.ACCEPT if now <= before else Code.WORSE_THAN_CURRENT
+        return Verdict(code, f"{before:.3f} mm rms are {now:.3f} mm {with_what}")
     words = f"{rms:.3f} mm rms {with_what} become {now:.3f} mm"
     if now <= WORTH_IT * rms:
         return Verdict(Code.ACCEPT, words)
@@ -512,7 +516,7 @@ def keep_shift(
     nominal: SerialArm,
     shift: FrameShift,
     q: Array,
-    document: Document,
+    document: Mapping[str, Any],
     verdict: Verdict,
     wall_ns: int,
 ) -> int:

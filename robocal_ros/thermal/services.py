@@ -8,7 +8,7 @@ does not command.
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
@@ -51,6 +51,9 @@ from robocal_ros.thermal.proposing import (
 )
 from robocal_ros.thermal.reference import SpheresInCell
 from robocal_ros.thermal.session import ThermalSession
+
+if TYPE_CHECKING:
+    from robocal_ros.programs.documents import ShiftInForceDocument
 
 POINT, CLOUD = "point", "cloud"
 MOST_POINTS = 1000  # of a call: their doubts take a tenth of a second
@@ -272,15 +275,12 @@ class FrameShiftInterface:
         models = CorrectionModels(session.nominal, current.arm, reference)
         shift = best_shift(models, q, T)
         names = tuple(str(i + 1) for i in range(len(q)))
-        document = {
-            **shift_document(shift, names, LIMIT_MM),
-            "in_force": None,
-            "shift_frames_of": of,
-        }
+        found = shift_document(shift, names, LIMIT_MM)
+        was: ShiftInForceDocument | None = None
         if (kept := shift_in_force(self._history, models, q, T)) is not None:
-            errors = errors_of(kept.shift.after, LIMIT_MM)
-            document["in_force"] = {"revision": kept.revision, **errors}
-        verdict = shift_verdict(document, only_judged=False)
+            was = {"revision": kept.revision, **errors_of(kept.shift.after, LIMIT_MM)}
+        document = {**found, "in_force": was, "shift_frames_of": of}
+        verdict = shift_verdict(found, was, only_judged=False)
         number = keep_shift(
             self._history, session.nominal, shift, q, document, verdict, time.time_ns()
         )
