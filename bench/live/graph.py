@@ -48,6 +48,7 @@ class Executable:
         files: Sequence[Path] = (),
     ) -> None:
         self.name, self.log = name, folder / f"{name}.log"
+        self._asked = False
         program = EXECUTABLES / name
         if not program.exists():
             raise LiveError(f"{program} is missing: run make setup")
@@ -80,9 +81,10 @@ class Executable:
             raise LiveError(f"{self.name} ended with status {status}:\n{self.log.read_text()}")
 
     def ask_to_end(self) -> None:
-        """As Ctrl-C does."""
-        if self._process.poll() is None:
+        """As Ctrl-C does, once: at a second one a node ends whatever it still writes."""
+        if not self._asked and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
+        self._asked = True
 
     def stop(self) -> None:
         """End it."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What starts nodes may be killed at any time: none of them goes on without it."""
+"""What starts nodes may be killed at any time: none of them goes on without it, or is cut short."""
 
 import os
 import signal
@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 from domains import free_domain
+
+from bench.live.graph import Executable
 
 ROOT = Path(__file__).parent.parent.parent
 WITHIN_S = 10.0
@@ -38,6 +40,40 @@ time.sleep(600)
 
 
 SCRIPTS = {"bench": BENCH, "tests": of_tests(forked=False), "forked": of_tests(forked=True)}
+
+
+# What a recorder does: it takes a moment to write the end of its file.
+SLOW = f"""#!{sys.executable}
+import signal, time
+asked = []
+signal.signal(signal.SIGINT, lambda *_: asked.append(1))
+print("is there", flush=True)
+while not asked:
+    time.sleep(0.01)
+print("ends", flush=True)
+time.sleep(0.3)
+print("asked", len(asked))
+"""
+
+
+def test_a_node_is_asked_to_end_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a second signal a node ends at once, and a recording would lack its end."""
+    program = tmp_path / "slow"
+    program.write_text(SLOW)
+    program.chmod(0o755)
+    monkeypatch.setattr("bench.live.graph.EXECUTABLES", tmp_path)
+    node = Executable("slow", {}, {}, tmp_path)
+
+    def waits_for(words: str) -> None:
+        deadline = time.monotonic() + WITHIN_S
+        while words not in node.log.read_text() and time.monotonic() < deadline:
+            time.sleep(0.01)
+
+    waits_for("is there")
+    node.ask_to_end()
+    waits_for("ends")
+    node.stop()
+    assert node.log.read_text().splitlines() == ["is there", "ends", "asked 1"]
 
 
 def lives(pid: int) -> bool:
