@@ -205,6 +205,8 @@ def figures_of(error: Array) -> dict[str, float]:
     }
 
 
+LONG = 24  # letters; the longest code has 21
+MANY = 9  # columns
 CSS = """
 :root { --ink: #22303a; --faint: #6d7b85; --line: #e1e6ea; --accent: #0f6f86; --warm: #c2603a; }
 * { box-sizing: border-box; }
@@ -227,17 +229,19 @@ th, td { text-align: right; padding: .42rem .45rem; border-bottom: 1px solid var
   vertical-align: top; }
 th { color: var(--faint); font-weight: 600; }
 th:first-child, td:first-child, td.words, th.words { text-align: left; }
-td:first-child { min-width: 6.5rem; }
-td:first-child, td.words { overflow-wrap: anywhere; }
+.many th, .many td { padding: .4rem .22rem; font-size: .95em; }
+.long { overflow-wrap: anywhere; }
+td.long:first-child { min-width: 6.5rem; }
 figure { margin: 1rem 0 0; }
 figure svg { width: 100%; height: auto; display: block; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .25rem 1.2rem; margin: 0;
-  font-size: .93rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .25rem 1.2rem;
+  margin: .8rem 0 0; font-size: .93rem; }
 dt { color: var(--faint); }
 dd { margin: 0; overflow-wrap: anywhere; }
 @media (max-width: 62rem) { .wide { overflow-x: auto; } }
 @media print { body { max-width: none; padding: 0; font-size: 10.5pt; }
-  table { font-size: 8pt; } th, td { padding: .2rem .25rem; } td:first-child { min-width: 4.5rem; }
+  table { font-size: 8pt; } th, td, .many th, .many td { padding: .2rem .2rem; }
+  td.long:first-child { min-width: 4.5rem; }
   figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } }
 """
 
@@ -256,18 +260,24 @@ def figure(svg: str, caption: str) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[int] = ()) -> str:
-    """A table; columns ``words`` are text."""
+    """A table; columns ``words`` are text, in which a code breaks behind its underscores alone.
+
+    Sentences and long names break anywhere.
+    """
+
+    def cell(tag: str, column: int, value: str) -> str:
+        long = tag == "td" and (" " in value or len(value) > LONG)
+        kinds = ["words"] * (column in words) + ["long"] * long
+        text = escape(value).replace("_", "_<wbr>") if column in words else escape(value)
+        kind = f' class="{" ".join(kinds)}"' if kinds else ""
+        return f"<{tag}{kind}>{text}</{tag}>"
 
     def cells(tag: str, values: Sequence[str]) -> str:
-        return "".join(
-            f'<{tag} class="words">{escape(v)}</{tag}>'
-            if i in words
-            else f"<{tag}>{escape(v)}</{tag}>"
-            for i, v in enumerate(values)
-        )
+        return "".join(cell(tag, column, value) for column, value in enumerate(values))
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>{body}</table></div>'
+    many = " many" if len(head) > MANY else ""
+    return f'<div class="wide{many}"><table><tr>{cells("th", head)}</tr>{body}</table></div>'
 
 
 Figures = Mapping[str, Sequence[Sequence[Drawn]]]
@@ -401,8 +411,10 @@ def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
                 f"<b>{_mm(now['rms_with_mm'])} mm</b> (true, rms), without correction by "
                 f"{_mm(now['rms_without_mm'])} mm{bound}.{before}"
             )
+    told = {bag["bag"] for bag in bags if bag.get("cells")}  # of these the truth was told above
     for row in rows:
-        if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
+        measured = row["kind"] == "thermal" and row["rms_without_mm"] is not None
+        if measured and row["bag"] not in told:
             true = row["judged_by"] == "truth"
             corrected = row["rms_after_mm" if true else "rms_in_force_mm"]
             when = "after each cycle" if true else "with the model in force, at its oldest"
