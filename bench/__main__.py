@@ -42,6 +42,7 @@ PARTS = {
     "knocks": "closed_loop.knocks",
     "fixture": "fixture",
     "files": "files",
+    "urdf": "urdf",
     "replay_speed": "replay_speed",
 }
 

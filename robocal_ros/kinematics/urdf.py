@@ -520,7 +520,7 @@ def urdf_of(arm: SerialArm, max_velocity: Array | None = None) -> str:
 
     What joints turn besides what is read (joint functions) has no place in a URDF.
 
-    ``max_velocity`` (n,): NaN where not known.
+    ``max_velocity`` (n,): NaN where not known; 0 is written, as urdfdom reads no limit without one.
     """
     top = ElementTree.Element("robot", name=arm.name)
     links = ["base", *(f"link_{i + 1}" for i in range(arm.n)), "flange"]
@@ -537,7 +537,7 @@ def urdf_of(arm: SerialArm, max_velocity: Array | None = None) -> str:
         if slides and not bounded:  # a URDF needs limits there
             bounded, low, high = True, -UNLIMITED_M, UNLIMITED_M
         limit = {"lower": repr(low), "upper": repr(high)} if bounded else {}
-        limit |= {"effort": "0"} | ({"velocity": repr(speed)} if np.isfinite(speed) else {})
+        limit |= {"effort": "0", "velocity": repr(speed) if np.isfinite(speed) else "0"}
         ElementTree.SubElement(joint, "limit", limit)
     _element(top, "flange_joint", "fixed", links[arm.n], "flange", fixed[-1])
     return _text(top)

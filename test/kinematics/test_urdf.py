@@ -168,6 +168,20 @@ def test_shipped_robots_go_there_and_back(name):
     assert np.abs(arm_of(again).arm.fk(q) - other.fk(q)).max() < EXACT
 
 
+def test_a_speed_that_is_not_known_is_written_as_0_and_read_as_not_known():
+    """urdfdom, and who reads by it, refuse a limit without speed and effort."""
+    arm = load_robot("ur10")
+    known = np.array([1.0, np.nan, 2.0, np.nan, np.nan, 3.0])
+    for speeds in (known, None):
+        text = urdf_of(arm, speeds)
+        limits = [joint.find("limit") for joint in ElementTree.fromstring(text).findall("joint")]
+        given = [limit.attrib for limit in limits if limit is not None]
+        assert len(given) == arm.n
+        assert all(set(one) == {"lower", "upper", "effort", "velocity"} for one in given)
+        told = np.full(arm.n, np.nan) if speeds is None else speeds
+        np.testing.assert_array_equal(arm_of(chain(read_urdf(text, "a"))).max_velocity, told)
+
+
 @given(arms())
 def test_any_arm_goes_there_and_back(drawn):
     arm, q = drawn
