@@ -30,7 +30,7 @@ from robocal_ros.cli.main import (
     share,
     text,
 )
-from robocal_ros.estimation.assessment import hold_out, pose_groups
+from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted
 from robocal_ros.ground.samples import Measurements
@@ -39,8 +39,10 @@ from robocal_ros.identification.full_model import FullIdentification
 from robocal_ros.identification.judged import (
     CYCLES,
     NO_LOAD,
+    another_set_up,
     contradicted,
     explain_mismatch,
+    held_out,
     identification_document,
     read_positions,
     repeated,
@@ -458,10 +460,16 @@ def _show_plan(console: "Console", document: Document) -> None:
     print_output(console, document)
 
 
-_OTHER_SET_UP = (
-    "if the check data come from another set-up (measuring device or targets moved), say so with "
-    "--check-refit base,tool"
-)
+def _moved(judged: JudgedIdentification, check: Measurements) -> list[str]:
+    """Say that the check data may come from another set-up, where they look like it."""
+    moved = another_set_up(judged, check)
+    if not moved and judged.verdict.code is not Code.RESIDUAL_TOO_LARGE:
+        return []
+    words = (
+        "if the check data come from another set-up (measuring device or targets moved), say so "
+        "with --check-refit base,tool"
+    )
+    return ["; ".join(filter(None, (moved, words)))]
 
 
 def _identified(
@@ -480,8 +488,7 @@ def _identified(
     data, file = read(args.data), None if args.check is None else str(args.check)
     part, draw = (args.hold_out or _HOLD_OUT, args.seed or 0) if file is None else (None, None)
     if part is not None:
-        held = hold_out(pose_groups(data.q), part, draw or 0)
-        train, check = data.take(~held), data.take(held)
+        train, check = held_out(data, part, draw or 0, str(args.data))
     else:
         train, check = data, read(args.check)
         warnings += _compared(train, check, args)
@@ -513,8 +520,8 @@ def _identified(
             require_match(cell.arm, check, base=True, tool=True, hold=True, file=file)
         elif not refit and (mistake := explain_mismatch(cell.arm, check, cell.residual)):
             raise InputError(mistake, file=file)
-        if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not refit:
-            warnings.append(_OTHER_SET_UP)
+        else:
+            warnings += _moved(judged, check)
     document: Document = {**identification_document(judged)}
     document["data"] = {
         "file": str(args.data),

@@ -186,6 +186,7 @@ def _mistakes(arm: SerialArm, data: Measurements) -> Iterator[tuple[str, Measure
 CURVE = 300  # points of a joint's function
 MOST_UNCOVERED = 0.05  # of the check poses, from where on the verdict's reason says so
 CONTRADICTED = 2.0  # residuals over their sigmas: no choice of weights explains more
+MOVED = 2.0  # errors over those with base and targets placed anew: then most is where these are
 LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
 
 
@@ -368,6 +369,30 @@ def _require_orientations(result: Identification, data: Measurements) -> None:
         )
 
 
+def held_out(
+    data: Measurements, share: float, seed: int, file: str | None = None
+) -> tuple[Measurements, Measurements]:
+    """The measurements that solve, and those at the ``share`` of the poses that judges.
+
+    Raises
+    ------
+    InputError
+        For a target that would only judge, naming it and ``file``.
+    """
+    judges = hold_out(pose_groups(data.q), share, seed)
+    train, check = data.take(~judges), data.take(judges)
+    for name in check.targets:
+        if name not in train.targets:
+            rows = sum(target == name for target in data.target)
+            raise InputError(
+                f"target {name!r} cannot be placed: its measurements ({rows}) are all held out to "
+                "judge; measure it at more poses, leave it out, or take another seed",
+                file=file,
+                column="target",
+            )
+    return train, check
+
+
 def identify_and_hold_out(
     arm: SerialArm,
     data: Measurements,
@@ -387,9 +412,8 @@ def identify_and_hold_out(
     TooFewSamplesError, RankDeficientError
         When the data cannot answer.
     """
-    held = hold_out(pose_groups(data.q), share, seed)
+    train, check = held_out(data, share, seed)
     require_match(arm, data, base=True, tool=True, hold=True)
-    train, check = data.take(~held), data.take(held)
     return identify_and_judge(arm, train, check, method=method, model=model, in_force=in_force)
 
 
@@ -407,8 +431,7 @@ def held_out_errors(
     Found again from what is kept of `identify_and_hold_out`: its ``document``, the model in force
     ``before`` it and its own, ``arm``, and ``data``, what it was identified and judged by.
     """
-    held = hold_out(pose_groups(data.q), share, seed)
-    train, check = data.take(~held), data.take(held)
+    train, check = held_out(data, share, seed)
     poses = document["T_flange_target"]
     T_frame_base, *T_flange_target = (
         transform_from_quat(np.array(pose["xyz_mm"]) * 1e-3, pose["quat_xyzw"])
@@ -431,6 +454,27 @@ def _check_error(cell: CellModel, check: Measurements, refit: Collection[Part]) 
         )
         cell = identify(cell.arm, check, fit=refit, method="map", start=start).cell
     return np.asarray(np.linalg.norm(cell.residual(check), axis=1))
+
+
+def another_set_up(judged: JudgedIdentification, check: Measurements) -> str:
+    """Say by how much less check data miss with base and targets placed anew; empty if by little.
+
+    Placing them makes up for noise as well: sums of squares count by what they leave free.
+    """
+    free = 1.0 - (6 + 3 * len(check.targets)) / (3 * len(check))
+    if free <= 0.0:
+        return ""
+    try:
+        anew = _check_error(judged.identification.cell, check, ("base", "tool"))
+    except (TooFewSamplesError, RankDeficientError):
+        return ""
+    before, after = judged.candidate.rms_m, summarise(anew).rms_m / np.sqrt(free)
+    if before <= MOVED * after:
+        return ""
+    return (
+        f"with base and targets placed anew the check data miss the model by {after * 1e3:.3g} mm "
+        f"rms instead of {before * 1e3:.3g} mm"
+    )
 
 
 def _predicted(

@@ -11,6 +11,7 @@ from campaign import NOISE_M, ROBOT, edited, measured, renamed, table, true_arm,
 from command import conforms, robocal, robocal_json
 
 from robocal_ros.cli.main import main
+from robocal_ros.estimation.assessment import hold_out, pose_groups
 from robocal_ros.ground.errors import ConflictError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL
@@ -170,6 +171,49 @@ class TestAnswer:
         assert status == 0
         assert document["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
         assert any("--check-refit base,tool" in words for words in document["warnings"])
+
+    @pytest.mark.parametrize("refit", [(), ("--check-refit", "tool")])
+    @pytest.mark.parametrize("moved_m", [3e-3, 0.5])
+    def test_a_device_that_moved_is_told_with_the_remedy(
+        self, data: Path, folder: Path, identify, refit: tuple[str, ...], moved_m: float
+    ) -> None:
+        """By 3 mm the model is still the better one of two that are off by 3 mm."""
+        check = measured(60, 9)
+        moved = replace(check, position=check.position + np.array([moved_m, 0.0, 0.0]))
+        path = table(folder / "moved.csv", moved)
+        status, document = identify("--data", data, "--check", path, *refit)
+        told = [words for words in document["warnings"] if "--check-refit base,tool" in words]
+        assert (status, len(told)) == (0, 1)
+        before = document["calibrated"]["held_out"]["rms_mm"]
+        assert f"rms instead of {before:.3g} mm" in told[0]
+        _, anew = identify("--data", data, "--check", path, "--check-refit", "base,tool")
+        left = anew["calibrated"]["held_out"]["rms_mm"]
+        free = 1.0 - 9 / 180  # of the coordinates: six of the base, three of the target
+        assert f"by {left / np.sqrt(free):.3g} mm rms instead" in told[0]
+        assert not any("--check-refit" in words for words in anew["warnings"])
+
+    def test_where_nothing_moved_none_is_suspected(
+        self, data: Path, folder: Path, identify
+    ) -> None:
+        for count in (6, 60):
+            check = table(folder / f"fresh{count}.csv", measured(count, 9))
+            _, document = identify("--data", data, "--check", check)
+            assert not any("--check-refit" in words for words in document["warnings"])
+
+    def test_a_target_that_would_only_judge_is_named_with_file_and_remedy(
+        self, folder: Path, identify
+    ) -> None:
+        one = measured(60)
+        names = list(one.target)
+        held = np.flatnonzero(hold_out(pose_groups(one.q), 0.5, 0))
+        names[held[0]] = "peg"
+        path = table(folder / "peg_once.csv", replace(one, target=tuple(names)))
+        status, document = identify("--data", path)
+        assert (status, document["error"]["file"]) == (2, str(path))
+        assert document["error"]["column"] == "target"
+        for words in ("'peg'", "its measurements (1) are all held out", "take another seed"):
+            assert words in document["error"]["message"]
+        assert identify("--data", path, "--seed", 1)[0] == 0
 
     def test_several_targets_and_sigma(self, folder: Path, identify) -> None:
         two = measured(120, 3, targets=("ball", "peg"))
