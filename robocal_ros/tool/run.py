@@ -346,6 +346,8 @@ class ToolConfig:
     ``mandrel_radius_m``: as certified, where it places the beams. ``taper``: growth of the tool's
     radius per length above the tip. ``spin_rad``: turn of the flange about the laser's z while it
     measures. ``step_timeout_s``: a step without any edge for so long ends the run.
+    ``joint_error_rad``: rms by which joints turn otherwise than their encoders show, where no model
+    in force holds it; 0: nothing is said of it.
     """
 
     points_m: Rows
@@ -360,6 +362,7 @@ class ToolConfig:
     taper: float = 0.0
     spin_rad: float = 0.0
     step_timeout_s: float = 30.0
+    joint_error_rad: float = 0.0
     motion: MeasuringMotion = field(default_factory=MeasuringMotion)
     input: InputRule = field(default_factory=InputRule)
     noise: RobotNoise = field(default_factory=RobotNoise)
@@ -559,6 +562,12 @@ class ToolRun:
     def last_edge_s(self) -> Array:
         """Time (1,) of its last edge."""
         return np.array([max(edge.time_s for edge in self.steps[-1].edges)])
+
+    @property
+    def last_q(self) -> Array:
+        """Joints (n,) there."""
+        path = self.path
+        return np.asarray(path.q[np.searchsorted(path.time_s, self.last_edge_s[0])])
 
     def estimate(self, held: Held) -> ToolEstimate:
         """The tool as the steps so far show it."""

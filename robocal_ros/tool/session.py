@@ -20,24 +20,21 @@ from robocal_ros.history.history_records import (
     MANDREL,
     THERMAL,
     TOOL,
-    Head,
     Proposal,
 )
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
 from robocal_ros.session.events import (
     OWN,
     Command,
     Handler,
-    HistoryFollower,
     Outcome,
     SessionBase,
     configured_with,
     recorded_arguments,
     seeded,
 )
-from robocal_ros.tool.crossed_model import Held
+from robocal_ros.tool.crossed_model import Held, ToolEstimate
 from robocal_ros.tool.edges import (
     AHEAD_NS,
     EDGES,
@@ -49,6 +46,8 @@ from robocal_ros.tool.edges import (
     edge_sample,
 )
 from robocal_ros.tool.files import check_document, run_document
+from robocal_ros.tool.in_force import ToolInForce
+from robocal_ros.tool.joint_errors import JointErrors, joint_errors
 from robocal_ros.tool.judging import (
     SMALL_M,
     Answer,
@@ -72,109 +71,19 @@ from robocal_ros.tool.run import (
     MeasuringPlan,
     Mode,
     PlannedStep,
-    RunTraits,
     ToolConfig,
     ToolRun,
-    alike,
     made_with,
 )
 from robocal_ros.tool.station import (
-    StationMeasurement,
-    StationTrend,
     measure_station,
     measurement_document,
-    measurement_of,
     result_document,
     station_shift,
     station_verdict,
 )
 from robocal_ros.tool.sweeps import SweepLog
 from robocal_ros.tool.touch_points import HandMeasured, TouchLog
-
-
-class ToolInForce(HistoryFollower):
-    """What the history has in force for a tool, as of the last look.
-
-    ``head``, ``thermal``, ``healthy``, ``mandrel``, ``station``: heads of the tools, of the thermal
-    models and of the measurements of the healthy tool, of the mandrel and of the beams.
-    """
-
-    def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
-        self._nominal = nominal
-        self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
-        self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
-        super().__init__(history, TOOL)
-
-    def _read(self) -> None:
-        super()._read()
-        self.thermal: Head = self._history.head(THERMAL)
-        self.healthy: Head = self._history.head(HEALTHY_TOOL)
-        self.mandrel: Head = self._history.head(MANDREL)
-        self.station: Head = self._history.head(LASER_FRAME)
-
-    @property
-    def arm(self) -> SerialArm:
-        """The arm with the thermal model in force."""
-        model = self.thermal.model
-        return self._nominal if model is None else arm_of(model, self._nominal)
-
-    @property
-    def tool(self) -> KnownTool:
-        """The tool in force; without one the taught one."""
-        model = self.head.model
-        return self._taught if model is None else KnownTool.of_document(model)
-
-    @property
-    def anchor(self) -> Array:
-        """Tip (3,) of the last tool whose cause was known: in force, or before small changes."""
-        known = (self.head.model or {}).get("anchor")
-        return self.tool.T_flange_tool[:3, 3] if known is None else np.array(known)
-
-    @property
-    def measured_healthy(self) -> KnownTool | None:
-        """How the healthy tool was measured; None without, or with another tool or station."""
-        model = self._healthy_model
-        return None if model is None else KnownTool.of_document(model)
-
-    @property
-    def healthy_traits(self) -> RunTraits | None:
-        """What its run showed beside the tool; None where that is not known."""
-        model = self._healthy_model
-        traits = None if model is None else model.get("traits")
-        return None if traits is None else RunTraits.of_document(traits)
-
-    @property
-    def measured_mandrel(self) -> KnownTool | None:
-        """How the mandrel was measured; None without, or with another one or another station."""
-        model = self.mandrel.model
-        if model is None or not alike(model["made_with"], self._made_with):
-            return None
-        return KnownTool.of_document(model) if alike(model["mandrel"], self._mandrel) else None
-
-    @property
-    def commissioned_station(self) -> StationMeasurement | None:
-        """The first measurement of the beams with this mandrel and laser file; None before it."""
-        model = self._station_model
-        return None if model is None else measurement_of(model["first"])
-
-    @property
-    def station_trend(self) -> StationTrend:
-        """How they drift since then; none before it, or of a version that did not follow it."""
-        known = (self._station_model or {}).get("trend")
-        return StationTrend() if known is None else StationTrend.of_model(known)
-
-    @property
-    def _station_model(self) -> dict[str, Any] | None:
-        model = self.station.model
-        if model is None or not alike(model["made_with"], self._made_with):
-            return None
-        return model if alike(model["mandrel"], self._mandrel) else None
-
-    @property
-    def _healthy_model(self) -> dict[str, Any] | None:
-        model = self.healthy.model
-        return model if model and alike(model["made_with"], self._made_with) else None
-
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"
 WITNESS, WITNESS_REFERENCE, LASER = OF_MANDREL = "witness", "witness reference", "laser"
@@ -274,7 +183,11 @@ class ToolResults:
             witness = replace(witness, cause="station", reason=turned)
         witness = self._with_mandrel(witness, found, shift, command)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
+        erring = self._joint_errors(run, estimate, found)
+        if erring is not None and erring.words:
+            verdict = replace(verdict, reason=f"{verdict.reason}; {erring.words}")
         document = run_document(found, estimate, run.circles, verdict) | {
+            "joint_errors": None if erring is None else erring.document(),
             "change": change_between(in_force.T_flange_tool, found.T_flange_tool).document(),
             "absolute": absolute,
             "witness": witness.document(),
@@ -285,6 +198,21 @@ class ToolResults:
         model = found.document() | known
         kept = self._keep(TOOL, run, command, wall_ns, verdict, document, model)
         return Outcome(command, verdict.code, verdict.reason, document, kept)
+
+    def _joint_errors(
+        self, run: ToolRun, estimate: ToolEstimate, found: KnownTool
+    ) -> JointErrors | None:
+        """What joints that err add to the tip that was found; None where that is not told."""
+        size_rad, healthy = self._config.joint_error_rad, self._current.measured_healthy
+        if size_rad == 0.0 or found.covariance is None:
+            return None
+        before = None
+        if healthy is not None:
+            if (q := self._current.healthy_joints) is None:
+                return None
+            before = q, healthy.T_flange_tool[:3, 3]
+        now = run.last_q, estimate.tip
+        return joint_errors(run.arm, size_rad, now, before, found.covariance[:3, :3])
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         """Keep how healthy tool or mandrel measure; in force at once: it moves nothing."""
@@ -297,7 +225,10 @@ class ToolResults:
         verdict = judge_healthy(found, estimate, taught)
         document: Document = {**run_document(found, estimate, run.circles, verdict)}
         document["change"] = change_between(taught, found.T_flange_tool).document()
-        own: Document = {"traits": run.traits(estimate).document()}
+        own: Document = {
+            "traits": run.traits(estimate).document(),
+            "joints": run.last_q.tolist(),
+        }
         if mandrel:
             own = {"mandrel": taught.tolist()}
         kept = self._keep(kind, run, command, wall_ns, verdict, document, found.document() | own)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the history has in force for a tool: itself, and how what it is compared with measured."""
+
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.ground.frames import Array
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import (
+    HEALTHY_TOOL,
+    LASER_FRAME,
+    MANDREL,
+    THERMAL,
+    TOOL,
+    Head,
+)
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.session.events import HistoryFollower
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.run import RunTraits, ToolConfig, alike, made_with
+from robocal_ros.tool.station import StationMeasurement, StationTrend, measurement_of
+
+
+class ToolInForce(HistoryFollower):
+    """What the history has in force for a tool, as of the last look.
+
+    ``head``, ``thermal``, ``healthy``, ``mandrel``, ``station``: heads of the tools, of the thermal
+    models and of the measurements of the healthy tool, of the mandrel and of the beams.
+    """
+
+    def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
+        self._nominal = nominal
+        self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
+        self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
+        super().__init__(history, TOOL)
+
+    def _read(self) -> None:
+        super()._read()
+        self.thermal: Head = self._history.head(THERMAL)
+        self.healthy: Head = self._history.head(HEALTHY_TOOL)
+        self.mandrel: Head = self._history.head(MANDREL)
+        self.station: Head = self._history.head(LASER_FRAME)
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the thermal model in force."""
+        model = self.thermal.model
+        return self._nominal if model is None else arm_of(model, self._nominal)
+
+    @property
+    def tool(self) -> KnownTool:
+        """The tool in force; without one the taught one."""
+        model = self.head.model
+        return self._taught if model is None else KnownTool.of_document(model)
+
+    @property
+    def anchor(self) -> Array:
+        """Tip (3,) of the last tool whose cause was known: in force, or before small changes."""
+        known = (self.head.model or {}).get("anchor")
+        return self.tool.T_flange_tool[:3, 3] if known is None else np.array(known)
+
+    @property
+    def measured_healthy(self) -> KnownTool | None:
+        """How the healthy tool was measured; None without, or with another tool or station."""
+        model = self._healthy_model
+        return None if model is None else KnownTool.of_document(model)
+
+    @property
+    def healthy_traits(self) -> RunTraits | None:
+        """What its run showed beside the tool; None where that is not known."""
+        model = self._healthy_model
+        traits = None if model is None else model.get("traits")
+        return None if traits is None else RunTraits.of_document(traits)
+
+    @property
+    def healthy_joints(self) -> Array | None:
+        """At which (n,) its tip was measured; None where that is not known."""
+        known = (self._healthy_model or {}).get("joints")
+        return None if known is None else np.array(known)
+
+    @property
+    def measured_mandrel(self) -> KnownTool | None:
+        """How the mandrel was measured; None without, or with another one or another station."""
+        model = self.mandrel.model
+        if model is None or not alike(model["made_with"], self._made_with):
+            return None
+        return KnownTool.of_document(model) if alike(model["mandrel"], self._mandrel) else None
+
+    @property
+    def commissioned_station(self) -> StationMeasurement | None:
+        """The first measurement of the beams with this mandrel and laser file; None before it."""
+        model = self._station_model
+        return None if model is None else measurement_of(model["first"])
+
+    @property
+    def station_trend(self) -> StationTrend:
+        """How they drift since then; none before it, or of a version that did not follow it."""
+        known = (self._station_model or {}).get("trend")
+        return StationTrend() if known is None else StationTrend.of_model(known)
+
+    @property
+    def _station_model(self) -> dict[str, Any] | None:
+        model = self.station.model
+        if model is None or not alike(model["made_with"], self._made_with):
+            return None
+        return model if alike(model["mandrel"], self._mandrel) else None
+
+    @property
+    def _healthy_model(self) -> dict[str, Any] | None:
+        model = self.healthy.model
+        return model if model and alike(model["made_with"], self._made_with) else None
