@@ -242,7 +242,7 @@ def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
     assert "none of thermal, reference" in unknown.stderr
 
 
-RIGID = BAGS / "rigid"  # recorded before simulated robots had gears
+RIGID = BAGS / "rigid"  # before simulated robots had gears; of thermal_node and sensors by b419956
 
 
 def test_the_runs_of_an_older_recording_stay_as_they_were():
@@ -259,10 +259,27 @@ def test_the_runs_of_an_older_recording_stay_as_they_were():
     assert document["final_tool"]["xyz_mm"] == pytest.approx(tip_mm.tolist(), abs=0.01)
 
 
+def test_the_cycles_of_an_older_recording_stay_as_they_were():
+    """What the golden shift of b419956 holds of thermal_node, by the definitions that it brings."""
+    file = RIGID / "thermal_cycles.mcap"
+    with BagReader(file) as reader:
+        events = [m.message for m in reader.messages(["/thermal_node/session_events"])]
+    document = robocal_json("replay.json", "replay", file)
+    commands = document["commands"]
+    outcomes = [(e.command, json.loads(e.outcome)) for e in events if e.command != "configure"]
+    assert [(c["command"], Code[c["code"]]) for c in commands] == [
+        (name, outcome["status"]) for name, outcome in outcomes
+    ]
+    judged = [c["message"] for c in commands if c["command"] == "end_cycle"]
+    assert judged == [o["message"] for name, o in outcomes if name == "end_cycle"]
+    assert len(judged) == 2
+    assert document["warnings"] == []
+
+
 @pytest.mark.parametrize(
     "file",
-    [*(BAGS / f"hand_eye_{kind}.mcap" for kind in ("sphere", "step", "line")),
-     *(RIGID / f"hand_eye_{kind}.mcap" for kind in ("sphere", "line"))],
+    [*(folder / f"hand_eye_{kind}.mcap" for folder in (BAGS, RIGID)
+       for kind in ("sphere", "step", "line"))],
     ids=lambda file: f"{file.parent.name}/{file.stem}",
 )  # fmt: skip
 def test_the_golden_bags_give_what_they_recorded(file):
