@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,6 +36,9 @@ from robocal_ros.ros.endpoints import DeferredActionServer, EndpointNode
 
 Result = FollowJointTrajectory.Result
 
+# Points of a goal while the robot is being moved, when a stop is to be answered within 50 ms: of
+# 1000 rclpy makes objects, and messages of these again, in 11 ms.
+MOST_IN_MOTION = 3_000
 ANSWER_S = 5.0  # a controller that has not answered a goal or a cancel by then never will
 WATCH_S = 0.2
 _ABOUT_JOINTS = {Reason.UNKNOWN_JOINT, Reason.DOUBLED_JOINT, Reason.MISSING_JOINT}
@@ -56,8 +59,7 @@ class LongGoal:
     points: int
 
 
-@cache
-def brief_action(most: int) -> Any:
+def brief_action(most: Callable[[], int]) -> Any:
     """The action, as a server of rclpy takes it, whose goals of more points stay in C.
 
     rclpy makes an object of each point before it asks anybody: of 100 000 the node would be deaf
@@ -95,7 +97,7 @@ def brief_action(most: int) -> Any:
     def briefly(request: int) -> Any:
         count = points(request)
         many = count.value
-        if many <= most:
+        if many <= most():
             return convert(request)
         count.value = 0
         try:
@@ -172,7 +174,7 @@ class TrajectoryProxy:
         self._own_name = node.resolve_topic_name(name)
         self._server = DeferredActionServer(
             node,
-            brief_action(MOST_POINTS),
+            brief_action(self._most),
             self._own_name,
             goal_callback=self._safe(self._asked, GoalResponse.REJECT),
             handle_accepted_callback=self._safe(self._begin),
@@ -254,12 +256,20 @@ class TrajectoryProxy:
         for goal in list(self._goals):
             self._fail(goal, goal.stopped or why)
 
+    def _most(self) -> int:
+        """Points of a goal that is taken now."""
+        moves = self.controller and self._session.moves(time.monotonic())
+        return MOST_IN_MOTION if moves else MOST_POINTS
+
     def _asked(self, request: Any) -> GoalResponse:
         why = ""
         if not (self._node.is_active and self.controller):
             why = f"the node is {self._node.state}"
         elif isinstance(request, LongGoal):
-            why = f"it has {request.points} points, allowed {MOST_POINTS}"
+            why = (
+                f"it has {request.points} points, allowed {MOST_POINTS}, and {MOST_IN_MOTION} "
+                "while the robot is being moved"
+            )
         elif not request.trajectory.points:
             why = "it has no points, which is no stop: cancel the goal that is under way"
         if not why:

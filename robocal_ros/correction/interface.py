@@ -85,7 +85,7 @@ class RefusedError(RobocalError):
         self.code = _CODES.get(reason, Code.BAD_INPUT)
 
 
-MOST_POINTS = 10_000  # of a trajectory: within 50 ms, so that nothing else waits longer
+MOST_POINTS = 10_000  # of a trajectory: in some 50 ms at most, so that nothing waits longer
 TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
 
 

@@ -332,6 +332,20 @@ def tail_message(command: JointCommand, kind: type, stamp_ns: int) -> Any:
     return message
 
 
+def _fields_of(command: TrajectoryCommand) -> tuple[Array | None, ...]:
+    return command.position, command.velocity, command.acceleration
+
+
+def changed_path(message: Any, command: TrajectoryCommand) -> Any:
+    """A ``JointTrajectory`` with a command's positions, rates and mark: the one that is given."""
+    message.header.frame_id = command.mark
+    for name, values in zip(POINT_FIELDS, _fields_of(command), strict=False):
+        if values is not None:
+            for point, row in zip(message.points, values, strict=True):
+                setattr(point, name, doubles(row))
+    return message
+
+
 class PathMessage:
     """A serialized trajectory of ``points``, its command, and what goes out for it.
 
@@ -415,18 +429,13 @@ class PathMessage:
 
     def changed(self, command: TrajectoryCommand) -> Any:
         """What to publish: with the command's positions, rates and mark."""
-        rows = dict(enumerate((command.position, command.velocity, command.acceleration)))
-        given = {field: values for field, values in rows.items() if values is not None}
         if (_string_size(command.mark) - _string_size(self._frame_id)) % 8:
             message = read_message(self._came, JointTrajectory)  # its numbers would not be aligned
-            message.header.frame_id = command.mark
-            for field, values in given.items():
-                for point, row in zip(message.points, values, strict=True):
-                    setattr(point, POINT_FIELDS[field], doubles(row))
-            return message
+            return changed_path(message, command)
         written = self._doubles.copy()
-        for field, values in given.items():
-            scatter_rows(np.ascontiguousarray(values), self._places[:, field], written)
+        for field, values in enumerate(_fields_of(command)):
+            if values is not None:
+                scatter_rows(np.ascontiguousarray(values), self._places[:, field], written)
         body, stamp = written.tobytes(), FRAME - STAMP
         rest = body[stamp + _string_size(self._frame_id) : self._size]
         return HEAD + body[:stamp] + _string_bytes(command.mark) + rest

@@ -38,8 +38,8 @@ from robocal_ros.correction.messages import (
     JointMessage,
     JointWire,
     PathMessage,
+    changed_path,
     joint_names,
-    read_message,
     tail_message,
 )
 from robocal_ros.correction.report import LOOK_S, STREAM, CorrectionReport
@@ -400,16 +400,7 @@ class JointCorrectionNode(RobotNode):
                 raise
             return trajectory, None
         path = None if self._shadow else self._session.output.path
-        if command is came:
-            return trajectory, path
-        try:
-            changed = message.changed(command)
-            as_bytes = isinstance(changed, bytes)
-            return read_message(changed, JointTrajectory) if as_bytes else changed, path
-        except Exception:
-            if path is not None:  # it never goes out
-                self._session.reject(path)
-            raise
+        return trajectory if command is came else changed_path(trajectory, command), path
 
     def _goal_sent(self) -> None:
         """Tell what a goal is corrected by."""

@@ -189,11 +189,14 @@ class CorrectionSession:
         if self._gate.watch_age(now_ns):
             self._want()
         everything = np.arange(self._reference.n)
-        path = self.output.path
-        busy = self.stream.runs(now_s) or (path is not None and path.live(now_s))
         waits = self._gate.tools.waiting is not None
-        if waits and not busy and self.robot.stands(everything, now_s):
+        if waits and not self.moves(now_s) and self.robot.stands(everything, now_s):
             self._adopt_tool()
+
+    def moves(self, now_s: float) -> bool:
+        """Whether the robot may still be moving by what was put out."""
+        path = self.output.path
+        return self.stream.runs(now_s) or (path is not None and path.live(now_s))
 
     def _adopt_tool(self) -> None:
         tools = self._gate.tools

@@ -28,6 +28,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from unique_identifier_msgs.msg import UUID
 
 from robocal_ros.correction import action as trajectory_proxy
+from robocal_ros.correction.action import MOST_IN_MOTION
 from robocal_ros.correction.interface import MOST_POINTS
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
@@ -267,17 +268,21 @@ def test_a_goal_without_points_is_rejected_and_disturbs_nothing(cell: Any) -> No
 def test_a_goal_of_too_many_points_is_rejected_and_disturbs_nothing(cell: Any) -> None:
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=2.0).moves()
-    many = Sent(cell, goal_of(*np.linspace(HOME, MOVED, MOST_POINTS + 1), lasts_s=100.0))
-    cell.graph.spin_until(lambda: many.handle, "the answer")
-    assert not many.handle.accepted
+    for most in (MOST_IN_MOTION, MOST_POINTS):
+        many = Sent(cell, goal_of(*np.linspace(HOME, MOVED, most + 1), lasts_s=100.0))
+        cell.graph.spin_until(lambda m=many: m.handle, "the answer")
+        assert not many.handle.accepted
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
     assert len(cell.robot.goals[-1].trajectory.points) == 2
+    cell.taught()
+    back = cell.send(*np.linspace(MOVED, HOME, MOST_IN_MOTION + 1), lasts_s=1.0)  # from rest
+    back.ends(GoalStatus.STATUS_SUCCEEDED)
 
 
 def test_of_a_long_goal_nothing_but_its_id_becomes_python() -> None:
     """So its many points keep the node from nothing; of a goal that is taken all arrive."""
     usual = FollowJointTrajectory.Impl.SendGoalService.Request
-    brief = trajectory_proxy.brief_action(1000).Impl.SendGoalService.Request
+    brief = trajectory_proxy.brief_action(lambda: 1000).Impl.SendGoalService.Request
     goal_id = UUID(uuid=range(16))
     for count in (1, 1000, 1001):
         goal = goal_of(*[HOME] * count)
@@ -300,7 +305,7 @@ def test_of_a_long_goal_nothing_but_its_id_becomes_python() -> None:
 
 def test_a_long_goal_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Finding: rclpy got a pointer to any object that lay there, and freed it."""
-    kind = trajectory_proxy.brief_action(1).Impl.SendGoalService.Request
+    kind = trajectory_proxy.brief_action(lambda: 1).Impl.SendGoalService.Request
     goal = goal_of(HOME, HOME)
     data = serialize_message(FollowJointTrajectory.Impl.SendGoalService.Request(goal=goal))
 
