@@ -16,6 +16,7 @@ from correction_robot import (
     REST,
     REST_A,
     ROUNDING,
+    START,
     Robot,
     bent_tool,
     drifted,
@@ -30,12 +31,19 @@ from hypothesis import strategies as st
 from joint_errors import with_joint_errors
 from scipy.interpolate import CubicHermiteSpline
 
-from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.limiter import STILL
 from robocal_ros.correction.sent_path import SentPath
 
 WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
-
+TIGHT = {"thermal": ShiftBounds(0.1e-3, np.radians(0.1), np.radians(0.3))}  # and that many exceed
+MODES = [
+    WIDE,
+    WIDE | {"free_axis": True},
+    TIGHT | {"policy": Policy.CLAMP},
+    TIGHT | {"policy": Policy.PASS},
+]
 
 BEGINS = np.inf  # for the rate of an offset
 INSTANT_S = 1e-6
@@ -46,28 +54,39 @@ class Watch:
 
     def __init__(self, robot: Robot, period_s: float = DT) -> None:
         self.robot, self.period_s = robot, period_s  # the least of the stream's
+        self.begins, self.now_s, self.elapsed_s = True, -np.inf, np.inf  # nothing went out yet
         self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
+        self.came: dict[int, float] = {}  # joint: its target, as it was followed
         self.offsets: dict[int, tuple[float, float, float]] = {}  # when, offset, rate
         self.begun: set[int] = set()  # joints of which one step is known since they stood
         self.taught = np.full(6, np.nan)  # the last target, as it was followed
 
-    def out(self, names: tuple[str, ...], out: np.ndarray) -> None:
-        """Positions that went out now: no joint is faster than it may be."""
-        now = self.robot.now
-        for name, x in zip(names, out, strict=True):
-            j = NAMES.index(name)
+    def out(self, names: tuple[str, ...], out: np.ndarray, stood: np.ndarray | None = None) -> None:
+        """Positions that went out now: no joint is faster than it may be.
+
+        The first of a stream are where the robot ``stood`` (6,), others no more than two periods
+        from those before, as the controller has held since.
+        """
+        now, index = self.robot.now, [NAMES.index(name) for name in names]
+        if self.begins and stood is not None:
+            assert np.all(np.abs(out - stood[index]) <= START + ROUNDING)
+        self.begins, self.now_s, self.elapsed_s = False, now, now - self.now_s
+        periods_s = 2.0 * np.fmax(self.period_s, self.robot.session.stream.period_s)
+        for j, x in zip(index, out, strict=True):
             if j in self.last:
                 at, before = self.last[j]
                 fastest = LIMITS["velocity_limits"][j]
-                assert abs(x - before) <= fastest * (now - at) + ROUNDING, (name, x - before)
+                longest = min(now - at, periods_s)
+                assert abs(x - before) <= fastest * longest + ROUNDING, (NAMES[j], x - before)
             self.last[j] = now, x
 
     def offset(self, names: tuple[str, ...], taught: np.ndarray, out: np.ndarray) -> None:
-        """The same, of targets as they were followed."""
-        now = self.robot.now
-        for name, q, x in zip(names, taught, out, strict=True):
-            j = NAMES.index(name)
-            offset = x - q
+        """The same, of targets as they were followed; where none moves, the limits at rest."""
+        now, index = self.robot.now, [NAMES.index(name) for name in names]
+        ways = [abs(q - self.came.get(j, q)) for j, q in zip(index, taught, strict=True)]
+        moves = max(ways) > STILL * self.elapsed_s
+        for name, j, q, x in zip(names, index, taught, out, strict=True):
+            offset, self.came[j] = x - q, q
             if j in self.offsets:
                 at, before, rate = self.offsets[j]
                 dt = now - at
@@ -75,13 +94,15 @@ class Watch:
                     assert abs(offset - before) <= FASTEST * dt + ROUNDING
                     continue
                 new = (offset - before) / dt
-                assert abs(new) <= FASTEST + ROUNDING / dt
+                calm = not moves and abs(rate) <= REST
+                fastest, change = (REST, REST_A) if calm else (FASTEST, LARGEST_A)
+                assert abs(new) <= fastest + ROUNDING / dt
                 # after two periods without a message the controller holds, and the robot stands
                 held = dt > 2.0 * self.period_s + ROUNDING
                 if np.isfinite(rate):
                     # the step that began at rest is one of the rate's already
                     begun = REST_A * self.period_s if j in self.begun else 0.0
-                    goes_on = abs(new - rate) <= LARGEST_A * dt + begun + 2.0 * ROUNDING / dt
+                    goes_on = abs(new - rate) <= change * dt + begun + 2.0 * ROUNDING / dt
                     from_rest = abs(offset - before) <= LARGEST_A * dt * dt + ROUNDING
                     assert goes_on or (held and from_rest), name
                 self.begun.discard(j)
@@ -110,6 +131,7 @@ class Watch:
     def forget(self) -> None:
         """Nothing was commanded for a while: offsets are those of what begins anew."""
         self.offsets.clear()
+        self.begins = True
 
 
 EVENT = st.tuples(
@@ -129,10 +151,15 @@ def happen(robot: Robot, watch: Watch, what: str, seed: int, revision: int, q: n
     session = robot.session
     if what in ("on", "off"):
         session.enable(what == "on")
-    elif what == "model":
-        session.offer_model(offer(drifted(0.4 * seed, seed), revision))
-    elif what == "full":
-        session.offer_model(offer(with_joint_errors(drifted(0.2 * seed, seed), seed), revision))
+    elif what in ("model", "full"):
+        arm = drifted(0.4 * seed, seed)
+        if what == "full":
+            arm = with_joint_errors(drifted(0.2 * seed, seed), seed)
+        try:
+            session.offer_model(offer(arm, revision))
+        except RefusedError as error:
+            if error.reason is not Reason.TCP_BOUND:  # where the robot is, of tight bounds
+                raise
     elif what == "nominal":
         session.offer_model(offer(NOMINAL, revision))
     elif what == "tool":
@@ -229,14 +256,20 @@ def slow_down(robot: Robot, watch: Watch) -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.lists(EVENT, min_size=1, max_size=12), st.floats(0.0, 1.0), st.booleans())
-@example([("on", 0, 1), ("tool", 1, 1), ("pause", 0, 1), ("on", 0, 1)], 0.25, False)
-@example([("on", 0, 9), ("full", 2, 60), ("off", 0, 9), ("on", 0, 60), ("model", 1, 60)], 1.0, True)
+@given(
+    st.lists(EVENT, min_size=1, max_size=12), st.just(0.0) | st.floats(0.0, 1.0), st.booleans(),
+    st.sampled_from(range(len(MODES))),
+)  # fmt: skip
+@example([("on", 0, 1), ("tool", 1, 1), ("pause", 0, 1), ("on", 0, 1)], 0.25, False, 0)
+@example([("on", 0, 9), ("full", 2, 60), ("off", 0, 9), ("on", 0, 60)], 1.0, True, 0)
+@example([("full", 5, 9), ("tool", 3, 9), ("on", 0, 60), ("off", 0, 60)], 0.0, True, 1)
+@example([("model", 5, 9), ("on", 0, 60), ("tool", 3, 60), ("off", 0, 60)], 1.0, True, 2)
+@example([("on", 0, 9), ("model", 5, 60), ("full", 4, 60), ("nominal", 0, 60)], 1.0, True, 3)
 def test_streams_through_anything(
-    events: list[tuple[str, int, int]], speed: float, whole: bool
+    events: list[tuple[str, int, int]], speed: float, whole: bool, mode: int
 ) -> None:
     """A swinging stream; it is taken up again where the robot stands when it was ended."""
-    robot = Robot(**WIDE)
+    robot = Robot(**MODES[mode])
     watch, t = Watch(robot), 0.0
     centre = HOME.copy()
     for revision, (what, seed, count) in enumerate(events, start=1):
@@ -266,6 +299,7 @@ def test_streams_through_anything(
             names, target = NAMES, q
             if what == "some" and not whole:
                 names, target = NAMES[:3], q[:3]
+            stood = robot.at
             try:
                 robot.stream(target, names=names)
             except RefusedError:
@@ -278,7 +312,7 @@ def test_streams_through_anything(
                 watch.forget()
                 continue
             index = [NAMES.index(n) for n in names]
-            watch.out(names, robot.at[index])
+            watch.out(names, robot.at[index], stood)
             watch.offset(names, watch.followed(index, target), robot.at[index])
 
 
@@ -640,7 +674,7 @@ def test_a_program_that_wanders_through_anything(seed: int) -> None:
             dt = rng.uniform(0.01, 0.3)
         elif what:
             happen(robot, watch, str(what), int(rng.integers(1, 5)), revision, q)
-        near = (q < NOMINAL.lower + 1.0) | (q > NOMINAL.upper - 1.0)
+        stood, near = robot.at, (q < NOMINAL.lower + 1.0) | (q > NOMINAL.upper - 1.0)
         wanted = np.where(near, np.where(q < HOME, 0.3, -0.3), wanted)
         v = v + np.clip(wanted - v, -change, change)
         q = q + v * min(dt, 3.0 * DT)
@@ -651,5 +685,5 @@ def test_a_program_that_wanders_through_anything(seed: int) -> None:
             robot, watch, q = anew(robot, restart=bool(rng.random() < 0.3))
             v, wanted = np.zeros(6), np.zeros(6)
             continue
-        watch.out(NAMES, robot.at)
+        watch.out(NAMES, robot.at, stood)
         watch.offset(NAMES, robot.session.output.taught, robot.at)

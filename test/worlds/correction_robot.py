@@ -36,6 +36,7 @@ LIMITS = {
 # Of the offset, as the house promises it: at rest, and never more.
 REST, FASTEST = np.radians(2.0), np.radians(10.0)
 REST_A, LARGEST_A = np.radians(20.0), np.radians(200.0)
+START = np.radians(0.02)  # by so much the robot may stand beside where a command begins
 ROUNDING = 1e-9
 assert pytest.approx(astuple(TURNING)) == (REST, REST_A, FASTEST, LARGEST_A)
 
