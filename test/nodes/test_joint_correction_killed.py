@@ -6,7 +6,7 @@ environment, without it that test is skipped.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -43,6 +43,7 @@ class Stream:
     """A planner, a correction node as a process, and a controller."""
 
     OUTPUT = f"{NODE}/joint_trajectory"
+    PARAMETERS: ClassVar[dict[str, Any]] = {}  # of the node, besides
 
     def __init__(self, graph: Any, controller: Controlled, profiles: Path) -> None:
         self.graph, self.controller, self._profiles = graph, controller, profiles
@@ -92,7 +93,7 @@ class Stream:
             patch.setitem(environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(self._profiles))
             node = self.graph.start(
                 "joint_correction_node",
-                {"robot": "ur10", "serial": "s1", "joint_state_age_s": 0.5},
+                {"robot": "ur10", "serial": "s1", "joint_state_age_s": 0.5} | self.PARAMETERS,
                 {
                     "~/joint_trajectory": self.OUTPUT,
                     "controller_state": f"{NODE}/controller_state",

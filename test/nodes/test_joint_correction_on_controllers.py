@@ -7,16 +7,28 @@ skipped.
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
+from control_msgs.action import FollowJointTrajectory
 from jumps import no_jump
 from long_form import amount
+from rclpy.action import ActionClient
 from robocal_msgs.msg import CorrectionStatus
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from test_joint_correction_killed import CORRECTION, Stream
-from trajectory_controllers import CONTROLLERS, HOME, NODE, Controlled, seconds, trajectory
+from trajectory_controllers import (
+    CONTROLLERS,
+    HOME,
+    NAMES,
+    NODE,
+    Controlled,
+    seconds,
+    trajectory,
+)
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.ground.samples import CORRECTED
@@ -29,6 +41,12 @@ SPEED = np.array([0.6, 0.2, -0.1, 0.3, -0.2, 0.1])  # rad/s
 # The joint that needs longest slows down as it may, the others with it.
 SLOWS_S = float(np.max(np.abs(SPEED) / load_description("ur10").max_acceleration))
 PROFILES = Path(__file__).parents[2] / "tools" / "fastdds.xml"
+
+
+def motion(start: np.ndarray, speed: np.ndarray) -> list[Any]:
+    """Of 4 s: points from rest to rest, with their velocities."""
+    ways = (1.0, 0.5, 1.0), (3.0, 2.5, 1.0), (4.0, 3.0, 0.0)
+    return [(at_s, start + way * speed, share * speed) for at_s, way, share in ways]
 
 
 class Program(Stream):
@@ -55,10 +73,7 @@ class Program(Stream):
         """Begin a motion of 4 s, and wait for its middle; its speed, and its end as corrected."""
         start = self.controller.q
         speed = SPEED if start[0] < HOME[0] + SPEED[0] else -SPEED
-        points = [
-            (at_s, start + way * speed, share * speed)
-            for at_s, way, share in ((1.0, 0.5, 1.0), (3.0, 2.5, 1.0), (4.0, 3.0, 0.0))
-        ]
+        points = motion(start, speed)
         for _ in range(3):  # the real controller subscribes as best effort
             sent = self.says(*points)
             self.graph.spin_for(0.5)
@@ -87,6 +102,24 @@ class Lossy(Program):
             self.lost -= 1
         else:
             self._onward.publish(message)
+
+
+class ByAction(Program):
+    """Its motions are goals of the node's action."""
+
+    PARAMETERS: ClassVar = {"follow_joint_trajectory": f"/{NODE}/follow_joint_trajectory"}
+
+    def __init__(self, graph: Any, controller: Controlled) -> None:
+        super().__init__(graph, controller)
+        own = f"{CORRECTION}/follow_joint_trajectory"
+        controller.action = ActionClient(graph.probe, FollowJointTrajectory, own)
+        self.readings = graph.collect(JointState, f"{CORRECTION}/joint_states")
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Where the robot is, as a planner sees it."""
+        by_name = dict(zip(self.readings[-1].name, self.readings[-1].position, strict=True))
+        return np.array([by_name[name] for name in NAMES])
 
 
 @pytest.fixture
@@ -187,6 +220,32 @@ def test_a_corrected_motion_follows_the_speed_scaling(program):
 
     program.graph.undisturbed(scaled)
     program.graph.undisturbed(stops)
+
+
+@on(ByAction, False)
+def test_a_corrected_goal_follows_the_speed_scaling_and_outlasts_a_pause(program):
+    controller = program.controller
+
+    def scaled() -> None:
+        controller.scale(1.0)
+        start = program.shown
+        speed = SPEED if start[0] < HOME[0] + SPEED[0] else -SPEED
+        points, began_s = motion(start, speed), controller.now_s
+        handle = controller.goal(trajectory(points))
+        controller.moved(0.1, start)
+        for factor, for_s in ((0.5, 0.3), (0.1, 0.5), (0.0, amount(1.5, 10.0)), (0.2, 0.5)):
+            controller.scale(factor)
+            controller.graph.spin_for(for_s)
+        controller.scale(1.0)
+        assert controller.end(handle) == (GoalStatus.STATUS_SUCCEEDED, 0)
+        controller.stands()
+        assert program.shown == pytest.approx(points[-1][1], abs=1e-6)
+        assert np.max(np.abs(controller.q - program.shown)) > 1e-5  # it is corrected
+        _, found = controller.speeds(began_s)
+        no_jump(found * np.sign(speed) > -1e-6, "nothing goes back")
+        assert program.status[-1].state == CorrectionStatus.ON
+
+    program.graph.undisturbed(scaled)
 
 
 @on(Program, False)

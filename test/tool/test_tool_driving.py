@@ -71,12 +71,13 @@ def test_a_mandrel_is_driven_through_the_beams_and_tells_of_a_knock(history):
 
 
 @pytest.mark.parametrize("tells", [False, *more(True)])
-def test_a_mandrel_is_measured_by_a_robot_that_is_slow_and_pauses(history, tells):
+@pytest.mark.parametrize("mode", ["witness reference", "laser"])
+def test_a_mandrel_is_measured_by_a_robot_that_is_slow_and_pauses(history, mode, tells):
     """On a way of 23 s as it is planned: longer than a step may have no edge."""
     robot = with_mandrel(history, MANDREL)
     robot.speed, robot.tells = 0.5, tells
     robot.driver.arm(robot.now_s)
-    robot.measure("witness reference")
+    robot.measure(mode)
     for phase in (DrivePhase.APPROACH, DrivePhase.MEASURE):
         robot.run(100.0, until=lambda p=phase: robot.driver.phase is p)
         robot.run(0.4)
@@ -84,7 +85,7 @@ def test_a_mandrel_is_measured_by_a_robot_that_is_slow_and_pauses(history, tells
         robot.run(10.0)
         assert robot.driver.phase is phase
         robot.speed = 1.0
-    robot.run(100.0, until=robot.at_rest)
+    robot.run(300.0, until=robot.at_rest)
     assert robot.outcomes[-1].status is Code.ACCEPT, robot.outcomes[-1].message
 
 
