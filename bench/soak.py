@@ -103,8 +103,6 @@ def endurance(amount: Amount) -> Table:
         lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
     add("a beam station found again in a live gap, and knocked; replayed as live", 1,
         lambda: not _pytest("test/nodes/soak_laser_frame.py"))  # fmt: skip
-    add("a node that is stopped for 50 to 500 ms in a fast stream: largest step against direct", 1,
-        lambda: not _pytest("test/nodes/soak_stalls.py"))  # fmt: skip
     add("hostile requests to a live bridge and a live page", HOSTILE, lambda: not _hostile())
     for room, files in _other_long_forms():
         add(f"tests of {room} with all their cases and draws: files", len(files),
@@ -200,6 +198,13 @@ def correction(seconds: float) -> Table:
     return soak(seconds)
 
 
+def stalls() -> Table:
+    """joint_correction_node stopped in a fast stream."""
+    from bench.soak_stalls import DIRECT_RUNS, soak
+
+    return soak(DIRECT_RUNS)
+
+
 def shift(seconds: float) -> Table:
     """A whole cell at real time, driven by a PLC."""
     from bench.soak_shift import soak
@@ -227,7 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     amount = SHORT if given.short else LONG
     start = time.monotonic()
-    streams = (live(amount.live_s), correction(amount.live_s))
+    streams = (live(amount.live_s), correction(amount.live_s), stalls())
     tables = [*streams, shift(amount.shift_s), *simulated(amount.robots)]
     if not given.short:
         tables += closed_loop.tables(closed_loop.LONG)
