@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from robocal_ros.cli.main import COMMANDS, CliGroup
+from robocal_ros.cli.commands import COMMANDS, CliGroup
 
 ROOT = Path(__file__).parents[1]
 MKDOCS = ROOT / ".venv-docs" / "bin" / "mkdocs"

@@ -66,7 +66,8 @@ def parameters() -> str:
 
 def commands() -> str:
     """The help of each command and action."""
-    from robocal_ros.cli.main import COMMANDS, CliGroup, main
+    from robocal_ros.cli.commands import COMMANDS, CliGroup
+    from robocal_ros.cli.main import main
 
     os.environ["COLUMNS"] = "100"
     parts = ["# Commands", "As `robocal … --help` prints it."]

@@ -111,6 +111,7 @@ class TestUsage:
             ("identfy", "identify"),
             ("tool crosed", "crossed"),
             ("identify --hold-ot 0.5 --robot ur10 --data x.csv", "--hold-out"),
+            ("identify --rbot=ur10 --data x.csv", "--robot"),
         ],
     )
     def test_what_was_meant_is_named(self, arguments, meant):

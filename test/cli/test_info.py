@@ -15,6 +15,7 @@ from recordings import plain_bag, shift
 from tool_runs import run_tables
 
 from robocal_ros.cli import main
+from robocal_ros.cli.commands import COMMANDS, CliGroup
 from robocal_ros.cli.examples import EXAMPLES
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
@@ -108,8 +109,8 @@ def test_a_file_that_was_made_is_known(made, name, kind, fact):
 
 def test_the_help_of_each_command_has_an_example_that_it_takes():
     leaves = set()
-    for name, command in main.COMMANDS.items():
-        actions = command.actions if isinstance(command, main.CliGroup) else {}
+    for name, command in COMMANDS.items():
+        actions = command.actions if isinstance(command, CliGroup) else {}
         leaves |= {f"{name} {action}" for action in actions} or {name}
     longer = {"correct-program", "frame-shift"}
     assert set(EXAMPLES) == leaves - longer

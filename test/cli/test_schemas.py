@@ -22,7 +22,7 @@ from tracker_files import SCAN, tracker_files
 
 from bench.laser_tracker import prp_cell
 from bench.live.opc_ua import security_folder
-from robocal_ros.cli.main import COMMANDS
+from robocal_ros.cli.commands import COMMANDS
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics.robots import load_description, load_robot, save_robot
 from robocal_ros.kinematics.tables import joint_texts, write_cells

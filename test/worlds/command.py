@@ -102,6 +102,7 @@ def robocal_json(schema: str, *arguments: object, status: int = 0, **variables: 
 def takes(command: str) -> None:
     """Fail unless the command line is one: words in capitals stand for files and names."""
     from robocal_ros.cli import main
+    from robocal_ros.cli.commands import COMMANDS
 
     words = shlex.split(command)
     if words[0] == "robocal":
@@ -109,7 +110,7 @@ def takes(command: str) -> None:
         numbers = {"UP": "400", "DOWN": "360", "RADIUS": "20"}
         arguments = [numbers.get(word, word) for word in words[1:]]
         named = [word for word in arguments if not word.startswith("-")]
-        main._declare(parser, "command", main.COMMANDS, named)
+        main._declare(parser, "command", COMMANDS, named)
         assert isinstance(parser.parse_args(arguments), argparse.Namespace)
     else:
         assert words[:3] in (["ros2", "launch", "robocal_ros"], ["ros2", "run", "robocal_ros"])
