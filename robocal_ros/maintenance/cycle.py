@@ -252,10 +252,9 @@ class ToolPart:
             if not (yield from self._check(f"{cycle_id}/check", goes_on=True)):
                 return
             record, every_s = self._memory.tool, self._cell.config.full_every_s
-            if record.answer == "pass":
-                recent = 0.0 <= self._age_s(record.full_ns) < every_s
-                if every_s <= 0.0 or recent or not self._cell.fits(self._cell.tool_worst_s(FULL)):
-                    return  # only when time allows
+            recent = every_s <= 0.0 or 0.0 <= self._age_s(record.full_ns) < every_s
+            if record.answer == "pass" and recent:
+                return
         candidate = yield from self._measured_anew(f"{cycle_id}/full")
         if candidate and not (yield from self._ask_mandrel(cycle_id, candidate)):
             yield from self._settle(cycle_id)
@@ -321,7 +320,7 @@ class ToolPart:
         return (self.wall_ns - wall_ns) / NS
 
     def find_beams(self, cycle_id: str) -> Script[None]:
-        """Find the beams again where that is due and fits: how their station drifts.
+        """Find the beams again where that is due: how their station drifts.
 
         The first time is a person's, while the station stands right.
         """
@@ -329,13 +328,18 @@ class ToolPart:
         if every_s <= 0.0 or cell.config.driving.mandrel is None or outcome.left or outcome.fault:
             return
         recent = 0.0 <= self._age_s(self._memory.tool.laser_ns) < every_s
-        if recent or not self._decider.revision(LASER_FRAME):
-            return
-        if words := cell.too_short(cell.tool_worst_s(LASER)):
-            outcome.left, outcome.station = f"tool measurement ({LASER})", f"beam station: {words}"
-            outcome.station_code = Code.LIMIT_EXCEEDED
-            return
-        yield from self._measured(LASER, f"{cycle_id}/laser frame")
+        if not recent and self._decider.revision(LASER_FRAME):
+            yield from self._measured(LASER, f"{cycle_id}/laser frame")
+
+    def _leave_out(self, mode: str, words: str) -> None:
+        """A measurement that is due does not fit: which gap would do stands in ``words``."""
+        outcome = self.outcome
+        outcome.left = f"tool measurement ({mode})"
+        if mode == LASER:
+            outcome.station, outcome.station_code = f"beam station: {words}", Code.LIMIT_EXCEEDED
+        else:
+            note = f"{outcome.left}: {words}"
+            outcome.note = "; ".join(filter(None, (outcome.note, note)))
 
     def _check(self, name: str, *, goes_on: bool = False) -> Script[bool]:
         """A quick check; whether it gave an answer."""
@@ -361,8 +365,8 @@ class ToolPart:
             outcome.left = f"tool measurement ({mode})"
             outcome.take(DriverAnswer(Code.CONFLICT, cell.tool.advice(), absent=True))
             return None
-        if not cell.fits(cell.tool_worst_s(mode)):
-            outcome.left = f"tool measurement ({mode})"
+        if words := cell.too_short(cell.tool_worst_s(mode)):
+            self._leave_out(mode, words)
             return None
         cell.doing = f"tool measurement ({mode})"
         yield from cell.stand(STANDS_S)

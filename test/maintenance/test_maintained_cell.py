@@ -293,6 +293,25 @@ def test_a_full_measurement_of_a_healthy_tool_leaves_all_as_it_is(history):
     assert cell.accuracy().level is not AccuracyLevel.DEGRADED
 
 
+def test_a_full_measurement_that_is_overdue_says_which_gap_would_do(history):
+    """The check fits, the full measurement after it does not; in the gap that is told it does."""
+    cell = MaintainedCell(history, TAUGHT, poses=np.zeros((0, 6)), full_every_s=3600.0)
+    commissioning = ToolSession(cell.arm, history, cell.session.config, "test")
+    assert Driver(commissioning, cell.cell, cell.tool).measure("reference").done
+    cell.run(0.5)
+    times = cell.maintenance.config.times
+    way_s = 3.0 * times.answer_s + 4.0 * times.rest_s + times.tool_home_s + times.reserve_s
+    short = cell.maintain("short", times.check_s + way_s + 1.0)
+    assert (short.code, short.tool_answer, short.complete) == (Code.ACCEPT, "pass", False)
+    assert short.left == ("tool measurement (full)",)
+    told = r"tool measurement \(full\): the gap is [\d.]+ s too short, one of (\d+) s would do"
+    would_do = re.search(told, short.message)
+    assert would_do, short.message
+    done = cell.maintain("done", float(would_do[1]))
+    assert (done.complete, done.tool_code) == (True, Code.NO_SIGNIFICANT_GAIN), done.message
+    assert "too short" not in done.message
+
+
 def test_a_thermal_node_that_is_started_anew_between_two_gaps_has_lost_poses(warm):
     """The cycle's name is open again, but what was measured before is gone."""
     cell = warm()
