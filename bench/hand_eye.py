@@ -17,6 +17,7 @@ from bench.hand_eye_cell import PoseRobot
 from bench.hand_eye_worlds import (
     CELL,
     CENTRE,
+    GAUGED_M,
     LINE,
     RADIUS_M,
     STAIRCASE,
@@ -232,7 +233,8 @@ def plan_table() -> Table:
     half_m = 0.5 * (CELL.sensor.far_m - CELL.sensor.near_m)
     width_m = 2.0 * 0.2 * float(np.tan(CELL.sensor.half_angle_rad))
     sensor = SensorRange(half_m, -half_m, width_m, noise_m=CELL.sensor.noise_m)
-    target = StepTarget(T_BASE_USER, STAIRCASE.marked_corners(), STAIRCASE.edge_user)
+    corners = STAIRCASE.marked_corners()
+    target = StepTarget(T_BASE_USER, corners, STAIRCASE.edge_user, GAUGED_M)
     line = np.stack([LINE.point_base, LINE.direction_base])
     planned: tuple[PlannedTarget, ...] = (
         PlannedSphere(RADIUS_M, sensor, (CENTRE[0], CENTRE[1], CENTRE[2])),
@@ -245,8 +247,8 @@ def plan_table() -> Table:
         "Planned poses: expected error in the field of view, mm, and what it comes to",
         ("target", "expected", "achieved", "achieved over expected", "goal"),
         f"Simulated, whole profiles, {PLANNED_RUNS} runs from each of {PLANS} plans; the plan "
-        "knows the mount to 2 mm and 0.02 rad, the sphere's centre, the noise of sensor, robot and "
-        "eye. Goal: within 1.5 either way.",
+        "knows the mount to 2 mm and 0.02 rad, the sphere's centre, how well stairs are gauged, "
+        "the noise of sensor, robot and eye. Goal: within 1.5 either way.",
     )
     for (name, draw), plan in zip(CASES.items(), planned, strict=True):
         expected, achieved = _planned(draw, plan, sensor)
