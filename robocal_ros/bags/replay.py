@@ -2,9 +2,12 @@
 """A recorded stream through the thermal session: the live node's results, off line."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import (
@@ -18,6 +21,7 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, SessionBase, digest, read_command
+from robocal_ros.session.inputs import Between
 
 EVENTS = "session_events"
 NOT_BITS = "not to the last bit"
@@ -46,11 +50,29 @@ class ReplayReport:
     """What came of a replay.
 
     ``differs`` lists recorded commands whose result here is not the recorded one, bit for bit.
+    ``unheard``: recorded messages, by topic, that were left out: they never came to the session.
+    ``lacking``: joint readings that it had, and the recording has not.
     """
 
     outcomes: list[Outcome] = field(default_factory=list)
     differs: list[str] = field(default_factory=list)
     commands: int = 0
+    unheard: Counter[str] = field(default_factory=Counter)
+    lacking: int = 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """That recording and session had not the same, in words."""
+        told = [
+            f"{count} recorded messages of {topic} never came to the node and are left out"
+            for topic, count in self.unheard.items()
+        ]
+        if self.lacking:
+            told.append(
+                f"the recording lacks {self.lacking} joint states that the node had: what was made "
+                "of them may differ"
+            )
+        return told
 
 
 def topic_kind(topic: str) -> str:
@@ -178,6 +200,49 @@ def one_by_one(
             start += session.take_plain(block, start)
 
 
+def heard_messages(
+    messages: Iterable[RecordedMessage],
+    commands: Iterable[Command],
+    topics: Mapping[str, str] | None,
+    unheard: Counter[str],
+) -> Iterator[RecordedMessage]:
+    """The messages without those that were lost on their way to the session, as commands tell.
+
+    ``topics``: see `feed`. ``unheard``: counts those that are left out, by topic.
+    """
+    lost: dict[str, list[Between]] = {}
+    for command in commands:
+        for kind, between in ({} if command.heard is None else command.heard.lost).items():
+            lost.setdefault(kind, []).extend((after, before) for after, before in between)
+    ends = {kind: np.array(sorted(found), dtype=np.int64).T for kind, found in lost.items()}
+    for recorded in messages:
+        message, kind = recorded.message, _input(recorded.topic, topics)
+        if kind not in ends:
+            yield recorded
+            continue
+        block = isinstance(message, JointBlock)
+        stamps = message.stamp_ns if block else np.array([_stamp_ns(message)])
+        after, before = ends[kind]
+        place = np.searchsorted(after, stamps) - 1  # of the last one that begins before the stamp
+        gone = (place >= 0) & (stamps < before[place])
+        if not gone.any():
+            yield recorded
+            continue
+        unheard[recorded.topic] += int(gone.sum())
+        if block and not gone.all():
+            kept = JointBlock(message.stamp_ns[~gone], message.names, message.position[~gone])
+            yield One(recorded.topic, kept)
+
+
+def _stamp_ns(message: Any) -> int:
+    """Of a message or a sample."""
+    return int(message.stamp_ns if hasattr(message, "stamp_ns") else stamp_ns(message.header.stamp))
+
+
+def _input(topic: str, topics: Mapping[str, str] | None) -> str:
+    return topic_kind(topic) if topics is None else topics.get(topic, "")
+
+
 def feed(
     session: S,
     recorded: RecordedMessage,
@@ -188,9 +253,7 @@ def feed(
 
     ``topics``: see `input_topics`; without it the last part of the name decides.
     """
-    topic = recorded.topic
-    kind = topic_kind(topic) if topics is None else topics.get(topic, "")
-    take(session, kind, recorded.message)
+    take(session, _input(recorded.topic, topics), recorded.message)
 
 
 def replay(
@@ -203,54 +266,80 @@ def replay(
     """Play samples through a session and carry out commands where they were carried out.
 
     ``commands``: each with its recorded outcome (empty: none was recorded). Ids of calibrations
-    differ between histories; a recorded id is translated to the one given here.
+    differ between histories; a recorded id is translated to the one given here. What was lost on
+    its way to the session is left out.
     ``topics``: see `input_topics`; ``take`` gives a message of an input to the session.
     """
     report = ReplayReport(commands=len(commands))
-    expected = iter(commands)
-    ids: dict[int, int] = {}
-    awaited = _submit_next(session, expected, ids)
-    for recorded in one_by_one(session, messages):
+    obeyed = _Obeyed(session, commands, report)
+    heard = heard_messages(messages, [command for command, _ in commands], topics, report.unheard)
+    for recorded in one_by_one(session, heard):
         feed(session, recorded, topics, take)
-        while awaited is not None and (done := session.step(wall_ns=session.newest_joints_ns)):
-            awaited = _take(session, report, done, awaited, expected, ids)
-    while awaited is not None:
-        done = session.step(wall_ns=session.newest_joints_ns, force=True)
-        awaited = _take(session, report, done, awaited, expected, ids)
+        while obeyed.step():
+            pass
+    while obeyed.step(force=True):
+        pass
     return report
 
 
-def _submit_next(
-    session: SessionBase,
-    expected: Iterator[tuple[Command, Mapping[str, Any]]],
-    ids: Mapping[int, int],
-) -> Mapping[str, Any] | None:
-    following = next(expected, None)
-    if following is None:
-        return None
-    command, outcome = following
-    arguments = dict(command.arguments)
-    if arguments.get("id"):
-        arguments["id"] = ids.get(int(arguments["id"]), int(arguments["id"]))
-    session.submit(Command(command.name, arguments, command.stamp_ns, command.marks))
-    return outcome
+class _Obeyed:
+    """Recorded commands, one given to a session after the other."""
 
+    def __init__(
+        self,
+        session: SessionBase,
+        commands: Sequence[tuple[Command, Mapping[str, Any]]],
+        report: ReplayReport,
+    ) -> None:
+        self._session, self._report = session, report
+        self._following = iter(commands)
+        self._ids: dict[int, int] = {}
+        self._joints: tuple[int, int] | None = None  # readings so far, recorded and here
+        self._submit()
 
-def _take(
-    session: SessionBase,
-    report: ReplayReport,
-    done: list[Outcome],
-    recorded: Mapping[str, Any],
-    expected: Iterator[tuple[Command, Mapping[str, Any]]],
-    ids: dict[int, int],
-) -> Mapping[str, Any] | None:
-    outcome = done[-1]
-    report.outcomes.append(outcome)
-    if recorded:
-        if recorded["id"] and outcome.calibration_id:
-            ids.setdefault(int(recorded["id"]), outcome.calibration_id)
-        report.differs += _difference(outcome, recorded)
-    return _submit_next(session, expected, ids)
+    def _submit(self) -> None:
+        self._awaited = next(self._following, None)
+        if self._awaited is None:
+            return
+        command = self._awaited[0]
+        arguments = dict(command.arguments)
+        if arguments.get("id"):
+            arguments["id"] = self._ids.get(int(arguments["id"]), int(arguments["id"]))
+        self._session.submit(replace(command, arguments=arguments))
+
+    def step(self, *, force: bool = False) -> bool:
+        """Carry the next command out, if its samples are there; whether it was."""
+        if self._awaited is None:
+            return False
+        done = self._session.step(wall_ns=self._session.newest_joints_ns, force=force)
+        if not done:
+            return False
+        command, recorded = self._awaited
+        outcome, report = done[-1], self._report
+        report.outcomes.append(outcome)
+        lacking = self._lacking(command, outcome)
+        report.lacking += max(lacking, 0)
+        if recorded:
+            if recorded["id"] and outcome.calibration_id:
+                self._ids.setdefault(int(recorded["id"]), outcome.calibration_id)
+            more = f" (without {lacking} joint states that the node had)" if lacking > 0 else ""
+            report.differs += [f"{words}{more}" for words in _difference(outcome, recorded)]
+        self._submit()
+        return True
+
+    def _lacking(self, command: Command, outcome: Outcome) -> int:
+        """Joint readings since the command before that the session had and the recording has not.
+
+        Negative: the recording has more. Of an older recording, and of what a node had before the
+        recording or its own restart, nothing is known.
+        """
+        if command.heard is None or outcome.command.heard is None:
+            return 0
+        now = command.heard.joints, outcome.command.heard.joints
+        before, self._joints = self._joints, now
+        if before is None or now[0] < before[0]:
+            return 0
+        return (now[0] - before[0]) - (now[1] - before[1])
 
 
 def _difference(outcome: Outcome, recorded: Mapping[str, Any]) -> list[str]:

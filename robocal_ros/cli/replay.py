@@ -101,7 +101,7 @@ def commanded_document(
             for outcome in report.outcomes
         ],
         "differs": report.differs,
-        "warnings": recording.warnings,
+        "warnings": [*recording.warnings, *report.warnings],
     }
 
 

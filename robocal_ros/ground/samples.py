@@ -446,6 +446,7 @@ class JointStream:
     """The latest joint readings of one arm, in its joint order, oldest first.
 
     Content depends on the readings alone, not on when they arrive between other topics.
+    ``count``: of all that it ever held.
     """
 
     def __init__(self, joint_names: tuple[str, ...], capacity: int = 16384) -> None:
@@ -456,8 +457,14 @@ class JointStream:
         self._size = 0
         self._order: dict[tuple[str, ...], NDArray[np.int64]] = {}
         self._held: tuple[int, Array] | None = None  # a reading that leapt, not yet believed
+        self.count = 0
         self.gap_count = 0
         self.longest_gap_ns = 0
+
+    def count_until(self, stamp_ns: int) -> int:
+        """How many it ever held, without those after a stamp."""
+        later = np.searchsorted(self._stamp[: self._size], stamp_ns, side="right")
+        return self.count - (self._size - int(later))
 
     @property
     def newest_ns(self) -> int | None:
@@ -515,6 +522,7 @@ class JointStream:
         if len(pauses):
             self.gap_count += len(pauses)
             self.longest_gap_ns = max(self.longest_gap_ns, int(pauses.max()))
+        self.count += count
         rows = slice(start, start + count)
         stamps, q = block.stamp_ns[rows], block.position[rows][:, order]
         while len(stamps):
@@ -542,6 +550,7 @@ class JointStream:
         self._make_room()
         self._stamp[self._size], self._q[self._size] = stamp_ns, q
         self._size += 1
+        self.count += 1
 
     def window(self, from_ns: int, to_ns: int) -> tuple[NDArray[np.int64], Array]:
         """Stamps (k,) and joints (k, n) of the readings from ``from_ns`` up to ``to_ns``."""

@@ -34,14 +34,15 @@ from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session import events
-from robocal_ros.session.events import GAP_NS, Command, Ignored
+from robocal_ros.session.events import GAP_NS, Command
+from robocal_ros.session.inputs import AheadOfJoints, Ignored
 
 PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
 TRACKER_POINT = "tracker_point"
 COMPRESSED = "image/compressed"  # the input ``image`` in another encoding
 SHOTS = (PROFILE, TARGET_POSE, IMAGE, COMPRESSED, TRACKER_POINT)
 MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
-AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
+BEHIND_NS = 10_000_000_000  # the joints, when a shot arrives
 FARTHEST_TRACKED_M = 100.0  # the longest trackers measure 80 m
 
 
@@ -114,12 +115,13 @@ class ShotLog:
     def __init__(self) -> None:
         self._shots: deque[Shot] = deque()
         self._bytes = 0
+        self.ahead: AheadOfJoints[Shot] = AheadOfJoints()
 
     def add(self, shot: Shot, frame: str, joints_ns: int) -> None:
         """Take a shot; ``joints_ns``: newest stamp of the joints, 0 before any.
 
-        Raises `InputError` when it is of another frame, or stamped on another clock than the
-        joints, or there are no joints yet.
+        Raises `InputError` when it is of another frame or stamped on another clock than the joints;
+        also when it is ahead of them, or there are none yet: then it waits.
         """
         if shot.frame != frame:
             whose = "tracker" if shot.topic == TRACKER_POINT else "sensor"
@@ -127,14 +129,25 @@ class ShotLog:
                 f"{shot.topic} in frame '{shot.frame}', the {whose}'s frame is '{frame}': set "
                 f"{whose}_frame, or connect the right {whose}"
             )
-        if not joints_ns:
-            raise InputError(f"{shot.topic} came before any joint states")
+        most = min(MOST_KEPT, MOST_BYTES // (shot.size + 1) + 1)
+        if why := self.ahead.why(shot.topic, shot, joints_ns, most):
+            raise InputError(f"{shot.topic} {why}")
         away_ns = shot.stamp_ns - joints_ns
-        if not -BEHIND_NS <= away_ns <= AHEAD_NS:
+        if away_ns < -BEHIND_NS:
             raise InputError(
                 f"{shot.topic} at {shot.stamp_ns} ns is {away_ns * 1e-9:+.1f} s from the joint "
                 "states: stamp both on one clock"
             )
+        self._keep(shot)
+
+    def come(self, joints_ns: int) -> list[Shot]:
+        """Take the shots whose joint readings have come."""
+        found = self.ahead.come(joints_ns) if self.ahead else []
+        for shot in found:
+            self._keep(shot)
+        return found
+
+    def _keep(self, shot: Shot) -> None:
         self._shots.append(shot)
         self._bytes += shot.size
         while len(self._shots) > MOST_KEPT or (self._bytes > MOST_BYTES and len(self._shots) > 1):
@@ -155,6 +168,7 @@ class ShotLog:
     def clear(self) -> None:
         """Forget all."""
         self._shots.clear()
+        self.ahead.clear()
         self._bytes = 0
 
 

@@ -317,14 +317,7 @@ class HandEyeSession(SessionBase):
             by_tracker = sample.topic == TRACKER_POINT
             frame = self.config.tracker_frame if by_tracker else self.config.sensor_frame
             self._shots.add(sample, frame, self.newest_joints_ns)
-            waiting = self._waits_for(sample.topic)
-            if waiting is not None and sample.stamp_ns < waiting.from_ns:
-                early_s = (waiting.from_ns - sample.stamp_ns) * 1e-9
-                words = f"{sample.topic} is stamped {early_s:.3f} s before the call"
-                self._why = InputError(f"{words}: is the sensor's clock behind?")
-            self.received[sample.topic] += 1
-            newest = self.newest_ns.get(sample.topic, 0)
-            self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
+            self._took(sample)
         else:
             before_ns = self.newest_joints_ns or sample.stamp_ns
             if self._take_joints(sample):
@@ -332,7 +325,19 @@ class HandEyeSession(SessionBase):
                 words = "the clock jumped back: capture again"
                 self._found = self.broken_off(Code.CONFLICT, words)
             self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
+            for shot in self._shots.come(self.newest_joints_ns):
+                self._took(shot)
         self._look()
+
+    def _took(self, shot: Shot) -> None:
+        waiting = self._waits_for(shot.topic)
+        if waiting is not None and shot.stamp_ns < waiting.from_ns:
+            early_s = (waiting.from_ns - shot.stamp_ns) * 1e-9
+            words = f"{shot.topic} is stamped {early_s:.3f} s before the call"
+            self._why = InputError(f"{words}: is the sensor's clock behind?")
+        self.received[shot.topic] += 1
+        newest = self.newest_ns.get(shot.topic, 0)
+        self.newest_ns[shot.topic] = max(shot.stamp_ns, newest)
 
     def _waits_for(self, topic: str) -> Capture | None:
         """The capture that waits, if for this input."""
@@ -342,7 +347,8 @@ class HandEyeSession(SessionBase):
         return waiting
 
     def _watches_joints(self) -> bool:
-        return self.data is not None and self.data.waiting is not None and self._found is None
+        captures = self.data is not None and self.data.waiting is not None and self._found is None
+        return captures or bool(self._shots.ahead)
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""

@@ -90,6 +90,9 @@ class MaintenanceConfig:
     # poses of a cycle for measured in its middle, half of a pause away: within 300 s a cold robot
     # of this size drifts by as much as one measurement scatters, 0.03 mm.
     resume_within_s: float = 600.0
+    # and with poses that are left, when its first one is no older: of poses spread evenly over a
+    # span the rms distance from its middle is a square root of twelfth, 260 s of this one
+    cycle_within_s: float = 900.0
     # check_every_s, full_every_s: tool measurements that are due without a reason; 0: in each gap,
     # and never
     check_every_s: float = 0.0

@@ -54,12 +54,14 @@ class ThermalCycle:
     id: str = ""  # empty: none
     visited: set[int] = field(default_factory=set)  # poses that are done, from 1; measured or not
     unmeasured: set[int] = field(default_factory=set)  # of these, with too few measurements
-    last_s: float = -np.inf  # when the last one was
+    first_s: float = -np.inf  # when the first one was
+    last_s: float = -np.inf  # and the last one
     moved: bool = False  # the last cycle that ended found that the sensor or the robot has moved
 
     def forget(self) -> None:
         """No cycle is open."""
-        self.id, self.visited, self.unmeasured, self.last_s = "", set(), set(), -np.inf
+        self.id, self.visited, self.unmeasured = "", set(), set()
+        self.first_s = self.last_s = -np.inf
 
 
 class ThermalPart:
@@ -98,7 +100,8 @@ class ThermalPart:
         """
         cell, thermal = self._cell, self._thermal
         todo = [i for i in range(1, cell.ways.count + 1) if i not in thermal.visited]
-        if todo:
+        old = self._old() if todo else ""
+        if todo and not old:
             left = f"{MEASUREMENT}, {len(todo)} poses"
             if words := cell.too_short(self.worst_s()):
                 return DriverAnswer(Code.LIMIT_EXCEEDED, f"{words}: {EACH_POSE}"), left
@@ -123,7 +126,8 @@ class ThermalPart:
         answer = yield from self._end()
         if answer.code not in FOUND:
             return answer, MEASUREMENT
-        lacking = [f"{MEASUREMENT} at pose {unmeasured}"] if unmeasured else []
+        lacking = [f"{MEASUREMENT}, {len(todo)} poses: {old}"] if old else []
+        lacking += [f"{MEASUREMENT} at pose {unmeasured}"] if unmeasured else []
         if answer.visited is not None and answer.visited < measured:
             # it was started anew meanwhile, its clock jumped, or they are not of the cold reference
             has = f"of which the thermal node has {answer.visited}"
@@ -146,9 +150,21 @@ class ThermalPart:
             cell.doing = f"measuring pose {pose} of {cell.ways.count}"
             if not (yield from cell.measured_at(q, cell.measured)):
                 thermal.unmeasured.add(pose)
+            thermal.first_s = thermal.first_s if thermal.visited else cell.now_s
             thermal.visited.add(pose)
             thermal.last_s = cell.now_s
         return 0
+
+    def _old(self) -> str:
+        """That the open cycle ends with the poses that it has; empty: it goes on."""
+        thermal, span_s = self._thermal, self._cell.config.cycle_within_s
+        age_s = self._cell.now_s - thermal.first_s
+        if not thermal.visited or age_s <= span_s:
+            return ""
+        return (
+            f"the first of its cycle is {age_s:.0f} s old (cycle_within_s = {span_s:g} s), and the "
+            "robot drifts on"
+        )
 
     def _end(self) -> Script[DriverAnswer]:
         self._cell.doing = "thermal cycle ends"

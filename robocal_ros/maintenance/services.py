@@ -438,6 +438,14 @@ SETTINGS = (
         0.01,
         86400.0,
     ),
+    number(
+        "cycle_within_s",
+        900.0,
+        "With poses that are left it goes on when its first pose is no older, else it ends with "
+        "those it has: they count as measured at once",
+        0.01,
+        86400.0,
+    ),
     number("check_every_s", 0.0, "A quick check is due so often; 0: in each gap", 0.0, 1e7),
     number(
         "full_every_s",
@@ -522,6 +530,7 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
         home_near=settings["home_near_deg"] * np.where(arm.prismatic, MM, degree),
         measurements=settings["measurements"],
         resume_within_s=settings["resume_within_s"],
+        cycle_within_s=settings["cycle_within_s"],
         check_every_s=settings["check_every_s"],
         full_every_s=settings["full_every_s"],
         laser_frame_every_s=settings["laser_frame_every_s"],

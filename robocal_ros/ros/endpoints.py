@@ -27,7 +27,7 @@ from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code, RobocalError
-from robocal_ros.session.events import MOST_REASONS, kind_of
+from robocal_ros.session.inputs import MOST_REASONS, kind_of
 
 
 def _profile(
@@ -102,6 +102,27 @@ class InputCount:
     lost: int = 0
 
 
+class PublisherNumbers:
+    """Finds what of a topic was lost, on the way or in a full queue, by its publisher's numbers.
+
+    ``publishers``: how many there are; the numbers of several tell nothing. ``known``: whether the
+    middleware tells them.
+    """
+
+    def __init__(self, publishers: Callable[[], int]) -> None:
+        self._publishers = publishers
+        self._last = 0
+        self.known = False
+
+    def missed(self, info: Mapping[str, Any]) -> int:
+        """How many messages were lost before this one; ``info``: what rclpy knows of it."""
+        number, last = info.get("publication_sequence_number") or 0, self._last
+        self._last, self.known = number, number > 0
+        if not 0 < last < number - 1 or self._publishers() != 1:
+            return 0
+        return int(number - last - 1)
+
+
 class LogLimit:
     """One log line per topic and reason in `LOG_EVERY_S`: a flood hides no other reason."""
 
@@ -133,7 +154,7 @@ class EndpointNode(LifecycleNode):
         self._log_limit = LogLimit()
         self.async_group = ReentrantCallbackGroup()
         self._release: list[Callable[[], object]] = []
-        self._takers: list[tuple[str, Subscription, Callable[[Any], None]]] = []
+        self._takers: list[tuple[str, Subscription, Callable[..., None], Callable[..., None]]] = []
         self._taking = False
 
     @property
@@ -166,16 +187,19 @@ class EndpointNode(LifecycleNode):
         *,
         raw: bool = False,
         timed: bool = False,
+        numbered: bool = False,
     ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
 
         A defect in the callback counts it too and is logged; it does not end the node. ``raw``:
         the callback is given the serialized message; ``timed``: also what rclpy knows of it, its
-        ``source_timestamp`` (ns) among that.
+        ``source_timestamp`` (ns) among that. ``numbered``: what was lost is counted by the
+        publisher's numbers, also what the queue had no room for. Neither goes with an events
+        executor, which ends at a callback of two arguments (rclpy 7).
         """
         count = self.inputs.setdefault(topic, InputCount())
 
-        def receive(message: Any, *info: Any) -> None:
+        def take(message: Any, *info: Any) -> None:
             count.received += 1
             if not self.is_active:
                 count.ignored += 1
@@ -186,22 +210,30 @@ class EndpointNode(LifecycleNode):
                 count.invalid += 1
                 self._log(topic, error)
 
-        def receive_timed(message: Any, info: Any) -> None:  # rclpy counts the arguments
-            receive(message, info)
+        def note(info: Any) -> None:
+            count.lost += numbers.missed(info) if numbered else 0
+
+        def take_timed(message: Any, info: Any) -> None:  # rclpy counts the arguments
+            take(message, info)
+
+        def take_numbered(message: Any, info: Any) -> None:
+            note(info)
+            take(message)
 
         def lose(event: Any) -> None:
-            count.lost += event.total_count_change
+            count.lost += 0 if numbers.known else event.total_count_change
 
         subscription = self.create_subscription(
             kind,
             topic,
-            receive_timed if timed else receive,
+            take_numbered if numbered else take_timed if timed else take,
             own(profile),
             event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             qos_overriding_options=overridable(),
             raw=raw,
         )
-        self._takers.append((topic, subscription, receive))
+        numbers = PublisherNumbers(subscription.get_publisher_count)
+        self._takers.append((topic, subscription, note, take))
         self._release.append(lambda: self.destroy_subscription(subscription))
         return subscription
 
@@ -216,7 +248,7 @@ class EndpointNode(LifecycleNode):
             return
         self._taking = True
         try:
-            for topic, subscription, receive in self._takers:
+            for topic, subscription, note, take in self._takers:
                 waiting: list[Any] = []
                 while (not topics or topic in topics) and len(waiting) < MOST_WAITING:
                     with subscription.handle:
@@ -225,9 +257,10 @@ class EndpointNode(LifecycleNode):
                         )
                     if taken is None:
                         break
+                    note(taken[1])
                     waiting.append(taken[0])
                 for message in pick(waiting):
-                    receive(message)
+                    take(message)
         finally:
             self._taking = False
 

@@ -31,6 +31,7 @@ from robocal_ros.ros.endpoints import (
     WARN,
     EndpointNode,
     Health,
+    InputCount,
     NotActiveError,
     trigger_text,
 )
@@ -241,14 +242,19 @@ class SessionEvents:
 class CommandQueue:
     """Between the callers of a node and its session.
 
-    ``timeout_s``: a command waits at most so long for its samples. ``show``: takes each outcome,
-    also of what was decided outside. ``session``: None while the node is inactive.
+    ``timeout_s``: a command waits at most so long for its samples. ``look``: called before each is
+    carried out. ``show``: takes each outcome, also of what was decided outside. ``session``: None
+    while the node is inactive.
     """
 
     def __init__(
-        self, node: EndpointNode, timeout_s: float, show: Callable[[Outcome], None]
+        self,
+        node: EndpointNode,
+        timeout_s: float,
+        look: Callable[[], None],
+        show: Callable[[Outcome], None],
     ) -> None:
-        self._node, self._show = node, show
+        self._node, self._look, self._show = node, look, show
         self._asked: deque[Future] = deque()
         self.session: SessionBase | None = None
         self._deadline = node.add_timer(timeout_s, lambda: self.step(force=True), steady=True)
@@ -269,6 +275,9 @@ class CommandQueue:
     def step(self, *, force: bool = False) -> None:
         """Carry out the commands whose samples are complete."""
         while self.session is not None and self._asked:
+            if not (force or self.session.ready):
+                return
+            self._tell(self._look)
             try:
                 outcomes: list[Any] = self.session.step(wall_ns=time.time_ns(), force=force)
             except Exception as error:  # a defect must not end the node: the caller is told
@@ -278,12 +287,15 @@ class CommandQueue:
                 return
             asked = self._asked.popleft()  # before it is shown: that may give a command too
             for outcome in outcomes:
-                try:
-                    self._show(outcome)
-                except Exception:  # must not take the answer from its caller
-                    self._node.get_logger().error(f"not shown:\n{traceback.format_exc()}")
+                self._tell(self._show, outcome)
             asked.set_result(outcomes[-1])
         self._deadline.cancel()
+
+    def _tell(self, tell: Callable[..., None], *outcome: Outcome) -> None:
+        try:
+            tell(*outcome)
+        except Exception:  # must not take the answer from its caller
+            self._node.get_logger().error(f"not shown:\n{traceback.format_exc()}")
 
     def close(self) -> None:
         """End the session; calls that wait are answered."""
@@ -292,6 +304,27 @@ class CommandQueue:
         while self._asked:
             error = NotActiveError("deactivated while the command waited: nothing was done")
             self._asked.popleft().set_exception(error)
+
+
+class _LastTaken:
+    """The last message of an input that a session was given: it is told what is missing after it.
+
+    ``count``: of the input. ``left_out``: messages since then were not given to it.
+    """
+
+    def __init__(self, count: InputCount) -> None:
+        self._count, self._lost = count, 0
+        self._session: SessionBase | None = None
+        self._stamp_ns = 0
+        self.left_out = False
+
+    def note(self, session: SessionBase, kind: str, stamp_ns: int) -> None:
+        """The session is given the message of this stamp now."""
+        missing = self.left_out or self._count.lost != self._lost
+        if missing and self._session is session:
+            session.lose(kind, self._stamp_ns, stamp_ns)
+        self._session, self._stamp_ns = session, stamp_ns
+        self._lost, self.left_out = self._count.lost, False
 
 
 SessionT = TypeVar("SessionT", bound=SessionBase)
@@ -355,8 +388,8 @@ class SessionNode(RobotNode, Generic[SessionT]):
         self._stamps = StampWatch(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in self.INPUTS}
         for kind, (message_type, profile) in self.INPUTS.items():
-            self.add_input(message_type, kind, self._taker(kind), profile)
-        self._desk = CommandQueue(self, command_s, self._show)
+            self.add_input(message_type, kind, self._taker(kind), profile, numbered=True)
+        self._desk = CommandQueue(self, command_s, self._look, self._show)
         self.add_timer(POLL_S, self._poll, steady=True)
         return self._history
 
@@ -379,24 +412,36 @@ class SessionNode(RobotNode, Generic[SessionT]):
         self._history = None
 
     def _taker(self, kind: str) -> Callable[[Any], None]:
+        last = _LastTaken(self.inputs.setdefault(kind, InputCount()))
+
         def take(message: Any) -> None:
             session = self._session
             if session is None:
                 return
             self._stamps.note(kind, message)
             if kind == JOINTS and (fault := self._guard.fault_at(session.received[JOINTS])):
+                last.left_out = True
                 session.refuse(JOINTS, InputError(fault))
                 return
+            last.note(session, kind, stamp_ns(message.header.stamp))
             self.take(session, kind, message)
 
         return take
 
     def _poll(self) -> None:
         self._guard.look()
+        self._look(due=True)
+
+    def _look(self, *, due: bool = False) -> None:
+        """Tell what others brought into force: before the command that goes by it.
+
+        ``due``: do what is due, too.
+        """
         if self._session is None:
             return
         try:
-            self.polled(self._session)
+            if due:
+                self.polled(self._session)
             for outcome in self._session.poll():
                 self._show(outcome)
             self.show_in_force()
@@ -427,6 +472,8 @@ class SessionNode(RobotNode, Generic[SessionT]):
             return health
         health.values = {"revision in force": session.in_force.revision}
         self.report(session, history, health)
+        if lost := [topic for topic, count in self.inputs.items() if count.lost]:
+            health.worsen(WARN, f"messages lost on {', '.join(lost)}")
         if note := self._payload_note(history):
             health.worsen(WARN, note)
         health.values |= session.ignored.listed() | self._stamps.judge(health)

@@ -7,10 +7,9 @@ their turn, as far as the joint readings have come.
 
 import hashlib
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from robocal_ros import __version__
@@ -29,6 +28,7 @@ from robocal_ros.history.history_records import (
     Proposal,
 )
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.inputs import Between, Heard, Ignored
 
 CONFIGURE = "configure"
 CALIBRATE_SENSOR = "calibrate_sensor"
@@ -71,6 +71,7 @@ class Command:
     # newest stamp taken from each topic when the command was carried out; None until then. A
     # recorded command carries them, so that replay uses the same samples.
     marks: Mapping[str, int] | None = None
+    heard: Heard | None = None  # once it was carried out; older recordings have none
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,8 @@ def digest(document: Mapping[str, Any] | None) -> str:
 def arguments_text(command: Command) -> str:
     """Arguments and marks of a command as JSON, with the version of this form."""
     marks = dict(command.marks or {})
-    return _text({"version": VERSION, "arguments": dict(command.arguments), "marks": marks})
+    record = {"version": VERSION, "arguments": dict(command.arguments), "marks": marks}
+    return _text(record if command.heard is None else record | {"heard": asdict(command.heard)})
 
 
 def outcome_text(outcome: Outcome) -> str:
@@ -165,7 +167,8 @@ def read_command(name: str, stamp_ns: int, arguments: str) -> Command:
                 f"version {VERSION}: replay it with the software that recorded it"
             )
         marks = {str(topic): int(mark) for topic, mark in record["marks"].items()}
-        return Command(name, dict(record["arguments"]), stamp_ns, marks)
+        heard = Heard(**record["heard"]) if "heard" in record else None
+        return Command(name, dict(record["arguments"]), stamp_ns, marks, heard)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"session event '{name}' cannot be read: {error}") from error
 
@@ -379,56 +382,9 @@ class HistoryFollower:
         return [d for d in decided if d.kind == self._kind and d.wall_ns != own_wall_ns]
 
 
-MOST_REASONS = 30
-_NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
-
-
-def kind_of(reason: str) -> str:
-    """The reason with '#' for its numbers, which do not tell reasons apart."""
-    return _NUMBER.sub("#", reason)
-
-
-class Ignored(dict[str, Counter[str]]):
-    """Counts by topic and reason; numbers (put as '#') do not tell reasons apart."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._last: dict[tuple[str, str], str] = {}
-
-    def add(self, topic: str, reason: str, count: int = 1) -> None:
-        """Count samples that are not used."""
-        counter = self.setdefault(topic, Counter())
-        key = kind_of(reason)
-        key = key if key in counter or len(counter) < MOST_REASONS else "other"
-        counter[key] += count
-        self._last[topic, key] = reason
-
-    def listed(self) -> dict[str, str]:
-        """All reasons with their counts and the latest words, as nodes show them."""
-        return {
-            f"{topic} ignored: {key}": f"{count}, last: {self._last[topic, key]}"
-            for topic, counter in self.items()
-            for key, count in counter.items()
-        }
-
-    def told(self) -> dict[str, dict[str, int]]:
-        """By topic the latest words of each reason, with its count."""
-        return {
-            topic: {self._last[topic, key]: count for key, count in counter.items()}
-            for topic, counter in self.items()
-        }
-
-    def words(self) -> str:
-        """Tell the most frequent reason of each topic; empty when nothing was ignored."""
-        parts = [
-            f"{counter.total()} of {topic} ({self._last[topic, counter.most_common(1)[0][0]]})"
-            for topic, counter in self.items()
-        ]
-        return f"ignored: {', '.join(parts)}" if parts else ""
-
-
 WHILE = "in force while this was recorded"
 GAP_NS = 250_000_000
+MOST_LOST = 500  # stretches of an input between two commands; the count of the joints tells more
 Handler = Callable[[Command, int], Outcome]
 
 
@@ -453,6 +409,7 @@ class SessionBase:
         self.newest_ns: dict[str, int] = {}
         self.received: Counter[str] = Counter()
         self.ignored = Ignored()
+        self._lost: dict[str, list[Between]] = {}
 
     def _handlers(self) -> Mapping[str, Handler]:
         """What carries out each command beside the decisions."""
@@ -481,6 +438,15 @@ class SessionBase:
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message of an input that cannot be used."""
         self.ignored.add(kind, str(error))
+
+    def lose(self, kind: str, after_ns: int, before_ns: int) -> None:
+        """Note that of an input's messages those between two stamps were lost.
+
+        They may be in a recording all the same: a replay leaves out what the session did not have.
+        """
+        found = self._lost.setdefault(kind, [])
+        if len(found) < MOST_LOST:
+            found.append((after_ns, before_ns))
 
     def _take_joints(self, sample: JointSample) -> bool:
         """Take a reading; tells whether the clock jumped back, which begins everything anew."""
@@ -533,9 +499,14 @@ class SessionBase:
         """Number of commands not yet carried out."""
         return len(self._queue)
 
+    @property
+    def ready(self) -> bool:
+        """Whether the samples of the next command are complete."""
+        return bool(self._queue) and reached(self._wanted(self._queue[0]), self.marks)
+
     def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
         """Carry out one command: what was decided outside before it, and it."""
-        if not self._queue or not (force or reached(self._wanted(self._queue[0]), self.marks)):
+        if not (self.ready or (force and self._queue)):
             return []
         command = self._queue.pop(0)
         outside = self.poll()
@@ -544,6 +515,11 @@ class SessionBase:
         if self._kind != THERMAL:  # whose own commands bring thermal models into force
             handlers[CONFIGURE] = self._reconfigured
         outcome = carried_out(handlers, command, wall_ns)
+        if not outcome.repeated:  # it is recorded
+            until_ns = (command.marks or {}).get(JOINTS, 0)
+            heard = Heard(self.stream.count_until(until_ns), self._lost)
+            outcome = replace(outcome, command=replace(outcome.command, heard=heard))
+            self._lost = {}
         outside += [outside_decision(d, self.marks) for d in self._followed.look(wall_ns)]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
 

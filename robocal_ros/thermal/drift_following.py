@@ -29,7 +29,14 @@ from robocal_ros.session.events import HistoryFollower
 from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work, process_of
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
 from robocal_ros.thermal.reference import ColdReference, commissioned_of, holds_drift, reference_of
-from robocal_ros.thermal.tracking import DriftProcess, DriftState, Heat, TrackedCycle, track_cycle
+from robocal_ros.thermal.tracking import (
+    APPROACH_S,
+    DriftProcess,
+    DriftState,
+    Heat,
+    TrackedCycle,
+    track_cycle,
+)
 
 Prior = Literal["default", "learned"]
 Arrangement = Literal["fixed-sensor", "flange-sensor"]
@@ -57,13 +64,15 @@ class ThermalConfig:
     one measured coordinate in one visit of a pose. ``drift_parameters``: what ``lsq`` solves of a
     drift; empty: all, which takes many poses. ``hold_out``, ``seed``: share of the poses kept to
     judge a calibration without reference. ``cycle_timeout_s``: a cycle ends when nothing was
-    measured for so long. ``tolerance_m``, ``expires_after_s``: error that the process allows, and
-    age at which a measurement says nothing any more. ``work_poses``, ``tip_m``: where accuracy is
-    judged: joints of the working poses, rad (prismatic: m), and the tool's tip on the flange;
-    empty: throughout the joint limits, and the target. ``lateness_s``: a command waits for joint
-    readings this much newer, so that measurements under way still count. ``measuring_frame``: frame
-    of the measurements; empty: that of the first one used. ``target``: name of the target where the
-    measurement's frame_id gives none. ``sphere``: what a sphere in a cloud must be like.
+    measured for so long, or its first measurement is ``cycle_span_s`` old: what belongs to a cycle
+    counts as measured in its middle. ``tolerance_m``, ``expires_after_s``: error that the process
+    allows, and age at which a measurement says nothing any more. ``work_poses``, ``tip_m``: where
+    accuracy is judged: joints of the working poses, rad (prismatic: m), and the tool's tip on the
+    flange; empty: throughout the joint limits, and the target. ``lateness_s``: a command waits for
+    joint readings this much newer, so that measurements under way still count.
+    ``measuring_frame``: frame of the measurements; empty: that of the first one used. ``target``:
+    name of the target where the measurement's frame_id gives none. ``sphere``: what a sphere in a
+    cloud must be like.
     """
 
     method: Method = "map"
@@ -73,6 +82,7 @@ class ThermalConfig:
     hold_out: float = 0.5
     seed: int = 0
     cycle_timeout_s: float = 660.0
+    cycle_span_s: float = APPROACH_S
     tolerance_m: float = 3e-4
     expires_after_s: float = 8.0 * 3600.0
     work_poses: tuple[tuple[float, ...], ...] = ()

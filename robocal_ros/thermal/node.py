@@ -94,6 +94,7 @@ from robocal_ros.thermal.services import (
     SensorOnTf,
 )
 from robocal_ros.thermal.session import ThermalSession, configuration, take_message
+from robocal_ros.thermal.tracking import APPROACH_S
 
 ACCURACY_S = 1.0
 MOST_POSES = 20  # a plan holds the node up for two seconds then
@@ -225,6 +226,14 @@ SETTINGS = (
             7200.0,
         ),
         number(
+            "cycle_span_s",
+            APPROACH_S,
+            "A cycle ends when its first measurement is so old: links follow what heats them in an "
+            "hour; longer than maintenance_node's cycle_within_s and a gap",
+            60.0,
+            86400.0,
+        ),
+        number(
             "lateness_s",
             0.2,
             "Commands on measurements wait for joint readings so much newer than the call",
@@ -254,6 +263,7 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig
         hold_out=settings["hold_out"],
         seed=settings["seed"],
         cycle_timeout_s=settings["cycle_timeout_s"],
+        cycle_span_s=settings["cycle_span_s"],
         tolerance_m=settings["tolerance_mm"] * MM,
         expires_after_s=settings["expires_after_s"],
         work_poses=tuple(tuple(pose) for pose in poses),
@@ -519,6 +529,7 @@ class ThermalNode(SessionNode[ThermalSession]):
         self._shifts.look()
         self._on_tf.poll()
         if (command := session.overdue()) is not None:
+            self.get_logger().info(f"the measuring cycle ends: {command.arguments['reason']}")
             self._desk.ask(command)
 
     def show(self, outcome: Outcome) -> None:
@@ -580,9 +591,6 @@ class ThermalNode(SessionNode[ThermalSession]):
         named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
         values["cycle"] = f"{named}{visited} of {poses} poses measured"
         values["joint gaps"] = session.desk.stream.gap_count
-        lost = [topic for topic, count in self.inputs.items() if count.lost]
-        if lost:
-            health.worsen(WARN, f"messages lost on {', '.join(lost)}")
         if taken := self._on_tf.fault():
             health.worsen(WARN, taken)
 

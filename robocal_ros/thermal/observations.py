@@ -35,7 +35,8 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Ignored
+from robocal_ros.session.events import Command
+from robocal_ros.session.inputs import Ignored
 from robocal_ros.thermal.drift_following import InForce, ThermalConfig
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
@@ -384,6 +385,7 @@ class Windows:
     ) -> None:
         self._desk, self._cycle, self._current, self._config = desk, cycle, current, config
         self._pause_ns = int(config.cycle_timeout_s * 1e9)
+        self._span_ns = int(config.cycle_span_s * 1e9)
 
     def _cycle_ns(self) -> int:
         """Stamp from which measurements belong to a cycle: it holds no pause of its time-out."""
@@ -428,22 +430,27 @@ class Windows:
         return data, np.array(fixed).reshape(-1, 3)
 
     def overdue(self) -> Command | None:
-        """The command that ends a cycle in which nothing came for its time-out, or None.
+        """The command that ends a cycle in which nothing came for its time-out, or that is too old.
 
+        The robot drifts on: what was measured at its end is not of the robot of its beginning.
         Without ``begin_cycle`` a cycle is what follows each other without such a pause, at half
         of the cold reference's poses or more.
         """
         desk, cycle = self._desk, self._cycle
-        last_ns = max((o.sample.stamp_ns for o in desk.unused(desk.from_ns)), default=0)
-        last_ns = max(last_ns, cycle.begun_ns if cycle.id else 0)
+        stamps = [o.sample.stamp_ns for o in desk.unused(self._cycle_ns())]
+        last_ns = max([*stamps, cycle.begun_ns if cycle.id else 0])
         due_ns = max(last_ns, cycle.postponed_ns) + self._pause_ns
+        why = f"nothing was measured for {self._config.cycle_timeout_s:g} s"
+        if stamps and cycle.postponed_ns < last_ns and min(stamps) + self._span_ns < due_ns:
+            due_ns = min(stamps) + self._span_ns
+            why = f"its first measurement is {self._config.cycle_span_s:g} s old"
         if not last_ns or desk.newest_ns.get(JOINTS, 0) <= due_ns:
             return None
         if not cycle.id:
             visited, poses = self.progress()
             if poses == 0 or 2 * visited < poses:
                 return None
-        return Command(events.END_CYCLE, {"by": TIME_OUT}, due_ns)
+        return Command(events.END_CYCLE, {"by": TIME_OUT, "reason": why}, due_ns)
 
     def progress(self) -> tuple[int, int]:
         """How many poses of the cold reference were visited in this cycle, and of how many."""

@@ -16,6 +16,7 @@ import numpy as np
 from robocal_ros.ground.errors import Code, InputError, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.session.inputs import AHEAD_NS, AheadOfJoints
 
 Beam = Literal["x", "y", "up", "down"]
 BEAMS: tuple[Beam, Beam] = ("x", "y")  # crossed
@@ -184,7 +185,6 @@ def edge_sample(message: Any, names: Mapping[str, Beam]) -> EdgeSample:
 
 EDGES = "beam_events"
 MOST_EDGES = 1000  # of one step: more is a beam that flickers
-AHEAD_NS = 1_000_000_000
 
 
 class EdgeLog:
@@ -192,25 +192,36 @@ class EdgeLog:
 
     def __init__(self) -> None:
         self._edges: list[EdgeSample] = []
+        self.ahead: AheadOfJoints[EdgeSample] = AheadOfJoints()
 
     def add(self, sample: EdgeSample, newest_ns: dict[str, int], joints_ns: int) -> None:
         """Take an edge; ``newest_ns``: newest stamp of each beam, brought up to date.
 
         Raises `InputError` when it is not after the beam's last one, or far ahead of the joint
-        readings: one wrong stamp must not blind a beam.
+        readings, for which it waits: one wrong stamp must not blind a beam.
         """
-        ahead_ns = sample.stamp_ns - joints_ns
-        if joints_ns and ahead_ns > AHEAD_NS:
-            raise InputError(
-                f"edge at {sample.stamp_ns} ns is {ahead_ns * 1e-9:.1f} s ahead of the joint "
-                "states: stamp both on one clock"
-            )
+        if why := self.ahead.why(sample.beam, sample, joints_ns, MOST_EDGES):
+            raise InputError(f"edge at {sample.stamp_ns} ns {why}")
+        if not self._take(sample, newest_ns):
+            newest = newest_ns[f"{EDGES}/{sample.beam}"]
+            raise InputError(f"edge at {sample.stamp_ns} ns is not after {newest} ns")
+
+    def come(self, newest_ns: dict[str, int], joints_ns: int) -> list[EdgeSample]:
+        """Take the edges whose joint readings have come."""
+        if not self.ahead:
+            return []
+        came = self.ahead.come(joints_ns)
+        return [sample for sample in came if self._take(sample, newest_ns)]
+
+    def _take(self, sample: EdgeSample, newest_ns: dict[str, int]) -> bool:
+        """Whether it is after the beam's last one."""
         topic = f"{EDGES}/{sample.beam}"
         if sample.stamp_ns <= newest_ns.get(topic, -1):
-            raise InputError(f"edge at {sample.stamp_ns} ns is not after {newest_ns[topic]} ns")
+            return False
         newest_ns[topic] = sample.stamp_ns
         if len(self._edges) < MOST_EDGES:
             self._edges.append(sample)
+        return True
 
     def take(self, from_ns: int, marks: Mapping[str, int]) -> list[EdgeSample]:
         """Edges after a stamp, up to the marks; they are not given again."""
@@ -234,6 +245,33 @@ class EdgeLog:
     def clear(self) -> None:
         """Forget all."""
         self._edges.clear()
+        self.ahead.clear()
+
+
+BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges themselves show
+STRAYS = 2
+
+
+class StrayEdges:
+    """Edges of a run that come with a stamp far from the joints'.
+
+    One may be a mistake, a second one is none.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def doubt(self, sample: EdgeSample, joints_ns: int) -> str:
+        """What is wrong, once it is sure; else empty."""
+        away_s = (sample.stamp_ns - joints_ns) * 1e-9
+        self._count += not -BEHIND_S <= away_s <= AHEAD_NS * 1e-9
+        if self._count != STRAYS:
+            return ""
+        where = "ahead of" if away_s > 0.0 else "behind"
+        return (
+            f"edges come stamped {abs(away_s):.2f} s {where} the joint states: a clock has jumped, "
+            "or one of them comes late; stamp both on one clock"
+        )
 
 
 REST_S = 0.1

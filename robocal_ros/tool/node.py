@@ -509,8 +509,6 @@ class TcfNode(SessionNode[ToolSession]):
         if outcome.repeated or self._session is None:
             return
         try:
-            if name == MEASURE_TOOL:  # a run goes by the thermal model of its begin
-                self.show_in_force()
             self._outputs.events.tell(outcome.command, outcome)
             if name == MEASURE_TOOL and outcome.done:
                 self.run_end, self.last = Future(), None

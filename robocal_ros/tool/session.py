@@ -36,13 +36,13 @@ from robocal_ros.session.events import (
 )
 from robocal_ros.tool.crossed_model import Held, ToolEstimate
 from robocal_ros.tool.edges import (
-    AHEAD_NS,
     EDGES,
     MOST_EDGES,
     PARALLEL,
     BeamError,
     EdgeLog,
     EdgeSample,
+    StrayEdges,
     edge_sample,
 )
 from robocal_ros.tool.files import check_document, run_document
@@ -387,11 +387,6 @@ class ToolResults:
         )
 
 
-AHEAD_S = AHEAD_NS * 1e-9
-BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges themselves show
-STRAYS = 2
-
-
 class ToolSession(SessionBase):
     """Measures the tool of one arm at one station of two crossed beams.
 
@@ -412,7 +407,7 @@ class ToolSession(SessionBase):
         self._edges = EdgeLog()
         self._touches, self._sweeps = TouchLog(config), SweepLog(config)
         self._runs = 0
-        self._strays = 0  # edges of the run that came with a stamp far from the joints'
+        self._strays = StrayEdges()
         self._over: Command | None = None
         self.run: ToolRun | None = None
 
@@ -434,7 +429,12 @@ class ToolSession(SessionBase):
             self._edges.clear()
             self._sweeps.jumped()
             self._end_early("the clock jumped back", Code.CLOCK_WRONG)
-        elif run is not None and self._over is None and newest > run.from_ns:
+            return
+        self._sweeps.come(self.newest_ns, newest)
+        for sample_come in self._edges.come(self.newest_ns, newest):
+            if run is not None:
+                run.watch_edge(sample_come)
+        if run is not None and self._over is None and newest > run.from_ns:
             _, q = self.stream.window(newest, newest)
             waited_s, limit_s = run.waited_s(newest), self.config.step_timeout_s
             if run.step_over(newest, q[0]):
@@ -451,7 +451,8 @@ class ToolSession(SessionBase):
                 self._end_early(f"{run.awaited.name}: {why}")
 
     def _watches_joints(self) -> bool:
-        return self.run is not None and self._over is None
+        waiting = self._edges.ahead or self._sweeps.awaits_joints
+        return bool(waiting) or (self.run is not None and self._over is None)
 
     def _end_early(self, reason: str, code: Code = Code.BEAM_EDGES_WRONG) -> None:
         if self.run is not None:
@@ -470,17 +471,9 @@ class ToolSession(SessionBase):
             )
             self._end_early(words)
             raise InputError(words)
-        if self.run is not None and self.newest_joints_ns:
-            # One edge that is stamped far from the joints may be a mistake, a second one is none.
-            ahead_s = (sample.stamp_ns - self.newest_joints_ns) * 1e-9
-            self._strays += not -BEHIND_S <= ahead_s <= AHEAD_S
-            if self._strays == STRAYS:
-                where = "ahead of" if ahead_s > 0.0 else "behind"
-                self._end_early(
-                    f"edges come stamped {abs(ahead_s):.2f} s {where} the joint states: a clock "
-                    "has jumped, or one of them comes late; stamp both on one clock",
-                    Code.CLOCK_WRONG,
-                )
+        joints_ns = self.newest_joints_ns
+        if self.run is not None and joints_ns and (why := self._strays.doubt(sample, joints_ns)):
+            self._end_early(why, Code.CLOCK_WRONG)
         self._edges.add(sample, self.newest_ns, self.newest_joints_ns)
         self.received[EDGES] += 1
         if self.run is not None:
@@ -542,7 +535,7 @@ class ToolSession(SessionBase):
             self._runs, mode, cycle_id, plan, config, arm, revision, begun_ns, begun_ns, healthy
         )
         self._edges.forget_marked(command.marks or {})
-        self._over, self._strays = None, 0
+        self._over, self._strays = None, StrayEdges()
         words = f"run {self._runs} ({mode}): {', '.join(plan.names)}"
         return Outcome(command, Code.ACCEPT, words)
 

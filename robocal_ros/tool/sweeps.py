@@ -78,8 +78,17 @@ class SweepLog:
 
     def add_edge(self, sample: EdgeSample, newest_ns: dict[str, int], joints_ns: int) -> None:
         """Take an edge; as `EdgeLog.add`."""
-        self._edges.forget(sample.stamp_ns - LONGEST_NS)
+        self._edges.forget(min(sample.stamp_ns, joints_ns) - LONGEST_NS)
         self._edges.add(sample, newest_ns, joints_ns)
+
+    def come(self, newest_ns: dict[str, int], joints_ns: int) -> None:
+        """As `EdgeLog.come`."""
+        self._edges.come(newest_ns, joints_ns)
+
+    @property
+    def awaits_joints(self) -> bool:
+        """Whether an edge waits for joint readings."""
+        return bool(self._edges.ahead)
 
     def add(self, command: Command, stream: JointStream, arm: SerialArm) -> Outcome:
         """Take the sweep that is over.

@@ -2,6 +2,7 @@
 """Hand-eye sessions, driven by a simulated robot that brings a laser sensor before a sphere."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hand_eye_driver import (
     SPHERE,
     T_BASE_BOARD,
     Recorded,
+    namespace,
     profile,
     sphere_set,
     target_pose,
@@ -19,19 +21,34 @@ from hand_eye_driver import (
 )
 from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 
+from robocal_ros.bags.replay import replay
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
+from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.camera import CameraSettings
+from robocal_ros.hand_eye.data import PROFILE
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import HandEyeSettings
-from robocal_ros.hand_eye.session import HandEyeConfig, solved
+from robocal_ros.hand_eye.session import (
+    HandEyeConfig,
+    HandEyeSession,
+    solved,
+    take_hand_eye_message,
+)
 from robocal_ros.hand_eye.solve import solve_task
 from robocal_ros.hand_eye.stairs import task_of
 from robocal_ros.hand_eye.tasks import HandEyeData
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, hand_eye_kind
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.session import events
-from robocal_ros.session.events import bring_into_force, digest
+from robocal_ros.session.events import (
+    arguments_text,
+    bring_into_force,
+    digest,
+    outcome_text,
+    read_command,
+)
 
 KIND = hand_eye_kind(FRAME)
 LIMIT_M = 5e-4  # at the working distance
@@ -78,6 +95,28 @@ def test_each_sample_is_a_command_that_names_its_shot(history):
     assert sample.q == pytest.approx(np.mean(near, axis=0), abs=1e-15)
     q, _ = SHOTS[2]
     assert sample.q == pytest.approx(q, abs=1e-7)  # the readings scatter by that
+
+
+@pytest.mark.parametrize("later", [JOINTS, PROFILE])
+def test_a_recorder_may_write_the_topics_in_another_order(history, tmp_path, later):
+    """One that stood still for seconds brings a topic far behind the other."""
+    driver = driver_of(history)
+    driver.sphere(6)
+    written = [m for m in driver.recorded if isinstance(m, Recorded)]
+    written.sort(key=lambda m: m.stamp_ns + 3_000_000_000 * (m.kind == later))
+    commands = [
+        (
+            read_command(o.command.name, o.command.stamp_ns, arguments_text(o.command)),
+            json.loads(outcome_text(o)),
+        )
+        for o in driver.outcomes
+    ]
+    messages = [SimpleNamespace(topic=m.kind, message=namespace(m.fields)) for m in written]
+    with CalibrationHistory.open("K2", state_dir=tmp_path) as other:
+        session = HandEyeSession(ARM, other, driver.session.config, "test")
+        report = replay(session, messages, commands, None, take_hand_eye_message)
+        assert report.differs == []
+        assert digest(session.data.document()) == digest(driver.session.data.document())
 
 
 def test_flange_poses_come_from_the_thermal_model_in_force_when_they_were_captured(history):

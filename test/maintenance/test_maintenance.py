@@ -184,6 +184,24 @@ def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
     assert kinds(cell)[: kinds(cell).index("EndCycle")].count("Move") == len(POSES) + 1
 
 
+def test_a_thermal_cycle_whose_first_pose_is_old_ends_with_the_poses_that_it_has(history):
+    """A sphere seen at eight and one seen at noon are of no state of the robot."""
+    lone = {"poses": MANY_POSES, "T_base_laser": None}
+    cell = Cell(history, config_of(**lone, resume_within_s=60.0, cycle_within_s=50.0))
+    cell.open_gap()
+    (left,) = cell.ran("c1", 24.0).left
+    cell.pass_time(40.0)  # its last pose is young enough
+    cell.log.clear()
+    result = cell.ran("c2", 24.0)
+    assert kinds(cell) == ["EndCycle"], "nothing more is driven"
+    assert (result.thermal_code, result.complete) == (cell.thermal.code, False)
+    (missing,) = result.left
+    assert missing.startswith(f"{left}: the first of its cycle is 5")
+    assert missing.endswith(" s old (cycle_within_s = 50 s), and the robot drifts on")
+    assert cell.ran("c3").complete, "the next gap begins anew"
+    assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c3"]
+
+
 def test_a_full_measurement_that_did_not_fit_comes_next(cell):
     cell.check = bent()
     assert cell.ran("c1", 30.0).left == ("tool measurement (full)",)

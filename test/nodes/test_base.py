@@ -22,7 +22,7 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.endpoints import LOG_EVERY_S, WARN, Health, LogLimit
 from robocal_ros.ros.parameters import Setting
-from robocal_ros.session.events import MOST_REASONS
+from robocal_ros.session.inputs import MOST_REASONS
 
 BUG = 5e5  # of this number the callback has a defect
 

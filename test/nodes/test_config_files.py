@@ -144,6 +144,7 @@ def test_each_node_takes_over_what_another_one_gives_as_all_is_set():
     assert maintenance["accept_tool_deg"] <= tcf["tilt_limit_deg"]
     assert maintenance["accept_thermal_mm"] <= correction["thermal_tcp_mm"]
     assert maintenance["resume_within_s"] + 60.0 <= ThermalConfig().cycle_timeout_s
+    assert maintenance["cycle_within_s"] < ThermalConfig().cycle_span_s
     assert maintenance["correction_silent_s"] > 0.0  # cell.launch.py and the demo have one
 
 
@@ -154,8 +155,9 @@ def test_what_is_judged_without_a_file_is_judged_as_with_it():
     assert np.degrees(limits.tilt_rad) == pytest.approx(tcf["tilt_limit_deg"])
     assert 1e3 * tool.tcp_m == pytest.approx(correction["tool_tcp_mm"])
     assert np.degrees(tool.tcp_rad) == pytest.approx(correction["tool_tcp_deg"])
-    (timeout,) = [s for s in ThermalNode.SETTINGS if s.name == "cycle_timeout_s"]
-    assert timeout.default == ThermalConfig().cycle_timeout_s
+    defaults = {s.name: s.default for s in ThermalNode.SETTINGS}
+    for name in ("cycle_timeout_s", "cycle_span_s"):
+        assert defaults[name] == getattr(ThermalConfig(), name)
 
 
 def test_the_page_of_motions_names_them_as_the_parameters_do():

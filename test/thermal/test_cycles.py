@@ -348,6 +348,26 @@ def test_a_fixed_sphere_alone_keeps_no_cycle_open(cell):
     assert cell.session.overdue() is not None
 
 
+@pytest.mark.parametrize("begins", [True, False])
+def test_a_cycle_ends_when_its_first_measurement_is_old(tmp_path, begins):
+    """However short its pauses: the links have followed what heats them meanwhile."""
+    cell = Cell(tmp_path, replace(CONFIG, cycle_span_s=300.0))
+    cell.capture()
+    if begins:
+        cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    first_ns = cell.shift.now_ns
+    while cell.session.overdue() is None:
+        cell.visit(15.0, slice(6), after_h=50.0 / 3600.0)
+        assert cell.shift.now_ns < first_ns + 600 * NS
+    command = cell.session.overdue()
+    assert command.arguments["reason"] == "its first measurement is 300 s old"
+    cell.session.submit(command)
+    outcome = cell.session.advance(wall_ns=1, force=True)[-1]
+    assert outcome.command.name == events.END_CYCLE
+    assert outcome.samples > 6
+    assert cell.session.overdue() is None
+
+
 def test_a_time_out_on_a_full_disk_keeps_the_cycle(cell):
     cell.visit(15.0, after_h=2.0)
     cell.idle(61.0)

@@ -15,7 +15,7 @@ from robocal_ros.ground.samples import (
     Reading,
     StandstillRule,
 )
-from robocal_ros.session.events import MOST_REASONS
+from robocal_ros.session.inputs import MOST_REASONS
 from robocal_ros.thermal.observations import MOST_WAITING, ObservationDesk, as_measurements
 
 MS = 1_000_000
