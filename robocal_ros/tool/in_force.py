@@ -33,6 +33,7 @@ class ToolInForce(HistoryFollower):
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
         self._nominal = nominal
         self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
+        self._mandrel_radius_m = config.mandrel_radius_m
         self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
         super().__init__(history, TOOL)
 
@@ -90,7 +91,7 @@ class ToolInForce(HistoryFollower):
 
     @property
     def commissioned_station(self) -> StationMeasurement | None:
-        """The first measurement of the beams with this mandrel and laser file; None before it."""
+        """The first measurement with this mandrel, radius and laser file; None before it."""
         model = self._station_model
         return None if model is None else measurement_of(model["first"])
 
@@ -105,7 +106,9 @@ class ToolInForce(HistoryFollower):
         model = self.station.model
         if model is None or not alike(model["made_with"], self._made_with):
             return None
-        return model if alike(model["mandrel"], self._mandrel) else None
+        radius_m = model.get("mandrel_radius_m", self._mandrel_radius_m)  # older ones have none
+        same = [model["mandrel"], radius_m], [self._mandrel, self._mandrel_radius_m]
+        return model if alike(*same) else None
 
     @property
     def _healthy_model(self) -> dict[str, Any] | None:

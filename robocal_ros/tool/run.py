@@ -260,7 +260,7 @@ class RunTraits:
         expected = self.rate_hz * span_s
         lost = 1.0 - count / expected if expected > 0.0 else 0.0
         sigma = np.sqrt(max(lost * (1.0 - lost), 0.0) / max(expected, 1.0))
-        if _beyond(max(lost, 0.0), float(sigma), limits.lost):
+        if beyond(max(lost, 0.0), float(sigma), limits.lost):
             raise TooFewSamplesError(
                 f"{lost:.0%} of the joint readings are missing: {count} in {span_s:.1f} s, the "
                 f"healthy tool was measured with {self.rate_hz:.0f} in a second; edges are lost "
@@ -275,7 +275,7 @@ class RunTraits:
         """
         later = self.latency_s - healthy.latency_s
         sigma = float(np.hypot(self.latency_sigma_s, healthy.latency_sigma_s))
-        if _beyond(later, sigma, limits.latency_s):
+        if beyond(later, sigma, limits.latency_s):
             raise ClockError(
                 f"the edges are {1e3 * self.latency_s:.1f} ms behind the joint readings, with the "
                 f"healthy tool it were {1e3 * healthy.latency_s:.1f} ms: a clock has jumped, or "
@@ -296,13 +296,13 @@ class RunTraits:
         apart, both = float(change[0] - change[1]), float(np.mean(change))
         x, y = (f"{1e3 * part:+.3f}" for part in change)
         words = f"against the healthy tool its radius is {x} mm in beam x and {y} mm in beam y"
-        if _beyond(apart, np.sqrt(2.0) * sigma, limits.radius_m):
+        if beyond(apart, np.sqrt(2.0) * sigma, limits.radius_m):
             worse = BEAMS[int(np.argmax(np.abs(change)))]
             raise BeamError(
                 f"{words}: a tool changes for both, so beam {worse} is dirty or out of line; clean "
                 "and align it, then measure the healthy tool anew"
             )
-        if _beyond(both, np.sqrt(0.5) * sigma, limits.radius_m):
+        if beyond(both, np.sqrt(0.5) * sigma, limits.radius_m):
             raise WrongToolError(
                 f"{words}: another tool is mounted, this one is worn or fouled, or both beams are "
                 "dirty; mount the right one, or measure it in mode REFERENCE"
@@ -318,7 +318,7 @@ def require_even(rates_hz: Sequence[float], limits: TraitLimits) -> None:
     Raises `TooFewSamplesError` when the slowest and the fastest step differ by more than the limit.
     """
     slowest, fastest = min(rates_hz), max(rates_hz)
-    if _beyond(1.0 - slowest / fastest, 0.0, limits.lost):
+    if beyond(1.0 - slowest / fastest, 0.0, limits.lost):
         raise TooFewSamplesError(
             f"joint readings came at {slowest:.0f} to {fastest:.0f} in a second: some were lost, "
             "and a healthy tool measured so would hide later loss; look at network and load, then "
@@ -326,7 +326,7 @@ def require_even(rates_hz: Sequence[float], limits: TraitLimits) -> None:
         )
 
 
-def _beyond(change: float, sigma: float, limit: float) -> bool:
+def beyond(change: float, sigma: float, limit: float) -> bool:
     """Whether a change is larger than the limit in all but 5 % of cases; not a number is."""
     return limit > 0.0 and not abs(change) - ONE_SIDED * sigma <= limit
 

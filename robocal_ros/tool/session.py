@@ -267,7 +267,12 @@ class ToolResults:
         document = result_document(found, shift, trend, verdict, commissioned=first is not None)
         document["cycle_id"] = run.cycle_id
         measured, before = measurement_document(found), measurement_document(first or found)
-        model = measured | {"mandrel": mandrel.tolist(), "first": before, "trend": trend.model()}
+        model = measured | {
+            "mandrel": mandrel.tolist(),
+            "mandrel_radius_m": config.mandrel_radius_m,
+            "first": before,
+            "trend": trend.model(),
+        }
         kept = self._keep(LASER_FRAME, run, command, wall_ns, verdict, document, model)
         if verdict.accept:
             self._accept(kept, command, verdict, wall_ns)

@@ -4,8 +4,9 @@
 Upright circles tell where each beam lies across and which way it runs, plunges beside the crossing
 how high it is at two places. The problem is that of a tool's run (`crossed_model`) the other way
 round: the tool is known and the points A ... D of the beams are free, so that the covariance holds
-the robot's repeatability and the edges. What the mandrel itself is off by is in every measurement
-alike: it is not in the sigma, and cancels in a change.
+the robot's repeatability and the edges. What the mandrel's place is off by is in every measurement
+alike: it is not in the sigma, and cancels in a change. Nor can a run tell a wrong radius from beams
+that reach further: so what its shadows are wider than both say counts in the frame's height.
 """
 
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from robocal_ros.tool.crossed_model import (
     run_problem,
 )
 from robocal_ros.tool.laser_frame import POINTS, FlangePath, LaserFrame
-from robocal_ros.tool.run import LITTLE_TURN_RAD, WrongToolError
+from robocal_ros.tool.run import LITTLE_TURN_RAD, TraitLimits, WrongToolError, beyond
 
 if TYPE_CHECKING:
     from robocal_ros.tool.documents import StationShiftDocument, StationTrendDocument
@@ -37,6 +38,7 @@ ROUGH_M = 5e-3  # how well the beams' points are known before: a drawing, or bef
 KNOWN = Held(tilt_rad=EXACT_M, along_m=EXACT_M, across_m=EXACT_M)
 REACHES = 3  # turns of reach and place: one moves the other by its square
 NEVER = 0.001  # chance that a station that stands still looks moved
+CLEAR_SIGMAS = 3.29  # as seldom a mandrel of the right radius seems another
 LARGEST_REACH_M = 2e-3  # half of the thickest beam
 DAY_NS = 86_400 * 10**9
 H_M = 1e-7
@@ -47,19 +49,24 @@ class StationMeasurement:
     """Beams as a run found them.
 
     ``laser``: with the reach of each beam. ``covariance`` (8, 8): of A ... D, each across its beam
-    and upwards, m^2. ``misfit_m``: rms of the edges, m.
+    and upwards, m^2. ``misfit_m``: rms of the edges, m. ``wider_m``, ``wider_sigma_m``: by how much
+    the shadows are wider, in the mean of both beams, than the mandrel's radius and the reach that
+    the laser file had.
     """
 
     laser: LaserFrame
     covariance: Array
     misfit_m: float
+    wider_m: float = 0.0
+    wider_sigma_m: float = 0.0
 
     @property
     def frame_covariance(self) -> Array:
         """(6, 6) of the frame's origin and of its turn about that, base, m^2 and rad^2."""
-        R = np.kron(np.eye(2), self.laser.T_base_laser[:3, :3])
-        rows = R @ _frame_rows(self.laser)
-        return np.asarray(rows @ self.covariance @ rows.T)
+        R, rows = np.kron(np.eye(2), self.laser.T_base_laser[:3, :3]), _frame_rows(self.laser)
+        spread = rows @ self.covariance @ rows.T
+        spread[2, 2] += clear_m(self.wider_m, self.wider_sigma_m) ** 2
+        return np.asarray(R @ spread @ R.T)
 
     @property
     def sigma_m(self) -> float:
@@ -107,6 +114,11 @@ class StationShift:
             "turn_sigma_deg": np.degrees(sigma[3:]).tolist(),
             "moved": self.moved,
         }
+
+
+def clear_m(wider_m: float, sigma_m: float) -> float:
+    """What chance does not explain of it: all, or nothing."""
+    return wider_m if abs(wider_m) > CLEAR_SIGMAS * sigma_m else 0.0
 
 
 def moved_points(laser: LaserFrame, bend: Array) -> LaserFrame:
@@ -160,28 +172,43 @@ def measure_station(
         )
     names = found.names
     beams = [i for i, name in enumerate(names) if name.startswith("laser_")]
-    C = found.covariance[np.ix_(beams, beams)].copy()
+    C, reach_variance = found.covariance[np.ix_(beams, beams)].copy(), []
     for b, beam in enumerate("xy"):  # what is not known of a reach lifts both points of its beam
         own = [i for i, name in enumerate(names) if name.startswith(f"radius_{beam}_")]
         variance = float(found.covariance[np.ix_(own, own)].mean())
         up = [4 * b + 1, 4 * b + 3]
         C[np.ix_(up, up)] += variance
+        reach_variance.append(variance)
     squares = problem.misfit(found, found.scale)
     free = len(found.residual) - problem.undetermined - bend.size
     if free > 0 and squares > chi2_quantile(SOUND_FIT, free):
         C *= squares / free
     placed = moved_points(rough, bend)
     sigma_m = float(np.sqrt(np.mean(np.diag(C))))
-    return StationMeasurement(replace(placed, sigma_m=sigma_m), C, misfit_m)
+    wider_m = float(np.mean(wider - laser.reach))
+    wider_sigma_m = float(np.hypot(0.5 * np.sqrt(np.sum(reach_variance)), laser.sigma_m))
+    return StationMeasurement(replace(placed, sigma_m=sigma_m), C, misfit_m, wider_m, wider_sigma_m)
 
 
 def station_shift(before: StationMeasurement, now: StationMeasurement) -> StationShift:
     """How the station has moved between two measurements with one mandrel.
 
-    Raises `InputError` when they are not of the same beams.
+    What the shadows of both are wider, no more than a tool's may be, counts in the height.
+
+    Raises `InputError` when they are not of the same beams; `WrongToolError` when their shadows are
+    of two cylinders.
     """
     bend = _bend(before.laser, now.laser)
-    C = before.covariance + now.covariance
+    C, up = before.covariance + now.covariance, np.tile([0.0, 1.0], 4)
+    sigma_m = float(np.hypot(now.wider_sigma_m, before.wider_sigma_m or now.wider_sigma_m))
+    wider_m = clear_m(float(np.mean(now.laser.reach - before.laser.reach)), sigma_m)
+    if beyond(wider_m, sigma_m, TraitLimits.radius_m):
+        raise WrongToolError(
+            f"its shadows are of a radius {1e3 * wider_m:+.3f} mm from that of the first time: "
+            "another mandrel is mounted, it or both beams are dirty, or mandrel_radius_mm was "
+            "wrong then; mount the right one, clean all"
+        )
+    C = C + wider_m**2 * np.outer(up, up)
     if float(np.abs(bend).max()) > 2.0 * ROUGH_M:
         raise InputError(
             f"the beams lie {1e3 * np.abs(bend).max():.1f} mm apart: these are two stations"
@@ -203,6 +230,11 @@ def station_verdict(
     """
     if shift is None:
         words = f"the beams are known to {1e3 * found.sigma_m:.3f} mm at each point"
+        if wider_m := clear_m(found.wider_m, found.wider_sigma_m):
+            words += (
+                f"; the mandrel's shadows are {1e3 * wider_m:+.3f} mm from what mandrel_radius_mm "
+                "and the laser file's reach_mm say: where the radius is wrong the height is"
+            )
         return Verdict(Code.ACCEPT, words)
     words = (
         f"the crossing is {1e3 * shift.size_m:.3f} mm from where it was first "
@@ -251,6 +283,8 @@ def measurement_document(found: StationMeasurement) -> Document:
         "reach_m": found.laser.reach.tolist(),
         "covariance": found.covariance.tolist(),
         "misfit_m": found.misfit_m,
+        "wider_m": found.wider_m,
+        "wider_sigma_m": found.wider_sigma_m,
     }
 
 
@@ -259,7 +293,8 @@ def measurement_of(document: Document) -> StationMeasurement:
     C = np.array(document["covariance"])
     points = np.array([document["points_m"][name] for name in POINTS])
     laser = LaserFrame(points, float(np.sqrt(np.mean(np.diag(C)))), np.array(document["reach_m"]))
-    return StationMeasurement(laser, C, document["misfit_m"])
+    wider = (document.get(name, 0.0) for name in ("wider_m", "wider_sigma_m"))  # older have none
+    return StationMeasurement(laser, C, document["misfit_m"], *wider)
 
 
 @dataclass(frozen=True, eq=False)

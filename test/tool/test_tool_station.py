@@ -33,6 +33,7 @@ from robocal_ros.tool.station import (
     measurement_document,
     measurement_of,
     station_shift,
+    station_verdict,
 )
 
 RADIUS_M = 2.5e-3
@@ -53,8 +54,10 @@ def knocked(cell: ToolCell, shift_m, turn_rad=(0.0, 0.0, 0.0)) -> ToolCell:
     return replace(cell, station=replace(cell.station, beams=beams))
 
 
-def driven(cell: ToolCell, seed: int, tool: RoundTool | None = None) -> StationMeasurement:
-    """All steps of a laser run, and what follows from them."""
+def driven(
+    cell: ToolCell, seed: int, tool: RoundTool | None = None, radius_m: float = RADIUS_M
+) -> StationMeasurement:
+    """All steps of a laser run, and what follows from them with a radius as it is told."""
     rng, tool = np.random.default_rng(seed), tool or RoundTool.cylinder(MANDREL, RADIUS_M)
     plan, now_s, q = MeasuringPlan("laser", cell.laser, MANDREL), 0.0, cell.q_near
     times, joints, steps = [], [], []
@@ -69,7 +72,7 @@ def driven(cell: ToolCell, seed: int, tool: RoundTool | None = None) -> StationM
         joints.append(way)
         now_s, q = float(time[-1]) + 1.0, way[-1]
     path = JointPath(cell.arm, np.concatenate(times), np.concatenate(joints))
-    return measure_station(cell.laser, path, steps, MANDREL, RADIUS_M, ROBOT)
+    return measure_station(cell.laser, path, steps, MANDREL, radius_m, ROBOT)
 
 
 def bends(cell: ToolCell, found: StationMeasurement) -> StationShift:
@@ -178,6 +181,35 @@ def test_another_mandrel_is_named():
         driven(noisy_cell(), 12, RoundTool.cylinder(MANDREL, 6e-3))
 
 
+@pytest.mark.parametrize("wrong_m", [-5e-4, -2.5e-5, 2.5e-5, 1e-4, 5e-4])
+def test_a_wrong_radius_counts_in_the_height_and_is_said(wrong_m):
+    """It lowers the beams by as much, which the covariance of the frame holds."""
+    cell = by_interrupt(noisy_cell())
+    found = driven(cell, 15, radius_m=RADIUS_M - wrong_m)
+    away = found.laser.T_base_laser[:3, 3] - laser_of(cell.station).T_base_laser[:3, 3]
+    z = found.laser.T_base_laser[:3, 2]
+    assert z @ away == pytest.approx(-wrong_m, abs=8e-5)
+    height = z @ found.frame_covariance[:3, :3] @ z
+    assert (z @ away) ** 2 < chi2.ppf(0.999, 1) * height
+    told = station_verdict(found, None, 2e-4).reason
+    assert f"{1e3 * found.wider_m:+.3f} mm from what mandrel_radius_mm" in told
+    right = station_verdict(driven(cell, 15), None, 2e-4).reason
+    assert "mandrel_radius_mm" not in right
+
+
+def test_another_radius_than_the_first_time_is_named():
+    """A tenth of a millimetre; what is less counts in the height of the shift."""
+    cell = by_interrupt(noisy_cell())
+    first = driven(cell, 16)
+    thicker = RoundTool.cylinder(MANDREL, RADIUS_M + 1e-4)
+    with pytest.raises(WrongToolError, match=r"\+0\.(09|10)\d mm from that of the first time"):
+        station_shift(first, driven(cell, 17, thicker))
+    little = driven(cell, 17, RoundTool.cylinder(MANDREL, RADIUS_M + 3e-5))
+    shift = station_shift(first, little)
+    assert shift.sigma_m > 2.5e-5
+    assert not shift.moved
+
+
 def test_two_stations_are_not_one_that_moved():
     cell = noisy_cell()
     found = driven(cell, 13)
@@ -206,6 +238,16 @@ def driver(tmp_path):
         made.program.station = "s"
         made.history = history
         yield made
+
+
+def test_another_radius_as_told_is_another_first_time(driver):
+    """What is told of a mandrel moves no station."""
+    assert driver.measure("laser", cycle_id="c1").status is Code.ACCEPT
+    mended = replace(driver.session.config, mandrel_radius_m=RADIUS_M + 3e-4)
+    driver.session = ToolSession(driver.cell.arm, driver.history, mended, "test")
+    assert driver.session.current.commissioned_station is None
+    assert driver.measure("laser", cycle_id="c2").status is Code.ACCEPT
+    assert driver.session.current.commissioned_station is not None
 
 
 def test_a_station_is_commissioned_and_followed(driver, tmp_path):
