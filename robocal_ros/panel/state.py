@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from robocal_ros.ground.errors import Code
-from robocal_ros.panel.words import instruction_key, step_of
+from robocal_ros.panel.words import TOO_SHORT, instruction_key, step_of
 
 Values = Mapping[str, Any]
 
@@ -228,6 +228,8 @@ class PanelState:
             code = code_of(gap["thermal_code"])
             if code not in WELL:
                 found.append(_task(code, "drift", gap["message"]))
+        if self.gaps and TOO_SHORT.search(self.gaps[-1]["message"]):
+            found.append(_task(Code.LIMIT_EXCEEDED, "gap", self.gaps[-1]["message"]))
         if fixture := self.sources[FIXTURE].values:
             code, number = code_of(fixture["code"]), fixture["candidate_id"]
             waits = number in self.pending or number > self.newest

@@ -24,11 +24,15 @@ STEPS: Mapping[str, str] = {
     "check": r"tool measurement \(quick\)",
     "full": r"tool measurement \((?:full|reference)\)",
     "mandrel": r"tool measurement \(witness\)",
+    "beams": r"tool measurement \(laser\)",
     "home": r"on its way home",
     "broken_off": r"is broken off",
     "fault": r"fault",
 }
 """What maintenance_node says that it does, by the keys of its texts; groups are their numbers."""
+
+TOO_SHORT = re.compile(r"(?:beam station|tool measurement \(\w+\)): the gap is [\d.]+ s too short")
+"""How maintenance_node says in a result's message that something was due and did not fit."""
 
 Table = Mapping[str, Mapping[str, Mapping[str, str]]]
 

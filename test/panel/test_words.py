@@ -9,7 +9,7 @@ import pytest
 from robocal_ros.ground.errors import Code
 from robocal_ros.panel import state
 from robocal_ros.panel.words import LANGUAGES, STEPS, instruction_key, step_of, table
-from robocal_ros.tool.session import FULL, QUICK, WITNESS
+from robocal_ros.tool.session import FULL, LASER, QUICK, WITNESS
 
 ROOT = Path(__file__).parents[2]
 PAGE = "".join(
@@ -69,7 +69,7 @@ def test_every_step_of_the_maintenance_has_a_text():
         said |= set(re.findall(r'cell\.doing = None, "([^"]+)"', file.read_text()))
     assert len(said) >= 8
     for words in said:
-        for mode in (QUICK, FULL, WITNESS):
+        for mode in (QUICK, FULL, WITNESS, LASER):
             spoken = re.sub(r"\{mode\}", mode, words)
             key, _ = step_of(re.sub(r"\{[^}]+\}", "3", spoken))
             assert key in table()["steps"], words
