@@ -129,3 +129,16 @@ def test_sentences_of_a_mount_by_a_robot_with_gears_have_the_kept_figures():
     there = " ".join((DOCS / "simulation.md").read_text().split())
     words = r"edge is at ([\d.]+) sigmas of .*? alone at ([\d.]+) of the error"
     assert re.search(words, there).groups() == (whole, field[0])
+
+
+def test_the_readme_has_the_kept_figures_of_the_real_robot():
+    """Ranges: of the nominal model, the full one, the geometry; and of the full one of A later."""
+    campaigns, later = (figures("real_data", f"ur10_{name}") for name in ("campaigns", "later"))
+    means = [[row[1] for row in campaigns[0][kind::3]] for kind in (0, 2, 1)]
+    means.append([row[2] for row in later[0][1:6:2]])
+    assert [row[2] for row in campaigns[1][:3]] == ["nominal", "geometric", "full"]
+    assert [row[3] for row in later[1][:6]] == 3 * ["geometric", "full"]
+    assert [row[0] for row in later[1][:6:2]] == 3 * ["A"]
+    text = (DOCS.parent / "README.md").read_text()
+    quoted = re.findall(r"(\d\.\d\d)\N{EN DASH}(\d\.\d\d) mm", text)
+    assert quoted == [(f"{min(kept):.2f}", f"{max(kept):.2f}") for kept in means]
