@@ -135,7 +135,7 @@ class Plc:
         self._controller.wait(self._at_home, "the robot at home")
         now = sum(self._correction[-1].refused)
         if now > refused:
-            raise LiveError(f"the correction refused the programme: {self._correction[-1]}")
+            raise LiveError(f"the programme: {self._correction[-1].last_refusal}")
 
     def _until(self, when_s: float) -> None:
         self._controller.wait(lambda: time.monotonic() >= when_s, "the programme", 120.0)
