@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.real_data import PLAN_DRAWS, PLANNED, campaign, data_folder
+from bench.real_data import DRAWS, PLANNED, campaign, data_folder
 from bench.tables import Goal, Table
 from robocal_ros.bags.ur10_campaigns import halves
 from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
@@ -81,12 +81,12 @@ def known_geometry_table() -> Table:
     arm = identify(load_robot("ur10"), train).cell.arm
     for count in PLANNED:
         means = []
-        for seed in range(PLAN_DRAWS):
+        for seed in range(DRAWS):
             chosen = np.random.default_rng(seed).permutation(len(train))[:count]
             errors = _errors_m(identify_full(arm, train.take(chosen)), check)
             means.append(float(errors.mean()) * 1e3)
         mean = float(np.mean(means))
-        table.add(count, PLAN_DRAWS, mean, Goal(mean, LARGEST_KNOWN_MM[count]), max(means))
+        table.add(count, DRAWS, mean, Goal(mean, LARGEST_KNOWN_MM[count]), max(means))
     return table
 
 
