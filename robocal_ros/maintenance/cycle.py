@@ -34,12 +34,9 @@ MEASUREMENT = "thermal measurement"
 NONE_BETTER = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 FOUND = (Code.ACCEPT, *NONE_BETTER)  # verdicts that tell the drift; any other one leaves it unknown
 FAILED = (  # without a result they say that something is wrong with the tool, or its measurement
-    Code.WRONG_TOOL,
-    Code.CLOCK_WRONG,
-    Code.BEAM_EDGES_WRONG,
-    Code.RESIDUAL_TOO_LARGE,
+    Code.WRONG_TOOL, Code.CLOCK_WRONG, Code.BEAM_EDGES_WRONG, Code.RESIDUAL_TOO_LARGE,
     Code.LIMIT_EXCEEDED,
-)
+)  # fmt: skip
 MEASURED_ANEW = ("recalibrate", "cannot tell")  # answers of a check
 OF_STATION = (WITNESS, LASER)  # tell nothing of the tool
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
