@@ -27,6 +27,7 @@ from robocal_ros.plc.access import Role, Users
 
 OPERATOR, ENGINEER = ("plc", "a plc's password"), ("ada", "an engineer's password")
 PASSWORDS = dict((OPERATOR, ENGINEER))
+LEAVES_S = 3.0
 PROGRAM_S, BEATS_MS = 0.05, 20.0  # the program's cycle; how often its client looks for a beat
 NAMESPACE = "urn:robocal_ros:cell"
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
@@ -96,10 +97,16 @@ class PlcClient:
         return client
 
     async def connect(self) -> None:
-        """Begin a session."""
+        """Begin a session; the one before ends, and so does one that cannot be used."""
+        if hasattr(self, "client"):
+            await _ended(self.client)
         client = await self.secured(self.made())
-        await client.connect()
-        self.index = await client.get_namespace_index(NAMESPACE)
+        try:
+            await client.connect()
+            self.index = await client.get_namespace_index(NAMESPACE)
+        except BaseException:
+            await _ended(client)
+            raise
         self.client = client
 
     async def connect_once_there(self, within_s: float = 60.0) -> None:
@@ -187,7 +194,7 @@ class PlcClient:
                 if getattr(task.get_coro(), "__name__", "") == "program":
                     task.cancel()
             if hasattr(self, "client"):
-                await asyncio.wait_for(self.client.disconnect(), 3.0)
+                await _ended(self.client)
 
         try:
             self.do(leave(), 5.0)
@@ -195,6 +202,12 @@ class PlcClient:
             logging.getLogger(__name__).debug("leaves: %s", error)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(5.0)
+
+
+async def _ended(client: Client) -> None:
+    """Leave the server, which may be gone."""
+    with contextlib.suppress(Exception):
+        await asyncio.wait_for(client.disconnect(), LEAVES_S)
 
 
 class PlcProcess:

@@ -183,6 +183,52 @@ def test_names_that_nobody_has_unlock_none(tmp_path: Path, monkeypatch: pytest.M
     assert "'plc' is locked" in told[-1].words
 
 
+def test_logins_are_looked_at_in_one_thread(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finding: glibc kept the 16 MB of a hash for each thread that had looked at a password."""
+    threads: list[int] = []
+    look = access.Users.login
+
+    def noted(*arguments: Any) -> Any:
+        threads.append(threading.get_ident())
+        return look(*arguments)
+
+    monkeypatch.setattr(access.Users, "login", noted)
+    for _ in range(4):  # what else goes beside the loop takes the threads by turns
+        with contextlib.closing(PlcClient(served.folder, served.port, "ada")) as other:
+            other.do(other.connect())
+    assert len(threads) == 4
+    assert len(set(threads)) == 1
+
+
+def test_a_client_that_connects_again_leaves_no_session(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the one before, nor one that it cannot use; the fixture's own stays."""
+    state = served.thread.state
+
+    def open_now() -> int:
+        gc.collect()
+        return sum(name.startswith("ada") for name in state.sessions)
+
+    def become(count: int) -> None:
+        until_s = time.monotonic() + UP_S
+        while open_now() != count:
+            assert time.monotonic() < until_s, state.sessions
+            time.sleep(0.05)
+
+    with contextlib.closing(PlcClient(served.folder, served.port, "ada")) as other:
+        other.do(other.connect())
+        become(2)
+        other.do(other.connect())
+        become(2)
+        monkeypatch.setattr("bench.live.opc_ua.NAMESPACE", "urn:of:nobody")
+        with pytest.raises(ValueError, match="urn:of:nobody"):
+            other.do(other.connect())
+        become(1)
+
+
 def test_a_call_that_nobody_answers_ends_in_time(served: Served) -> None:
     began_s = time.monotonic()
     with pytest.raises(ua.UaStatusCodeError) as caught:
