@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.correction.damping import (
     CONVERGED,
+    ITERATIONS,
     POSITION_ERROR,
+    REPORT,
     ROTATION_ERROR,
     TCP_ROTATION,
     TCP_SHIFT,
@@ -22,6 +24,7 @@ from robocal_ros.correction.damping import (
     WEIGHT,
     Nine,
     Six,
+    Three,
     damping,
     dot,
     inverse,
@@ -57,7 +60,9 @@ SERIES = 1e-2
 # Square of a tool's change (1.1 deg, 6 mm) from which on three matrices leave more than rounding.
 LARGE_CHANGE = 4e-4
 LANES = 16
-ITERATIONS = 3.0  # one more of a large change
+# ``rows`` hold so many points, row by row: the joints that came, those corrected, their report.
+CAME, GOES, SAID = 0, N, 2 * N
+ROWS = SAID + REPORT
 
 # A residual (m, rad) that is left alone.
 AT_GOAL = 1e-12
@@ -297,68 +302,91 @@ def _two_steps(
 
 
 @lean
-def _solve(c: Array, q: Six, large: bool) -> tuple[Six, Six, Six, bool, bool]:
-    """Shift, first and last residual, whether it is the solution, and whether something is weak."""
+def solve(c: Array, q: Six, large: bool) -> tuple[Six, Six, Six, Three, Frame, Frames, Frames]:
+    """Shift, first and last residual; iterations, whether that is the solution, whether it is weak.
+
+    Then the goal, and the actual arm's frames at ``q`` and at the solution.
+    """
     aim = goal(c, q)
-    frames = walk(c, ACTUAL, q)
+    begin = frames = walk(c, ACTUAL, q)
     error, near = residual(aim, frames[6])
     fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
     # of no more than this nothing is left to do, and nothing is done
-    fine &= dot(error, error) > AT_GOAL * AT_GOAL * N
+    still = dot(error, error) <= AT_GOAL * AT_GOAL * N
     J = _rows(c, frames)
     i, j, k, l, m, n = J
     A, B, C = _product(i, j, k, i, j, k), _product(i, j, k, l, m, n), _product(l, m, n, l, m, n)
     P, R, weak = damping(A, B, C, weighed(error), c[DAMPING], c[DAMPING + 1])
     y = x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    fine &= good & (second <= BESIDE * BESIDE * first)
+    found = good & (second <= BESIDE * BESIDE * first)
     y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    fine &= good
+    found &= good
     if large:
         y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-        fine &= good
+        found &= good
     y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    fine &= good & (first <= NEAR * NEAR) & (second <= SHORT * SHORT) & within(c, x, FAR)
+    found &= good & (first <= NEAR * NEAR) & (second <= SHORT * SHORT) & within(c, x, FAR)
     last, _ = residual(aim, frames[6])
-    return x, error, last, fine, weak > 0.0
+    x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0) if still else x
+    last = error if still else last
+    iterations = 0.0 if still else (4.0 if large else 3.0)
+    done, weak = 1.0 if fine & (found | still) else 0.0, 0.0 if still | (weak <= 0.0) else 1.0
+    return x, error, last, (iterations, done, weak), aim, begin, frames
 
 
 @lean
-def _length(x: float, y: float, z: float) -> float:
-    return float(np.sqrt(x * x + y * y + z * z))
-
-
-@lean
-def _correct(c: Array, q: Array, k: int, lanes: int, large: bool, out: Array) -> None:
-    """Point ``k`` of ``lanes``: corrected joints, and their report."""
-    at = (
-        q[k], q[lanes + k], q[2 * lanes + k],
-        q[3 * lanes + k], q[4 * lanes + k], q[5 * lanes + k],
+def six(rows: Array, at: int, k: int, lanes: int) -> Six:
+    """Six numbers of point ``k`` of ``lanes``, from row ``at`` on."""
+    first = at * lanes + k
+    return (
+        rows[first], rows[first + lanes], rows[first + 2 * lanes],
+        rows[first + 3 * lanes], rows[first + 4 * lanes], rows[first + 5 * lanes],
     )  # fmt: skip
-    x, first, last, fine, weak = _solve(c, at, large)
-    x = more(at, 1.0, x)
-    out[k], out[lanes + k], out[2 * lanes + k] = x[0], x[1], x[2]
-    out[3 * lanes + k], out[4 * lanes + k], out[5 * lanes + k] = x[3], x[4], x[5]
-    out[(N + POSITION_ERROR) * lanes + k] = _length(last[0], last[1], last[2])
-    out[(N + ROTATION_ERROR) * lanes + k] = _length(last[3], last[4], last[5])
-    out[(N + CONVERGED) * lanes + k] = 1.0 if fine else 0.0
-    out[(N + WEAK) * lanes + k] = 1.0 if weak else 0.0
-    out[(N + TCP_SHIFT) * lanes + k] = _length(first[0], first[1], first[2])
-    out[(N + TCP_ROTATION) * lanes + k] = _length(first[3], first[4], first[5])
+
+
+@lean
+def put(x: Six, rows: Array, at: int, k: int, lanes: int) -> None:
+    """Keep them there."""
+    first = at * lanes + k
+    rows[first], rows[first + lanes], rows[first + 2 * lanes] = x[0], x[1], x[2]
+    rows[first + 3 * lanes], rows[first + 4 * lanes] = x[3], x[4]
+    rows[first + 5 * lanes] = x[5]
+
+
+@lean
+def put_sizes(e: Six, rows: Array, shift: int, turn: int, k: int, lanes: int) -> None:
+    """Keep the sizes of a twist."""
+    rows[shift * lanes + k] = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    rows[turn * lanes + k] = np.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
+
+
+@lean
+def correct(c: Array, rows: Array, k: int, lanes: int, large: bool) -> tuple[Frame, Frames, Frames]:
+    """Corrected joints of what came, and their report; goal, frames there and at the solution."""
+    q = six(rows, CAME, k, lanes)
+    x, first, last, told, aim, begin, end = solve(c, q, large)
+    put(more(q, 1.0, x), rows, GOES, k, lanes)
+    put_sizes(last, rows, SAID + POSITION_ERROR, SAID + ROTATION_ERROR, k, lanes)
+    put_sizes(first, rows, SAID + TCP_SHIFT, SAID + TCP_ROTATION, k, lanes)
+    rows[(SAID + ITERATIONS) * lanes + k] = told[0]
+    rows[(SAID + CONVERGED) * lanes + k] = told[1]
+    rows[(SAID + WEAK) * lanes + k] = told[2]
+    return aim, begin, end
 
 
 @kernel
-def correct_one(c: Array, q: Array, out: Array) -> None:
-    """Corrected joints of one point (6,) and its report (but for the iterations): ``out`` (13,)."""
-    _correct(c, q, 0, 1, c[LARGE] > 0.5, out)
+def correct_one(c: Array, rows: Array) -> None:
+    """Corrected joints of one point, and its report."""
+    correct(c, rows, 0, 1, c[LARGE] > 0.5)
 
 
 @kernel
-def correct_lanes(c: Array, q: Array, out: Array) -> None:
-    """`correct_one` for sixteen points: ``q`` (96,) and ``out`` (208,), row by row."""
+def correct_lanes(c: Array, rows: Array) -> None:
+    """`correct_one` for sixteen points."""
     if c[LARGE] > 0.5:
         for k in range(LANES):
-            _correct(c, q, k, LANES, True, out)
+            correct(c, rows, k, LANES, True)
         return
     for k in range(LANES):
-        _correct(c, q, k, LANES, False, out)
+        correct(c, rows, k, LANES, False)

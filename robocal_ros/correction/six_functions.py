@@ -2,8 +2,8 @@
 """Compiled joint functions and winding under load of six turning joints, as in `six_axis`.
 
 ``rows`` (ROWS * lanes,) hold so many points, row by row, from the joints given to those corrected:
-`turn` puts a reference model's functions on before `six_axis`, and `read` takes those of the actual
-model off behind. A model's load stands in the constants behind those of `six_axis`. See
+`turn` puts a reference model's functions on before `six_axis`, and those of the actual model are
+taken off behind. A model's load stands in the constants behind those of `six_axis`. See
 `kinematics.kernels` for the equations, which these are without a branch.
 """
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from robocal_ros.correction import six_axis
 from robocal_ros.correction.damping import (
     CONVERGED,
-    REPORT,
     TCP_ROTATION,
     TCP_SHIFT,
     Six,
@@ -21,7 +20,20 @@ from robocal_ros.correction.damping import (
     dot,
     more,
 )
-from robocal_ros.correction.six_axis import ACTUAL, LANES, Frame, Frames, N
+from robocal_ros.correction.six_axis import (
+    ACTUAL,
+    CAME,
+    GOES,
+    LANES,
+    LARGE,
+    SAID,
+    Frame,
+    Frames,
+    N,
+    put,
+    put_sizes,
+    six,
+)
 from robocal_ros.ground.compiled import kernel, lean
 from robocal_ros.kinematics.kernels import CENTRE, COMPLIANCE, MASS, spline
 
@@ -35,14 +47,13 @@ LOAD = 3 + EACH * N
 LOADS = six_axis.CONSTANTS
 CONSTANTS = LOADS + 2 * LOAD
 
-# Rows: joints given; what a rigid reference arm reads there; what `six_axis` makes of it, with its
-# report; joints tried, with value and slope of their functions; what a rigid actual arm reads
-# there, and how far load winds it; squares of the last step under load, of how that changed the
-# load, and of the step behind it.
-GIVEN, CAME, GOES = 0, N, 2 * N
-TRIED, VALUE, SLOPE, TURNED, WOUND, STEPS = (k * N + REPORT for k in range(3, 9))
+# Rows behind those of `six_axis`: joints given, of which a rigid reference arm reads those that
+# come there; where the tool must go; how far load winds the actual arm at the joints given, and at
+# those tried, with value and slope of their functions; squares of the step under load, of how that
+# changed the load, and of the step behind it.
+GIVEN = six_axis.ROWS
+AIM, WINDS, WOUND, TRIED, VALUE, SLOPE, STEPS = (GIVEN + N * k for k in (1, 3, 4, 5, 6, 7, 8))
 ROWS = STEPS + 3
-ROUNDS = 2
 # Squares (rad^2): the longest last steps, whose own squares are rounding, and what load may leave
 # of them: of a step the square of the share by which it changed the load, of that behind it that.
 UNDER_LOAD, BEHIND, LEFT = 1e-5**2, 1e-9**2, 1e-12**2
@@ -73,23 +84,6 @@ def splines(layer: Array, rows: Array, at: int, lanes: int) -> None:
         for k in range(lanes):
             value, slope = spline(layer[i], rows[(at + i) * lanes + k])
             rows[(VALUE + i) * lanes + k], rows[(SLOPE + i) * lanes + k] = value, 1.0 + slope
-
-
-@lean
-def _six(rows: Array, at: int, k: int, lanes: int) -> Six:
-    first = at * lanes + k
-    return (
-        rows[first], rows[first + lanes], rows[first + 2 * lanes],
-        rows[first + 3 * lanes], rows[first + 4 * lanes], rows[first + 5 * lanes],
-    )  # fmt: skip
-
-
-@lean
-def _put(x: Six, rows: Array, at: int, k: int, lanes: int) -> None:
-    first = at * lanes + k
-    rows[first], rows[first + lanes], rows[first + 2 * lanes] = x[0], x[1], x[2]
-    rows[first + 3 * lanes], rows[first + 4 * lanes] = x[3], x[4]
-    rows[first + 5 * lanes] = x[5]
 
 
 @lean
@@ -200,59 +194,84 @@ def _over(x: Six, y: Six) -> Six:
 @lean
 def _turn(c: Array, rows: Array, k: int, lanes: int) -> None:
     """What a rigid reference arm would read."""
-    q = _six(rows, GIVEN, k, lanes)
+    q = six(rows, GIVEN, k, lanes)
     _, w = _carried(c, 0, LOADS, six_axis.walk(c, 0, q))
-    turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, _wound(c, LOADS, w))
-    _put(turned, rows, CAME, k, lanes)
+    turned = more(more(q, 1.0, six(rows, VALUE, k, lanes)), 1.0, _wound(c, LOADS, w))
+    put(turned, rows, CAME, k, lanes)
 
 
 @lean
-def _step(c: Array, rows: Array, k: int, lanes: int) -> None:
-    """A step towards the joints of which a rigid arm reads what is wanted, and the load there."""
-    q, load = _six(rows, TRIED, k, lanes), LOADS + LOAD
-    a, w = _carried(c, ACTUAL, load, six_axis.walk(c, ACTUAL, q))
-    wound = _wound(c, load, w)
-    turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, wound)
-    step = more(_six(rows, GOES, k, lanes), -1.0, turned)
-    step = _over(step, _six(rows, SLOPE, k, lanes))
-    change = _wound_by(c, load, a, w, step)
-    _put(turned, rows, TURNED, k, lanes)
-    _put(more(more(q, 1.0, step), -1.0, change), rows, TRIED, k, lanes)
-    _put(more(wound, 1.0, change), rows, WOUND, k, lanes)
-    rows[STEPS * lanes + k] = dot(step, step)
-    rows[(STEPS + 1) * lanes + k] = dot(change, change)
+def _correct(c: Array, rows: Array, k: int, lanes: int, large: bool) -> None:
+    """What `six_axis` makes of it, and how far load winds the actual arm before and behind."""
+    load = LOADS + LOAD
+    aim, begin, end = six_axis.correct(c, rows, k, lanes, large)
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = aim
+    put((x0, x1, x2, y0, y1, y2), rows, AIM, k, lanes)
+    put((z0, z1, z2, p0, p1, p2), rows, AIM + N, k, lanes)
+    _, w = _carried(c, ACTUAL, load, begin)
+    put(_wound(c, load, w), rows, WINDS, k, lanes)
+    _, w = _carried(c, ACTUAL, load, end)
+    put(_wound(c, load, w), rows, WOUND, k, lanes)
 
 
 @lean
-def _refine(rows: Array, k: int, lanes: int) -> None:
-    """A step with the functions alone, which the load does not notice."""
-    q, slope = _six(rows, TRIED, k, lanes), _six(rows, SLOPE, k, lanes)
-    turned = more(more(q, 1.0, _six(rows, VALUE, k, lanes)), 1.0, _six(rows, WOUND, k, lanes))
-    step = _over(more(_six(rows, GOES, k, lanes), -1.0, turned), slope)
-    _put(more(q, 1.0, step), rows, TRIED, k, lanes)
-    rows[(STEPS + 2) * lanes + k] = dot(step, step)
+def _wind(c: Array, rows: Array, k: int, lanes: int) -> None:
+    """How far load winds the actual arm at the joints given, where others came of them."""
+    w = _carried(c, ACTUAL, LOADS + LOAD, six_axis.walk(c, ACTUAL, six(rows, GIVEN, k, lanes)))[1]
+    put(_wound(c, LOADS + LOAD, w), rows, WINDS, k, lanes)
 
 
 @lean
 def _shift(c: Array, rows: Array, k: int, lanes: int) -> None:
     """The error at the tool without a correction: that of the true arms."""
-    aim = six_axis.goal(c, _six(rows, CAME, k, lanes))
-    e, near = six_axis.residual(aim, six_axis.walk(c, ACTUAL, _six(rows, TURNED, k, lanes))[6])
-    at = (GOES + N) * lanes + k
-    rows[at + TCP_SHIFT * lanes] = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    rows[at + TCP_ROTATION * lanes] = np.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
-    rows[at + CONVERGED * lanes] = rows[at + CONVERGED * lanes] if near else 0.0
+    turned = more(six(rows, GIVEN, k, lanes), 1.0, six(rows, VALUE, k, lanes))
+    here = six_axis.walk(c, ACTUAL, more(turned, 1.0, six(rows, WINDS, k, lanes)))[6]
+    x0, x1, x2, y0, y1, y2 = six(rows, AIM, k, lanes)
+    z0, z1, z2, p0, p1, p2 = six(rows, AIM + N, k, lanes)
+    e, near = six_axis.residual((x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2), here)
+    put_sizes(e, rows, SAID + TCP_SHIFT, SAID + TCP_ROTATION, k, lanes)
+    at = (SAID + CONVERGED) * lanes + k
+    rows[at] = rows[at] if near else 0.0
+
+
+@lean
+def _try(rows: Array, at: int, k: int, lanes: int) -> float:
+    """A step from joints ``at`` that load does not notice, with the functions alone; its square."""
+    q = six(rows, at, k, lanes)
+    turned = more(more(q, 1.0, six(rows, VALUE, k, lanes)), 1.0, six(rows, WOUND, k, lanes))
+    step = more(six(rows, GOES, k, lanes), -1.0, turned)
+    step = _over(step, six(rows, SLOPE, k, lanes))
+    put(more(q, 1.0, step), rows, TRIED, k, lanes)
+    return dot(step, step)
+
+
+@lean
+def _step(c: Array, rows: Array, k: int, lanes: int) -> None:
+    """A step towards the joints of which a rigid arm reads what is wanted, and the load there."""
+    q, load = six(rows, TRIED, k, lanes), LOADS + LOAD
+    a, w = _carried(c, ACTUAL, load, six_axis.walk(c, ACTUAL, q))
+    wound = _wound(c, load, w)
+    turned = more(more(q, 1.0, six(rows, VALUE, k, lanes)), 1.0, wound)
+    step = more(six(rows, GOES, k, lanes), -1.0, turned)
+    step = _over(step, six(rows, SLOPE, k, lanes))
+    # a share of it is what the arm turns for the load's change, a share of that for its change
+    change = _wound_by(c, load, a, w, more(step, -1.0, _wound_by(c, load, a, w, step)))
+    put(more(more(q, 1.0, step), -1.0, change), rows, TRIED, k, lanes)
+    put(more(wound, 1.0, change), rows, WOUND, k, lanes)
+    rows[STEPS * lanes + k] = dot(step, step)
+    rows[(STEPS + 1) * lanes + k] = dot(change, change)
 
 
 @lean
 def _end(rows: Array, k: int, lanes: int) -> None:
-    """The joints found, if they are."""
-    at, steps = (GOES + N + CONVERGED) * lanes + k, STEPS * lanes + k
-    step, change, behind = rows[steps], rows[steps + lanes], rows[steps + 2 * lanes]
+    """The last step, and the joints found, if they are."""
+    behind = _try(rows, TRIED, k, lanes)
+    at, steps = (SAID + CONVERGED) * lanes + k, STEPS * lanes + k
+    step, change = rows[steps], rows[steps + lanes]
     small = (step <= UNDER_LOAD) & (behind <= BEHIND)
-    small &= change * (change + behind) <= LEFT * step
+    small &= (change * change * change <= LEFT * step * step) & (change * behind <= LEFT * step)
     rows[at] = rows[at] if small else 0.0
-    _put(_six(rows, TRIED, k, lanes), rows, GOES, k, lanes)
+    put(six(rows, TRIED, k, lanes), rows, GOES, k, lanes)
 
 
 @kernel
@@ -268,33 +287,42 @@ def turn(c: Array, layer: Array, rows: Array, lanes: int) -> None:
 
 
 @kernel
-def read_one(c: Array, layer: Array, rows: Array) -> None:
-    """Make joints of what a rigid arm would read, and of the tool's shift that of the true arms."""
-    _put(_six(rows, GIVEN, 0, 1), rows, TRIED, 0, 1)
-    for n in range(ROUNDS):
-        splines(layer, rows, TRIED, 1)
-        _step(c, rows, 0, 1)
-        if n == 0:
-            _shift(c, rows, 0, 1)
-        splines(layer, rows, TRIED, 1)
-        _refine(rows, 0, 1)
+def correct_one(c: Array, layer: Array, rows: Array, taught: bool) -> None:
+    """`six_axis.correct_one`, with the joints read and the shift at the tool of the true arms."""
+    _correct(c, rows, 0, 1, c[LARGE] > 0.5)
+    if taught:
+        _wind(c, rows, 0, 1)
+    splines(layer, rows, GIVEN, 1)
+    _shift(c, rows, 0, 1)
+    splines(layer, rows, GOES, 1)
+    _try(rows, GOES, 0, 1)
+    splines(layer, rows, TRIED, 1)
+    _step(c, rows, 0, 1)
+    splines(layer, rows, TRIED, 1)
     _end(rows, 0, 1)
 
 
 @kernel
-def read_lanes(c: Array, layer: Array, rows: Array) -> None:
-    """`read_one` for sixteen points."""
-    for k in range(N * LANES):
-        rows[TRIED * LANES + k] = rows[GIVEN * LANES + k]
-    for n in range(ROUNDS):
-        splines(layer, rows, TRIED, LANES)
+def correct_lanes(c: Array, layer: Array, rows: Array, taught: bool) -> None:
+    """`correct_one` for sixteen points."""
+    if c[LARGE] > 0.5:
         for k in range(LANES):
-            _step(c, rows, k, LANES)
-        if n == 0:
-            for k in range(LANES):
-                _shift(c, rows, k, LANES)
-        splines(layer, rows, TRIED, LANES)
+            _correct(c, rows, k, LANES, True)
+    else:
         for k in range(LANES):
-            _refine(rows, k, LANES)
+            _correct(c, rows, k, LANES, False)
+    if taught:
+        for k in range(LANES):
+            _wind(c, rows, k, LANES)
+    splines(layer, rows, GIVEN, LANES)
+    for k in range(LANES):
+        _shift(c, rows, k, LANES)
+    splines(layer, rows, GOES, LANES)
+    for k in range(LANES):
+        _try(rows, GOES, k, LANES)
+    splines(layer, rows, TRIED, LANES)
+    for k in range(LANES):
+        _step(c, rows, k, LANES)
+    splines(layer, rows, TRIED, LANES)
     for k in range(LANES):
         _end(rows, k, LANES)

@@ -25,9 +25,9 @@ from robocal_ros.correction.damping import (
     Nine,
     Six,
 )
-from robocal_ros.correction.six_axis import LANES, N
-from robocal_ros.correction.six_functions import CAME, CONSTANTS, GIVEN, GOES, ROWS, TRIED
-from robocal_ros.ground.compiled import lean
+from robocal_ros.correction.six_axis import CAME, GOES, LANES, N
+from robocal_ros.correction.six_functions import CONSTANTS, GIVEN, ROWS
+from robocal_ros.ground.compiled import kernel, lean
 from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.kernels import (
     PER_STEP,
@@ -57,11 +57,21 @@ STEP_AHEAD_S = 5e-7
 VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
 MOST_STEPS = 20
 POSES, TWISTS = 6, 4
-STEEPNESS, PER_ERROR, IS_STRAIGHT, TAUGHT_TURNS, SETTINGS = 0, 1, 2, 3, 4
+# of the settings: the damping's steepness and its rise, see `joint_correction` (3); whether
+# `six_axis` serves; whether a model has joint functions, and whether the reference model has
+STEEPNESS, PER_ERROR, IS_STRAIGHT, TURNS, TAUGHT_TURNS, SETTINGS = range(6)
+
+
+class SixJoints(NamedTuple):
+    """The first parts of ``work``, for `six_axis` and `six_functions`."""
+
+    settings: Array
+    constants: Array
+    rows: Array  # sixteen points
 
 
 class Workspace(NamedTuple):
-    """Where a solution is worked out: parts of ``work``.
+    """Where a solution is worked out otherwise: further parts of ``work``.
 
     Poses have the axes of the flange, their origin is the tool's.
     """
@@ -84,11 +94,7 @@ class Workspace(NamedTuple):
     spare: Array
     order: Array
     x: Array  # (n,) shift of the joints
-    # steepness and its rise, see `joint_correction` (3); whether `six_axis` serves, and whether the
-    # reference model has joint functions
     settings: Array
-    constants: Array  # of `six_axis` and `six_functions`
-    rows: Array  # sixteen points
     taught_layer: Array  # (n + 1, w) joint functions of both models; w is 0 where neither has some
     layer: Array
     scratch: Array  # (n, SCRATCH) of `turn_joints`
@@ -96,6 +102,7 @@ class Workspace(NamedTuple):
     back: Array
 
 
+@lean
 def work_size(n: int, w: int) -> int:
     """How many scratch numbers a solution needs: n joints, w columns of their functions."""
     many = CONSTANTS + LANES * ROWS
@@ -104,9 +111,25 @@ def work_size(n: int, w: int) -> int:
 
 
 @lean
+def six_in(work: Array) -> SixJoints:
+    """Divide the beginning of ``work``, at places that are known when this is compiled."""
+    first, rows = SETTINGS + CONSTANTS, SETTINGS + CONSTANTS + LANES * ROWS
+    return SixJoints(work[:SETTINGS], work[SETTINGS:first], work[first:rows])
+
+
+@lean
+def layers_in(work: Array, n: int) -> tuple[Array, Array]:
+    """Joint functions (n + 1, w) of both models, at the end of ``work``."""
+    at = work_size(n, 0)
+    layers = work[at:].reshape(2, n + 1, (work.shape[0] - at) // (2 * (n + 1)))
+    return layers[0], layers[1]
+
+
+@lean
 def room_in(work: Array, n: int) -> Workspace:
-    """Divide ``work``."""
-    links, at = work[: 18 * n].reshape(2, n, 9), 18 * n
+    """Divide ``work``. A reshaped part costs some 20 ns: none is made for nothing."""
+    at = SETTINGS + CONSTANTS + LANES * ROWS
+    links, at = work[at : at + 18 * n].reshape(2, n, 9), at + 18 * n
     poses, at = work[at : at + 16 * POSES].reshape(POSES, 4, 4), at + 16 * POSES
     turns, at = work[at : at + turns_size(n)], at + turns_size(n)
     frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
@@ -114,16 +137,13 @@ def room_in(work: Array, n: int) -> Workspace:
     B, at = work[at : at + 36].reshape(6, 6), at + 36
     twists, at = work[at : at + 6 * TWISTS].reshape(TWISTS, 6), at + 6 * TWISTS
     x, at = work[at : at + n], at + n
-    settings, at = work[at : at + SETTINGS], at + SETTINGS
-    constants, at = work[at : at + CONSTANTS], at + CONSTANTS
-    rows, at = work[at : at + LANES * ROWS], at + LANES * ROWS
     scratch, at = work[at : at + SCRATCH * n].reshape(n, SCRATCH), at + SCRATCH * n
-    both, at = work[at : at + 2 * n].reshape(2, n), at + 2 * n
-    layers = work[at:].reshape(2, n + 1, (work.shape[0] - at) // (2 * (n + 1)))
+    both = work[at : at + 2 * n].reshape(2, n)
+    taught_layer, layer = layers_in(work, n)
     return Workspace(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
-        turns, frames, J[0], J[1], B, twists[0], twists[1], twists[2], twists[3], x, settings,
-        constants, rows, layers[0], layers[1], scratch, both[0], both[1],
+        turns, frames, J[0], J[1], B, twists[0], twists[1], twists[2], twists[3], x,
+        work[:SETTINGS], taught_layer, layer, scratch, both[0], both[1],
     )  # fmt: skip
 
 
@@ -136,7 +156,7 @@ def prepare(
     The last w columns are the joint functions' layers.
     """
     n = models.shape[1] - 2
-    room = room_in(work, n)
+    room, six, taught_turns = room_in(work, n), six_in(work), False
     for i in range(n):
         for c in range(9):
             room.taught_links[i, c], room.links[i, c] = models[0, i, c], models[1, i, c]
@@ -147,28 +167,29 @@ def prepare(
     newton.pose(models[0, n + 1], room.taught_tool)
     newton.pose(models[1, n], room.root)
     newton.pose(models[1, n + 1], room.tool)
-    room.settings[STEEPNESS], room.settings[PER_ERROR] = steepness, per_error
-    room.settings[TAUGHT_TURNS] = 0.0
+    turns = room.layer.shape[1] > 0
     for i in range(n):
-        if _is_turned(room) and room.taught_layer[i, PER_STEP] > 0.0:
-            room.settings[TAUGHT_TURNS] = 1.0
+        taught_turns = taught_turns or (turns and room.taught_layer[i, PER_STEP] > 0.0)
+    six.settings[STEEPNESS], six.settings[PER_ERROR] = steepness, per_error
+    six.settings[TURNS] = 1.0 if turns else 0.0
+    six.settings[TAUGHT_TURNS] = 1.0 if taught_turns else 0.0
     turning = not free and n == N
     for i in range(n):
         turning = turning and room.links[i, 8] < 0.5
-    room.settings[IS_STRAIGHT] = 0.0
+    six.settings[IS_STRAIGHT] = 0.0
     if not turning:
         return
+    constants, taught, tool = six.constants, room.taught_tool, room.tool
     for i in range(N):
-        room.constants[six_axis.LARGEST + i] = largest[i]
-    room.constants[six_axis.DAMPING], room.constants[six_axis.DAMPING + 1] = steepness, per_error
-    taught, tool = room.taught_tool, room.tool
-    six_axis.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
-    six_axis.constants(room.links, room.root, tool, taught, six_axis.ACTUAL, room.constants)
-    room.settings[IS_STRAIGHT] = 1.0 if six_axis.serves(room.constants) else 0.0
-    if _is_turned(room):
-        at, actual = six_functions.LOADS, six_functions.LOADS + six_functions.LOAD
-        six_functions.loads(room.taught_layer, taught, at, room.constants)
-        six_functions.loads(room.layer, tool, actual, room.constants)
+        constants[six_axis.LARGEST + i] = largest[i]
+    constants[six_axis.DAMPING], constants[six_axis.DAMPING + 1] = steepness, per_error
+    six_axis.constants(room.taught_links, room.taught_root, taught, taught, 0, constants)
+    six_axis.constants(room.links, room.root, tool, taught, six_axis.ACTUAL, constants)
+    six.settings[IS_STRAIGHT] = 1.0 if six_axis.serves(constants) else 0.0
+    if turns:
+        six_functions.loads(room.taught_layer, taught, six_functions.LOADS, constants)
+        actual = six_functions.LOADS + six_functions.LOAD
+        six_functions.loads(room.layer, tool, actual, constants)
 
 
 @lean
@@ -289,23 +310,9 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
     out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = newton.length(e, 0), newton.length(e, 3)
 
 
-@lean
-def _take_over(room: Workspace, lane: int, lanes: int, out: Array) -> bool:
-    """A point of `six_axis`, with its report; False where it must be solved here."""
-    for r in range(N + REPORT):
-        out[r] = room.rows[(GOES + r) * lanes + lane]
-    out[N + ITERATIONS] = six_axis.ITERATIONS + room.constants[six_axis.LARGE]
-    return bool(out[N + CONVERGED] > 0.5)
-
-
 # Where joints turn otherwise than they read, what a rigid reference arm would read is corrected to
 # what a rigid actual one would, and that is read off the joints: of a joint's own function nothing
 # is given up, whatever direction is weak.
-
-
-@lean
-def _is_turned(room: Workspace) -> bool:
-    return room.layer.shape[1] > 0
 
 
 @lean
@@ -336,30 +343,11 @@ def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> N
         out[n + ROTATION_ERROR] = out[n + TCP_ROTATION]
 
 
-@lean
-def _solve(lanes: int, room: Workspace) -> None:
-    """Solve the points given in ``lanes`` rows."""
-    constants, rows = room.constants, room.rows
-    came, goes = rows[CAME * lanes : GOES * lanes], rows[GOES * lanes : TRIED * lanes]
-    if _is_turned(room) and room.settings[TAUGHT_TURNS] > 0.5:
-        six_functions.turn(constants, room.taught_layer, rows, lanes)
-    else:
-        for k in range(N * lanes):
-            came[k] = rows[GIVEN * lanes + k]
-    if lanes == 1:
-        six_axis.correct_one(constants, came, goes)
-    else:
-        six_axis.correct_lanes(constants, came, goes)
-    if _is_turned(room) and lanes == 1:
-        six_functions.read_one(constants, room.layer, rows)
-    elif _is_turned(room):
-        six_functions.read_lanes(constants, room.layer, rows)
-
-
-@lean
-def _correct_alone(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
+@kernel
+def _correct_alone(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
     """A point (n,) of any arm, by `_correct`."""
-    if not _is_turned(room):
+    room = room_in(work, q.shape[0])
+    if room.settings[TURNS] < 0.5:
         _correct(q, largest, free, room, out)
         return
     turn_joints(q, room.taught_links, room.taught_root, room.taught_layer, room.scratch)
@@ -370,16 +358,54 @@ def _correct_alone(q: Array, largest: Array, free: bool, room: Workspace, out: A
 
 
 @lean
-def _correct_one(q: Array, largest: Array, free: bool, room: Workspace, out: Array) -> None:
+def _given(six: SixJoints) -> int:
+    """From which row on the joints given stand."""
+    return GIVEN if six.settings[TURNS] > 0.5 else CAME
+
+
+@lean
+def _solve(lanes: int, six: SixJoints, work: Array) -> None:
+    """Solve the points of ``lanes``, whose joints stand in the rows `_given`."""
+    constants, rows = six.constants, six.rows
+    if six.settings[TURNS] < 0.5:
+        if lanes == 1:
+            six_axis.correct_one(constants, rows)
+        else:
+            six_axis.correct_lanes(constants, rows)
+        return
+    taught_layer, layer = layers_in(work, N)
+    taught = six.settings[TAUGHT_TURNS] > 0.5
+    if taught:
+        six_functions.turn(constants, taught_layer, rows, lanes)
+    else:
+        for k in range(N * lanes):
+            rows[CAME * lanes + k] = rows[GIVEN * lanes + k]
+    if lanes == 1:
+        six_functions.correct_one(constants, layer, rows, taught)
+    else:
+        six_functions.correct_lanes(constants, layer, rows, taught)
+
+
+@lean
+def _take_over(six: SixJoints, lane: int, lanes: int, out: Array) -> bool:
+    """A solved point with its report; False where it must be solved alone."""
+    for r in range(N + REPORT):
+        out[r] = six.rows[(GOES + r) * lanes + lane]
+    return bool(out[N + CONVERGED] > 0.5)
+
+
+@lean
+def _correct_one(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
     """A point (n,) of any arm."""
-    solved = False
-    if room.settings[IS_STRAIGHT] > 0.5:
+    six, solved = six_in(work), False
+    if six.settings[IS_STRAIGHT] > 0.5:
+        given = _given(six)
         for i in range(N):
-            room.rows[i] = q[i]
-        _solve(1, room)
-        solved = _take_over(room, 0, 1, out)
+            six.rows[given + i] = q[i]
+        _solve(1, six, work)
+        solved = _take_over(six, 0, 1, out)
     if not solved:
-        _correct_alone(q, largest, free, room, out)
+        _correct_alone(q, largest, free, work, out)
 
 
 @lean
@@ -387,9 +413,8 @@ def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Arra
     """One point (n,) through k stages with ``works`` (k, size); ``out`` (k, n + 7)."""
     n = q.shape[0]
     for stage in range(works.shape[0]):
-        room = room_in(works[stage], n)
         start = q if stage == 0 else out[stage - 1, :n]
-        _correct_one(start, largest[stage], free, room, out[stage])
+        _correct_one(start, largest[stage], free, works[stage], out[stage])
 
 
 @lean
@@ -399,18 +424,19 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
     ``largest`` (n,) bounds the joint shift; ``free``: the turn about the tool's z is free.
     ``out`` (m, n + 7): joints, then the report.
     """
-    room, first = room_in(work, q.shape[1]), 0
-    while room.settings[IS_STRAIGHT] > 0.5 and q.shape[0] - first >= LANES:
+    six, first = six_in(work), 0
+    given = _given(six)
+    while six.settings[IS_STRAIGHT] > 0.5 and q.shape[0] - first >= LANES:
         for lane in range(LANES):
             for i in range(N):
-                room.rows[(GIVEN + i) * LANES + lane] = q[first + lane, i]
-        _solve(LANES, room)
+                six.rows[(given + i) * LANES + lane] = q[first + lane, i]
+        _solve(LANES, six, work)
         for lane in range(LANES):
-            if not _take_over(room, lane, LANES, out[first + lane]):
-                _correct_alone(q[first + lane], largest, free, room, out[first + lane])
+            if not _take_over(six, lane, LANES, out[first + lane]):
+                _correct_alone(q[first + lane], largest, free, work, out[first + lane])
         first += LANES
     for i in range(first, q.shape[0]):
-        _correct_one(q[i], largest, free, room, out[i])
+        _correct_one(q[i], largest, free, work, out[i])
 
 
 @lean
@@ -465,7 +491,7 @@ def rates_at(
     n = q.shape[0]
     taught, room = room_in(first, n), room_in(last, n)
     J, L, v, a = room.J, room.B, room.e, room.spare
-    if _is_turned(room):
+    if room.settings[TURNS] > 0.5:
         return False
     _stand(q, taught.taught_links, taught.taught_root, taught.taught_tool, room)
     newton.bias(taught.taught_links, room.frames, room.here, qd, v, a)

@@ -18,10 +18,13 @@ from robocal_ros.correction.bounds import (
     require_within,
     survey,
 )
+from robocal_ros.correction.damping import CONVERGED
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
 from robocal_ros.correction.joint_correction import JointCorrection, pack_model
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.correction.solution import correct_staged
+from robocal_ros.correction.six_axis import GOES, LANES, SAID
+from robocal_ros.correction.six_functions import CONSTANTS, ROWS
+from robocal_ros.correction.solution import SETTINGS, correct_staged
 from robocal_ros.kinematics import SerialArm
 
 NM = 1e-9
@@ -77,6 +80,18 @@ def test_what_load_leaves_of_a_step_is_measured_and_not_taken_for_small() -> Non
     goal = nominal.fk(q[whole]) @ nominal.T_flange_tool
     for error in pose_error(soft, found.q[whole], goal):
         assert error < 6 * 1e-11 * 4.0
+
+
+def test_joint_functions_alone_are_taken_off_sixteen_points_at_a_time() -> None:
+    """Where the geometry is the same nothing was to solve, and each point was solved alone."""
+    nominal = robot("ur10")
+    correction = JointCorrection.between(nominal, with_joint_errors(nominal, 1))
+    q = well_conditioned(nominal, np.random.default_rng(1), 200)[:LANES]
+    found = correction.correct(q)
+    rows = correction.work[SETTINGS + CONSTANTS :][: LANES * ROWS].reshape(ROWS, LANES)
+    np.testing.assert_array_equal(rows[SAID + CONVERGED], 1.0)
+    np.testing.assert_array_equal(found.q.T, rows[GOES : GOES + 6])
+    assert np.all(found.iterations == 0)
 
 
 def test_its_shift_at_the_tool_is_that_of_the_arms_as_they_are() -> None:
