@@ -96,7 +96,6 @@ class HouseNode(EndpointNode):
             self._stop_acting()
         self._clean_up()
         self.destroy_node()
-        self._state_machine.destroy_when_not_in_use()  # it holds the node, which others still see
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Validate the parameters, then `configure`; undone when it fails."""

@@ -280,9 +280,8 @@ class Graph:
         if client is None:
             client = self._clients[name] = self.probe.create_client(kind, name)
             self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
-            if not self._serves(client.service_name):
-                # A server drops its answer to a client that it has not discovered itself yet.
-                self.spin_for(DISCOVERY_S)
+            # A server drops its answer to a client that it has not discovered itself yet.
+            self.spin_for(DISCOVERY_S)
         self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
         return client
 
@@ -291,11 +290,6 @@ class Graph:
         future = self.client(kind, name, within_s).call_async(kind.Request(**fields))
         self.spin_until(future.done, f"service {name} answers", within_s)
         return future.result()
-
-    def _serves(self, name: str) -> bool:
-        """Whether this process does: what is of one participant is not discovered."""
-        nodes = (self.probe, *self._nodes)
-        return name in {service.service_name for node in nodes for service in node.services}
 
     def _forget_clients(self) -> None:
         """A node that starts has to discover whom it answers."""

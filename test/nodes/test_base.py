@@ -293,13 +293,6 @@ def test_diagnostics_tell_the_health_of_an_active_node_once_a_second(graph: Any)
     assert values["number received"] == "0"
 
 
-def test_a_node_that_is_closed_leaves_the_graph_at_once(graph: Any) -> None:
-    node = graph.add(Doubler)
-    assert "doubler" in graph.probe.get_node_names()
-    node.close()
-    assert graph.probe.get_node_names() == ["probe"]
-
-
 def test_configures_again_after_cleanup(graph: Any) -> None:
     node = graph.add(Doubler)
     assert change_state(graph, Transition.TRANSITION_DEACTIVATE)
