@@ -84,9 +84,7 @@ test-floor: $(VENV)-floor/.stamp  ## tests that need no ROS, with the versions o
 	OPENBLAS_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)-floor/kernels \
 		$(VENV)-floor/bin/python -m pytest -m "not ros" $(TESTS)
 
-# Messages are built while kernels are compiled.
-setup: setup-python  ## everything that the demo needs
-	+@$(MAKE) --no-print-directory -j2 setup-ros $(STAMPS)/kernels
+setup: setup-python setup-ros $(STAMPS)/kernels  ## everything that the demo needs
 
 setup-dev: setup $(STAMPS)/dev  ## that, and what tests and lint need
 

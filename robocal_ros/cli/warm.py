@@ -6,18 +6,14 @@ called with: so each is called once, as nodes and commands do.
 """
 
 import argparse
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from multiprocessing import get_context
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robocal_ros.cli.main import CliResult, Document, print_words, progress_console
-from robocal_ros.correction import limiter, solution
 from robocal_ros.correction.session import load_kernels
 from robocal_ros.ground import compiled, frames, mcap_records, serialized_joints
 from robocal_ros.ground.samples import Measurements
@@ -35,8 +31,6 @@ if TYPE_CHECKING:
 
 POSES = 30
 LINE_EVERY = 10  # kernels, where no terminal shows each
-LOOK_S = 0.2
-FIRST = "the arm"  # all others call its kernels, too
 
 
 def arm_of_six_joints() -> SerialArm:
@@ -61,24 +55,8 @@ def arm_of_six_joints() -> SerialArm:
     )
 
 
-def compile_streams() -> None:
-    """Compile for other processes what joint correction would come to last."""
-    one, row, table, stack = "f8", "f8[::1]", "f8[:,::1]", "f8[:,:,::1]"
-    limited = (row, row, one, one, table, table, row, table, table, table, row)
-    kernels: Sequence[tuple[Any, tuple[str, ...]]] = (
-        (limiter.step_out, (*limited, table, "b1", table, stack, row)),
-        (solution.uncorrect_staged, (row, table, "b1", table, "i8", one, table, row)),
-        (
-            solution.taught_velocity,
-            (row, row, row, table, "b1", table, table, table, table, row),
-        ),
-    )
-    for function, given in kernels:
-        function.compile(f"({', '.join(given)})")
-
-
 def warming() -> Mapping[str, Callable[[], object]]:
-    """What nodes and commands call first, by what it is for; what takes longest comes first."""
+    """What nodes and commands call first, by what it is for; in this order."""
     arm = arm_of_six_joints()
     rng = np.random.default_rng(0)
     q = rng.uniform(-1.5, 1.5, (POSES, 6))
@@ -112,12 +90,11 @@ def warming() -> Mapping[str, Callable[[], object]]:
             serialized.load_kernels()
 
     return {
-        FIRST: arms,
-        "joint correction": lambda: load_kernels(arm),
-        "streams of joint correction": compile_streams,
-        "hand-eye": cameras,
-        "the arm's inverse": back,
+        "the arm": arms,
+        "its inverse": back,
         "identification": models,
+        "hand-eye": cameras,
+        "joint correction": lambda: load_kernels(arm),
         "messages": messages,
     }
 
@@ -127,63 +104,31 @@ def add_warm(parser: argparse.ArgumentParser) -> None:
 
 
 def run_warm(args: argparse.Namespace) -> CliResult:
-    """Do ``warm`` on all cores, telling on standard error how far it is."""
-    console, steps = progress_console(), warming()
-    done, told, context = list["WarmStepDocument"](), list[str](), get_context("spawn")
-    names: Any = context.Queue()
-    with (
-        console.status("") as status,
-        ProcessPoolExecutor(os.cpu_count(), context, _tell_to, (names,)) as pool,
-    ):
+    """Do ``warm``, telling on standard error how far it is."""
+    console, steps, names = progress_console(), warming(), list[str]()
+    with console.status("") as status:
 
-        def tell() -> None:
-            while not names.empty():
-                told.append(names.get())
-                words = f"{len(told)} kernels, {told[-1]}"
-                status.update(words)
-                if not console.is_terminal and len(told) % LINE_EVERY == 0:
-                    console.print(words)
+        def tell(name: str) -> None:
+            names.append(name)
+            words = f"{len(names)} kernels, {name}"
+            status.update(words)
+            if not console.is_terminal and len(names) % LINE_EVERY == 0:
+                console.print(words)
 
-        for these in ([FIRST], [name for name in steps if name != FIRST]):
-            for step in _each_done(pool, these, tell):
+        done: list[WarmStepDocument] = []
+        with compiled.compiling(tell):
+            for number, (name, call) in enumerate(steps.items(), start=1):
+                before, begun_s = len(names), time.monotonic()
+                call()
+                step: WarmStepDocument = {
+                    "name": name,
+                    "compiled": len(names) - before,
+                    "seconds": time.monotonic() - begun_s,
+                }
                 done.append(step)
-                console.print(f"{len(done)} of {len(steps)}: {_in_words(step)}")
-    for call in steps.values():  # of what two processes kept at once that of one may be lost
-        call()
-    document: WarmDocument = {
-        "steps": done, "compiled": sum(step["compiled"] for step in done), "warnings": []
-    }  # fmt: skip
+                console.print(f"{number} of {len(steps)}: {_in_words(step)}")
+    document: WarmDocument = {"steps": done, "compiled": len(names), "warnings": []}
     return CliResult(document, _show)
-
-
-def _each_done(
-    pool: ProcessPoolExecutor, these: Sequence[str], tell: Callable[[], None]
-) -> "Iterator[WarmStepDocument]":
-    under_way = {pool.submit(_warmed, name) for name in these}
-    while under_way:
-        done, under_way = wait(under_way, LOOK_S, FIRST_COMPLETED)
-        tell()
-        yield from (step.result() for step in done)
-
-
-def _tell_to(names: Any) -> None:
-    _names.append(names)
-
-
-_names: list[Any] = []  # of a process of the pool: where it tells what it compiles
-
-
-def _warmed(name: str) -> "WarmStepDocument":
-    count, begun_s = 0, time.monotonic()
-
-    def tell(kernel: str) -> None:
-        nonlocal count
-        count += 1
-        _names[0].put(kernel)
-
-    with compiled.compiling(tell):
-        warming()[name]()
-    return {"name": name, "compiled": count, "seconds": time.monotonic() - begun_s}
 
 
 def _in_words(step: "WarmStepDocument") -> str:

@@ -83,13 +83,6 @@ def test_an_installation_compiles_what_a_node_loads(monkeypatch: pytest.MonkeyPa
     assert loaded == [6]
 
 
-def test_what_is_compiled_ahead_is_what_a_stream_calls() -> None:
-    load_kernels(NOMINAL)
-    before = compiled()
-    warm.compile_streams()
-    assert compiled() == before
-
-
 def test_nothing_is_compiled_while_commands_are_corrected() -> None:
     """In a process of its own: here other tests have called the kernels."""
     run = [sys.executable, __file__]
