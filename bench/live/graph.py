@@ -16,7 +16,6 @@ from typing import Any
 import rclpy
 from rclpy.client import Client
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
@@ -24,6 +23,7 @@ from std_srvs.srv import Trigger
 from bench.processes import ENDS_WITH_PARENT, hand_nice_on
 from bench.startup import EXECUTABLES
 from robocal_ros.ros import endpoints
+from robocal_ros.ros.executor import OneThreadExecutor
 
 PATIENCE_S = 30.0
 END_S = 5.0
@@ -103,7 +103,7 @@ class CellController:
         self._context = Context()
         rclpy.init(args=[], context=self._context)
         self._node = Node("cell_controller", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = OneThreadExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._executables: list[Executable] = []
         self._clients: dict[str, Client] = {}

@@ -24,13 +24,14 @@ from typing import Any, ClassVar
 
 import rclpy
 from lifecycle_msgs.msg import State
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from robocal_ros.ground.errors import RobocalError
 from robocal_ros.ros.endpoints import ERROR, WARN, Diagnostics, EndpointNode, Health
+from robocal_ros.ros.executor import OneThreadExecutor
 from robocal_ros.ros.parameters import ParameterTable, Setting
 
 NO_SERIAL = "unset"  # the history's name where none is set
@@ -237,50 +238,6 @@ class QuietMemory:
         """Collect as Python does."""
         gc.unfreeze()
         gc.enable()
-
-
-class _WakesLater:
-    """An executor's guard condition for one callback: silent in the turn in which this begins."""
-
-    def __init__(self, executor: "OneThreadExecutor") -> None:
-        self._executor, self._turn = executor, executor.turn
-
-    def trigger(self) -> None:
-        """Wake the executor for those that wait for a callback that had awaited something."""
-        if self._executor.turn != self._turn:
-            self._executor.wake()
-
-
-class OneThreadExecutor(SingleThreadedExecutor):
-    """Builds one wait set for each callback, where rclpy's builds two: a fourth of a node's load.
-
-    rclpy's handler of a callback wakes the executor after it, for those that another thread held
-    back as its group was taken. In one thread the next wait set is only built when the callback
-    has ended or awaits; one that ends later wakes it, and whoever else does. An rclpy that names
-    its guard or its handlers otherwise is used as it is.
-    """
-
-    turn = 0  # number of the callback that runs
-    _made_in = 0  # the thread that makes a handler
-
-    @property
-    def _guard(self) -> Any:
-        return _WakesLater(self) if self._made_in == threading.get_ident() else self._wakes
-
-    @_guard.setter
-    def _guard(self, guard: Any) -> None:
-        self._wakes = guard
-
-    def _spin_once_impl(self, *given: Any, **named: Any) -> None:
-        self.turn += 1
-        super()._spin_once_impl(*given, **named)
-
-    def _make_handler(self, *given: Any) -> Any:
-        self._made_in = threading.get_ident()
-        try:
-            return super()._make_handler(*given)
-        finally:
-            self._made_in = 0
 
 
 SPIN_S = 0.5

@@ -28,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.ros import endpoints
-from robocal_ros.ros.base import OneThreadExecutor
+from robocal_ros.ros.executor import OneThreadExecutor
 
 ROOT = Path(__file__).parent.parent.parent
 sys.path.insert(0, str(Path(__file__).parent))  # some tests share helpers of another

@@ -12,7 +12,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.lifecycle import LifecycleNode
-from rclpy.task import Future
 from robocal_msgs.srv import Decide
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -225,40 +224,6 @@ def test_parameters_describe_themselves(graph: Any) -> None:
     assert factor.floating_point_range[0].to_value == 10.0
     assert "may change at any time" in factor.additional_constraints
     assert "badly" in start_fails.additional_constraints
-
-
-def test_a_callback_does_not_wake_its_executor(graph: Any, monkeypatch: Any) -> None:
-    """After it one wait set is built, and waited with until the time is over."""
-    node = graph.add(Doubler)
-    graph.publisher(Float64, "/number").publish(Float64(data=1.0))
-    graph.spin_until(lambda: node.inputs["number"].received)
-    built = []
-    get_nodes = graph.executor.get_nodes
-    monkeypatch.setattr(graph.executor, "get_nodes", lambda: built.append(1) or get_nodes())
-    node._diagnostics._timer.cancel()  # nothing else is to come
-    graph.executor.spin_once(timeout_sec=0.05)
-    assert len(built) == 1
-
-
-def test_a_callback_that_awaited_something_wakes_its_executor(graph: Any, monkeypatch: Any) -> None:
-    """Others may wait for what it did: they come at once, not with the next message."""
-    node, gate, begun = graph.add(Doubler), Future(), []
-
-    async def answer(request: Any, response: Any) -> Any:
-        begun.append(request)
-        await gate
-        return response
-
-    node.add_service(Trigger, "~/wait", answer)
-    asked = graph.client(Trigger, "/doubler/wait").call_async(Trigger.Request())
-    graph.spin_until(lambda: begun)
-    woken: list[int] = []
-    monkeypatch.setattr(graph.executor, "wake", lambda: woken.append(1))
-    graph.spin_for(0.1)
-    assert not woken
-    gate.set_result(None)
-    graph.spin_until(asked.done)
-    assert woken
 
 
 def test_an_invalid_message_is_counted_and_does_no_harm(graph: Any) -> None:
