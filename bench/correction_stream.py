@@ -147,7 +147,7 @@ def _own() -> dict[str, tuple[float, ...]]:
     node = JointCorrectionNode()
     try:
         node.autostart()
-        arm, take = node.robot.arm, {topic: act for topic, _, act in node._takers}
+        arm, take = node.robot.arm, {topic: act for topic, *_, act in node._takers}
         take["kinematic_model"](offered(arm, drifted(arm, DRIFT_M), 1, KinematicModel.ACCEPTED))
         buffer, still = Buffer(arm.joint_names), np.zeros(arm.n)
         begin_s, out = time.monotonic(), node._session.output.out
