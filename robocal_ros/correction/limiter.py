@@ -37,7 +37,7 @@ from robocal_ros.correction.solution import (
     velocity_by_differences,
     within,
 )
-from robocal_ros.ground.compiled import kernel, lean
+from robocal_ros.ground.compiled import bare, kernel, lean
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def _aim(
     return share * d, follows, share * d - state[OFFSET, j] - follows * dt
 
 
-@lean
+@bare
 def advance(
     state: Array, desired: Array, dt: float, moves: bool, limits: Array, active: Array
 ) -> None:
@@ -166,7 +166,7 @@ def advance(
         state[DESIRED, j], state[SHARE, j] = desired[j], share
 
 
-@lean
+@bare
 def put_out(
     memory: Array, goal: Array, desired: Array, elapsed: float, longest: float, limits: Array,
     active: Array, fastest: Array, span: Array,
@@ -261,7 +261,7 @@ def follow(
             offsets[k, j], rates[k, j] = state[OFFSET, j], state[OFFSET_RATE, j]
 
 
-@lean
+@bare
 def step_out(
     goal: Array, velocity: Array, elapsed: float, longest: float, memory: Array, limits: Array,
     active: Array, speeds: Array, span: Array, bounds: Array, tcp: Array, largest: Array,

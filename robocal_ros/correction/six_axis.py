@@ -24,7 +24,6 @@ from robocal_ros.correction.damping import (
     WEIGHT,
     Nine,
     Six,
-    Three,
     damping,
     dot,
     inverse,
@@ -62,7 +61,14 @@ LARGE_CHANGE = 4e-4
 LANES = 16
 # ``rows`` hold so many points, row by row: the joints that came, those corrected, their report.
 CAME, GOES, SAID = 0, N, 2 * N
-ROWS = SAID + REPORT
+# Then what is worked out: the goal, frames behind each joint, residual and Jacobian at the joints
+# that came, the damping, multipliers and shift, and how well that goes.
+AIM, FRAMES = SAID + REPORT, SAID + REPORT + 12
+TOOL_FRAME = FRAMES + 60
+ERROR, JACOBIAN = FRAMES + 72, FRAMES + 78
+DAMPED = JACOBIAN + N * N
+STEPS, FINE, FOUND = DAMPED + 18, DAMPED + 30, DAMPED + 32
+ROWS = FINE + N
 
 # A residual (m, rad) that is left alone.
 AT_GOAL = 1e-12
@@ -125,15 +131,19 @@ def _link(c: Array, at: int, q: float, frame: Frame) -> Frame:
 
 
 @lean
-def walk(c: Array, at: int, q: Six) -> Frames:
-    """Frames of all joints, then the flange's axes at the tool's origin."""
+def _root(c: Array, at: int) -> Frame:
+    """Frame of the first joint."""
     r = at + ROOT
-    # fmt: off
-    f0 = (
+    return (
         c[r], c[r + 1], c[r + 2], c[r + 3], c[r + 4], c[r + 5],
         c[r + 6], c[r + 7], c[r + 8], c[r + 9], c[r + 10], c[r + 11],
-    )
-    # fmt: on
+    )  # fmt: skip
+
+
+@lean
+def walk(c: Array, at: int, q: Six) -> Frames:
+    """Frames of all joints, then the flange's axes at the tool's origin."""
+    f0 = _root(c, at)
     f1 = _link(c, at, q[0], f0)
     f2 = _link(c, at + 9, q[1], f1)
     f3 = _link(c, at + 18, q[2], f2)
@@ -281,6 +291,22 @@ def _joints(J: Rows, y: Six) -> Six:
 
 
 @lean
+def _begin(c: Array, q: Six) -> tuple[Six, bool, Frame, Frames, Rows, Nine, Nine, float]:
+    """Residual, whether the series serve, goal, frames and Jacobian at the joints that came.
+
+    Then the damping P and R, and how many directions have it.
+    """
+    aim, frames = goal(c, q), walk(c, ACTUAL, q)
+    error, near = residual(aim, frames[6])
+    fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
+    J = _rows(c, frames)
+    i, j, k, l, m, n = J
+    A, B, C = _product(i, j, k, i, j, k), _product(i, j, k, l, m, n), _product(l, m, n, l, m, n)
+    P, R, weak = damping(A, B, C, weighed(error), c[DAMPING], c[DAMPING + 1])
+    return error, fine, aim, frames, J, P, R, weak
+
+
+@lean
 def _two_steps(
     c: Array, q: Six, aim: Frame, J: Rows, P: Nine, R: Nine, y: Six, x: Six, frames: Frames
 ) -> tuple[Six, Six, Frames, float, float, bool]:
@@ -302,43 +328,8 @@ def _two_steps(
 
 
 @lean
-def solve(c: Array, q: Six, large: bool) -> tuple[Six, Six, Six, Three, Frame, Frames, Frames]:
-    """Shift, first and last residual; iterations, whether that is the solution, whether it is weak.
-
-    Then the goal, and the actual arm's frames at ``q`` and at the solution.
-    """
-    aim = goal(c, q)
-    begin = frames = walk(c, ACTUAL, q)
-    error, near = residual(aim, frames[6])
-    fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
-    # of no more than this nothing is left to do, and nothing is done
-    still = dot(error, error) <= AT_GOAL * AT_GOAL * N
-    J = _rows(c, frames)
-    i, j, k, l, m, n = J
-    A, B, C = _product(i, j, k, i, j, k), _product(i, j, k, l, m, n), _product(l, m, n, l, m, n)
-    P, R, weak = damping(A, B, C, weighed(error), c[DAMPING], c[DAMPING + 1])
-    y = x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    found = good & (second <= BESIDE * BESIDE * first)
-    y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    found &= good
-    if large:
-        y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-        found &= good
-    y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    found &= good & (first <= NEAR * NEAR) & (second <= SHORT * SHORT) & within(c, x, FAR)
-    last, _ = residual(aim, frames[6])
-    x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0) if still else x
-    last = error if still else last
-    iterations = 0.0 if still else (4.0 if large else 3.0)
-    done, weak = 1.0 if fine & (found | still) else 0.0, 0.0 if still | (weak <= 0.0) else 1.0
-    return x, error, last, (iterations, done, weak), aim, begin, frames
-
-
-@lean
-def six(rows: Array, at: int, k: int, lanes: int) -> Six:
-    """Six numbers of point ``k`` of ``lanes``, from row ``at`` on."""
-    first = at * lanes + k
+def six(rows: Array, first: int, lanes: int) -> Six:
+    """Six numbers of a point, from the place ``first`` on: those of ``lanes`` stand in a row."""
     return (
         rows[first], rows[first + lanes], rows[first + 2 * lanes],
         rows[first + 3 * lanes], rows[first + 4 * lanes], rows[first + 5 * lanes],
@@ -346,47 +337,176 @@ def six(rows: Array, at: int, k: int, lanes: int) -> Six:
 
 
 @lean
-def put(x: Six, rows: Array, at: int, k: int, lanes: int) -> None:
+def put(x: Six, rows: Array, first: int, lanes: int) -> None:
     """Keep them there."""
-    first = at * lanes + k
     rows[first], rows[first + lanes], rows[first + 2 * lanes] = x[0], x[1], x[2]
     rows[first + 3 * lanes], rows[first + 4 * lanes] = x[3], x[4]
     rows[first + 5 * lanes] = x[5]
 
 
 @lean
+def _nine(rows: Array, first: int, lanes: int) -> Nine:
+    a, b, c, d, e, f = six(rows, first, lanes)
+    g = first + 6 * lanes
+    return a, b, c, d, e, f, rows[g], rows[g + lanes], rows[g + 2 * lanes]
+
+
+@lean
+def _put_nine(m: Nine, rows: Array, first: int, lanes: int) -> None:
+    put((m[0], m[1], m[2], m[3], m[4], m[5]), rows, first, lanes)
+    g = first + 6 * lanes
+    rows[g], rows[g + lanes], rows[g + 2 * lanes] = m[6], m[7], m[8]
+
+
+@lean
+def frame(rows: Array, first: int, lanes: int) -> Frame:
+    """A frame of a point, from the place ``first`` on."""
+    x0, x1, x2, y0, y1, y2 = six(rows, first, lanes)
+    z0, z1, z2, p0, p1, p2 = six(rows, first + N * lanes, lanes)
+    return x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2
+
+
+@lean
+def _put_frame(f: Frame, rows: Array, first: int, lanes: int) -> None:
+    put((f[0], f[1], f[2], f[3], f[4], f[5]), rows, first, lanes)
+    put((f[6], f[7], f[8], f[9], f[10], f[11]), rows, first + N * lanes, lanes)
+
+
+@lean
+def frames_found(c: Array, rows: Array, k: int, lanes: int) -> Frames:
+    """Frames of the actual arm at the joints found for point ``k`` of ``lanes``."""
+    at, each = FRAMES * lanes + k, 12 * lanes
+    return (
+        _root(c, ACTUAL), frame(rows, at, lanes), frame(rows, at + each, lanes),
+        frame(rows, at + 2 * each, lanes), frame(rows, at + 3 * each, lanes),
+        frame(rows, at + 4 * each, lanes), frame(rows, at + 5 * each, lanes),
+    )  # fmt: skip
+
+
+@lean
+def _put_frames(f: Frames, rows: Array, k: int, lanes: int) -> None:
+    at, each = FRAMES * lanes + k, 12 * lanes
+    _put_frame(f[1], rows, at, lanes)
+    _put_frame(f[2], rows, at + each, lanes)
+    _put_frame(f[3], rows, at + 2 * each, lanes)
+    _put_frame(f[4], rows, at + 3 * each, lanes)
+    _put_frame(f[5], rows, at + 4 * each, lanes)
+    _put_frame(f[6], rows, at + 5 * each, lanes)
+
+
+@lean
 def put_sizes(e: Six, rows: Array, shift: int, turn: int, k: int, lanes: int) -> None:
-    """Keep the sizes of a twist."""
+    """Keep the sizes of a twist of point ``k`` in two rows."""
     rows[shift * lanes + k] = np.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     rows[turn * lanes + k] = np.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
 
 
 @lean
-def correct(c: Array, rows: Array, k: int, lanes: int, large: bool) -> tuple[Frame, Frames, Frames]:
-    """Corrected joints of what came, and their report; goal, frames there and at the solution."""
-    q = six(rows, CAME, k, lanes)
-    x, first, last, told, aim, begin, end = solve(c, q, large)
-    put(more(q, 1.0, x), rows, GOES, k, lanes)
+def _end(
+    c: Array, x: Six, first: Six, last: Six, fine: bool, found: bool, weak: float, rows: Array,
+    k: int, lanes: int,
+) -> None:  # fmt: skip
+    """Keep the corrected joints of point ``k`` and their report."""
+    # of no more than this nothing is left to do, and nothing is done
+    still = dot(first, first) <= AT_GOAL * AT_GOAL * N
+    found &= within(c, x, FAR)
+    x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0) if still else x
+    put(more(six(rows, CAME * lanes + k, lanes), 1.0, x), rows, GOES * lanes + k, lanes)
+    last = first if still else last
     put_sizes(last, rows, SAID + POSITION_ERROR, SAID + ROTATION_ERROR, k, lanes)
     put_sizes(first, rows, SAID + TCP_SHIFT, SAID + TCP_ROTATION, k, lanes)
-    rows[(SAID + ITERATIONS) * lanes + k] = told[0]
-    rows[(SAID + CONVERGED) * lanes + k] = told[1]
-    rows[(SAID + WEAK) * lanes + k] = told[2]
-    return aim, begin, end
+    rows[(SAID + ITERATIONS) * lanes + k] = 0.0 if still else 3.0 + c[LARGE]
+    rows[(SAID + CONVERGED) * lanes + k] = 1.0 if fine & (found | still) else 0.0
+    rows[(SAID + WEAK) * lanes + k] = 0.0 if still | (weak <= 0.0) else 1.0
 
 
 @kernel
 def correct_one(c: Array, rows: Array) -> None:
     """Corrected joints of one point, and its report."""
-    correct(c, rows, 0, 1, c[LARGE] > 0.5)
+    q = six(rows, CAME, 1)
+    error, fine, aim, frames, J, P, R, weak = _begin(c, q)
+    y = x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    y, x, frames, first, second, found = _two_steps(c, q, aim, J, P, R, y, x, frames)
+    found &= second <= BESIDE * BESIDE * first
+    y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
+    found &= good
+    if c[LARGE] > 0.5:
+        y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
+        found &= good
+    y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
+    found &= good & (first <= NEAR * NEAR) & (second <= SHORT * SHORT)
+    last, _ = residual(aim, frames[6])
+    _put_frame(aim, rows, AIM, 1)
+    _put_frames(frames, rows, 0, 1)
+    _end(c, x, error, last, fine, found, weak, rows, 0, 1)
+
+
+# Of sixteen points what is worked out stays in the rows, so that all pairs of steps are one loop:
+# written one after the other, they would take the compiler half a minute.
+
+
+@lean
+def _begin_lane(c: Array, rows: Array, k: int) -> None:
+    error, fine, aim, frames, J, P, R, weak = _begin(c, six(rows, CAME * LANES + k, LANES))
+    put(error, rows, ERROR * LANES + k, LANES)
+    _put_frame(aim, rows, AIM * LANES + k, LANES)
+    _put_frames(frames, rows, k, LANES)
+    at, each = JACOBIAN * LANES + k, N * LANES
+    put(J[0], rows, at, LANES)
+    put(J[1], rows, at + each, LANES)
+    put(J[2], rows, at + 2 * each, LANES)
+    put(J[3], rows, at + 3 * each, LANES)
+    put(J[4], rows, at + 4 * each, LANES)
+    put(J[5], rows, at + 5 * each, LANES)
+    _put_nine(P, rows, DAMPED * LANES + k, LANES)
+    _put_nine(R, rows, (DAMPED + 9) * LANES + k, LANES)
+    zero = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    put(zero, rows, STEPS * LANES + k, LANES)
+    put(zero, rows, (STEPS + N) * LANES + k, LANES)
+    put((1.0 if fine else 0.0, weak, 1.0, 0.0, 0.0, 0.0), rows, FINE * LANES + k, LANES)
+
+
+@lean
+def _two_steps_lane(c: Array, rows: Array, k: int, beside: float) -> None:
+    """`_two_steps`; ``beside``: what the second one's square may have besides its share."""
+    at, each = JACOBIAN * LANES + k, N * LANES
+    J = (
+        six(rows, at, LANES), six(rows, at + each, LANES), six(rows, at + 2 * each, LANES),
+        six(rows, at + 3 * each, LANES), six(rows, at + 4 * each, LANES),
+        six(rows, at + 5 * each, LANES),
+    )  # fmt: skip
+    P, R = _nine(rows, DAMPED * LANES + k, LANES), _nine(rows, (DAMPED + 9) * LANES + k, LANES)
+    y, x = six(rows, STEPS * LANES + k, LANES), six(rows, (STEPS + N) * LANES + k, LANES)
+    q, aim = six(rows, CAME * LANES + k, LANES), frame(rows, AIM * LANES + k, LANES)
+    frames = frames_found(c, rows, k, LANES)
+    y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
+    good &= second <= BESIDE * BESIDE * first + beside
+    _put_frames(frames, rows, k, LANES)
+    put(y, rows, STEPS * LANES + k, LANES)
+    put(x, rows, (STEPS + N) * LANES + k, LANES)
+    found = FOUND * LANES + k
+    rows[found] = rows[found] if good else 0.0
+    rows[found + LANES], rows[found + 2 * LANES] = first, second
+
+
+@lean
+def _end_lane(c: Array, rows: Array, k: int) -> None:
+    fine, weak, found, first, second, _ = six(rows, FINE * LANES + k, LANES)
+    solved = (found > 0.5) & (first <= NEAR * NEAR) & (second <= SHORT * SHORT)
+    x, error = six(rows, (STEPS + N) * LANES + k, LANES), six(rows, ERROR * LANES + k, LANES)
+    aim, end = frame(rows, AIM * LANES + k, LANES), frame(rows, TOOL_FRAME * LANES + k, LANES)
+    last, _ = residual(aim, end)
+    _end(c, x, error, last, fine > 0.5, solved, weak, rows, k, LANES)
 
 
 @kernel
 def correct_lanes(c: Array, rows: Array) -> None:
     """`correct_one` for sixteen points."""
-    if c[LARGE] > 0.5:
-        for k in range(LANES):
-            correct(c, rows, k, LANES, True)
-        return
     for k in range(LANES):
-        correct(c, rows, k, LANES, False)
+        _begin_lane(c, rows, k)
+    for i in range(4 if c[LARGE] > 0.5 else 3):
+        beside = 0.0 if i == 0 else np.inf
+        for k in range(LANES):
+            _two_steps_lane(c, rows, k, beside)
+    for k in range(LANES):
+        _end_lane(c, rows, k)

@@ -22,10 +22,10 @@ from robocal_ros.correction.damping import (
 )
 from robocal_ros.correction.six_axis import (
     ACTUAL,
+    AIM,
     CAME,
     GOES,
     LANES,
-    LARGE,
     SAID,
     Frame,
     Frames,
@@ -52,7 +52,7 @@ CONSTANTS = LOADS + 2 * LOAD
 # those tried, with value and slope of their functions; squares of the step under load, of how that
 # changed the load, and of the step behind it.
 GIVEN = six_axis.ROWS
-AIM, WINDS, WOUND, TRIED, VALUE, SLOPE, STEPS = (GIVEN + N * k for k in (1, 3, 4, 5, 6, 7, 8))
+WINDS, WOUND, TRIED, VALUE, SLOPE, STEPS = (GIVEN + N * k for k in range(1, 7))
 ROWS = STEPS + 3
 # Squares (rad^2): the longest last steps, whose own squares are rounding, and what load may leave
 # of them: of a step the square of the share by which it changed the load, of that behind it that.
@@ -194,41 +194,28 @@ def _over(x: Six, y: Six) -> Six:
 @lean
 def _turn(c: Array, rows: Array, k: int, lanes: int) -> None:
     """What a rigid reference arm would read."""
-    q = six(rows, GIVEN, k, lanes)
+    q = six(rows, GIVEN * lanes + k, lanes)
     _, w = _carried(c, 0, LOADS, six_axis.walk(c, 0, q))
-    turned = more(more(q, 1.0, six(rows, VALUE, k, lanes)), 1.0, _wound(c, LOADS, w))
-    put(turned, rows, CAME, k, lanes)
-
-
-@lean
-def _correct(c: Array, rows: Array, k: int, lanes: int, large: bool) -> None:
-    """What `six_axis` makes of it, and how far load winds the actual arm before and behind."""
-    load = LOADS + LOAD
-    aim, begin, end = six_axis.correct(c, rows, k, lanes, large)
-    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = aim
-    put((x0, x1, x2, y0, y1, y2), rows, AIM, k, lanes)
-    put((z0, z1, z2, p0, p1, p2), rows, AIM + N, k, lanes)
-    _, w = _carried(c, ACTUAL, load, begin)
-    put(_wound(c, load, w), rows, WINDS, k, lanes)
-    _, w = _carried(c, ACTUAL, load, end)
-    put(_wound(c, load, w), rows, WOUND, k, lanes)
+    turned = more(more(q, 1.0, six(rows, VALUE * lanes + k, lanes)), 1.0, _wound(c, LOADS, w))
+    put(turned, rows, CAME * lanes + k, lanes)
 
 
 @lean
 def _wind(c: Array, rows: Array, k: int, lanes: int) -> None:
-    """How far load winds the actual arm at the joints given, where others came of them."""
-    w = _carried(c, ACTUAL, LOADS + LOAD, six_axis.walk(c, ACTUAL, six(rows, GIVEN, k, lanes)))[1]
-    put(_wound(c, LOADS + LOAD, w), rows, WINDS, k, lanes)
+    """How far load winds the actual arm at the joints given, and at those that `six_axis` found."""
+    load = LOADS + LOAD
+    w = _carried(c, ACTUAL, load, six_axis.walk(c, ACTUAL, six(rows, GIVEN * lanes + k, lanes)))[1]
+    put(_wound(c, load, w), rows, WINDS * lanes + k, lanes)
+    w = _carried(c, ACTUAL, load, six_axis.frames_found(c, rows, k, lanes))[1]
+    put(_wound(c, load, w), rows, WOUND * lanes + k, lanes)
 
 
 @lean
 def _shift(c: Array, rows: Array, k: int, lanes: int) -> None:
     """The error at the tool without a correction: that of the true arms."""
-    turned = more(six(rows, GIVEN, k, lanes), 1.0, six(rows, VALUE, k, lanes))
-    here = six_axis.walk(c, ACTUAL, more(turned, 1.0, six(rows, WINDS, k, lanes)))[6]
-    x0, x1, x2, y0, y1, y2 = six(rows, AIM, k, lanes)
-    z0, z1, z2, p0, p1, p2 = six(rows, AIM + N, k, lanes)
-    e, near = six_axis.residual((x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2), here)
+    turned = more(six(rows, GIVEN * lanes + k, lanes), 1.0, six(rows, VALUE * lanes + k, lanes))
+    here = six_axis.walk(c, ACTUAL, more(turned, 1.0, six(rows, WINDS * lanes + k, lanes)))[6]
+    e, near = six_axis.residual(six_axis.frame(rows, AIM * lanes + k, lanes), here)
     put_sizes(e, rows, SAID + TCP_SHIFT, SAID + TCP_ROTATION, k, lanes)
     at = (SAID + CONVERGED) * lanes + k
     rows[at] = rows[at] if near else 0.0
@@ -237,27 +224,29 @@ def _shift(c: Array, rows: Array, k: int, lanes: int) -> None:
 @lean
 def _try(rows: Array, at: int, k: int, lanes: int) -> float:
     """A step from joints ``at`` that load does not notice, with the functions alone; its square."""
-    q = six(rows, at, k, lanes)
-    turned = more(more(q, 1.0, six(rows, VALUE, k, lanes)), 1.0, six(rows, WOUND, k, lanes))
-    step = more(six(rows, GOES, k, lanes), -1.0, turned)
-    step = _over(step, six(rows, SLOPE, k, lanes))
-    put(more(q, 1.0, step), rows, TRIED, k, lanes)
+    q = six(rows, at * lanes + k, lanes)
+    turned = more(
+        more(q, 1.0, six(rows, VALUE * lanes + k, lanes)), 1.0, six(rows, WOUND * lanes + k, lanes)
+    )
+    step = more(six(rows, GOES * lanes + k, lanes), -1.0, turned)
+    step = _over(step, six(rows, SLOPE * lanes + k, lanes))
+    put(more(q, 1.0, step), rows, TRIED * lanes + k, lanes)
     return dot(step, step)
 
 
 @lean
 def _step(c: Array, rows: Array, k: int, lanes: int) -> None:
     """A step towards the joints of which a rigid arm reads what is wanted, and the load there."""
-    q, load = six(rows, TRIED, k, lanes), LOADS + LOAD
+    q, load = six(rows, TRIED * lanes + k, lanes), LOADS + LOAD
     a, w = _carried(c, ACTUAL, load, six_axis.walk(c, ACTUAL, q))
     wound = _wound(c, load, w)
-    turned = more(more(q, 1.0, six(rows, VALUE, k, lanes)), 1.0, wound)
-    step = more(six(rows, GOES, k, lanes), -1.0, turned)
-    step = _over(step, six(rows, SLOPE, k, lanes))
+    turned = more(more(q, 1.0, six(rows, VALUE * lanes + k, lanes)), 1.0, wound)
+    step = more(six(rows, GOES * lanes + k, lanes), -1.0, turned)
+    step = _over(step, six(rows, SLOPE * lanes + k, lanes))
     # a share of it is what the arm turns for the load's change, a share of that for its change
     change = _wound_by(c, load, a, w, more(step, -1.0, _wound_by(c, load, a, w, step)))
-    put(more(more(q, 1.0, step), -1.0, change), rows, TRIED, k, lanes)
-    put(more(wound, 1.0, change), rows, WOUND, k, lanes)
+    put(more(more(q, 1.0, step), -1.0, change), rows, TRIED * lanes + k, lanes)
+    put(more(wound, 1.0, change), rows, WOUND * lanes + k, lanes)
     rows[STEPS * lanes + k] = dot(step, step)
     rows[(STEPS + 1) * lanes + k] = dot(change, change)
 
@@ -271,7 +260,7 @@ def _end(rows: Array, k: int, lanes: int) -> None:
     small = (step <= UNDER_LOAD) & (behind <= BEHIND)
     small &= (change * change * change <= LEFT * step * step) & (change * behind <= LEFT * step)
     rows[at] = rows[at] if small else 0.0
-    put(six(rows, TRIED, k, lanes), rows, GOES, k, lanes)
+    put(six(rows, TRIED * lanes + k, lanes), rows, GOES * lanes + k, lanes)
 
 
 @kernel
@@ -287,11 +276,9 @@ def turn(c: Array, layer: Array, rows: Array, lanes: int) -> None:
 
 
 @kernel
-def correct_one(c: Array, layer: Array, rows: Array, taught: bool) -> None:
-    """`six_axis.correct_one`, with the joints read and the shift at the tool of the true arms."""
-    _correct(c, rows, 0, 1, c[LARGE] > 0.5)
-    if taught:
-        _wind(c, rows, 0, 1)
+def read_one(c: Array, layer: Array, rows: Array) -> None:
+    """Joints of what `six_axis` found, and the shift at the tool of the true arms."""
+    _wind(c, rows, 0, 1)
     splines(layer, rows, GIVEN, 1)
     _shift(c, rows, 0, 1)
     splines(layer, rows, GOES, 1)
@@ -303,17 +290,10 @@ def correct_one(c: Array, layer: Array, rows: Array, taught: bool) -> None:
 
 
 @kernel
-def correct_lanes(c: Array, layer: Array, rows: Array, taught: bool) -> None:
-    """`correct_one` for sixteen points."""
-    if c[LARGE] > 0.5:
-        for k in range(LANES):
-            _correct(c, rows, k, LANES, True)
-    else:
-        for k in range(LANES):
-            _correct(c, rows, k, LANES, False)
-    if taught:
-        for k in range(LANES):
-            _wind(c, rows, k, LANES)
+def read_lanes(c: Array, layer: Array, rows: Array) -> None:
+    """`read_one` for sixteen points."""
+    for k in range(LANES):
+        _wind(c, rows, k, LANES)
     splines(layer, rows, GIVEN, LANES)
     for k in range(LANES):
         _shift(c, rows, k, LANES)

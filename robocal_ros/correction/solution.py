@@ -27,7 +27,7 @@ from robocal_ros.correction.damping import (
 )
 from robocal_ros.correction.six_axis import CAME, GOES, LANES, N
 from robocal_ros.correction.six_functions import CONSTANTS, GIVEN, ROWS
-from robocal_ros.ground.compiled import kernel, lean
+from robocal_ros.ground.compiled import bare, lean
 from robocal_ros.kinematics import newton
 from robocal_ros.kinematics.kernels import (
     PER_STEP,
@@ -147,7 +147,7 @@ def room_in(work: Array, n: int) -> Workspace:
     )  # fmt: skip
 
 
-@lean
+@bare
 def prepare(
     models: Array, largest: Array, steepness: float, per_error: float, free: bool, work: Array
 ) -> None:
@@ -343,7 +343,7 @@ def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> N
         out[n + ROTATION_ERROR] = out[n + TCP_ROTATION]
 
 
-@kernel
+@bare
 def _correct_alone(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
     """A point (n,) of any arm, by `_correct`."""
     room = room_in(work, q.shape[0])
@@ -364,26 +364,32 @@ def _given(six: SixJoints) -> int:
 
 
 @lean
+def _solve_rigid(lanes: int, six: SixJoints) -> None:
+    """Solve the points of ``lanes``, whose joints stand in the first rows."""
+    if lanes == 1:
+        six_axis.correct_one(six.constants, six.rows)
+    else:
+        six_axis.correct_lanes(six.constants, six.rows)
+
+
+@lean
 def _solve(lanes: int, six: SixJoints, work: Array) -> None:
     """Solve the points of ``lanes``, whose joints stand in the rows `_given`."""
-    constants, rows = six.constants, six.rows
     if six.settings[TURNS] < 0.5:
-        if lanes == 1:
-            six_axis.correct_one(constants, rows)
-        else:
-            six_axis.correct_lanes(constants, rows)
+        _solve_rigid(lanes, six)
         return
+    constants, rows = six.constants, six.rows
     taught_layer, layer = layers_in(work, N)
-    taught = six.settings[TAUGHT_TURNS] > 0.5
-    if taught:
+    if six.settings[TAUGHT_TURNS] > 0.5:
         six_functions.turn(constants, taught_layer, rows, lanes)
     else:
         for k in range(N * lanes):
             rows[CAME * lanes + k] = rows[GIVEN * lanes + k]
+    _solve_rigid(lanes, six)
     if lanes == 1:
-        six_functions.correct_one(constants, layer, rows, taught)
+        six_functions.read_one(constants, layer, rows)
     else:
-        six_functions.correct_lanes(constants, layer, rows, taught)
+        six_functions.read_lanes(constants, layer, rows)
 
 
 @lean
@@ -408,7 +414,7 @@ def _correct_one(q: Array, largest: Array, free: bool, work: Array, out: Array) 
         _correct_alone(q, largest, free, work, out)
 
 
-@lean
+@bare
 def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Array) -> None:
     """One point (n,) through k stages with ``works`` (k, size); ``out`` (k, n + 7)."""
     n = q.shape[0]
@@ -417,7 +423,7 @@ def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Arra
         _correct_one(start, largest[stage], free, works[stage], out[stage])
 
 
-@lean
+@bare
 def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
     """Joints that put the actual tool where the reference tool is at ``q`` (m, n).
 
@@ -439,7 +445,7 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
         _correct_one(q[i], largest, free, work, out[i])
 
 
-@lean
+@bare
 def uncorrect_staged(
     corrected: Array, largest: Array, free: bool, works: Array, steps: int, exact: float,
     out: Array, q: Array,
@@ -476,7 +482,7 @@ def _stand(q: Array, links: Array, root: Array, tool: Array, room: Workspace) ->
     newton.columns(links, room.frames, room.here, room.J)
 
 
-@lean
+@bare
 def rates_at(
     q: Array, qd: Array, qdd: Array, corrected: Array, first: Array, last: Array,
     velocity: Array, acceleration: Array,
@@ -509,7 +515,7 @@ def rates_at(
     return newton.largest_of(velocity) < np.inf
 
 
-@lean
+@bare
 def rates_batch(
     q: Array, qd: Array, qdd: Array, corrected: Array, first: Array, last: Array, out_v: Array,
     out_a: Array,
@@ -538,7 +544,7 @@ def velocity_by_differences(
         out[j] = velocity[j] + ((report[last, j] - at[j]) - (corrected[j] - q[j])) / h
 
 
-@lean
+@bare
 def taught_velocity(
     corrected: Array, velocity: Array, q: Array, largest: Array, free: bool, works: Array,
     back: Array, report: Array, spare: Array, out: Array,

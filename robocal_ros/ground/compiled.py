@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
@@ -32,6 +33,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 caching: Any = untyped  # numba is typed here and there
 llvm: Any = untyped_llvm
 events: Any = untyped_event
+# LLVM works on several points of a loop at a time where it can compare where the arrays in it lie.
+# It takes so many places in one array as one, else a hundred: `six_axis` has more.
+llvm.set_option("", "-memory-check-merge-threshold=1000")
 THIS_FILE = Path(__file__)
 PACKAGE = THIS_FILE.parents[1]
 MARK = b"\nfrom robocal_ros.ground.compiled import "  # how a module that has kernels is known
@@ -40,18 +44,26 @@ MARK = b"\nfrom robocal_ros.ground.compiled import "  # how a module that has ke
 def kernel(function: Function) -> Function:
     """Decorator: compile with numba, without the interpreter's lock, and keep the machine code.
 
-    What a kernel uses of ours, functions and constants, lies in modules that have kernels.
+    There is one machine code of it, which other kernels call. What a kernel uses of ours, functions
+    and constants, lies in modules that have kernels.
     """
     return _compiled(function, "never")
 
 
-def lean(function: Function) -> Function:
-    """Decorator: as `kernel`, for a small function that makes no array, only parts of given ones.
+def bare(function: Function) -> Function:
+    """Decorator: as `kernel`, for a function that makes no array, only parts of given ones.
 
-    Its machine code goes into each caller's, and no references are counted in it: both would take
-    longer than its work.
+    No references are counted in it, which would take longer than its work.
     """
-    return _compiled(function, "never", lean=True)
+    return _compiled(function, "never", counts=False)
+
+
+def lean(function: Function) -> Function:
+    """Decorator: as `bare`, for a small function, or one that is called at one place.
+
+    It is compiled again into each caller: of a large one that takes the compiler long.
+    """
+    return _compiled(function, "never", counts=False, is_part=True)
 
 
 def inlined(function: Function) -> Function:
@@ -60,13 +72,16 @@ def inlined(function: Function) -> Function:
 
 
 def _compiled(
-    function: Function, inline: Literal["never", "always"], lean: bool = False
+    function: Function,
+    inline: Literal["never", "always"],
+    counts: bool = True,
+    is_part: bool = False,
 ) -> Function:
-    options: dict[str, Any] = {"inline": inline, "forceinline": lean, "_nrt": not lean}
+    options: dict[str, Any] = {"inline": inline, "forceinline": is_part, "_nrt": counts}
     compiler: Any = numba.njit(nogil=True, error_model="numpy", **options)
     made = compiler(function)
     if made is not function:  # as it is with NUMBA_DISABLE_JIT
-        made._cache = _KeptCode(function)
+        made._cache = _KeptCode(function, is_part)
     return cast(Function, made)
 
 
@@ -139,27 +154,38 @@ class _LastLocator(caching._CacheLocator):  # type: ignore[misc]
 class _Places(caching.CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = (*caching.CompileResultCacheImpl._locator_classes, _LastLocator)
 
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Rebuild kept code; its bitcode is read when a kernel is built from it.
+    def reduce(self, cres: Any) -> Any:
+        """Keep with it of which kernels it calls the code."""
+        declared = (f.name for f in cres.library._final_module.functions if f.is_declaration)
+        called = [(symbol, *_called[symbol]) for symbol in declared if symbol in _called]
+        return called, super().reduce(cres)
 
-        Of the start of a node that reading is half a second, and no node builds kernels.
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """Rebuild kept code behind that of the kernels that it calls.
+
+        Its bitcode is read when a kernel is built from it: of the start of a node that reading is
+        half a second, and no node builds kernels.
         """
-        (name, kind, (code, bitcode)), described, *rest = payload
+        called, ((name, kind, (code, bitcode)), described, *rest) = payload
         engine = target_context.codegen()._engine
+        for symbol, module, function, sig in called:
+            getattr(import_module(module), function).compile(sig)
+            if symbol not in engine._defined_symbols:  # LLVM would end the process
+                raise LookupError(f"{function} was compiled anew, and so must be what calls it")
         engine._defined_symbols |= {
             described.llvm_func_name,
             described.llvm_cpython_wrapper_name,
             described.env_name,
         }
-        kept = (name, kind, (code, _nothing()))
+        kept = (name, kind, (code, _nothing().as_bitcode()))
         found = super().rebuild(target_context, (kept, described, *rest))
         found.library._get_module_for_linking = cache(lambda: _parsed(engine, bitcode))
         return found
 
 
 @cache
-def _nothing() -> bytes:
-    return bytes(llvm.parse_assembly("").as_bitcode())
+def _nothing() -> Any:
+    return llvm.parse_assembly("")
 
 
 def _parsed(engine: Any, bitcode: bytes) -> Any:
@@ -178,8 +204,9 @@ class _KeptCode(caching.FunctionCache):  # type: ignore[misc]
     _impl_class = _Places
     _cache_file: Any
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: Any, is_part: bool) -> None:
         super().__init__(function)
+        self._is_part, self._where = is_part, (function.__module__, function.__name__)
         own, digest = self._cache_file, _digest_of_sources()
         own._source_stamp = digest
         beside = str(Path(inspect.getfile(function)).parent / "__pycache__")
@@ -200,11 +227,19 @@ class _KeptCode(caching.FunctionCache):  # type: ignore[misc]
             except Exception:
                 continue
             if found is not None:
+                self._offer(sig, found)
                 return found
         return None
 
+    def _offer(self, sig: Any, made: Any) -> None:
+        """Let callers call this code, where nothing is built into them."""
+        if not self._is_part:
+            made.library._shared_module = _nothing()
+            _called[made.fndesc.llvm_func_name] = (*self._where, sig)
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what was compiled, where that is possible."""
+        self._offer(sig, data)
         self._cache_file = self._files[-1]
         try:
             if not _index(self._cache_file):
@@ -220,6 +255,7 @@ class _KeptCode(caching.FunctionCache):  # type: ignore[misc]
 
 
 _made: list[_KeptCode] = []
+_called: dict[str, tuple[str, str, Any]] = {}  # by symbol: module, function, types of arguments
 _warned: list[str] = []
 
 

@@ -118,7 +118,7 @@ class HouseNode(EndpointNode):
         if compiled is not None and compiled.is_cold():
             self.get_logger().warning(
                 "no machine code of the kernels is kept for this software and processor: they are "
-                "compiled now, which takes up to two minutes once; 'robocal warm' does it before"
+                "compiled now, which takes about a minute once; 'robocal warm' does it before"
             )
         self.configure()
 

@@ -69,6 +69,29 @@ def test_a_new_kernel_is_built_from_kept_code_and_an_edit_compiles_it_again(tree
     assert walk(tree)[0] == right
 
 
+CALLER = """
+import numpy as np
+from robocal_ros.kinematics.kernels import _turn_block, fk_batch
+T = np.empty((1, 4, 4))
+links = np.array([[0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0]])
+fk_batch(np.array([[0.5]]), links, np.eye(4), T)
+print(float(T[0, 0, 3]), sum(sum(k.stats.cache_hits.values()) for k in (fk_batch, _turn_block)))
+"""
+
+
+def test_a_kernel_calls_the_kept_code_of_another_and_is_made_again_with_it(tree):
+    right = pytest.approx(0.8775825618903728, abs=1e-15)
+    assert walk(tree, CALLER) == (right, 0)
+    assert walk(tree, CALLER) == (right, 2)
+    called = list((tree / "kept").rglob("kernels._turn_block-*"))
+    assert called
+    for path in called:
+        path.unlink()
+    # by another name than before, as other kernels are compiled first
+    assert walk(tree, WALK + CALLER) == (right, 0)
+    assert walk(tree, CALLER) == (right, 2)
+
+
 def modules(path: Path) -> set[Path]:
     """Modules of ours that a module imports."""
     found = set()
