@@ -22,7 +22,7 @@ from robocal_ros.cli.main import (
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text, write_text
 from robocal_ros.ground.frames import Array, log_rotation, transform_document
-from robocal_ros.identification.known_model import known_model
+from robocal_ros.identification.known_model import KnownModel, known_model
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_yaml, save_robot
 from robocal_ros.kinematics.tables import read_joints
@@ -182,7 +182,8 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
     steps = np.arange(_ROWS_PER_KNOT * knots + 1)[:, None] / _ROWS_PER_KNOT
     q = functions.first + functions.step * steps
     delta, slope = functions.delta(q), functions.slope(q)
-    known = None if functions.identified_from is None else known_model(arm)
+    kept = functions.identified_from is not None
+    known = known_model(arm) if kept or args.data is not None else None
     sigma = np.full(q.shape, np.nan) if known is None else known.function_sigma(q)
     joints: list[Any] = []  # names of fields have the joint's unit
     rows = ["joint,q,q_unit,delta,delta_unit,slope,sigma"]
@@ -213,7 +214,7 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
         "robot": arm.name,
         "model_hash": arm.model_hash,
         "joints": joints,
-        "predicted": None if args.data is None else _predicted(arm, args.data),
+        "predicted": _predicted(known, arm, args.data) if known and args.data else None,
         "figures": None,
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,
@@ -230,9 +231,9 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _predicted(arm: SerialArm, path: Path) -> "PredictedErrorDocument":
+def _predicted(known: KnownModel, arm: SerialArm, path: Path) -> "PredictedErrorDocument":
     """Error to expect of the first target at the poses of a table, base and target placed there."""
-    known, q = known_model(arm), read_joints(path, arm)
+    q = read_joints(path, arm)
     variance = known.predicted_variance(q, np.zeros(len(q), dtype=np.int64), ("base", "tool"))
     error_mm = 1e3 * np.sqrt(np.trace(variance, axis1=1, axis2=2))
     return {
