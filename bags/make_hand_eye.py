@@ -77,6 +77,7 @@ from robocal_ros.hand_eye.targets import (
     StepTarget,
     read_target,
 )
+from robocal_ros.kinematics.joint_errors import SIZE_URAD
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session.events import Outcome
 
@@ -100,7 +101,10 @@ DELAY_S = 0.04  # of a profile's message behind its stamp
 MICROMETRE = 1e-6
 TRUTH, FRAME = "/truth/hand_eye", "laser"
 CONFIG = HandEyeConfig(
-    sensor_frame=FRAME, sensor=sensor_of("", "towards"), capture_timeout_s=TIMEOUT_S
+    sensor_frame=FRAME,
+    sensor=sensor_of("", "towards"),
+    capture_timeout_s=TIMEOUT_S,
+    joint_error_rad=1e-6 * SIZE_URAD,
 )
 CLOUD_FIELDS = [
     {"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate("xyz")

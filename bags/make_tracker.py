@@ -28,6 +28,7 @@ from robocal_ros.hand_eye.data import SCAN
 from robocal_ros.hand_eye.profiles import sensor_of
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.hand_eye.targets import FACES, SPHERE, read_target, target_document
+from robocal_ros.kinematics.joint_errors import SIZE_URAD
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome
@@ -44,7 +45,10 @@ TIMEOUT_S = 1.0
 BROKEN, AGAIN_S = 3, 1.6  # capture that the tracker does not see at first; asked for again then
 CORNERS = [0, 2, 4, 6, 8]  # of nine points on a face
 CONFIG = HandEyeConfig(
-    sensor_frame=FRAME, sensor=sensor_of("", "away"), capture_timeout_s=TIMEOUT_S
+    sensor_frame=FRAME,
+    sensor=sensor_of("", "away"),
+    capture_timeout_s=TIMEOUT_S,
+    joint_error_rad=1e-6 * SIZE_URAD,
 )
 
 

@@ -49,7 +49,7 @@ from robocal_ros.hand_eye.targets import (
     Staircase,
     StepTarget,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, ShotJoints, Task
 
 Array = NDArray[np.float64]
 
@@ -85,8 +85,8 @@ class Calibration:
         return solve_task(self.task(method == "classic"), self.data, method, SETTINGS)
 
 
-def data_of(shots: SimulatedShots) -> HandEyeData:
-    """As an operator has them."""
+def data_of(shots: SimulatedShots, robot: Robot) -> HandEyeData:
+    """As an operator of the robot has them."""
     names = tuple(f"shot {i + 1}" for i in range(len(shots.profiles)))
     profiles: list[Profile | RobocalError] = []
     for points, name in zip(shots.profiles, names, strict=True):
@@ -94,9 +94,11 @@ def data_of(shots: SimulatedShots) -> HandEyeData:
             profiles.append(profile_of(points, name))
         except RobocalError as error:
             profiles.append(error)
-    return HandEyeData(
-        names, shots.T_base_flange, profiles, tuple(shots.marks) if any(shots.marks) else None
-    )
+    marks = tuple(shots.marks) if any(shots.marks) else None
+    joints = None
+    if isinstance(robot, ArmRobot) and shots.q is not None:
+        joints = ShotJoints(robot.nominal, shots.q)
+    return HandEyeData(names, shots.T_base_flange, profiles, marks, joints)
 
 
 def known_to(robot: Robot) -> Array:
@@ -109,21 +111,20 @@ def known_to(robot: Robot) -> Array:
 
 def sphere_set(cell: HandEyeCell, rng: np.random.Generator, poses: int = 15) -> Calibration:
     """A sphere."""
-    return Calibration(
-        SphereTarget(RADIUS_M), data_of(sphere_shots(cell, CENTRE, RADIUS_M, poses, rng))
-    )
+    shots = sphere_shots(cell, CENTRE, RADIUS_M, poses, rng)
+    return Calibration(SphereTarget(RADIUS_M), data_of(shots, cell.robot))
 
 
 def edge_set(cell: HandEyeCell, rng: np.random.Generator, poses: int = 15) -> Calibration:
     """An edge, unknown."""
-    return Calibration(None, data_of(edge_shots(cell, T_BASE_USER, poses, rng)))
+    return Calibration(None, data_of(edge_shots(cell, T_BASE_USER, poses, rng), cell.robot))
 
 
 def known_edge_set(cell: HandEyeCell, rng: np.random.Generator, poses: int = 15) -> Calibration:
     """An edge, known."""
     T = known_to(cell.robot) @ T_BASE_USER
     shots = edge_shots(cell, T_BASE_USER, poses, rng)
-    return Calibration(LineTarget(T[:3, 3], T[:3, 0]), data_of(shots))
+    return Calibration(LineTarget(T[:3, 3], T[:3, 0]), data_of(shots, cell.robot))
 
 
 def step_set(
@@ -142,7 +143,7 @@ def step_set(
     target = StepTarget(
         T, corners, STAIRCASE.edge_user, told_m, user_sigma_m=told[0], user_sigma_rad=told[1]
     )
-    return Calibration(target, data_of(shots))
+    return Calibration(target, data_of(shots, cell.robot))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +179,7 @@ class World:
         """Shots from these poses, which err anew."""
         cell = HandEyeCell(robot=self.robot)
         shots = cell.shoot(self.scene, self.wanted, len(self.wanted), rng)
-        return Calibration(self.target, data_of(shots))
+        return Calibration(self.target, data_of(shots, self.robot))
 
     def least(self, made: Calibration, pivot: Array) -> tuple[Least, Array]:
         """The bound of what these shots show, and the estimator's own at the truth (6, 6)."""

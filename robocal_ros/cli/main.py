@@ -170,6 +170,14 @@ def positive(value: str) -> float:
     return _between(value, math.inf, "a number above 0")
 
 
+def from_zero(value: str) -> float:
+    """Type of a finite number, zero or above."""
+    with contextlib.suppress(ValueError):
+        if float(value) == 0.0:
+            return 0.0
+    return _between(value, math.inf, "a number from 0")
+
+
 def share(value: str) -> float:
     """Type of a share between 0 and 1."""
     return _between(value, 1.0, "a share between 0 and 1")
@@ -224,6 +232,33 @@ def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
         metavar="S",
         help=f"noise of a coordinate of one visit{more}; default {SIGMA_MM}",
     )
+
+
+def add_joint_error(parser: "argparse._ActionsContainer") -> None:
+    """Offer ``--joint-error-urad``; None where it is not given."""
+    from robocal_ros.kinematics.joint_errors import SIZE_URAD
+
+    parser.add_argument(
+        "--joint-error-urad",
+        type=from_zero,
+        metavar="E",
+        help="joints turn by so much, rms, otherwise than they read, where the robot's model has "
+        f"no joint functions; default {SIZE_URAD:g}, as a UR10's; 0: nothing is said of it",
+    )
+
+
+def joint_error_rad(args: argparse.Namespace, known: bool = True) -> float:
+    """What is given there, or the default; 0 where it is not offered.
+
+    Raises `InputError` where it is given, but no joints are ``known``.
+    """
+    from robocal_ros.kinematics.joint_errors import SIZE_URAD
+
+    given = getattr(args, "joint_error_urad", 0.0)
+    if given and not known:
+        words = "--joint-error-urad needs the joints of each pose: give these, and --robot"
+        raise InputError(words)
+    return 1e-6 * (SIZE_URAD if given is None else float(given))
 
 
 def add_state(parser: argparse.ArgumentParser) -> None:

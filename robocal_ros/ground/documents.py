@@ -137,6 +137,14 @@ class ErrorsDocument(TypedDict):
     n: Ordinal
 
 
+class JointErrorsDocument(TypedDict):
+    """What joints that err add to what was found, where the model does not hold it."""
+
+    size_urad: Annotated[NotNegative, "Of a joint, rms: as given, or less where less is seen."]
+    sigma_mm: Annotated[ThreeSigmas, "What they add to a place, along the axes of its covariance."]
+    factor: Annotated[NotNegative, "How many of the sigmas that are told it is off with them."]
+
+
 class JudgedErrorsDocument(TypedDict):
     held_out: Annotated[ErrorsDocument, "Of every held-out row."]
     held_out_robust: NotRequired[

@@ -18,7 +18,9 @@ from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
     Document,
+    add_joint_error,
     input_topic,
+    joint_error_rad,
     positive,
     print_table,
     print_verdict,
@@ -69,7 +71,7 @@ from robocal_ros.hand_eye.targets import (
     TrackerTarget,
     read_target,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData
+from robocal_ros.hand_eye.tasks import HandEyeData, ShotJoints
 from robocal_ros.hand_eye.touch_test import TouchTest, compared, touch_test
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot, read_fields
@@ -220,14 +222,16 @@ def robot_sigma_of(args: argparse.Namespace) -> tuple[float | None, float | None
     )
 
 
-def settings_of(args: argparse.Namespace) -> HandEyeSettings:
-    """What is known of the robot, and what is good enough.
+def settings_of(args: argparse.Namespace, joints: bool = True) -> HandEyeSettings:
+    """What is known of the robot, and what is good enough; ``joints``: whether they are known.
 
-    Raises `InputError` for an orientation's noise alone.
+    Raises `InputError` for an orientation's noise alone; further as `joint_error_rad`.
     """
     if args.robot_sigma_mm is None and args.robot_sigma_deg is not None:
         raise InputError("--robot-sigma-deg goes with --robot-sigma-mm: give both, or the latter")
-    return HandEyeSettings(*robot_sigma_of(args), limit_m=args.limit_mm * 1e-3)
+    joint_rad = joint_error_rad(args, joints)
+    sigma = robot_sigma_of(args)
+    return HandEyeSettings(*sigma, limit_m=args.limit_mm * 1e-3, joint_error_rad=joint_rad)
 
 
 def arm_of(args: argparse.Namespace) -> SerialArm | None:
@@ -272,7 +276,9 @@ def read_shots(
     """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table, sensor)
-    return ReadShots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
+    joints = None if table.q is None or arm is None else ShotJoints(arm, table.q)
+    data = HandEyeData(table.names, table.T_base_flange, seen, table.mark, joints)
+    return ReadShots(data, table)
 
 
 def require_unused(judges: PoseTable, used: PoseTable) -> None:
@@ -336,6 +342,7 @@ def _saved(path: Path, arm: SerialArm) -> HandEyeData:
         flange_poses(q, [sample.thermal for sample in samples], arm),
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
         marks if any(marks) else None,
+        ShotJoints(samples[0].thermal.arm(arm), q),
     )
 
 
@@ -365,6 +372,7 @@ def _recorded(recording: BagOverview, arm: SerialArm, sensor: SensorDescription)
         np.array([arm.fk(one.q) for one in kept]),
         [Profile(one.shot.read(), one.name) for one in kept],
         marks if any(marks) else None,
+        ShotJoints(arm, np.array([one.q for one in kept])),
     ), rejected
 
 
@@ -466,6 +474,7 @@ def add_target_action(kind: str, parser: argparse.ArgumentParser) -> None:
     add_shots(parser)
     parser.add_argument("--method", choices=METHODS, default=METHODS[0])
     add_limits(parser, "default: from the residuals")
+    add_joint_error(parser)
     parser.add_argument(
         "--check",
         type=Path,
@@ -485,11 +494,12 @@ def add_target_action(kind: str, parser: argparse.ArgumentParser) -> None:
 
 def run_target(kind: str, args: argparse.Namespace) -> CliResult:
     """Do ``sphere``, ``step`` or ``line``. Raises `RobocalError` for what a user can mend."""
-    arm, settings = arm_of(args), settings_of(args)
+    arm = arm_of(args)
     target = given_target(kind, args.target, getattr(args, "radius_mm", None))
     classic, towards = args.method == "classic", described(args).towards
     task = task_of(target, getattr(args, "line_kind", None), classic, towards)
     shots = given_shots(args, arm)
+    settings = settings_of(args, shots.data.joints is not None)
     judges = None if args.check is None else given_shots(args, arm, args.check)
     if judges is not None:
         if judges.table is not None and shots.table is not None:
@@ -560,6 +570,7 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
     add_sensor(parser)
     add_robot(parser)
     add_limits(parser, "default: from the residuals")
+    add_joint_error(parser)
     parser.add_argument(
         "--check",
         type=text,
@@ -571,7 +582,7 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
 
 
 def run_joint(args: argparse.Namespace) -> CliResult:
-    arm, settings = arm_of(args), settings_of(args)
+    arm = arm_of(args)
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}
     if len(folders) < 2:
         raise InputError("give the folders of at least two of --sphere, --step, --line")
@@ -590,6 +601,7 @@ def run_joint(args: argparse.Namespace) -> CliResult:
             checks[task.kind] = judges.data
     if args.check is not None and not checks:
         raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
+    settings = settings_of(args, all(data.joints is not None for _, data in parts))
     result = solve_joint(parts, settings, checks)
     return CliResult(drawn_document(result, args, {}), show_mount)
 

@@ -318,14 +318,17 @@ class PoseModel:
     revision: int
     model: Document | None
 
+    def arm(self, nominal: SerialArm) -> SerialArm:
+        """The robot by it. Raises as `arm_of`."""
+        return nominal if self.model is None else arm_of(self.model, nominal)
+
 
 def flange_poses(q: Array, models: Sequence[PoseModel], nominal: SerialArm) -> Array:
     """T_base_flange (k, 4, 4), m, of joints (k, n), each by its own model."""
     found = np.zeros((len(q), 4, 4))
     for one in dict.fromkeys(models):
         rows = [i for i, model in enumerate(models) if model is one]
-        arm = nominal if one.model is None else arm_of(one.model, nominal)
-        found[rows] = arm.fk(q[rows])
+        found[rows] = one.arm(nominal).fk(q[rows])
     return found
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, NotRequired, TypedDict
 from robocal_ros.ground.documents import (
     Count,
     ErrorsDocument,
+    JointErrorsDocument,
     Matrix,
     Names,
     NotNegative,
@@ -123,6 +124,13 @@ class MountDocument(HandEyeResultDocument):
     working_distance_mm: NotRequired[float]
     spread: NotRequired[ErrorsDocument]
     linearity: NotRequired[UsedLinearityDocument]
+    joint_errors: NotRequired[
+        Annotated[
+            JointErrorsDocument | None,
+            "Of method best; null: the poses' joints are not known, or the robot file or the model "
+            "in force has joint functions.",
+        ]
+    ]
     held_out: Annotated[HeldOutDocument | None, "Of --check."]
 
 

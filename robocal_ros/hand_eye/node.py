@@ -55,7 +55,12 @@ from robocal_ros.ros.parameters import (
     pose_settings,
     standstill_rule,
 )
-from robocal_ros.ros.session_node import STATE_DIR, DecisionServices, SessionNode
+from robocal_ros.ros.session_node import (
+    JOINT_ERROR,
+    STATE_DIR,
+    DecisionServices,
+    SessionNode,
+)
 from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome, named
 
 WATCH_S = 0.1
@@ -114,6 +119,7 @@ SETTINGS = (
         1e-3,
         100.0,
     ),
+    JOINT_ERROR,
     Setting("tracker_frame", "tracker", "Name of a laser tracker's frame, in its messages"),
     number(
         "tracker_sigma_mm",
@@ -195,6 +201,7 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
         robot_sigma_m=settings["robot_sigma_mm"] * 1e-3 or None,
         robot_sigma_rad=float(np.radians(settings["robot_sigma_deg"])) or None,
         limit_m=settings["limit_mm"] * 1e-3,
+        joint_error_rad=settings["joint_error_urad"] * 1e-6,
         sensor=sensor_of(settings["sensor"], settings["z_grows"]),
         tracker_frame=settings["tracker_frame"],
         tracker_sigma_m=settings["tracker_sigma_mm"] * 1e-3,

@@ -68,12 +68,15 @@ class HandEyeSettings:
     is that shift at an arm's length of 3 m.
     ``limit_m``: largest expected error (rms) of a point in the field that the profiles cover.
     ``residual_m``: largest distance (rms) of samples from the target.
+    ``joint_error_rad``: rms by which joints turn otherwise than their encoders show, where the
+    model that poses are of does not hold it; 0: nothing is said of it.
     """
 
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
     limit_m: float = 1e-3
     residual_m: float = 2e-3
+    joint_error_rad: float = 0.0
 
     def noise(self) -> PoseNoise | None:
         """Of reported poses; None where it is to be estimated."""

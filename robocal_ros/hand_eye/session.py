@@ -96,6 +96,7 @@ class HandEyeConfig:
     error at the working distance that is accepted. ``sensor``: how a line laser tells its profiles.
     ``tracker_frame``: of the points of a laser tracker; ``tracker_sigma_m``: of a coordinate of
     one; ``joint_sigma_rad``, ``joint_sigma_m``: of a joint that moves between its visits.
+    ``joint_error_rad``: see `HandEyeSettings`.
     """
 
     base_frame: str = "base"
@@ -111,6 +112,7 @@ class HandEyeConfig:
     tracker_sigma_m: float = 1.5e-5
     joint_sigma_rad: float = float(np.radians(0.0029))
     joint_sigma_m: float = 2e-5
+    joint_error_rad: float = 0.0
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "HandEyeConfig":
@@ -193,7 +195,7 @@ def solved(
         return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
     from robocal_ros.hand_eye.solve import solve_task
     from robocal_ros.hand_eye.stairs import task_of
-    from robocal_ros.hand_eye.tasks import HandEyeData
+    from robocal_ros.hand_eye.tasks import HandEyeData, ShotJoints
 
     names = tuple(str(sample.handle) for sample in samples)
     shots = HandEyeData(
@@ -201,8 +203,14 @@ def solved(
         T_base_flange,
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
         tuple(sample.mark for sample in samples) if data.kind == "step" else None,
+        ShotJoints(samples[0].thermal.arm(nominal), np.array([sample.q for sample in samples])),
     )
-    settings = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad, config.limit_m)
+    settings = HandEyeSettings(
+        config.robot_sigma_m,
+        config.robot_sigma_rad,
+        config.limit_m,
+        joint_error_rad=config.joint_error_rad,
+    )
     target: Any = target_of(data.target)
     task = task_of(target, data.feature, method == "classic", config.sensor.towards)
     return solve_task(task, shots, cast(Method, method), settings)
@@ -239,7 +247,7 @@ def _solved_tracker(
 
     first, second = (Arc(mark, readings(mark), points(mark)) for mark in ARCS)
     measured = TrackerData(
-        arm=nominal if model.model is None else arm_of(model.model, nominal),
+        arm=model.arm(nominal),
         arcs=(first, second),
         sphere=points(SPHERE),
         faces=(points(FACES[0]), points(FACES[1])),

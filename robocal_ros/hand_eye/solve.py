@@ -18,6 +18,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Document
+from robocal_ros.hand_eye.erring import judged_with_joints
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
     LARGEST_POSE_M,
@@ -64,7 +65,7 @@ from robocal_ros.hand_eye.result import (
     judge_residuals,
     shots_of,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task, read_with
+from robocal_ros.hand_eye.tasks import HandEyeData, Read, ShotJoints, Task, read_with
 
 Part = tuple[Task, HandEyeData]
 
@@ -141,7 +142,7 @@ def _result_of(
     alone = len(tasks) == 1
     verdict = judge(fit, shots, shots - _shots(fit.views), error_m, settings)
     uncertain = verdict.code is Code.POSES_NOT_INFORMATIVE and error_m > settings.limit_m
-    return HandEyeResult(
+    found_one = HandEyeResult(
         kind=tasks[0].kind if alone else "joint",
         method="best",
         T_flange_sensor=fit.state.T_flange_sensor,
@@ -159,6 +160,7 @@ def _result_of(
         verdict=verdict,
         more=more,
     )
+    return judged_with_joints(found_one, fit, data.joints, settings)
 
 
 def _bent(
@@ -665,8 +667,17 @@ def _together(parts: Sequence[Part], reads: Sequence[Read]) -> tuple[HandEyeData
         tuple(f"{task.kind}/{name}" for task, data in parts for name in data.names),
         np.concatenate([data.T_base_flange for _, data in parts]),
         [profile for _, data in parts for profile in data.profiles],
+        joints=_same_joints([data.joints for _, data in parts]),
     )
     return together, named
+
+
+def _same_joints(parts: Sequence[ShotJoints | None]) -> ShotJoints | None:
+    """Those of all shots; None where some are not known."""
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    return ShotJoints(known[0].arm, np.concatenate([part.q for part in known]))
 
 
 def _held_out(

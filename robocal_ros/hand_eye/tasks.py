@@ -43,6 +43,7 @@ from robocal_ros.hand_eye.mount_problem import (
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import PoseNoise, TargetKind
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget
+from robocal_ros.kinematics import SerialArm
 
 Fit = TypeVar("Fit")
 
@@ -79,18 +80,28 @@ SEED = 5  # of the fixed set of trials
 
 
 @dataclass(frozen=True, eq=False)
+class ShotJoints:
+    """Readings (m, n) of joints at m shots, rad (prismatic: m), and the arm that poses are of."""
+
+    arm: SerialArm
+    q: Array
+
+
+@dataclass(frozen=True, eq=False)
 class HandEyeData:
     """Shots of one target.
 
     ``names`` (m) of the shots; ``T_base_flange``: (m, 4, 4) as the robot reports them.
     ``profiles`` (m) what the sensor saw, or why that cannot be used.
     ``marks`` (m) mark of a staircase that each laser plane was laid through, or None.
+    ``joints``: that the poses were read by; None where they are not known.
     """
 
     names: tuple[str, ...]
     T_base_flange: Array
     profiles: Sequence[Profile | RobocalError]
     marks: tuple[str, ...] | None = None
+    joints: ShotJoints | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from robocal_ros.history.history_file import acknowledge, damage_notice, history
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of, layer_of, payload_note
+from robocal_ros.kinematics.joint_errors import SIZE_URAD
 from robocal_ros.kinematics.robots import RobotDescription
 from robocal_ros.ros.base import NO_SERIAL, POLL_S
 from robocal_ros.ros.conversions import summary_message, time_message
@@ -36,7 +37,7 @@ from robocal_ros.ros.endpoints import (
     trigger_text,
 )
 from robocal_ros.ros.graph import SourceGuard
-from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.parameters import Setting, number
 from robocal_ros.ros.robot import RobotNode
 from robocal_ros.session.events import (
     ACCEPT,
@@ -119,6 +120,14 @@ class StampWatch:
 
 STATE_DIR = Setting(
     "state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"
+)
+JOINT_ERROR = number(
+    "joint_error_urad",
+    SIZE_URAD,
+    "Joints turn by so much, rms, otherwise than they read, where the model in force has no "
+    "joint functions; a UR10's do by 300, makers of gears state 50; 0: nothing is said of it",
+    0.0,
+    1e4,
 )
 
 

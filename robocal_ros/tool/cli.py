@@ -17,8 +17,10 @@ from robocal_ros.cli.main import (
     SIGMA_MM,
     CliResult,
     Document,
+    add_joint_error,
     add_state,
     describe_robot,
+    joint_error_rad,
     positive,
     print_output,
     print_table,
@@ -34,6 +36,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.history.history_records import LASER_FRAME
+from robocal_ros.kinematics.joint_errors import with_joint_errors
 from robocal_ros.programs.conventions import Load
 from robocal_ros.tool.circle import CircleMotion, classic_from_path, fit_circle
 from robocal_ros.tool.crossed_model import estimate_tool
@@ -55,7 +58,7 @@ from robocal_ros.tool.files import (
     run_document,
     touch_document,
 )
-from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
+from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run, tip_errors
 from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
 from robocal_ros.tool.run import alike
 from robocal_ros.tool.station import StationTrend, measurement_of, station_shift
@@ -191,6 +194,7 @@ def add_run_options(parser: "argparse._ActionsContainer") -> None:
         "--laser", type=Path, metavar="FILE", help="laser file of robocal tool beams"
     )
     add_frame_options(parser, "--taught-mm", "--taught-rpy-deg")
+    add_joint_error(parser)
 
 
 def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
@@ -208,20 +212,29 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
     path, origin_ns = read_joint_path(args.joints, arm)
     edges, names = read_step_edges(args.events, rule.sigma_s, origin_ns)
     steps = named_steps(edges, names, rule.debounce_s)
-    figure = None
+    figure = erring = None
     if args.method == "classic":
         tool = classic_run_document(classic_from_path(laser, path, steps, taught))
     else:
         circles = [step.name for step in steps if step.kind == "circle"]
         found = estimate_tool(laser, path, steps, taught)
-        known = KnownTool.measured(found)
-        tool = run_document(known, found, circles, judge_run(found, ToolLimits()))
+        known, verdict = KnownTool.measured(found), judge_run(found, ToolLimits())
+        if (size_rad := joint_error_rad(args)) > 0.0:
+            last_s = max(edge.time_s for edge in steps[-1].edges)
+            q = path.q[np.searchsorted(path.time_s, last_s)]
+            erring = tip_errors(arm, size_rad, (q, found.tip), None, found.covariance[:3, :3])
+        tool = run_document(known, found, circles, with_joint_errors(verdict, erring, "tip"))
         if args.figures is not None:
             left: dict[str, list[float]] = {step.name: [] for step in steps}
             for step, value in zip(found.edge_step, 1e3 * found.edge_m, strict=True):
                 left[steps[step].name].append(float(value))
             figure = _drawn(args.figures, left, found.covariance[:3, :3], found.misfit_m)
-    document: ToolRunDocument = {**tool, "figures": figure, "warnings": warnings}
+    document: ToolRunDocument = {
+        **tool,
+        "joint_errors": None if erring is None else erring.document(),
+        "figures": figure,
+        "warnings": warnings,
+    }
     return CliResult(document, _show_tool)
 
 
@@ -272,7 +285,9 @@ METHODS = ("best", "classic")
 DIRECTIONS = {"ccw": 1, "cw": -1}
 JITTER_S = 20e-6
 OF_CIRCLE = ("radius_mm", "period_s", "start_deg", "direction", "beam_angle_deg", "latency_s")
-OF_RUN = ("joints", "robot", "laser", "tool", "xyz_mm", "rpy_deg", "figures")
+OF_RUN = (
+    "joints", "robot", "laser", "tool", "xyz_mm", "rpy_deg", "joint_error_urad", "figures",
+)  # fmt: skip
 
 
 def add_crossed(parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, TypedDict
 
 from robocal_ros.ground.documents import (
     Four,
+    JointErrorsDocument,
     NotNegative,
     Ordinal,
     PoseDocument,
@@ -139,6 +140,10 @@ class FoundToolDocument(ToolFrameDocument):
 class ToolRunDocument(FoundToolDocument):
     """A whole run."""
 
+    joint_errors: Annotated[
+        JointErrorsDocument | None,
+        "null: the robot file has joint functions, --joint-error-urad 0, or method classic.",
+    ]
     figures: Annotated[str | None, "The figure; null without --figures."]
     warnings: Texts
 

@@ -17,6 +17,8 @@ from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import Array, Document
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_errors import JointErrors, flange_errors
 from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise, ToolEstimate, estimate_tool
 from robocal_ros.tool.laser_frame import FlangePath, LaserFrame, minimal_rotation
 
@@ -570,3 +572,29 @@ def _compared(found: ToolEstimate, stored: KnownTool, rule: CheckRule, ways: Arr
         tilt_rad=float(np.arctan2(np.hypot(*deviation[:2]), rule.lever_m)),
         measured=found,
     )
+
+
+def tip_errors(
+    arm: SerialArm,
+    size_rad: float,
+    now: tuple[Array, Array],
+    before: tuple[Array, Array] | None,
+    told: Array,
+) -> JointErrors | None:
+    """What the joints' errors add to a tip's change; None where the model in force holds them.
+
+    A run holds the joints within some degrees, and its residuals tell nothing of what these share.
+    It cancels in a change only as far as the bent tool is measured with the healthy one's joints.
+
+    ``now``, ``before``: joints (n,) of a run, and the tip (3,) that it found, flange frame, m; None
+    before where there was no healthy tool's run: then nothing cancels. ``told`` (3, 3): covariance
+    of the tip as it is told, m^2.
+    """
+    runs = [now] if before is None else [now, before]
+    errors = flange_errors(arm, size_rad, np.array([q for q, _ in runs]))
+    if errors is None:
+        return None
+    moves = np.array([np.hstack([np.eye(3), -frames.skew(tip)]) for _, tip in runs])
+    moves[1:] *= -1.0
+    more = np.einsum("gka,gahb,hlb->kl", moves, errors, moves)
+    return JointErrors.beside(size_rad, more, told)

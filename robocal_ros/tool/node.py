@@ -34,6 +34,7 @@ from robocal_ros.ros.parameters import (
     pose_settings,
 )
 from robocal_ros.ros.session_node import (
+    JOINT_ERROR,
     STATE_DIR,
     DecisionServices,
     SessionNode,
@@ -130,14 +131,7 @@ SETTINGS = (
     number("plunge_depth_mm", 7.0, "Depth of a plunge, half of it below the beams", 1.0, 50.0),
     number("plunge_speed_mm_s", 10.0, "Speed of a plunge", 0.1, 50.0),
     number("spin_deg", 0.0, "Turn of the flange about the laser's z", -360.0, 360.0),
-    number(
-        "joint_error_urad",
-        300.0,
-        "Joints turn by so much, rms, otherwise than they read, where the model in force has no "
-        "joint functions; a UR10's do by 300, makers of gears state 50; 0: nothing is said of it",
-        0.0,
-        1e4,
-    ),
+    JOINT_ERROR,
     number("taper", 0.0, "Growth of the tool's radius per length above the tip", -2.0, 2.0),
     number("quick_limit_mm", 0.2, "Deviation of the tip that a quick check passes", 0.01, 10.0),
     number("lever_mm", 150.0, "From where a bent tool bends to its tip", 1.0, 2000.0),

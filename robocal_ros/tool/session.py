@@ -23,6 +23,7 @@ from robocal_ros.history.history_records import (
     Proposal,
 )
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_errors import JointErrors, with_joint_errors
 from robocal_ros.session import events
 from robocal_ros.session.events import (
     OWN,
@@ -47,7 +48,6 @@ from robocal_ros.tool.edges import (
 )
 from robocal_ros.tool.files import check_document, run_document
 from robocal_ros.tool.in_force import ToolInForce
-from robocal_ros.tool.joint_errors import JointErrors, joint_errors
 from robocal_ros.tool.judging import (
     SMALL_M,
     Answer,
@@ -64,6 +64,7 @@ from robocal_ros.tool.judging import (
     sideways_check,
     spread_between,
     station_finding,
+    tip_errors,
     with_mandrel,
     witness_of,
 )
@@ -184,8 +185,7 @@ class ToolResults:
         witness = self._with_mandrel(witness, found, shift, command)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         erring = self._joint_errors(run, estimate, found)
-        if erring is not None and erring.words:
-            verdict = replace(verdict, reason=f"{verdict.reason}; {erring.words}")
+        verdict = with_joint_errors(verdict, erring, "tip")
         document = run_document(found, estimate, run.circles, verdict) | {
             "joint_errors": None if erring is None else erring.document(),
             "change": change_between(in_force.T_flange_tool, found.T_flange_tool).document(),
@@ -212,7 +212,7 @@ class ToolResults:
                 return None
             before = q, healthy.T_flange_tool[:3, 3]
         now = run.last_q, estimate.tip
-        return joint_errors(run.arm, size_rad, now, before, found.covariance[:3, :3])
+        return tip_errors(run.arm, size_rad, now, before, found.covariance[:3, :3])
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         """Keep how healthy tool or mandrel measure; in force at once: it moves nothing."""

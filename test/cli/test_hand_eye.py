@@ -27,6 +27,7 @@ from hand_eye_tables import (
     target_of,
     write_part,
 )
+from joint_errors import with_joint_errors
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import (
@@ -38,6 +39,7 @@ from bench.hand_eye_cell import (
     view,
 )
 from bench.hand_eye_files import write_target
+from bench.hand_eye_profiles import with_gears
 from bench.measured_runs import Q_NEAR
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ball_on_table
@@ -45,10 +47,11 @@ from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.files import read_flange_mount, read_pose_table, write_pose_table
 from robocal_ros.hand_eye.targets import LineTarget
-from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.robots import load_robot, save_robot
 
 FOLDERS = ("sphere", "step", "line", "groove")
 LEFT_HANDED = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, -1.0], *np.ones((2, 4))])
+JOINT_RAD = 2e-5  # by which joints of a robot like the shipped ones do not repeat: 0.02 mm
 FAR_OFF = float(chi2.ppf(0.9999, 6))  # one in ten thousand is farther from the truth
 
 
@@ -179,8 +182,10 @@ class TestRecovered:
     def test_joints_of_a_robot_instead_of_poses(self, tmp_path):
         arm = load_robot("ur10")
         rng = np.random.default_rng(0)
-        cell = replace(CELL, robot=ArmRobot(rigid_robot(arm, 0.0, rng), Q_NEAR))
-        some = sphere_shots(cell, CENTRE, RADIUS_M, 8, rng)
+        true = rigid_robot(arm, 0.0, rng)
+        effects = replace(true.effects, noise=True)
+        true = replace(true, repeatability=JOINT_RAD, effects=effects)
+        some = sphere_shots(replace(CELL, robot=ArmRobot(true, Q_NEAR)), CENTRE, RADIUS_M, 8, rng)
         path = write_part(tmp_path, "poses", some, range(8), joints=(arm, some.q))
         table = np.genfromtxt(path, delimiter=",", dtype=str)
         path.write_text("\n".join(",".join(row) for row in table[:, :-7]) + "\n")
@@ -188,6 +193,34 @@ class TestRecovered:
         assert chi_square(found) < FAR_OFF
         refused = robocal("sphere", *shots(tmp_path), "--radius-mm", 20, status=2)
         assert "name the robot" in refused["error"]["message"]
+
+    def test_joints_that_err_are_said_where_the_joints_are_known(self, made, tmp_path):
+        """Of poses within some degrees; not where the robot's file holds what the joints err by."""
+        rng = np.random.default_rng(5)
+        cell = replace(CELL, robot=with_gears(rng), tilt_rad=0.14, roll_rad=0.14)
+        some = sphere_shots(cell, CENTRE, RADIUS_M, 8, rng)
+        arm = load_robot("ur10")
+        write_part(tmp_path, "poses", some, range(8), joints=(arm, some.q))
+        sphere = ("sphere", *shots(tmp_path), "--radius-mm", 20)
+        found = robocal(*sphere, "--robot", "ur10")
+        factor = found["joint_errors"]["factor"]
+        assert factor > 1.2
+        assert found["verdict"]["reason"].endswith(
+            f"to the mount's sigma: count {factor:.1f} of it"
+        )
+        silent = robocal(*sphere, "--robot", "ur10", "--joint-error-urad", 0)
+        assert silent["joint_errors"] is None
+        assert found["covariance"] == silent["covariance"]
+        assert found["verdict"]["reason"].startswith(silent["verdict"]["reason"])
+        save_robot(with_joint_errors(arm, 1), tmp_path / "full.yaml")
+        full = robocal(*sphere, "--robot", tmp_path / "full.yaml")
+        assert full["joint_errors"] is None
+        assert robocal(*sphere)["joint_errors"] is None  # poses alone
+        words = "needs the joints of each pose"
+        failed = robocal(*sphere, "--joint-error-urad", 50, status=2)
+        assert words in failed["error"]["message"]
+        failed = robocal("joint", *HEIGHTS, *several(made), "--joint-error-urad", 50, status=2)
+        assert words in failed["error"]["message"]
 
     def test_people_read_the_verdict_first(self, made, capsys):
         words = ["sphere", *shots(made / "sphere"), "--radius-mm", 20]

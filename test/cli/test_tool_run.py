@@ -106,6 +106,22 @@ def test_a_run_recovers_the_bent_tool(crossed):
     assert max(found["sigma_mm"]) < 0.2
 
 
+def test_joints_that_err_are_said(crossed, tmp_path):
+    """No healthy tool's run takes them away; a robot file with joint functions holds them."""
+    found = crossed()
+    factor = found["joint_errors"]["factor"]
+    assert found["joint_errors"]["size_urad"] == 300.0
+    assert factor > 2.0
+    assert found["verdict"]["reason"].endswith(f"to the tip's sigma: count {factor:.1f} of it")
+    less = crossed("--joint-error-urad", 50)["joint_errors"]
+    assert less["sigma_mm"] == pytest.approx(np.array(found["joint_errors"]["sigma_mm"]) / 6.0)
+    assert 1.0 < less["factor"] < factor
+    silent = crossed("--joint-error-urad", 0)
+    assert silent["joint_errors"] is None
+    assert "joints that err" not in silent["verdict"]["reason"]
+    assert crossed("--method", "classic")["joint_errors"] is None
+
+
 def test_the_radii_are_those_of_the_tilted_cylinder(crossed):
     """Upright both beams see the radius; each edge is known to about 0.03 mm."""
     upright = crossed()["tool_radius_mm"][2]

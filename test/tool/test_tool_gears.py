@@ -21,7 +21,7 @@ from robocal_ros.cell_sim.gears import ur10_gears
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import Held, RobotNoise
-from robocal_ros.tool.joint_errors import joint_errors
+from robocal_ros.tool.judging import tip_errors
 
 DRAWS = amount(16, 100)
 NOISE = TrueNoise(3e-5, 1e-5)
@@ -55,7 +55,7 @@ def change_of_tip(seed: int, with_gears: bool) -> tuple[float, float, float]:
     before, now = (
         (run.path.q[-1], estimate.tip) for run, estimate in zip(runs, found, strict=True)
     )
-    erring = joint_errors(cell.arm, GEARS_RAD, now, before, covariance)
+    erring = tip_errors(cell.arm, GEARS_RAD, now, before, covariance)
     assert erring is not None
     squares = [
         float(error @ np.linalg.solve(C, error))

@@ -12,9 +12,10 @@ from robocal_ros.cell_sim.beams import RoundTool
 from robocal_ros.cell_sim.gears import ur10_gears
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.joint_errors import ALIKE_RAD
 from robocal_ros.kinematics.joint_functions import JointFunctions
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.tool.joint_errors import ALIKE_RAD, joint_errors
+from robocal_ros.tool.judging import tip_errors
 from robocal_ros.tool.session import ToolSession
 
 ARM = load_robot("ur10")
@@ -39,29 +40,29 @@ def test_the_covariance_is_that_of_differences():
     """Alone, and of two runs whose joints share a part of what they err by."""
     other = Q_NEAR + np.radians([2.0, -1.0, 4.0, 0.0, 30.0, 3.0])
     now, before = by_differences(Q_NEAR), by_differences(other)
-    alone = joint_errors(ARM, SIZE_RAD, (Q_NEAR, TIP), None, TOLD)
+    alone = tip_errors(ARM, SIZE_RAD, (Q_NEAR, TIP), None, TOLD)
     assert alone.covariance == pytest.approx(SIZE_RAD**2 * now @ now.T, rel=1e-5)
     alike = np.exp(-0.5 * ((other - Q_NEAR) / ALIKE_RAD) ** 2)
     pair = np.block([[np.eye(6), np.diag(alike)], [np.diag(alike), np.eye(6)]])
     rows = np.hstack([now, -before])
-    both = joint_errors(ARM, SIZE_RAD, (Q_NEAR, TIP), (other, TIP), TOLD)
+    both = tip_errors(ARM, SIZE_RAD, (Q_NEAR, TIP), (other, TIP), TOLD)
     assert both.covariance == pytest.approx(SIZE_RAD**2 * rows @ pair @ rows.T, rel=1e-5)
     size = np.trace(both.covariance) / np.trace(TOLD)
     assert both.factor == pytest.approx(np.sqrt(1.0 + size))
 
 
 def test_the_same_joints_cancel_and_nothing_is_said():
-    same = joint_errors(ARM, SIZE_RAD, (Q_NEAR, TIP), (Q_NEAR, TIP), TOLD)
+    same = tip_errors(ARM, SIZE_RAD, (Q_NEAR, TIP), (Q_NEAR, TIP), TOLD)
     assert same.factor == pytest.approx(1.0)
-    assert same.words == ""
+    assert same.words("tip") == ""
 
 
 def test_what_the_model_in_force_holds_is_not_added():
     functions = JointFunctions(np.zeros(6), np.ones(6), np.full((6, 8), 1e-4), np.zeros(6))
     arm = replace(ARM, functions=functions)
-    assert joint_errors(arm, SIZE_RAD, (Q_NEAR, TIP), None, TOLD) is None
+    assert tip_errors(arm, SIZE_RAD, (Q_NEAR, TIP), None, TOLD) is None
     none = replace(ARM, functions=replace(functions, coefficients=np.zeros((6, 8))))
-    assert joint_errors(none, SIZE_RAD, (Q_NEAR, TIP), None, TOLD) is not None
+    assert tip_errors(none, SIZE_RAD, (Q_NEAR, TIP), None, TOLD) is not None
 
 
 def test_joints_are_alike_as_far_as_those_of_a_real_arm():
