@@ -149,6 +149,13 @@ class SensorLinearity:
     left_out_m: float
     assumed: bool = False
 
+    @property
+    def root(self) -> Array:
+        """The covariance as numbers (k, r) of size one, which are independent, make it."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        seen = values > RIDGE * values[-1]
+        return np.asarray(vectors[:, seen] * np.sqrt(values[seen]))
+
     def corrected(self, points: Array) -> Array:
         """Points (n, 2) without the error; beyond the field it is that of the field's end."""
         true = points.copy()

@@ -13,6 +13,7 @@ from robocal_ros.ground.errors import RankDeficientError, ResidualError, Robocal
 from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.mount_problem import (
     FIRST_NOISE,
+    Bend,
     MountProblem,
     MountState,
     SphereModel,
@@ -143,11 +144,15 @@ def misfit(views: tuple[TargetView, ...], state: MountState) -> float:
 
 
 def fit_mount(
-    views: tuple[TargetView, ...], start: MountState, noise: PoseNoise | None = None
+    views: tuple[TargetView, ...],
+    start: MountState,
+    noise: PoseNoise | None = None,
+    bend: Bend | None = None,
 ) -> MountFit:
     """Estimate the sensor's pose and what is unknown of its targets.
 
-    ``noise``: of reported poses; None to estimate it.
+    ``noise``: of reported poses; None to estimate it. ``bend``: of the sensor; the covariance holds
+    what is not known of it.
     """
     rejected: dict[str, str] = {}
     state = start
@@ -155,12 +160,12 @@ def fit_mount(
     found = replace(found, aim_m=FIRST_NOISE.aim_m, repeat_m=FIRST_NOISE.repeat_m)
     poses = np.concatenate([view.sightings.pose for view in views])
     if len(np.unique(poses)) < len(poses):  # one sighting of a profile may be wrong, not all of it
-        estimate, wrong, found, _ = _settle(views, state, found, noise, together=False)
+        estimate, wrong, found, _ = _settle(views, state, found, noise, bend, together=False)
         state = estimate.state
         views = without(views, wrong, rejected)
-    estimate, wrong, found, settled = _settle(views, state, found, noise, together=True)
+    estimate, wrong, found, settled = _settle(views, state, found, noise, bend, together=True)
     views = without(views, wrong, rejected)
-    last = MountProblem(views, found, estimate.state)
+    last = MountProblem(views, found, estimate.state, bend=bend)
     return MountFit(
         views,
         estimate.state,
@@ -229,6 +234,7 @@ def _settle(
     state: MountState,
     noise: PoseNoise,
     given: PoseNoise | None,
+    bend: Bend | None,
     together: bool,
 ) -> tuple[Estimate[MountState], NDArray[np.bool_], PoseNoise, bool]:
     """Solve, take weights and noise anew, until both stay; whether they do is told last.
@@ -236,7 +242,7 @@ def _settle(
     Which sightings (m,) are wrong, too.
     """
     for _ in range(ROUNDS):
-        problem = MountProblem(views, noise, state, together)
+        problem = MountProblem(views, noise, state, together, bend=bend)
         freedom = max(noise_numbers(problem), 1) if given is None else np.inf
         estimate = _solved(problem, state, freedom)
         X, before = state.T_flange_sensor, noise
@@ -252,18 +258,12 @@ def _settle(
     return estimate, estimate.rejected[problem.sample], noise, settled
 
 
-def robot_numbers(problem: MountProblem) -> int:
-    """How many numbers tell the robot's noise: at most six of a pose, less the unknowns."""
-    told = min(POSE_NUMBERS * len(_poses(problem)), int(problem.sizes.sum()))
-    return told - len(problem.names)
-
-
 def noise_numbers(problem: MountProblem) -> int:
-    """How many numbers tell each noise.
+    """How many numbers tell each noise: at most six of a pose, less the unknowns.
 
     Where light is laid by eye, two of a pose tell how well; three unknowns look the same.
     """
-    told = robot_numbers(problem)
+    told = min(POSE_NUMBERS * len(_poses(problem)), int(problem.sizes.sum())) - len(problem.names)
     return min(told, 2 * len(_poses(problem)) - 3 + LEAST_AIM) if problem.aimed else told
 
 

@@ -11,12 +11,14 @@ residuals are whitened, profile by profile.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from robocal_ros.ground import frames
@@ -26,6 +28,8 @@ from robocal_ros.hand_eye.result import ARM_M, PoseNoise
 SAME = 2e-4  # m, and rad: readings of a robot at rest differ by less, poses on purpose by more
 COMPONENTS = 3  # of every sighting; a model with fewer leaves the last ones empty
 COMMON = 8  # errors that all sightings of one pose have in common
+# Of which of them each noise is, and of what changes from visit to visit.
+COLUMNS = {"sigma_m": slice(6), "aim_m": slice(6, COMMON), "repeat_m": slice(COMMON, None)}
 SENSOR_UNKNOWNS = ("sensor x", "sensor y", "sensor z", "turn x", "turn y", "turn z")
 EQUATOR = 0.995  # share of the radius beyond which the circle's radius goes on straight
 FLATTEST = 0.02  # sine of the angle between edge and laser plane below which nothing is seen
@@ -369,6 +373,18 @@ class Linear:
     covariance: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Bend:
+    """What is not known of a sensor's linearity: r numbers, of which nothing else is known.
+
+    Beforehand each is a normal one of size one. ``pull``: how each sighting (3, r), by its name,
+    moves with them. ``taken`` (r,): those that were taken out of the sightings.
+    """
+
+    pull: Mapping[str, Array]
+    taken: Array
+
+
 class MountProblem:
     """`Problem` of a sensor and targets; a sample is a profile or a sighting.
 
@@ -377,7 +393,8 @@ class MountProblem:
     ``near``: where the weights are taken; they stay while the state moves, or there is no one cost.
     ``pivot`` (3,) about which the sensor turns, sensor frame; None for the middle of what was seen.
     ``together``: whether the sightings of one pose are one sample, and their common error is known
-    to be common; otherwise each is its own (to find the one that is wrong).
+    to be common; otherwise each is its own (to find the one that is wrong). ``bend``: of the
+    sensor; the likelihood of noises counts it, the state does not hold it.
     """
 
     scale_components = 0  # noise is always given
@@ -389,8 +406,9 @@ class MountProblem:
         near: MountState,
         together: bool = True,
         pivot: Array | None = None,
+        bend: Bend | None = None,
     ) -> None:
-        self.views, self.noise = views, noise
+        self.views, self.noise, self.bend = views, noise, bend
         names = list(SENSOR_UNKNOWNS)
         self._columns = []  # of each target's unknowns
         for view in views:
@@ -518,7 +536,8 @@ class RestrictedLikelihood:
     """How likely noises are that are not known: of the poses, and of how the eye aims.
 
     Restricted maximum likelihood (Patterson and Thompson 1971): of that part of the measurements
-    which the unknowns cannot explain. Noises are given by their logarithms (n,).
+    which the unknowns cannot explain, what is not known of the sensor's bend among them: as far as
+    residuals tell that, they tell no noise. Noises are given by their logarithms (n,).
     """
 
     def __init__(
@@ -528,14 +547,22 @@ class RestrictedLikelihood:
         keep: NDArray[np.bool_],
         given: PoseNoise | None,
     ) -> None:
-        r, J, G, C = (part[keep] for part in problem.grouped(problem.linear(state)))
+        linear, bend = problem.linear(state), problem.bend
+        self._known = problem.prior()
+        self._pull = self._known @ problem.deviation(state)
+        if bend is not None:
+            names = [name for view in problem.views for name in view.sightings.names]
+            pull = np.array([bend.pull[name] for name in names])
+            both = np.concatenate([linear.jacobian, pull], axis=2)
+            linear = replace(linear, jacobian=both)
+            self._known = block_diag(self._known, np.eye(len(bend.taken)))
+            self._pull = np.concatenate([self._pull, bend.taken])
+        r, J, G, C = (part[keep] for part in problem.grouped(linear))
         self.unknown = ["sigma_m"] if given is None else []
         self.unknown += ["aim_m"] if np.any(G[..., 6:COMMON]) else []
         self.unknown += ["repeat_m"] if problem.visits else []
         self._own, self._noise, self._visits = C, problem.noise, problem.visits
         self._all = np.concatenate([r[..., None], J, G], axis=2)
-        self._known = problem.prior()
-        self._pull = self._known @ problem.deviation(state)
         self.now = np.log([getattr(self._noise, field) for field in self.unknown])
 
     def noise(self, log_sigma: Array) -> PoseNoise:
@@ -548,7 +575,8 @@ class RestrictedLikelihood:
     def at(self, log_sigma: Array) -> tuple[float, Array, Array, Array, Array]:
         """-2 log likelihood, normal matrix (k, k), the step (k,) to the best state there.
 
-        Then the whitened samples, and the covariance of what a pose has in common.
+        The last of the k are the bend's. Then the whitened samples, and the covariance of what a
+        pose has in common.
         """
         common = self.noise(log_sigma).covariance(self._visits)
         G = self._all[..., -len(common) :]
@@ -572,8 +600,24 @@ class RestrictedLikelihood:
         grown = np.sum(G**2, axis=(0, 1)) - np.sum(JG * np.linalg.solve(normal, JG), axis=(0, 1))
         fitted = np.sum((left[:, None, :] @ G) ** 2, axis=(0, 1))
         each = 2.0 * np.diag(common) * (grown - fitted)
-        parts = {"sigma_m": each[:6], "aim_m": each[6:COMMON], "repeat_m": each[COMMON:]}
-        return cost, np.array([parts[field].sum() for field in self.unknown])
+        return cost, np.array([each[COLUMNS[field]].sum() for field in self.unknown])
+
+    def information(self, log_sigma: Array) -> Array:
+        """What the measurements tell of them, as Fisher has it (n, n).
+
+        A change of the covariance by dV tells tr(P dV P dV) / 2 of its size, where P is the inverse
+        of V less what the unknowns take (Patterson and Thompson 1971); its root is Jeffreys' prior.
+        """
+        _, normal, _, white, common = self.at(log_sigma)
+        J, G = white[..., 1 : -len(common)], white[..., -len(common) :] * np.sqrt(np.diag(common))
+        groups, n = len(G), len(common)
+        GJ = (np.swapaxes(G, 1, 2) @ J).reshape(groups * n, -1)
+        seen = -(GJ @ np.linalg.solve(normal, GJ.T)).reshape(groups, n, groups, n)
+        own = np.arange(groups)
+        seen[own, :, own, :] += np.swapaxes(G, 1, 2) @ G
+        each = np.einsum("gihj->ij", seen**2)
+        parts = [COLUMNS[field] for field in self.unknown]
+        return np.array([[2.0 * each[a, b].sum() for b in parts] for a in parts])
 
 
 def restricted_noise(
@@ -605,28 +649,28 @@ def restricted_noise(
 def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoise | None) -> Array:
     """Covariance (k, k) of the unknowns, averaged over what the noise may be.
 
-    Few poses tell their own noise badly, and the covariance for the likeliest one is too small: for
-    n numbers to spare the mean of the noise's square is wider by n / (n - 3). By the law of total
-    variance, summed over a grid around the problem's own noise, which is the likeliest. The prior
-    is flat in the noise (Gelman 2006, Bayesian Analysis 1:515), not in its logarithm: that would
-    believe in noises near zero wherever what features err by hides them, and tell too little.
+    Few poses tell their own noise badly, and the covariance for the likeliest one is too small: an
+    error is of the noise that is true, which is independent of that found, and where n numbers tell
+    this their squared ratio is n / (n - 2) in the mean (of 1 / chi-square). So much the mean of the
+    noise's square is above the likeliest under Jeffreys' prior, and only under that. By the law of
+    total variance, summed over a grid around the problem's own noise, which is the likeliest.
     """
-    keep = np.ones(len(problem.poses), dtype=np.bool_)
+    keep, own = np.ones(len(problem.poses), dtype=np.bool_), slice(len(problem.names))
     likely = RestrictedLikelihood(problem, state, keep, given)
     best = likely.now
     least, normal = likely.at(best)[:2]
     if not likely.unknown:
-        return np.asarray(np.linalg.inv(normal))
+        return np.asarray(np.linalg.inv(normal)[own, own])
     width = []
     for axis in NEAR * np.eye(len(best)):
         bend = (likely.at(best + axis)[0] + likely.at(best - axis)[0] - 2.0 * least) / NEAR**2
         width.append(np.sqrt(2.0 / max(bend, 2.0 / WIDEST**2)))
     spread, weight = [], []
     for nodes in product(NODES, repeat=len(best)):
-        away = np.array(width) * nodes
-        cost, normal, step = likely.at(best + away)[:3]
+        there = best + np.array(width) * nodes
+        cost, normal, step = likely.at(there)[:3]
         spread.append(np.linalg.inv(normal) + np.outer(step, step))
-        weight.append(0.5 * (least - cost) + away.sum())
+        weight.append(0.5 * (least - cost + np.linalg.slogdet(likely.information(there))[1]))
     # The noise found need not be the likeliest, where the search for it ended early.
     weights = np.exp(np.array(weight) - np.max(weight))
-    return np.asarray(np.tensordot(weights, spread, 1) / np.sum(weights))
+    return np.asarray((np.tensordot(weights, spread, 1) / np.sum(weights))[own, own])

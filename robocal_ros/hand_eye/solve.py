@@ -36,7 +36,6 @@ from robocal_ros.hand_eye.mount_fit import (
     noise_of,
     require_radius,
     require_seen,
-    robot_numbers,
     solved_again,
     swapped,
     undone,
@@ -45,6 +44,7 @@ from robocal_ros.hand_eye.mount_fit import (
 from robocal_ros.hand_eye.mount_problem import (
     FIRST_NOISE,
     SENSOR_UNKNOWNS,
+    Bend,
     MountProblem,
     MountState,
     TargetView,
@@ -113,11 +113,6 @@ def _result_of(
     """The result of a fit to one target or several, judged."""
     field, pivot = field_of(data), pivot_of(fit.views)
     linearity = next((read.linearity for read in reads if read.linearity is not None), None)
-    of_it = np.zeros_like(fit.covariance)
-    if linearity is not None:
-        _, of_it, wider = _bent(fit, reads, linearity)
-        wider = wider if settings.noise() is None else 1.0
-        fit = replace(fit, covariance=wider * fit.covariance + of_it)
     error_m = float(expected_error_m(fit.covariance[:6, :6], field - pivot))
     shots = len(data.names)
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
@@ -129,8 +124,9 @@ def _result_of(
         "working_distance_mm": float(field[0, 2]) * 1e3,
     }
     if linearity is not None:
-        own_m = float(expected_error_m(of_it[:6, :6], field - pivot))
         if not linearity.assumed:
+            of_it = _bent(fit, reads, linearity)[1]
+            own_m = float(expected_error_m(of_it[:6, :6], field - pivot))
             more["linearity"] = {**linearity.document(), "working_error_mm": own_m * 1e3}
         error_m = float(np.hypot(error_m, linearity.rms_m))  # of points as the sensor tells them
     found: Document = {}
@@ -163,38 +159,34 @@ def _result_of(
     return judged_with_joints(found_one, fit, data.joints, settings)
 
 
-def _bent(
-    fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity
-) -> tuple[Array, Array, float]:
+def _bent(fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity) -> tuple[Array, Array]:
     """What mount and linearity say of each other, linearised at a fit.
 
-    The step (n,) of the coefficients to where both are likeliest: the curves' own form tells them
-    with their covariance, the mount's residuals the rest. Then what is left unknown of them in the
-    covariance (k, k) of the fit's unknowns: that of both together less that where they are known.
-    And how much wider the noise's square is which these residuals tell: they tell the coefficients
-    too, as many as the prior leaves to them (its effective number, Gull 1989).
+    How the numbers (r,) that stand for the coefficients have to move to where both are likeliest:
+    the curves' own form tells them with their covariance, the mount's residuals the rest. Then what
+    is left unknown of them in the covariance (k, k) of the fit's unknowns: that of both together
+    less that where they are known.
     """
-    pulled = {name: pull for read in reads for name, pull in read.pulled.items()}
-    pull = np.array([pulled[name] for name in fit.names])
+    pulled = _pulled(reads, linearity)
     problem = MountProblem(fit.views, fit.noise, fit.state)
     linear = problem.linear(fit.state)
-    both = np.concatenate([linear.jacobian, pull], axis=2)
+    both = np.concatenate([linear.jacobian, [pulled[name] for name in fit.names]], axis=2)
     residual, jacobian = problem.whitened(replace(linear, jacobian=both))
     J, P = np.split(jacobian.reshape(-1, both.shape[2]), [len(problem.names)], axis=1)
     r, prior = residual.ravel(), problem.prior()
     known = np.linalg.pinv(J.T @ J + prior, hermitian=True)
-    moved = known @ J.T @ P  # how the unknowns follow the coefficients
-    known_before = np.linalg.pinv(linearity.covariance, hermitian=True)
-    own = P.T @ P - P.T @ J @ moved + known_before
-    values, vectors = np.linalg.eigh(own)
-    seen = values > 0.0
-    spread = vectors[:, seen] / np.sqrt(values[seen])
+    moved = known @ J.T @ P  # how the unknowns follow the numbers
+    own = P.T @ P - P.T @ J @ moved + np.eye(P.shape[1])
     slope = P.T @ r - moved.T @ (J.T @ r + prior @ problem.deviation(fit.state))
-    step = -spread @ (spread.T @ slope)
-    told = float(np.sum(seen) - np.sum((known_before @ spread) * spread))
-    numbers = max(robot_numbers(problem), 1)
-    wider = numbers / max(numbers - told, 1.0)
-    return np.asarray(step), np.asarray((moved @ spread) @ (moved @ spread).T), wider
+    return np.asarray(np.linalg.solve(own, -slope)), np.asarray(
+        moved @ np.linalg.solve(own, moved.T)
+    )
+
+
+def _pulled(reads: Sequence[Read], linearity: SensorLinearity) -> dict[str, Array]:
+    """How features (3, r), by their names, move with the numbers of `SensorLinearity.root`."""
+    root = linearity.root
+    return {name: pull @ root for read in reads for name, pull in read.pulled.items()}
 
 
 def _with_linearity(
@@ -204,7 +196,8 @@ def _with_linearity(
     linearity = next((read.linearity for read in reads if read.linearity is not None), None)
     if linearity is None:
         return fit, reads
-    step, _, _ = _bent(fit, reads, linearity)
+    taken = _bent(fit, reads, linearity)[0]
+    step = linearity.root @ taken
     own = replace(linearity, coefficients=linearity.coefficients + step)
     without_it = []
     for read in reads:
@@ -212,7 +205,8 @@ def _with_linearity(
         moved = np.array([read.pulled[name] @ step for name in s.names])
         view = replace(read.view, sightings=replace(s, value=s.value - moved))
         without_it.append(replace(read, linearity=own, view=view))
-    return fit_mount(tuple(read.view for read in without_it), fit.state, given), without_it
+    views, bend = tuple(read.view for read in without_it), Bend(_pulled(reads, linearity), taken)
+    return fit_mount(views, fit.state, given, bend), without_it
 
 
 def field_of(data: HandEyeData) -> Array:

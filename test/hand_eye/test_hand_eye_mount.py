@@ -18,12 +18,14 @@ from hand_eye_sets import (
     step_task,
 )
 from long_form import amount, more
+from scipy.linalg import block_diag
 
 from bench.hand_eye_cell import step_shots
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.mount_fit import fit_mount
 from robocal_ros.hand_eye.mount_problem import (
+    Bend,
     LineModel,
     MountProblem,
     MountState,
@@ -167,17 +169,58 @@ def test_noise_of_poses_is_found_from_the_profiles():
     assert abs(np.log(found / POSE_M)) < 0.4
 
 
+def exact_sphere(count):
+    """Features without noise of their own, so that all their residuals tell of the poses'."""
+    view, place = sphere_view(np.random.default_rng(10), count)
+    exact = replace(view.sightings, covariance=np.tile(1e-18 * np.eye(3), (count, 1, 1)))
+    return TargetView(view.model, exact), MountState(X, (place,))
+
+
 def test_covariance_counts_that_few_poses_tell_their_noise_badly():
-    """With n numbers to spare the mean of the noise's square is n / (n - 3) of the likeliest."""
-    view, place = sphere_view(np.random.default_rng(10), 6)
-    exact = replace(view.sightings, covariance=np.tile(1e-18 * np.eye(3), (6, 1, 1)))
-    fit = fit_mount((TargetView(view.model, exact),), MountState(X, (place,)))
+    """An error over what n numbers tell: n / (n - 2) in the mean, of 1 / chi-square."""
+    view, start = exact_sphere(6)
+    fit = fit_mount((view,), start)
     assert not fit.rejected
     jacobian = MountProblem(fit.views, fit.noise, fit.state).linearise(fit.state)[1]
     rows = jacobian.reshape(-1, jacobian.shape[2])
     likeliest = np.linalg.inv(rows.T @ rows)
     wider = np.diag(fit.covariance) / np.diag(likeliest)
-    assert np.allclose(wider, 9.0 / 6.0, rtol=0.02)
+    assert np.allclose(wider, 9.0 / 7.0, rtol=0.02)
+
+
+def test_what_residuals_tell_of_the_bend_they_do_not_tell_of_the_noise():
+    """Of 12 numbers to spare three tell a bend of which nothing is known: nine are left."""
+    view, start = exact_sphere(7)
+    pull = np.random.default_rng(3).normal(0.0, 1.0, (7, 3, 3))
+    bend = Bend(dict(zip(view.sightings.names, pull, strict=True)), np.zeros(3))
+    noise = fit_mount((view,), start).noise
+    problem = MountProblem((view,), noise, start, bend=bend)
+    likely = RestrictedLikelihood(problem, start, np.ones(7, dtype=np.bool_), None)
+    assert likely.information(likely.now) == pytest.approx(2.0 * 9.0, rel=1e-3)
+    without = MountProblem((view,), noise, start)
+    likely = RestrictedLikelihood(without, start, np.ones(7, dtype=np.bool_), None)
+    assert likely.information(likely.now) == pytest.approx(2.0 * 12.0, rel=1e-3)
+
+
+def test_information_of_the_noises_is_that_of_the_whole_covariance():
+    """Half the trace of P dV P dV, of matrices over all measurements at once."""
+    view, place = step_view(np.random.default_rng(11), 6)
+    state = MountState(X, (place,))
+    likely = RestrictedLikelihood(
+        MountProblem((view,), NOISE, state), state, np.ones(6, dtype=np.bool_), None
+    )
+    _, normal, _, white, common = likely.at(likely.now)
+    J, G = white[..., 1 : -len(common)], white[..., -len(common) :]
+    J = J.reshape(-1, J.shape[2])
+    P = np.eye(len(J)) - J @ np.linalg.inv(normal) @ J.T
+    assert likely.unknown == ["sigma_m", "aim_m"]
+    grown = []
+    for columns in (slice(6), slice(6, 8)):
+        of_it = np.zeros_like(common)
+        of_it[columns, columns] = common[columns, columns]
+        grown.append(P @ block_diag(*(2.0 * own @ of_it @ own.T for own in G)))
+    dense = [[0.5 * np.trace(one @ other) for other in grown] for one in grown]
+    assert np.allclose(likely.information(likely.now), dense, rtol=1e-9)
 
 
 def test_slope_of_the_noise_is_the_numeric_one():
