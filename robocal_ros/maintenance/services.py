@@ -63,6 +63,10 @@ def result_message(result: CycleResult | None) -> MaintenanceResult:
         tool_code=int(result.tool_code),
         tool_id=result.tool_id,
         tool_answer=ANSWERS.get(result.tool_answer, 0),
+        fixture_code=int(result.fixture_code),
+        fixture_id=result.fixture_id,
+        station_code=int(result.station_code),
+        station_id=result.station_id,
         accepted=list(result.accepted),
     )
 

@@ -61,7 +61,7 @@ def _of(*names: str) -> Read:
 
 LAST: Read = _of(
     "cycle_id", "code", "message", "complete", "thermal_code", "thermal_id", "tool_found_code",
-    "tool_code", "tool_id",
+    "tool_code", "tool_id", "station_code",
 ) | {
     "left": lambda m: [words[:LONGEST_TEXT] for words in m.left[:MOST_LEFT]],
     "accepted": lambda m: list(m.accepted[:MOST_LEFT]),

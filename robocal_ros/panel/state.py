@@ -171,6 +171,8 @@ class PanelState:
                 self._found["drift"] = last
             if last["tool_code"] or last["tool_found_code"]:
                 self._found["tool"] = last
+            if last["station_code"]:
+                self._found["station"] = last
 
     def headline(self, now_s: float) -> str:
         """Key of the one sentence, which gives the colour too."""
@@ -228,6 +230,10 @@ class PanelState:
             code = code_of(gap["thermal_code"])
             if code not in WELL:
                 found.append(_task(code, "drift", gap["message"]))
+        if (gap := self._found.get("station")) is not None:
+            code = code_of(gap["station_code"])
+            if code not in WELL:
+                found.append(_task(code, "gap", gap["message"]))
         if self.gaps and TOO_SHORT.search(self.gaps[-1]["message"]):
             found.append(_task(Code.LIMIT_EXCEEDED, "gap", self.gaps[-1]["message"]))
         if fixture := self.sources[FIXTURE].values:
@@ -312,7 +318,7 @@ def _task(code: Code, source: str, words: str) -> Instruction:
 
 
 def _gap(last: Values) -> dict[str, Any]:
-    codes = ("code", "thermal_code", "tool_found_code", "tool_code")
+    codes = ("code", "thermal_code", "tool_found_code", "tool_code", "station_code")
     return {
         **{name: code_of(last[name]).name for name in codes},
         "message": last["message"],

@@ -67,6 +67,10 @@ INPUTS = (
     Register(36, "LastCycle.ToolId", "I", "Candidate of the last tool measurement"),
     Register(38, "Fixture.Id", "I", "The fixture's new frame, to be decided; 0: none"),
     Register(40, "Fixture.Code", "H", "What its last measurement said; 0: none was yet"),
+    Register(41, "LastCycle.FixtureCode", "H", "Verdict of the fixture; 0: not measured"),
+    Register(42, "LastCycle.FixtureId", "I", "Its candidate of that cycle; 0: none"),
+    Register(44, "LastCycle.StationId", "I", "Candidate of the beams that were found again"),
+    Register(46, "LastCycle.StationCode", "H", "Of the beams that were found again; 0: not"),
 )
 HOLDINGS = (
     Register(HEARTBEAT_AT, "Heartbeat", "I", "Beat while the robot may be moved, else 0"),
@@ -75,7 +79,7 @@ HOLDINGS = (
     Register(5, "Request.GapS", "H", "Length of the gap, s"),
     Register(6, "Request.Cycle", "I", "Number of the cycle; its id"),
 )
-INPUT_WORDS = 41
+INPUT_WORDS = 47
 
 
 class Image(Protocol):

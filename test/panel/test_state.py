@@ -187,6 +187,18 @@ def test_a_bent_tool_is_told_until_a_gap_has_measured_it_or_it_is_mended():
     assert keys(panel)[0] == "LIMIT_EXCEEDED/tool mended"
 
 
+def test_beams_that_were_not_found_again_are_told_until_they_are():
+    lost = ended("a", station_code=6)
+    panel = shown(**{STATUS: status(last=lost)})
+    assert keys(panel) == ["RESIDUAL_TOO_LARGE"]
+    panel.show(STATUS, status(last=ended("b")), 3, NOW_S, 1e9)  # they were not looked for
+    assert keys(panel) == ["RESIDUAL_TOO_LARGE"]
+    panel.show(STATUS, status(last=ended("c", station_code=10)), 4, NOW_S, 1e9)
+    assert keys(panel) == ["LIMIT_EXCEEDED/gap"]
+    panel.show(STATUS, status(last=ended("d", station_code=1)), 5, NOW_S, 1e9)
+    assert keys(panel) == ["state/OK"]
+
+
 def test_while_the_robot_moves_the_one_thing_to_do_is_to_keep_away():
     for state in ("RUNNING", "BREAKING_OFF"):
         said = status(state, cycle_id="x", doing="on its way home", last=ended(tool_code=15))

@@ -30,8 +30,8 @@ CHROMIUM = os.environ.get("ROBOCAL_CHROMIUM") or next(
 WITHIN_S = 20.0
 NOTHING = {
     "cycle_id": "", "code": 0, "message": "", "complete": False, "thermal_code": 0,
-    "thermal_id": 0, "tool_found_code": 0, "tool_code": 0, "tool_id": 0, "left": [],
-    "accepted": [], "stamp_ns": 0,
+    "thermal_id": 0, "tool_found_code": 0, "tool_code": 0, "tool_id": 0, "station_code": 0,
+    "left": [], "accepted": [], "stamp_ns": 0,
 }  # fmt: skip
 
 
