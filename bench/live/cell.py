@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParametersAtomically
 
 from bench.cell_samples import CellSamples
 from bench.closed_loop import setting
@@ -113,9 +113,11 @@ def set_fault(call: Callable[..., Any], fault: Fault, size: float = 0.0) -> None
     amount = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=size)
     name = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=fault)
     parameters = [Parameter(name="fault_size", value=amount), Parameter(name="fault", value=name)]
-    answer = call(SetParameters, "/cell_sim_node/set_parameters", parameters=parameters)
-    if not all(result.successful for result in answer.results):
-        raise LiveError(f"no {fault}: {answer.results}")
+    # at once: a size by itself would be that of the fault before
+    service = "/cell_sim_node/set_parameters_atomically"
+    result = call(SetParametersAtomically, service, parameters=parameters).result
+    if not result.successful:
+        raise LiveError(f"no {fault}: {result.reason}")
 
 
 def wiring() -> Mapping[str, Mapping[str, str]]:
