@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from fixture_driver import mounted
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from long_form import amount
 from panel_faults import wrongly_told
 from robocal_msgs.msg import AccuracyState, CalibrationQuality, GapOpen, MaintenanceStatus
 from robocal_msgs.srv import Decide, RunMaintenanceCycle
@@ -92,8 +93,8 @@ class FixtureCell:
     def status(self) -> MaintenanceStatus:
         return self.statuses[-1]
 
-    def ran(self, name: str) -> Any:
-        """The result of a gap that nothing has broken off."""
+    def ran(self, name: str, pause_s: float = 0.0) -> Any:
+        """The result of a gap that nothing has broken off; the robot's first motion pauses."""
         for again in range(TRIES):
             cycle = f"{name}{'+' * again}"
             self.graph.spin_until(lambda: not self.status.doing, "an open gap", 30.0)
@@ -101,6 +102,9 @@ class FixtureCell:
                 RunMaintenanceCycle, "/maintenance_node/run", cycle_id=cycle, gap_s=GAP_S
             )
             assert begun.success, begun.message
+            if pause_s:
+                self.graph.spin_until(lambda: not self.status.at_home, "it moves")
+                set_fault(self.graph.call, "protective_stop", pause_s)
             ended = lambda c=cycle: (  # noqa: E731
                 self.status.last.cycle_id == c and self.status.last.code != Code.NONE
             )
@@ -138,10 +142,12 @@ def test_a_fixture_that_moved_is_told_in_one_gap_and_corrected(cell: FixtureCell
     assert cell.call("accept")[0]
     cell.graph.spin_until(lambda: len(cell.frames) == 1, "the taught frame")
     set_fault(cell.graph.call, "fixture_moved", SHOWN_MM)
-    moved = cell.ran("moved")
+    moved = cell.ran("moved", amount(2.0, 10.0))
     assert moved.complete, moved.message
     assert "fixture: plate moved by " in moved.message
     verdict = cell.verdicts[-1]
+    assert (moved.fixture_code, moved.fixture_id) == (verdict.code, verdict.candidate_id)
+    assert (moved.station_code, moved.station_id) == (Code.NONE, 0)
     assert (verdict.code, verdict.accept) == (Code.ACCEPT, True), verdict.reason
     assert "sensor" not in verdict.reason
     assert "robot" not in verdict.reason
