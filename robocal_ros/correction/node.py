@@ -400,7 +400,12 @@ class JointCorrectionNode(RobotNode):
                 raise
             return trajectory, None
         path = None if self._shadow else self._session.output.path
-        return trajectory if command is came else changed_path(trajectory, command), path
+        try:
+            return trajectory if command is came else changed_path(trajectory, command), path
+        except Exception:
+            if path is not None:  # it never goes out
+                self._session.reject(path)
+            raise
 
     def _goal_sent(self) -> None:
         """Tell what a goal is corrected by."""
