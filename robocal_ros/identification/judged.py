@@ -347,10 +347,9 @@ def contradicted(result: Identification) -> str:
     ratio = result.sigma_ratio
     if 1.0 / CONTRADICTED <= ratio <= CONTRADICTED:
         return ""
-    stated_mm = result.noise_m / max(ratio, 1.0) * 1e3
     return (
-        f"the residuals are {ratio:.2g} times what sigma_mm says ({stated_mm:.3g} mm): state what "
-        "robot and sensor scatter together, or leave the column out, and it is found"
+        f"the residuals are {ratio:.2g} times what sigma_mm says: state what robot "
+        "and sensor scatter together, or leave the column out, and it is found"
     )
 
 
