@@ -33,6 +33,7 @@ SECONDS = 60.0  # of each stream
 BLOCK_S = 2.0  # each in its turn
 DRIFT_M = 0.5e-3
 POINTS, PATHS, PATH_S = 10_000, 10, 3.0
+STEP_NS = 200_000  # between two of them
 OWN_HZ, BLOCK, BLOCKS = 500, 100, 50
 NODE, RELAY, BYTES, SINGLE = "corrected", "relayed", "relayed_bytes", "relayed_single"
 IN_WORDS = {
@@ -310,7 +311,7 @@ def _paths(probe: "Probe", streams: "list[Stream]") -> dict[str, list[float]]:
         for stream in chosen:
             data = serialize_message(_trajectory(stream))
             name = stream.subject.name
-            _stand(probe, stream, 0.1)
+            _stand(probe, stream, 2.0 * POINTS * STEP_NS * 1e-9)  # the one before has ended
             came.clear()
             begin = time.perf_counter()
             publishers[name].publish(data)
@@ -331,7 +332,7 @@ def _stand(probe: "Probe", stream: "Stream", seconds: float, until: Sequence[flo
 
 
 def _trajectory(stream: "Stream") -> Any:
-    """The path from where the stream stands, a point each millisecond."""
+    """The path from where the stream stands."""
     from builtin_interfaces.msg import Duration
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -339,10 +340,11 @@ def _trajectory(stream: "Stream") -> Any:
 
     points = []
     for i in range(POINTS):
-        q, speed = path(stream.t + 1e-3 * i)
+        q, speed = path(stream.t + i * STEP_NS * 1e-9)
         rows = [array("d", row.tobytes()) for row in (q, speed, np.zeros(len(q)))]
         point = JointTrajectoryPoint(positions=rows[0], velocities=rows[1], accelerations=rows[2])
-        point.time_from_start = Duration(sec=i // 1000, nanosec=i % 1000 * 10**6)
+        sec, nanosec = divmod(i * STEP_NS, 10**9)
+        point.time_from_start = Duration(sec=sec, nanosec=nanosec)
         points.append(point)
     return JointTrajectory(joint_names=list(stream.names), points=points)
 
