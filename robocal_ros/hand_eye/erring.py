@@ -61,12 +61,15 @@ def mount_errors(
     by_pose = np.swapaxes(J, 1, 2) @ G  # (g, k, 6)
     known = np.linalg.inv(flat.T @ flat + problem.prior())
     moves = known[:6] @ by_pose  # (g, 6, 6): of the mount with each pose
-    # What of the poses' errors residuals show: their own less what the unknowns take.
-    shown = -np.einsum("gka,kl,hlb->gahb", by_pose, known, by_pose)
-    own = np.arange(poses)
-    shown[own, :, own, :] += np.swapaxes(G, 1, 2) @ G
-    seen = np.einsum("gahb,hbic,icga->", shown, errors, shown, optimize=True)
-    share = float(seen / np.sum(shown**2))
+    # What of the poses' errors residuals show, their own less what the unknowns take, squared: of
+    # hundreds of shots its product with the errors would take minutes.
+    own, taken = np.swapaxes(G, 1, 2) @ G, np.swapaxes(by_pose, 1, 2)
+    V, left = taken.reshape(-1, k), (own @ taken @ known).reshape(-1, k)
+    shown = (V @ known @ (V.T @ V) @ known - left) @ V.T - V @ left.T
+    shown = shown.reshape(poses, 6, poses, 6)
+    each = np.arange(poses)
+    shown[each, :, each, :] += own @ own
+    share = float(np.sum(errors * shown) / np.einsum("gaga->", shown))
     by_joints = np.einsum("gka,gahb,hlb->kl", moves, errors, moves, optimize=True)
     if share > 1.0 and given is None:
         by_joints, size_rad = by_joints / share, size_rad / float(np.sqrt(share))
