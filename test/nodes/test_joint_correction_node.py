@@ -293,6 +293,8 @@ def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
     actual = drifted()
     line.take(model_message(actual), line.to_model, "kinematic_model")
     line.settle()
+    session = line.node._session
+    graph.spin_until(lambda: not session.moves(time.monotonic()), "the end of that stream")
     line.stand()  # the robot has arrived, else it shows the step before
     q = HOME + np.linspace(0.0, 0.1, 10_000)[:, None]
     line.to_path.publish(trajectory(q, np.arange(1, 10_001) * 1e-3))
