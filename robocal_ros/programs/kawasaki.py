@@ -82,7 +82,7 @@ class KawasakiDialect(Dialect):
         """Locations that motions go to, and taught steps; of a file without programs all."""
         clean = masked(text, ";")
         headers = [*_HEADER.finditer(clean)]
-        ends = [*(found.start() for found in headers[1:]), len(clean)]
+        ends = [*(found.start() for found in headers), len(clean)][1:]
         sections = [(found[1], found.end(), end) for found, end in zip(headers, ends, strict=True)]
         programs = [(start, end) for name, start, end in sections if name == "PROGRAM"]
         located = [

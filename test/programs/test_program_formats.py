@@ -98,6 +98,12 @@ def test_text_that_is_not_changed_stays_to_the_byte(maker):
     assert len(gone) == len(text) - sum(len(part.text) for part in parts)
 
 
+@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda dialect: dialect.maker)
+@pytest.mark.parametrize("text", ["", "\n", "nothing of a program\n", "( ; ' \" .\n"])
+def test_a_text_that_is_no_program_holds_no_points(dialect, text):
+    assert dialect.read(text).points == ()
+
+
 def test_endings_are_of_one_maker_each():
     endings = [suffix for dialect in DIALECTS for suffix in dialect.suffixes]
     assert len(endings) == len(set(endings))
