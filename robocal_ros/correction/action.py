@@ -38,7 +38,7 @@ Result = FollowJointTrajectory.Result
 
 # Points of a goal while the robot is being moved, when a stop is to be answered within 50 ms: of
 # 1000 rclpy makes objects, and messages of these again, in 11 ms.
-MOST_IN_MOTION = 3_000
+MOST_GOAL_POINTS_IN_MOTION = 3_000
 ANSWER_S = 5.0  # a controller that has not answered a goal or a cancel by then never will
 WATCH_S = 0.2
 _ABOUT_JOINTS = {Reason.UNKNOWN_JOINT, Reason.DOUBLED_JOINT, Reason.MISSING_JOINT}
@@ -259,7 +259,7 @@ class TrajectoryProxy:
     def _most(self) -> int:
         """Points of a goal that is taken now."""
         moves = self.controller and self._session.moves(time.monotonic())
-        return MOST_IN_MOTION if moves else MOST_POINTS
+        return MOST_GOAL_POINTS_IN_MOTION if moves else MOST_POINTS
 
     def _asked(self, request: Any) -> GoalResponse:
         why = ""
@@ -267,8 +267,8 @@ class TrajectoryProxy:
             why = f"the node is {self._node.state}"
         elif isinstance(request, LongGoal):
             why = (
-                f"it has {request.points} points, allowed {MOST_POINTS}, and {MOST_IN_MOTION} "
-                "while the robot is being moved"
+                f"it has {request.points} points, allowed {MOST_POINTS}, and "
+                f"{MOST_GOAL_POINTS_IN_MOTION} while the robot is being moved"
             )
         elif not request.trajectory.points:
             why = "it has no points, which is no stop: cancel the goal that is under way"

@@ -83,7 +83,7 @@ KINDS = {
 }
 # Points of a trajectory by topic while the robot is being moved, when a stop is to be answered
 # within 50 ms: with joint functions and a tool bent far 1000 take 6 ms, and 1 to read and write.
-MOST_IN_MOTION = 6_000
+MOST_TOPIC_POINTS_IN_MOTION = 6_000
 ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
 # First point of a stop that is not stamped: the controller makes a cubic to it from where and as
 # fast as it is, which does not turn back where the message comes 60 ms late.
@@ -370,9 +370,13 @@ class JointCorrectionNode(RobotNode):
             if not self._shadow:
                 self._stop(f"{TRAJECTORY} without points")
             return
-        if message.points > MOST_IN_MOTION and not self._shadow and self._session.moves(now):
-            words = f"{message.points}, allowed {MOST_IN_MOTION} while the robot is being moved"
-            raise RefusedError(Reason.BURST, words)
+        if (
+            message.points > MOST_TOPIC_POINTS_IN_MOTION
+            and not self._shadow
+            and self._session.moves(now)
+        ):
+            allowed = f"allowed {MOST_TOPIC_POINTS_IN_MOTION} while the robot is being moved"
+            raise RefusedError(Reason.BURST, f"{message.points}, {allowed}")
         self._put_out(TRAJECTORY, message, *self._corrected(message))
         self._by_action = False
         if self._proxy is not None:  # a controller would call a goal reached by another path's end

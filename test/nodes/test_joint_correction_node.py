@@ -30,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from robocal_ros.correction.node import MOST_IN_MOTION, JointCorrectionNode
+from robocal_ros.correction.node import MOST_TOPIC_POINTS_IN_MOTION, JointCorrectionNode
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import OK, WARN
@@ -300,7 +300,7 @@ def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
     line.to_path.publish(trajectory(q, np.arange(1, 10_001) * 1e-3))
     out = line.wait(line.paths)
     assert len(out.points) == 10_000
-    for many in (MOST_IN_MOTION + 1, 10_001):  # they would hold a stop up
+    for many in (MOST_TOPIC_POINTS_IN_MOTION + 1, 10_001):  # they would hold a stop up
         q = HOME + np.linspace(0.0, 0.1, many)[:, None]
         line.refused(line.to_path, trajectory(q, np.arange(1, many + 1) * 1e-3), "joint_trajectory")
     assert distance(actual, out.points[0].positions) < 1e-9

@@ -28,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from unique_identifier_msgs.msg import UUID
 
 from robocal_ros.correction import action as trajectory_proxy
-from robocal_ros.correction.action import MOST_IN_MOTION
+from robocal_ros.correction.action import MOST_GOAL_POINTS_IN_MOTION
 from robocal_ros.correction.interface import MOST_POINTS
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
@@ -268,14 +268,16 @@ def test_a_goal_without_points_is_rejected_and_disturbs_nothing(cell: Any) -> No
 def test_a_goal_of_too_many_points_is_rejected_and_disturbs_nothing(cell: Any) -> None:
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=2.0).moves()
-    for most in (MOST_IN_MOTION, MOST_POINTS):
+    for most in (MOST_GOAL_POINTS_IN_MOTION, MOST_POINTS):
         many = Sent(cell, goal_of(*np.linspace(HOME, MOVED, most + 1), lasts_s=100.0))
         cell.graph.spin_until(lambda m=many: m.handle, "the answer")
         assert not many.handle.accepted
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
     assert len(cell.robot.goals[-1].trajectory.points) == 2
     cell.taught()
-    back = cell.send(*np.linspace(MOVED, HOME, MOST_IN_MOTION + 1), lasts_s=1.0)  # from rest
+    back = cell.send(
+        *np.linspace(MOVED, HOME, MOST_GOAL_POINTS_IN_MOTION + 1), lasts_s=1.0
+    )  # from rest
     back.ends(GoalStatus.STATUS_SUCCEEDED)
 
 
