@@ -43,6 +43,11 @@ ARGUMENTS = {
         "cell_sim_node in place of robot, sensor and beams; never in the graph of a real robot",
     ),
     "plc": ("false", "plc_bridge_node too, the PLC's OPC UA server; params has its security_dir"),
+    "shared": (
+        "false",
+        "Others measure in the same place: plc_bridge_node asks for the gap on gap_wanted, which "
+        "sharing_node passes on (two_robots.launch.py starts it)",
+    ),
     "panel": ("false", "panel_node too, the page for a browser; params has its security_dir"),
     "fixture": ("false", "fixture_node too; params has its fixture_file"),
     "params": (
@@ -53,6 +58,10 @@ ARGUMENTS = {
         ),
         "Parameter file of the cell, after each node's own; by default config/cell.yaml, "
         "of a simulated cell config/cells/kr150_shift.yaml",
+    ),
+    "own_params": (
+        LaunchConfiguration("params"),
+        "Parameter file after that: what this robot alone has, where several have params in common",
     ),
     "namespace": ("", "Of all nodes, and of all topics without a leading /"),
     "controller": (CONTROLLER, "Topic where trajectories end: the controller's joint_trajectory"),
@@ -71,6 +80,7 @@ def cell_node(name, condition=None):
     trajectories = "joint_trajectory" if simulated else "~/joint_trajectory"
     state = "~/controller_state" if simulated else "controller_state"
     sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    asks = IfElseSubstitution(LaunchConfiguration("shared"), "gap_wanted", "gap_open")
     movers = ("tcf_node", "maintenance_node", "joint_correction_node")
     return Node(
         package=PACKAGE,
@@ -80,6 +90,7 @@ def cell_node(name, condition=None):
         parameters=[
             in_share("config", f"{name}.yaml"),
             ParameterFile(LaunchConfiguration("params"), allow_substs=True),
+            ParameterFile(LaunchConfiguration("own_params"), allow_substs=True),
             {"use_sim_time": sim_time},
             *([MOTIONS] if name in movers else []),
         ],
@@ -90,6 +101,7 @@ def cell_node(name, condition=None):
             ("speed_scaling", LaunchConfiguration("speed_scaling")),
             ("kinematic_model", "thermal_node/model"),
             ("tool", "tcf_node/tool"),
+            *([("gap_open", asks)] if name == "plc_bridge_node" else []),
         ],
         # for SROS 2 (docs/security.md): of no effect unless ROS_SECURITY_ENABLE is true
         ros_arguments=[

@@ -332,11 +332,11 @@ class PlcBridgeNode(HouseNode):
         if days < EXPIRES_DAYS:
             words = "has expired" if days < 0 else f"expires in {days} days"
             health.worsen(WARN, f"the server's certificate {words}: make another one")
-        names = [info.node_name for info in self.get_publishers_info_by_topic(GAP_OPEN)]
+        names = [info.node_name for info in self.get_publishers_info_by_topic(self._gap.topic_name)]
         if self.get_name() in names:
             names.remove(self.get_name())  # another one may have the same name
         for name in names:
-            health.worsen(ERROR, f"{name} publishes {GAP_OPEN} too: one PLC alone")
+            health.worsen(ERROR, f"{name} publishes {self._gap.topic_name} too: one PLC alone")
         return health
 
 

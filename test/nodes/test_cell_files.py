@@ -17,6 +17,8 @@ from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.hand_eye.node import HandEyeNode
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.panel.node import PanelNode
+from robocal_ros.plc.node import PlcBridgeNode
 from robocal_ros.ros.base import AUTOSTART, SERIAL
 from robocal_ros.thermal.node import ThermalNode, session_config
 from robocal_ros.tool.node import TcfNode
@@ -66,6 +68,23 @@ def test_the_file_on_the_page_has_values_for_all_nodes():
             assert settings[parameter].accept(value) == value
         for parameter in shared.keys() & settings.keys():
             assert settings[parameter].accept(shared[parameter]) == shared[parameter]
+
+
+def test_files_of_two_robots_have_of_their_own_what_both_cannot_have():
+    left, right = (
+        yaml.safe_load((ROOT / "config" / "cells" / f"{name}.yaml").read_text())
+        for name in ("left", "right")
+    )
+    assert left.keys() == right.keys()
+    nodes = NODES | {f"/**/{n.NAME}": n for n in (PlcBridgeNode, PanelNode)}
+    for section, mine in left.items():
+        one, other = (found["ros__parameters"] for found in (mine, right[section]))
+        known = (SERIAL,) if section == SHARED else nodes[section].SETTINGS
+        settings = {s.name: s for s in known}
+        assert one.keys() == other.keys()
+        for name, value in one.items():
+            assert settings[name].accept(value) == value
+            assert value != other[name] or name == "security_dir"
 
 
 def test_there_is_one():

@@ -18,6 +18,7 @@ import yaml
 from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import GetParameters
 from test_config_files import NODES, settings
+from test_shared_gap import ASKS, ROBOTS
 
 pytest.importorskip("launch_ros", reason="launch_ros comes with a ROS installation only")
 
@@ -57,9 +58,12 @@ class Started:
         return [value for name, value in pairs if name == option]
 
     @property
+    def rules(self) -> dict[str, str]:
+        return dict(rule.split(":=") for rule in self.given("-r"))
+
+    @property
     def remaps(self) -> dict[str, str]:
-        pairs = (rule.split(":=") for rule in self.given("-r"))
-        return {old: new for old, new in pairs if not old.startswith("__")}
+        return {old: new for old, new in self.rules.items() if not old.startswith("__")}
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -147,6 +151,40 @@ def test_nodes_take_the_parameters_that_it_gives(file, given, nodes):
                 assert SETTINGS[name][parameter].accept(value) == value
             else:  # below /**, for others
                 assert parameter == "qos_overrides" or parameter in shared
+
+
+def of_two(**given: str) -> dict[str, Started]:
+    """What two_robots.launch.py starts, by namespace and name."""
+    mine = {f"{robot}_params": str(ROOT / "config/cells" / f"{robot}.yaml") for robot in ROBOTS}
+    description, context = described("two_robots", **mine, **given)
+    nodes = visit(description.entities, context)
+    spaces = ((node.rules.get("__ns", ""), node) for node in nodes)
+    return {f"{space.strip('/')}/{node.executable}": node for space, node in spaces}
+
+
+def test_two_robots_have_serials_and_ports_of_their_own_and_ask_for_the_one_gap():
+    found = of_two(simulated="true", plc="true", panel="true", shared="true")
+    names = CELL | {"cell_sim_node", "plc_bridge_node", "panel_node"}
+    of_each = {f"{robot}/{name}" for robot in ROBOTS for name in names}
+    assert set(found) == of_each | {"/sharing_node"}
+    own = {"plc_bridge_node": "port", "panel_node": "page_port", "thermal_node": "serial"}
+    for executable, parameter in own.items():
+        one, other = (found[f"{robot}/{executable}"].parameters for robot in ROBOTS)
+        assert {name for name in one if one[name] != other[name]} == {parameter, "serial"}
+    assert list(found["/sharing_node"].parameters["robots"]) == list(ROBOTS)
+    for name, node in found.items():
+        is_bridge = name.endswith("/plc_bridge_node")
+        assert {k: v for k, v in node.remaps.items() if k in ASKS} == (ASKS if is_bridge else {})
+
+
+def test_a_gap_that_is_not_shared_goes_straight_to_the_robot():
+    for bridge in (
+        started("cell", plc="true")["plc_bridge_node"],
+        of_two(plc="true")["left/plc_bridge_node"],
+    ):
+        assert bridge.remaps["gap_open"] == "gap_open"
+    shared = started("cell", plc="true", shared="true")["plc_bridge_node"].remaps
+    assert shared["gap_open"] == ASKS["gap_open"]
 
 
 @pytest.mark.parametrize("controller", ["", "joint_trajectory_controller"])
