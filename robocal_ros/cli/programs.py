@@ -27,7 +27,7 @@ from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, WrongRobotError
 from robocal_ros.ground.files import read_bytes, read_text, write_bytes
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.history.history_records import THERMAL
@@ -43,15 +43,16 @@ from robocal_ros.programs.correcting import (
     report,
 )
 from robocal_ros.programs.fanuc import FanucDialect
-from robocal_ros.programs.frame_shift import LEVER_M, PARTS, best_shift, given_shift
+from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_shift, given_shift
 from robocal_ros.programs.points import Dialect, frame_given
 from robocal_ros.thermal.proposing import (
-    FrameShiftInForce,
+    ShiftedWork,
     errors_of,
     keep_shift,
     shift_document,
     shift_in_force,
     shift_verdict,
+    shifted_work,
 )
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from robocal_ros.programs.documents import (
         CorrectedProgramDocument,
         FrameShiftDocument,
+        ShiftDocument,
         ShiftInForceDocument,
     )
 
@@ -334,9 +336,10 @@ def _show_corrected(console: "Console", document: Document) -> None:
 # ---- the shift of base and tool frame ------------------------------------------------------------
 
 
-_SHIFT_EXAMPLE = """example:
+_SHIFT_EXAMPLE = """examples:
   robocal frame-shift --robot kr150_r3100 --robot-serial 4711 --poses work.csv --maker kuka \\
       --tool 'TOOL_DATA[1]=0,0,300,0,0,0' --base 'BASE_DATA[2]=900,0,400,0,0,0'
+  robocal frame-shift --robot kr150_r3100 --robot-serial 4711 --in-force
 """
 _TURNED_MM = 1e3 * LEVER_M
 
@@ -347,13 +350,16 @@ def add_frame_shift(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     parser.add_argument(
         "--poses",
-        required=True,
         type=Path,
         metavar="CSV",
-        help="working poses: q1_deg … (prismatic: q1_mm), and sample and weight where wanted",
+        help="working poses: q1_deg … (prismatic: q1_mm), and sample and weight where wanted; "
+        "with --in-force, where left out, those that the shift was found for",
     )
     parser.add_argument(
-        "--maker", required=True, choices=sorted(COUNT), help="of the controller: how it is written"
+        "--maker",
+        choices=sorted(COUNT),
+        help="of the controller: how it is written; with --in-force, where left out, the six "
+        "numbers of both frames are told alone",
     )
     for name, what in (("tool", "tool"), ("base", "base, work object, user frame or feature")):
         parser.add_argument(
@@ -390,58 +396,53 @@ def add_frame_shift(parser: argparse.ArgumentParser) -> None:
     kept.add_argument(
         "--in-force",
         action="store_true",
-        help="find nothing: print the frames as the shift in force has them, and what it leaves",
+        help="find nothing: print the frames as the shift in force has them, and what it leaves; "
+        "needs neither --poses nor --maker",
     )
 
 
 def run_frame_shift(args: argparse.Namespace) -> CliResult:
-    if args.output is not None and args.output.exists():
-        raise InputError("is there already: name another file", file=str(args.output))
+    _check_shift(args)
     models, warnings = given_models(args)
     nominal = models.nominal
-    q, names, weight = _working_poses(args.poses, nominal)
-    tools = [frame_given(args.maker, given) for given in args.tool]
-    bases = [frame_given(args.maker, given) for given in args.base]
-    tools = tools or [("", nominal.T_flange_tool)]
-    bases = bases or [("", np.eye(4))]
-    if (args.keep or args.in_force) and args.robot_serial is None:
-        raise InputError("--keep and --in-force are about a history: give --robot-serial")
-    in_force = None if args.robot_serial is None else _in_force(args, models, q, tools[0][1])
+    work, weight = _shifted_work(args, nominal)
+    q, T_first = work.q, work.T_flange_tool
+    in_force = None
+    if args.robot_serial is not None and len(q):
+        with model_history(args, nominal) as history:
+            in_force = shift_in_force(history, models, q, T_first)
     if args.in_force:
-        still = FrameShiftInForce(0, given_shift(models, q, tools[0][1], np.eye(4), np.eye(4)))
-        shift = (in_force or still).shift
+        shift = _as_they_are(models, work) if in_force is None else in_force.shift
     else:
         shift = best_shift(
             models,
             q,
-            tools[0][1],
+            T_first,
             parts=tuple(args.parts.split(",")),
             weight=weight,
             lever_m=1e-3 * args.lever_mm,
         )
-    lines = []
-    if "tool" in args.parts:
-        T_first = tools[0][1]  # the shift is that of its axes; others move with the flange
-        T_flange_shift = T_first @ shift.T_tool_shift @ frames.invert(T_first)
-        moved = [(name, T_flange_shift @ T) for name, T in tools]
-        lines += [tool_text(args.maker, T, name) for name, T in moved]
-    if "base" in args.parts:
-        moved = [(name, shift.T_base_shift @ T) for name, T in bases]
-        lines += [base_text(args.maker, T, name) for name, T in moved]
-    words = "\n".join(lines)
+    words = None if args.maker is None else _shifted_text(args, shift, T_first)
     if args.output is not None:
-        write_bytes(args.output, (words + "\n").encode())
-    found = shift_document(shift, names, args.limit_mm)
+        write_bytes(args.output, f"{words}\n".encode())
+    found: ShiftDocument | None = None
     was: ShiftInForceDocument | None = None
+    verdict = Verdict(Code.ACCEPT, "no shift is in force: the frames are as they were")
     if in_force is not None:
         was = {"revision": in_force.revision, **errors_of(in_force.shift.after, args.limit_mm)}
-    verdict = shift_verdict(found, was, args.in_force)
+    if len(q):
+        found = shift_document(shift, work.names, args.limit_mm)
+        verdict = shift_verdict(found, was, args.in_force)
     document: FrameShiftDocument = {
         "robot": nominal.name,
         "model_hash": nominal.model_hash,
         "maker": args.maker,
         "text": words,
-        **found,
+        "T_base_shift": transform_document(shift.T_base_shift),
+        "T_tool_shift": transform_document(shift.T_tool_shift),
+        "before": None if found is None else found["before"],
+        "after": None if found is None else found["after"],
+        "poses": [] if found is None else found["poses"],
         "in_force": was,
         "calibration_id": None,
         "output": None if args.output is None else str(args.output),
@@ -451,16 +452,56 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     if args.keep:
         with model_history(args, nominal) as history:
             document["calibration_id"] = keep_shift(
-                history, nominal, shift, q, document, verdict, time.time_ns()
+                history, nominal, shift, q, T_first, document, verdict, time.time_ns()
             )
     return CliResult(document, _show_shift)
 
 
-def _in_force(
-    args: argparse.Namespace, models: CorrectionModels, q: Array, T_flange_tool: Array
-) -> FrameShiftInForce | None:
-    with model_history(args, models.nominal) as history:
-        return shift_in_force(history, models, q, T_flange_tool)
+def _check_shift(args: argparse.Namespace) -> None:
+    """Raises `InputError` for options that do not belong together."""
+    if (args.keep or args.in_force) and args.robot_serial is None:
+        raise InputError("--keep and --in-force are about a history: give --robot-serial")
+    missing = [name for name in ("poses", "maker") if getattr(args, name) is None]
+    if missing and not args.in_force:
+        raise InputError(f"give --{' and --'.join(missing)}: only --in-force does without")
+    if args.maker is None and (args.output is not None or args.tool or args.base):
+        raise InputError("--output, --tool and --base are in a controller's words: give --maker")
+    if args.output is not None and args.output.exists():
+        raise InputError("is there already: name another file", file=str(args.output))
+
+
+def _shifted_work(args: argparse.Namespace, nominal: SerialArm) -> tuple[ShiftedWork, Array | None]:
+    """Working poses and tool, as given or else as in force, and weights (m,)."""
+    kept = None
+    if args.in_force:
+        with model_history(args, nominal) as history:
+            kept = shifted_work(history, nominal.T_flange_tool)
+    kept = kept or ShiftedWork(np.empty((0, nominal.n)), (), nominal.T_flange_tool)
+    q, names, weight = kept.q, kept.names, None
+    if args.poses is not None:
+        q, names, weight = _working_poses(args.poses, nominal)
+    T_first = frame_given(args.maker, args.tool[0])[1] if args.tool else kept.T_flange_tool
+    return ShiftedWork(q, names, T_first), weight
+
+
+def _as_they_are(models: CorrectionModels, work: ShiftedWork) -> FrameShift:
+    if len(work.q):
+        return given_shift(models, work.q, work.T_flange_tool, np.eye(4), np.eye(4))
+    return FrameShift(np.eye(4), np.eye(4), np.empty((0, 6)), np.empty((0, 6)))
+
+
+def _shifted_text(args: argparse.Namespace, shift: FrameShift, T_first: Array) -> str:
+    """The frames that the controller has as shifted; ``T_first`` (4, 4): the tool of the poses."""
+    tools = [frame_given(args.maker, given) for given in args.tool] or [("", T_first)]
+    bases = [frame_given(args.maker, given) for given in args.base] or [("", np.eye(4))]
+    lines = []
+    if "tool" in args.parts:
+        # the shift is that of its axes; others move with the flange
+        T_flange_shift = T_first @ shift.T_tool_shift @ frames.invert(T_first)
+        lines += [tool_text(args.maker, T_flange_shift @ T, name) for name, T in tools]
+    if "base" in args.parts:
+        lines += [base_text(args.maker, shift.T_base_shift @ T, name) for name, T in bases]
+    return "\n".join(lines)
 
 
 def _working_poses(path: Path, arm: SerialArm) -> tuple[Array, tuple[str, ...], Array | None]:
@@ -479,6 +520,31 @@ def _working_poses(path: Path, arm: SerialArm) -> tuple[Array, tuple[str, ...], 
 
 
 def _show_shift(console: "Console", document: Document) -> None:
+    if document["poses"]:
+        _show_errors(console, document)
+    if document["in_force"]:
+        kept = document["in_force"]
+        words = f"In force: revision {kept['revision']}, with {kept['rms_mm']:.3f} mm rms"
+        print_words(console, words)
+    print_verdict(console, document)
+    if document["calibration_id"] is not None:
+        print_words(console, f"Kept as calibration {document['calibration_id']}")
+    if document["text"] is None:
+        head = ("frame", "x mm", "y mm", "z mm", "rx deg", "ry deg", "rz deg")
+        rows = [_six_numbers(part, document[f"T_{part}_shift"]) for part in PARTS]
+        print_table(console, "The shift, its turn as a rotation vector", head, rows)
+    else:
+        console.out(document["text"], highlight=False)
+    print_output(console, document)
+
+
+def _six_numbers(part: str, shift: Document) -> list[str]:
+    T = frames.transform_from_quat(shift["xyz_mm"], shift["quat_xyzw"])
+    turn = np.degrees(frames.log_rotation(T[:3, :3]))
+    return [part, *(f"{x:.4f}" for x in shift["xyz_mm"]), *(f"{x:.5f}" for x in turn)]
+
+
+def _show_errors(console: "Console", document: Document) -> None:
     rows = []
     for pose in document["poses"]:
         sizes = [pose[when][unit] for unit in ("mm", "deg") for when in ("before", "after")]
@@ -488,12 +554,3 @@ def _show_shift(console: "Console", document: Document) -> None:
     shares = (document[when]["share_within_limit"] for when in ("before", "after"))
     before, after = (f"{100.0 * share:.1f} %" for share in shares)
     print_words(console, f"Coordinates of the error within the limit: {before}, then {after}")
-    if document["in_force"]:
-        kept = document["in_force"]
-        words = f"In force: revision {kept['revision']}, with {kept['rms_mm']:.3f} mm rms"
-        print_words(console, words)
-    print_verdict(console, document)
-    if document["calibration_id"] is not None:
-        print_words(console, f"Kept as calibration {document['calibration_id']}")
-    console.out(document["text"], highlight=False)
-    print_output(console, document)

@@ -89,18 +89,29 @@ class ShiftInForceDocument(ShiftErrorsDocument):
     revision: Ordinal
 
 
-class ShiftDocument(TypedDict):
+class ShiftedFramesDocument(TypedDict):
     T_base_shift: Annotated[PoseDocument, "Goes before every base frame."]
     T_tool_shift: Annotated[PoseDocument, "Goes behind every tool."]
+
+
+class ShiftDocument(ShiftedFramesDocument):
     before: ShiftErrorsDocument
     after: ShiftErrorsDocument
     poses: Annotated[list[ShiftedPoseDocument], keywords(minItems=1)]
 
 
 @printed("frame-shift")
-class FrameShiftDocument(RobotDocument, ShiftDocument):
-    maker: Maker
-    text: Annotated[Words, "The frames as shifted, for the controller."]
+class FrameShiftDocument(RobotDocument, ShiftedFramesDocument):
+    before: Annotated[
+        ShiftErrorsDocument | None,
+        "Null where no shift is in force and no poses were given to judge the frames at.",
+    ]
+    after: ShiftErrorsDocument | None
+    poses: list[ShiftedPoseDocument]
+    maker: Annotated[Maker | None, "Null where none was named, to tell what is in force."]
+    text: Annotated[
+        Words | None, "The frames as shifted, for the controller; null without a maker."
+    ]
     output: Annotated[str | None, "The file that was written."]
     warnings: Texts
     verdict: VerdictDocument

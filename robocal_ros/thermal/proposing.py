@@ -430,6 +430,28 @@ def shift_in_force(
     return FrameShiftInForce(head.revision, given_shift(models, q, T_flange_tool, T_base, T_tool))
 
 
+@dataclass(frozen=True, eq=False)
+class ShiftedWork:
+    """What a shift serves: working poses q (m, n), their names, the tool (4, 4) there."""
+
+    q: Array
+    names: tuple[str, ...]
+    T_flange_tool: Array
+
+
+def shifted_work(history: CalibrationHistory, T_flange_tool: Array) -> ShiftedWork | None:
+    """What the shift in force was found for; None where the frames are as they were.
+
+    ``T_flange_tool`` (4, 4): where it was kept before the tool was kept with it.
+    """
+    number = history.head(FRAME_SHIFT).calibration_id
+    if number is None:
+        return None
+    inputs, poses = history.inputs(number), history.document(number)["poses"]
+    names = tuple(str(pose["name"]) for pose in poses)
+    return ShiftedWork(inputs["q"], names, inputs.get("T_flange_tool", T_flange_tool))
+
+
 def shift_document(shift: FrameShift, names: tuple[str, ...], limit_mm: float) -> "ShiftDocument":
     """A shift, and its errors, of each pose by its name; ``limit_mm``: for the shares."""
     poses = zip(names, _sizes(shift.before), _sizes(shift.after), strict=True)
@@ -516,6 +538,7 @@ def keep_shift(
     nominal: SerialArm,
     shift: FrameShift,
     q: Array,
+    T_flange_tool: Array,
     document: Mapping[str, Any],
     verdict: Verdict,
     wall_ns: int,
@@ -540,7 +563,7 @@ def keep_shift(
                 "T_tool_shift": shift.T_tool_shift.tolist(),
                 "thermal_revision": history.head(THERMAL).revision,
             },
-            inputs={"q": q},
+            inputs={"q": q, "T_flange_tool": T_flange_tool},
         )
     )
 

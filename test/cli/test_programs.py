@@ -19,7 +19,7 @@ from robot_programs import (
 )
 
 from robocal_ros.cli.main import main
-from robocal_ros.ground.frames import transform_from_quat
+from robocal_ros.ground.frames import log_rotation, transform_from_quat
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import save_robot
@@ -279,8 +279,8 @@ def cell(work: Path, capsys) -> tuple:
             )
             history.accept(history.propose(made), by="Ada", reason="", wall_ns=1)
 
-    def shift(*words):
-        ask = ["frame-shift", "--robot", "kr150_r3100", "--poses", "work.csv", "--maker", "kuka"]
+    def shift(*words, given=("--poses", "work.csv", "--maker", "kuka")):
+        ask = ["frame-shift", "--robot", "kr150_r3100", *given]
         status = main([*ask, *where, *words, "--json"])
         return status, json.loads(capsys.readouterr().out)
 
@@ -321,6 +321,44 @@ def test_a_shift_is_kept_verified_and_rolled_back(cell):
         "$TOOL={X 0.0000,Y 0.0000,Z 0.0000,A 0.00000,B 0.00000,C 0.00000}\n"
         "$BASE={X 0.0000,Y 0.0000,Z 0.0000,A 0.00000,B 0.00000,C 0.00000}"
     )
+
+
+def test_what_is_in_force_is_told_without_poses_and_maker(cell, capsys):
+    _, shift, history = cell
+    status, none = shift("--in-force", given=())
+    assert (status, none["text"], none["before"], none["poses"]) == (0, None, None, [])
+    assert none["verdict"]["reason"] == "no shift is in force: the frames are as they were"
+    assert none["T_base_shift"]["xyz_mm"] == [0.0, 0.0, 0.0]
+    _, kept = shift("--keep", "--tool", "TOOL_DATA[3]=120.5,-14.25,262,30,40,-15")
+    assert history("accept", str(kept["calibration_id"]))[0] == 0
+    # at the poses that it was found for, and with their tool
+    _, told = shift("--in-force", given=())
+    for name in ("T_base_shift", "T_tool_shift", "before", "after", "poses"):
+        assert told[name] == kept[name]
+    assert (told["maker"], told["text"], told["in_force"]["revision"]) == (None, None, 1)
+    _, of_maker = shift("--in-force", given=("--maker", "kuka"))
+    assert of_maker["text"] == kept["text"].replace("TOOL_DATA[3]", "$TOOL")
+    for words, missing in (((), "--poses and --maker"), (("--maker", "kuka"), "--poses")):
+        status, document = shift(given=words)
+        assert status == 2
+        assert f"give {missing}: only --in-force" in document["error"]["message"]
+    status, document = shift("--in-force", "--output", "frames.src", given=())
+    assert (status, "give --maker" in document["error"]["message"]) == (2, True)
+
+
+def test_people_get_the_six_numbers_of_each_frame_in_force(cell, capsys):
+    _, shift, history = cell
+    _, kept = shift("--keep")
+    history("accept", str(kept["calibration_id"]))
+    words = ["--robot", "kr150_r3100", "--robot-serial", SERIAL, "--state", "state"]
+    assert main(["frame-shift", *words, "--in-force"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for part in ("base", "tool"):
+        (row,) = (line.split()[1:] for line in lines if line.split()[:1] == [part])
+        numbers = np.array(row, dtype=float)
+        T = frames_of(kept[f"T_{part}_shift"])
+        np.testing.assert_allclose(numbers[:3], 1e3 * T[:3, 3], atol=5e-5)
+        np.testing.assert_allclose(numbers[3:], np.degrees(log_rotation(T[:3, :3])), atol=5e-6)
 
 
 def test_a_shift_for_a_model_that_is_gone_is_stale(cell):
