@@ -32,6 +32,7 @@ from robocal_msgs.msg import (
     ToolFrame,
 )
 from std_srvs.srv import Trigger
+from structured_text import StructuredText, samples
 from test_maintenance_calls import Plc, candidates, process
 
 from bench.live.opc_ua import OPERATOR, PlcClient, free_port, security_folder
@@ -344,6 +345,83 @@ def test_a_gap_by_the_register_map_of_modbus(line):
     assert until(lambda found: found["Answer.Number"] == 2)["Answer.Status"] == Code.CONFLICT
     gateway.close()
     line.graph.spin_until(lambda: line.doing, "the gap closes by its own rule", 5.0)
+
+
+def by_the_page(
+    line: Any, title: str, number: int, take: Callable[[Any], None], give: Callable[[Any], None]
+) -> None:
+    """Run a program of docs/plc.md, a cycle each 50 ms, until it has given one gap."""
+    line.quiet()
+    line.graph.spin_until(lambda: line.doing, "the gap is closed", 5.0)
+    line.graph.spin_for(CONTEST_S)  # the other PLC is silent
+    program = StructuredText(samples()[title], time.monotonic)
+    program["bCellSafe"], program["udiNumber"] = True, number
+    cycles: list[str] = []
+
+    def until(holds: Callable[[], object]) -> None:
+        until_s = time.monotonic() + DISAPPEARS_S
+        while not holds():
+            assert time.monotonic() < until_s, (program._values, line.doing)
+            line.graph.spin_for(0.05)
+            take(program)
+            program.scan()
+            give(program)
+            if not line.doing:
+                assert not program["bProducing"]
+            cycles.append(line.maintenance.statuses[-1].last.cycle_id)
+
+    until(lambda: program["bProducing"])
+    program["bPause"] = True
+    until(lambda: program["iStep"] == 4)
+    until(lambda: program["bProducing"])
+    assert program["udiNumber"] == number + 1, "its first call has begun the cycle"
+    assert line.call("Status", str(number + 1))[4] == Code.ACCEPT
+    assert cycles[-1] == str(number + 1) != cycles[0]
+
+
+def test_a_gap_by_the_program_of_the_page(line):
+    paths = {
+        "udiBeat": "Gap.Beat",
+        "diState": "Maintenance.State",
+        "diCode": "LastCycle.Code",
+        "sLast": "LastCycle.CycleId",
+        "bAtHome": "Maintenance.AtHome",
+    }
+    called: list[Any] = []
+
+    def take(program: StructuredText) -> None:
+        read = line.do(line.plc, line.plc.read_all(list(paths.values())))
+        for name, value in zip(paths, read, strict=True):
+            program[name] = value
+        program["bBeatGood"] = True  # read_all raises else
+
+    def give(program: StructuredText) -> None:
+        at = datetime.now(UTC) if line.plc.stamped else None
+        echo = u32(program["udiHeartbeat"])
+        line.do(line.plc, line.plc.write("Gap.Heartbeat", echo, at))
+        if program["bRun"] and not called:
+            called.append(line.plc.start(line.plc.call("Run", program["sMine"], 60.0)))
+        elif not program["bRun"]:
+            called.clear()
+        program["bRunDone"] = bool(called) and called[0].done()
+        program["bSuccess"] = program["bRunDone"] and called[0].result()[0]
+
+    by_the_page(line, "In Structured Text", 9000, take, give)
+
+
+def test_a_gap_by_the_program_of_the_page_and_modbus(line):
+    gateway = ModbusTcpClient("127.0.0.1", port=line.modbus_port)
+    line.graph.spin_until(gateway.connect, "Modbus")
+
+    def take(program: StructuredText) -> None:
+        program["awIn"] = gateway.read_input_registers(0, count=INPUT_WORDS).registers
+        program["bOnline"] = True
+
+    def give(program: StructuredText) -> None:
+        assert not gateway.write_registers(0, program["awOut"]).isError()
+
+    by_the_page(line, "In Structured Text, by Modbus", 9100, take, give)
+    gateway.close()
 
 
 def test_a_gap_by_another_stack(line, tmp_path):
