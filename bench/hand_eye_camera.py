@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
+from bench.hand_eye_joints import camera_table as joints_of_camera
 from bench.hand_eye_sets import (
     ARM_RMS_MM,
     BOARD,
@@ -319,7 +320,7 @@ def arm_table() -> Table:
 
 def tables() -> Sequence[Table]:
     """All of them; those of real measurements where these are."""
-    made = [bound_table(), intrinsics_table()]
+    made = [bound_table(), intrinsics_table(), joints_of_camera()]
     if not data_folder().is_dir():
         print(f"no real measurements at {data_folder()} (set ROBOCAL_DATA): left out")
         return made

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.hand_eye_joints import tracker_table as joints_of_tracker
 from bench.laser_tracker import Sizes, TrackerCell, prp_cell, six_axis_cell
 from bench.measured_runs import Q_NEAR
 from bench.tables import Goal, Table
@@ -227,4 +228,5 @@ def tables() -> Sequence[Table]:
     """All of them."""
     from bench.hand_eye_erring import erring_table  # which counts as this module does
 
-    return [repeatability_table(), bound_table(), effects_table(), erring_table()]
+    made = [repeatability_table(), bound_table(), effects_table(), erring_table()]
+    return [*made, joints_of_tracker()]

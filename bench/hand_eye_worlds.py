@@ -49,7 +49,8 @@ from robocal_ros.hand_eye.targets import (
     Staircase,
     StepTarget,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, ShotJoints, Task
+from robocal_ros.hand_eye.tasks import HandEyeData, Task
+from robocal_ros.kinematics.joint_errors import ShotJoints
 
 Array = NDArray[np.float64]
 

@@ -7,6 +7,7 @@ mistake in the estimator cannot hide.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,13 @@ def true_flange(arm: SerialArm, q: Array) -> Array:
         T = T @ shift(2, d + along) @ turn(2, theta + about)
         T = T @ shift(0, np.array([a])) @ turn(0, np.array([alpha])) @ turn(1, np.array([beta]))
     return np.asarray(T)
+
+
+class TrueArm(Protocol):
+    """What tells where a flange truly is."""
+
+    def fk(self, q: Array) -> Array:
+        """Flange poses (m, 4, 4) at readings (m, n)."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ class TrackerCell:
     edge_rad: float = float(np.radians(40.0))
     lean_rad: float = float(np.radians(7.0))
     around: tuple[ScannedBody, ...] = ()
-    true: SerialArm | None = None
+    true: TrueArm | None = None
 
     def flange(self, q: Array) -> Array:
         """True T_base_flange (m, 4, 4) at joint values (m, dof)."""

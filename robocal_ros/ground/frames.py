@@ -124,6 +124,18 @@ def skew(v: ArrayLike) -> Array:
     return np.asarray(S - np.swapaxes(S, -1, -2))
 
 
+def adjoint(T: Array) -> Array:
+    """(..., 6, 6): twists (v, w) given on the right of a frame, on the left of T (..., 4, 4).
+
+    ``exp(adjoint(T) x) T = T exp(x)``.
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    found = np.zeros((*T.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = R
+    found[..., :3, 3:] = skew(t) @ R
+    return found
+
+
 def left_jacobian_inverse(rotvec: ArrayLike) -> Array:
     """Inverse left Jacobian (..., 3, 3) of SO(3) at rotation vectors (..., 3).
 

@@ -15,6 +15,7 @@ from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamp
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import MOST_PIXELS, image_array
 from robocal_ros.hand_eye.camera_data import Mount, PosePairs, Shared
+from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.kinematics.robots import read_fields
 
 Image = NDArray[np.uint8]
@@ -488,17 +489,20 @@ def _posed(
 
 
 def board_pairs(
-    seen: SeenBoards, names: tuple[str, ...], T_base_flange: Array, mount: Mount
-) -> PosePairs:
+    seen: SeenBoards, names: tuple[str, ...], T_base_flange: Array, mount: Mount,
+    joints: ShotJoints | None = None,
+) -> PosePairs:  # fmt: skip
     """Pairs of the boards with the flange poses (m, 4, 4) of the samples ``names`` (m,)."""
     row = {name: index for index, name in enumerate(names)}
+    rows = np.array([row[name] for name in seen.names], dtype=np.int64)
     return PosePairs(
-        T_base_flange=T_base_flange[[row[name] for name in seen.names]],
+        T_base_flange=T_base_flange[rows],
         T_camera_board=seen.T_camera_board,
         names=seen.names,
         mount=mount,
         covariance=seen.covariance,
         shared=seen.shared,
+        joints=None if joints is None else joints.take(rows),
     )
 
 

@@ -42,8 +42,16 @@ from robocal_ros.hand_eye.camera_fit import (
     sample_sizes,
     score,
 )
+from robocal_ros.hand_eye.erring import PoseRows, beside_found_noise, said_of_joints
 from robocal_ros.hand_eye.mount_problem import same_pose
-from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings, apart, judge_classic
+from robocal_ros.hand_eye.result import (
+    HandEyeResult,
+    HandEyeSettings,
+    PoseNoise,
+    apart,
+    judge_classic,
+)
+from robocal_ros.kinematics.joint_errors import JointErrors, flange_errors
 
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.documents import CameraNoiseDocument
@@ -342,11 +350,13 @@ class CameraSettings:
     ``method``: ``best`` is maximum likelihood; the name of a closed form is the same from that
     start; ``classic`` is the closed form that fits best, alone, without covariance. ``noise``: what
     is known of it. ``limit_m``: largest expected error where the boards were that is accepted.
+    ``joint_error_rad``: see `HandEyeSettings`.
     """
 
     method: str = "best"
     noise: GivenNoise = field(default_factory=GivenNoise)
     limit_m: float = HandEyeSettings.limit_m
+    joint_error_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -491,7 +501,31 @@ def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
         working_error_m=error_m,
         verdict=unsettled(fit) or judge_camera(fit, size, error_m, how.limit_m),
     )
-    return result, fit.estimate.state
+    erring = joint_errors(fit, how.joint_error_rad, how.noise) if how.joint_error_rad else None
+    return said_of_joints(result, erring), fit.estimate.state
+
+
+def joint_errors(fit: PairFit, size_rad: float, given: GivenNoise) -> JointErrors | None:
+    """What joints that err by ``size_rad`` add to a camera's covariance.
+
+    None where joints are not known, or the model holds what they err by, and of a stream, which is
+    read while they turn.
+    """
+    used = np.flatnonzero(~fit.rejected)
+    pairs, J = fit.pairs.take(used), fit.jacobian[used]
+    if pairs.joints is None or pairs.time_s is not None:
+        return None
+    errors = flange_errors(pairs.joints.arm, size_rad, pairs.joints.q)
+    if errors is None:
+        return None
+    # A flange that is elsewhere is a camera that is, or to hand a board.
+    one, at = (J[..., :6], fit.at.X) if pairs.mount == "in-hand" else (J[..., 6:12], fit.at.Z)
+    both = np.concatenate([J, one @ frames.adjoint(frames.invert(at))], axis=2)
+    J, G = np.split(np.linalg.solve(np.linalg.cholesky(fit.expected[used]), both), [-6], axis=2)
+    rows = PoseRows(J, G, fit.estimate.covariance / fit.estimate.scale**2, slice(0, 6))
+    noise = PoseNoise(fit.noise.position_m, fit.noise.turn_rad)
+    told = fit.covariance[:6, :6]
+    return beside_found_noise(rows, errors, noise, told, size_rad, given.robot_m is not None)
 
 
 def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:

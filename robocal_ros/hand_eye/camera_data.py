@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.ground.frames import Array
+from robocal_ros.kinematics.joint_errors import ShotJoints
 
 # ---- pairs of a robot's pose and of what a camera (or a tracker) saw from there -----------------
 
@@ -46,7 +47,7 @@ class PosePairs:
     ``T_base_flange``, ``T_camera_board`` (m, 4, 4). ``names`` (m,) of the samples. ``covariance``
     (m, 6, 6) of T_camera_board, m and rad: of its position, and of its turn, both along the
     camera's axes; None where it is not known. ``time_s`` (m,) of the samples of a stream,
-    increasing; None of single shots.
+    increasing; None of single shots. ``joints``: that the flange poses were read by, where known.
     """
 
     T_base_flange: Array
@@ -56,6 +57,7 @@ class PosePairs:
     covariance: Array | None = None
     shared: Shared | None = None
     time_s: Array | None = None
+    joints: ShotJoints | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -88,6 +90,7 @@ class PosePairs:
             names=tuple(self.names[i] for i in index),
             covariance=None if self.covariance is None else self.covariance[index],
             time_s=None if self.time_s is None else self.time_s[index],
+            joints=None if self.joints is None else self.joints.take(index),
             shared=None
             if self.shared is None
             else replace(self.shared, sensitivity=self.shared.sensitivity[index]),

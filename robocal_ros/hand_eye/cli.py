@@ -71,9 +71,10 @@ from robocal_ros.hand_eye.targets import (
     TrackerTarget,
     read_target,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, ShotJoints
+from robocal_ros.hand_eye.tasks import HandEyeData
 from robocal_ros.hand_eye.touch_test import TouchTest, compared, touch_test
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.kinematics.robots import load_robot, read_fields
 from robocal_ros.session.events import session_kind
 
@@ -276,8 +277,7 @@ def read_shots(
     """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table, sensor)
-    joints = None if table.q is None or arm is None else ShotJoints(arm, table.q)
-    data = HandEyeData(table.names, table.T_base_flange, seen, table.mark, joints)
+    data = HandEyeData(table.names, table.T_base_flange, seen, table.mark, table.joints)
     return ReadShots(data, table)
 
 

@@ -7,11 +7,15 @@ from math import degrees, radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from robocal_ros.cli.main import (
     ROBOT_HELP,
     CliResult,
     Document,
+    add_joint_error,
     describe_robot,
+    joint_error_rad,
     positive,
     print_table,
     print_text,
@@ -118,7 +122,13 @@ def _tables(
     return used, judges
 
 
-def _from_images(args: argparse.Namespace, settings: CameraSettings) -> HandEyeResult:
+def _settings(args: argparse.Namespace, joints: bool) -> CameraSettings:
+    """How to calibrate; ``joints``: whether those of each pose are known."""
+    noise, joint_rad = GivenNoise(*robot_sigma_of(args)), joint_error_rad(args, joints)
+    return CameraSettings(args.method, noise, args.limit_mm * 1e-3, joint_rad)
+
+
+def _from_images(args: argparse.Namespace) -> HandEyeResult:
     board, intrinsics = _described(args)
     used, judges = _tables(args, "image")
     pairs, seen = _pairs_of_images(used, args, board, intrinsics)
@@ -128,7 +138,7 @@ def _from_images(args: argparse.Namespace, settings: CameraSettings) -> HandEyeR
         check = CheckPairs(held, shown.rejected)
     return calibrate_camera(
         pairs,
-        settings,
+        _settings(args, used.joints is not None),
         check=check,
         rejected=seen.rejected,
         more={"intrinsics": intrinsics_document(seen, intrinsics is None)},
@@ -161,11 +171,11 @@ def _pairs_of_images(
 
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
-    pairs = board_pairs(seen, table.names, table.T_base_flange, args.mount)
+    pairs = board_pairs(seen, table.names, table.T_base_flange, args.mount, table.joints)
     return pairs, replace(seen, rejected=unread | seen.rejected)
 
 
-def _from_poses(args: argparse.Namespace, settings: CameraSettings) -> HandEyeResult:
+def _from_poses(args: argparse.Namespace) -> HandEyeResult:
     robot, check = _tables(args, None)
     camera = read_pose_table(args.measured, None, None)
     tables = [robot, camera] if check is None else [robot, camera, check]
@@ -177,7 +187,9 @@ def _from_poses(args: argparse.Namespace, settings: CameraSettings) -> HandEyeRe
             for stamp_ns, table in zip(stamps, tables, strict=True)
         ]
         judge = None if check is None else streams[2]
-        return calibrate_streams(streams[0], streams[1], args.mount, settings, judge)
+        return calibrate_streams(
+            streams[0], streams[1], args.mount, _settings(args, joints=False), judge
+        )
     if check is not None and not check.named:
         raise InputError("needs a column sample, as the measured poses", file=check.path, row=1)
     pairs, alone = _paired(robot, camera, args.mount)
@@ -190,6 +202,7 @@ def _from_poses(args: argparse.Namespace, settings: CameraSettings) -> HandEyeRe
         held, absent = _paired(check, camera, args.mount)
         judges = CheckPairs(held, {name: absent[name] for name in check.names if name in absent})
         alone = {name: why for name, why in alone.items() if name not in held.names}
+    settings = _settings(args, robot.joints is not None)
     return calibrate_camera(pairs, settings, check=judges, rejected=alone)
 
 
@@ -202,7 +215,9 @@ def _paired(robot: PoseTable, camera: PoseTable, mount: Any) -> tuple[PosePairs,
             file=camera.path,
         )
     place = {name: index for index, name in enumerate(camera.names)}
-    rows = [index for index, name in enumerate(robot.names) if name in place]
+    rows = np.array(
+        [index for index, name in enumerate(robot.names) if name in place], dtype=np.int64
+    )
     names = tuple(robot.names[index] for index in rows)
     if not names:
         raise InputError(f"has no sample of {robot.path}", file=camera.path, column="sample")
@@ -211,6 +226,7 @@ def _paired(robot: PoseTable, camera: PoseTable, mount: Any) -> tuple[PosePairs,
         camera.T_base_flange[[place[name] for name in names]],
         names,
         mount,
+        joints=None if robot.joints is None else robot.joints.take(rows),
     )
     alone = {name: f"not in {camera.path}" for name in robot.names if name not in place}
     known = set(robot.names)
@@ -263,6 +279,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     )
     add_robot(parser)
     add_robot_sigma(parser, "default: from the residuals")
+    add_joint_error(parser)
     add_limit(parser, CAMERA_WHERE, LIMIT_MM)
     parser.add_argument(
         "--check",
@@ -274,7 +291,6 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
 
 
 def run_camera(args: argparse.Namespace) -> CliResult:
-    settings = CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
     if args.measured is not None:
         for option in ("profiles", "board", "square_mm", "intrinsics"):
             if getattr(args, option) is not None:
@@ -282,13 +298,13 @@ def run_camera(args: argparse.Namespace) -> CliResult:
                     f"--{option.replace('_', '-')} belongs to images, --measured to poses: give "
                     "one of both"
                 )
-        result = _from_poses(args, settings)
+        result = _from_poses(args)
     elif args.profiles is None or args.board is None:
         raise InputError(
             "give --profiles, --board and --square-mm for images, or --measured for board poses"
         )
     else:
-        result = _from_images(args, settings)
+        result = _from_images(args)
     return CliResult(drawn_document(result, args, {}), _show_camera)
 
 
@@ -361,6 +377,7 @@ def add_tracker(parser: argparse.ArgumentParser) -> None:
         ("joint-sigma-mm", "0.02"),
     ):  # fmt: skip
         noise.add_argument(f"--{option}", type=positive, metavar="S", help=f"default {default}")
+    add_joint_error(parser)
     add_limit(parser, TRACKER_WHERE, 1e3 * LIMIT_M)
     add_figures(parser)
 
@@ -379,7 +396,9 @@ def run_tracker(args: argparse.Namespace) -> CliResult:
         noise = replace(noise, joint_rad=radians(args.joint_sigma_deg))
     if args.joint_sigma_mm is not None:
         noise = replace(noise, joint_m=args.joint_sigma_mm * 1e-3)
-    result = solve_tracker(data, target, noise, args.method, args.limit_mm * 1e-3)
+    result = solve_tracker(
+        data, target, noise, args.method, args.limit_mm * 1e-3, joint_error_rad(args)
+    )
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
     return CliResult(drawn_document(result, args, {}), _show_tracker)
@@ -389,7 +408,7 @@ def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[s
     """All measurements, and the profiles that show next to nothing, with why."""
     arcs, sphere, faces = read_tracker_points(args.points, arm)
     table = read_pose_table(args.poses, arm)
-    if table.q is None:
+    if table.joints is None:
         raise InputError(
             "the joints are missing: the arcs and the scan are tied by the robot's joints; add "
             "q1_deg …",
@@ -404,7 +423,7 @@ def _read(args: argparse.Namespace, arm: SerialArm) -> tuple[TrackerData, dict[s
     }
     seen = [index for index, name in enumerate(table.names) if name not in rejected]
     profiles = [shot for shot in shots if isinstance(shot, Profile)]
-    return TrackerData(arm, arcs, sphere, faces, table.q[seen], profiles), rejected
+    return TrackerData(arm, arcs, sphere, faces, table.joints.q[seen], profiles), rejected
 
 
 def _show_tracker(console: "Console", document: Document) -> None:

@@ -111,6 +111,13 @@ class HandEyeResultDocument(TypedDict):
     rejected: Names
     rejected_because: dict[str, Words]
     unobservable: Names
+    joint_errors: NotRequired[
+        Annotated[
+            JointErrorsDocument | None,
+            "Of method best; null: the poses' joints are not known, or change, as in a stream; or "
+            "the robot file or the model in force has joint functions.",
+        ]
+    ]
     figures: NotRequired[Annotated[str, "The figure, with --figures."]]
     verdict: VerdictDocument
 
@@ -124,13 +131,6 @@ class MountDocument(HandEyeResultDocument):
     working_distance_mm: NotRequired[float]
     spread: NotRequired[ErrorsDocument]
     linearity: NotRequired[UsedLinearityDocument]
-    joint_errors: NotRequired[
-        Annotated[
-            JointErrorsDocument | None,
-            "Of method best; null: the poses' joints are not known, or the robot file or the model "
-            "in force has joint functions.",
-        ]
-    ]
     held_out: Annotated[HeldOutDocument | None, "Of --check."]
 
 

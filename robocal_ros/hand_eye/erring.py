@@ -5,33 +5,107 @@ Poses far apart show gears as scatter, which the noise that is found from the sh
 another they err alike, and that goes into the mount without a trace in the residuals.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.hand_eye.mount_fit import MountFit
 from robocal_ros.hand_eye.mount_problem import MountProblem
-from robocal_ros.hand_eye.result import HandEyeResult, HandEyeSettings, PoseNoise
-from robocal_ros.hand_eye.tasks import ShotJoints
-from robocal_ros.kinematics.joint_errors import JointErrors, flange_errors, with_joint_errors
+from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise
+from robocal_ros.kinematics.joint_errors import (
+    JointErrors,
+    ShotJoints,
+    flange_errors,
+    with_joint_errors,
+)
 
 
-def judged_with_joints(
-    result: HandEyeResult, fit: MountFit, joints: ShotJoints | None, settings: HandEyeSettings
-) -> HandEyeResult:
+def said_of_joints(result: HandEyeResult, found: JointErrors | None) -> HandEyeResult:
     """A result whose verdict and document say what the joints add to its sigma.
 
-    Where that is not told the document has null: without ``joints``, or where the model that they
-    were read by holds what joints err by.
+    ``found``: None where that is not known; the document has null.
     """
-    found = None
-    if joints is not None and settings.joint_error_rad > 0.0 and result.covariance is not None:
-        size_rad, given = settings.joint_error_rad, settings.noise()
-        found = mount_errors(fit, result.covariance, joints, size_rad, given)
     more = {**result.more, "joint_errors": None if found is None else found.document()}
-    verdict = with_joint_errors(result.verdict, found, "mount")
-    return replace(result, verdict=verdict, more=more)
+    return replace(result, verdict=with_joint_errors(result.verdict, found, "mount"), more=more)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """A fit's whitened residuals, linearised: r rows of each of g poses.
+
+    ``by_unknowns`` (g, r, k), of which ``mount`` are the sensor's six; ``known`` (k, k): their
+    covariance. ``by_pose`` (g, r, 6): by six numbers that a pose errs by.
+    """
+
+    by_unknowns: Array
+    by_pose: Array
+    known: Array
+    mount: slice
+
+    @cached_property
+    def _own(self) -> Array:
+        return np.swapaxes(self.by_pose, 1, 2) @ self.by_pose
+
+    @cached_property
+    def _taken(self) -> Array:
+        """(g, 6, k): what the unknowns take of the poses' errors."""
+        return np.swapaxes(self.by_pose, 1, 2) @ self.by_unknowns
+
+    @cached_property
+    def _moves(self) -> Array:
+        """(g, 6, 6): of the mount with each pose."""
+        return self.known[self.mount] @ np.swapaxes(self._taken, 1, 2)
+
+    def of_mount(self, errors: Array) -> Array:
+        """Covariance (6, 6) of the mount by that of the poses (g, 6, g, 6)."""
+        moves = self._moves
+        return np.asarray(np.einsum("gka,gahb,hlb->kl", moves, errors, moves, optimize=True))
+
+    def of_mount_anew(self) -> Array:
+        """The same by numbers of variance one, drawn anew for each pose."""
+        return np.asarray(np.einsum("gka,gla->kl", self._moves, self._moves))
+
+    def squared(self, errors: Array) -> float:
+        """What such errors of the poses add to the sum of the squared residuals."""
+        own = float(np.einsum("gagb,gab->", errors, self._own))
+        taken = self._taken
+        both = np.einsum("gak,gahb,hbl->kl", taken, errors, taken, optimize=True)
+        return own - float(np.sum(both * self.known))
+
+    def share(self, errors: Array) -> float:
+        """How much of the scatter such errors make that numbers of variance one make.
+
+        What residuals show of the poses, their own less what the unknowns take, squared: of
+        hundreds of shots its product with the errors would take minutes.
+        """
+        own, taken, poses = self._own, self._taken, len(self._own)
+        V, left = (part.reshape(-1, len(self.known)) for part in (taken, own @ taken @ self.known))
+        shown = (V @ self.known @ (V.T @ V) @ self.known - left) @ V.T - V @ left.T
+        shown = shown.reshape(poses, 6, poses, 6)
+        each = np.arange(poses)
+        shown[each, :, each, :] += own @ own
+        return float(np.sum(errors * shown) / np.einsum("gaga->", shown))
+
+
+def beside_found_noise(
+    rows: PoseRows, errors: Array, noise: PoseNoise, told: Array, size_rad: float, given: bool
+) -> JointErrors:
+    """What poses that err, (g, 6, g, 6), add where the noise of a pose was found from the shots.
+
+    Of that noise the share that such joints make is in ``told`` already, as if it were drawn anew
+    for each pose: what they make of the mount stands in its place. Where they would make more
+    scatter than the shots show, they err by less: by so much as makes all of it. Noise that is
+    ``given`` does not tell.
+    """
+    unit = np.repeat([noise.sigma_m, noise.sigma_rad], 3)
+    rows = replace(rows, by_pose=rows.by_pose * unit)  # of six numbers of variance one
+    errors = errors / unit[:, None, None] / unit
+    share, by_joints = rows.share(errors), rows.of_mount(errors)
+    if share > 1.0 and not given:
+        by_joints, size_rad = by_joints / share, size_rad / float(np.sqrt(share))
+    return JointErrors.beside(size_rad, by_joints - min(share, 1.0) * rows.of_mount_anew(), told)
 
 
 def mount_errors(
@@ -39,10 +113,7 @@ def mount_errors(
 ) -> JointErrors | None:
     """What joints that err by ``size_rad`` add to a mount's covariance ``told`` (6, 6).
 
-    To first order, with the fit's weights. Of the noise that was found from the shots, the share
-    that such joints make of it is in ``told`` already, as if it were drawn anew for each pose: what
-    they make of the mount stands in its place. Where they would make more scatter than the shots
-    show, they err by less: by so much as makes all of it. Noise that is ``given`` does not tell.
+    To first order, with the fit's weights; see `beside_found_noise`.
     """
     problem = MountProblem(fit.views, fit.noise, fit.state)
     first = np.unique(problem.sample, return_index=True)[1]
@@ -53,25 +124,7 @@ def mount_errors(
     linear, k = problem.linear(fit.state), len(problem.names)
     both = np.concatenate([linear.jacobian, linear.common[..., :6]], axis=2)
     J, G = np.split(problem.whitened(replace(linear, jacobian=both))[1], [k], axis=2)
-    unit = np.repeat([fit.noise.sigma_m, fit.noise.sigma_rad], 3)
-    G = G * unit  # so that the noise of a pose is drawn from six numbers of size one
-    errors = errors / unit[:, None, None] / unit
-    poses = len(G)
     flat = J.reshape(-1, k)
-    by_pose = np.swapaxes(J, 1, 2) @ G  # (g, k, 6)
     known = np.linalg.inv(flat.T @ flat + problem.prior())
-    moves = known[:6] @ by_pose  # (g, 6, 6): of the mount with each pose
-    # What of the poses' errors residuals show, their own less what the unknowns take, squared: of
-    # hundreds of shots its product with the errors would take minutes.
-    own, taken = np.swapaxes(G, 1, 2) @ G, np.swapaxes(by_pose, 1, 2)
-    V, left = taken.reshape(-1, k), (own @ taken @ known).reshape(-1, k)
-    shown = (V @ known @ (V.T @ V) @ known - left) @ V.T - V @ left.T
-    shown = shown.reshape(poses, 6, poses, 6)
-    each = np.arange(poses)
-    shown[each, :, each, :] += own @ own
-    share = float(np.sum(errors * shown) / np.einsum("gaga->", shown))
-    by_joints = np.einsum("gka,gahb,hlb->kl", moves, errors, moves, optimize=True)
-    if share > 1.0 and given is None:
-        by_joints, size_rad = by_joints / share, size_rad / float(np.sqrt(share))
-    as_noise = np.einsum("gka,gla->kl", moves, moves)
-    return JointErrors.beside(size_rad, by_joints - min(share, 1.0) * as_noise, told)
+    rows = PoseRows(J, G, np.asarray(known, dtype=np.float64), slice(0, 6))
+    return beside_found_noise(rows, errors, fit.noise, told, size_rad, given is not None)

@@ -35,6 +35,7 @@ from robocal_ros.hand_eye.profiles import (
 from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE
 from robocal_ros.hand_eye.tracker_data import Arc
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import (
     POSITION,
@@ -72,7 +73,7 @@ class PoseTable:
     ``names`` (m,) of the shots; where the table gives none the file's name, or the row's number.
     ``T_base_flange`` (m, 4, 4), m.
     ``files`` (m,) relative to the folder of the shots; none where no such column was asked for.
-    ``q`` (m, n) joint readings, rad (prismatic: m); None without them, or where no arm is known.
+    ``joints``: that were read; None without them, or where no arm is known.
     ``stamp_ns`` (m,); None without a column.
     ``mark`` (m,) of the target, through which the laser plane was laid; None without a column.
     ``path``, ``rows``, ``column``: the table's file, the row of each shot there, the column of
@@ -83,7 +84,7 @@ class PoseTable:
     names: tuple[str, ...]
     T_base_flange: Array
     files: tuple[str, ...]
-    q: Array | None
+    joints: ShotJoints | None
     stamp_ns: NDArray[np.int64] | None
     mark: tuple[str, ...] | None
     path: str
@@ -140,7 +141,7 @@ def read_pose_table(
         names=read_samples(table, files or tuple(map(str, table.rows))),
         T_base_flange=_poses(table, layout, arm, q),
         files=files,
-        q=q,
+        joints=None if q is None or arm is None else ShotJoints(arm, q),
         stamp_ns=read_stamps(table) if "stamp_s" in layout.place else None,
         mark=table.words("mark") or None,
         path=table.file,

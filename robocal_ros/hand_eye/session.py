@@ -68,6 +68,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.session import events
 from robocal_ros.session.events import (
     OWN,
@@ -190,20 +191,19 @@ def solved(
         raise InputError("marked points judge a sensor's place, they find none: call verify")
     if data.kind == TRACKER:
         return _solved_tracker(data, samples, nominal, cast(Method, method), config)
-    T_base_flange = sample_poses(samples, nominal)
     if data.kind == "camera":
-        return _solved_camera(data, samples, T_base_flange, cast(Method, method), config)
+        return _solved_camera(data, samples, nominal, cast(Method, method), config)
     from robocal_ros.hand_eye.solve import solve_task
     from robocal_ros.hand_eye.stairs import task_of
-    from robocal_ros.hand_eye.tasks import HandEyeData, ShotJoints
+    from robocal_ros.hand_eye.tasks import HandEyeData
 
     names = tuple(str(sample.handle) for sample in samples)
     shots = HandEyeData(
         names,
-        T_base_flange,
+        sample_poses(samples, nominal),
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
         tuple(sample.mark for sample in samples) if data.kind == "step" else None,
-        ShotJoints(samples[0].thermal.arm(nominal), np.array([sample.q for sample in samples])),
+        shot_joints(samples, nominal),
     )
     settings = HandEyeSettings(
         config.robot_sigma_m,
@@ -220,6 +220,11 @@ def sample_poses(samples: Samples, nominal: SerialArm) -> Array:
     """T_base_flange (k, 4, 4), m, each by the thermal model that was in force at its sample."""
     q = np.array([sample.q for sample in samples]).reshape(-1, nominal.n)
     return flange_poses(q, [sample.thermal for sample in samples], nominal)
+
+
+def shot_joints(samples: Samples, nominal: SerialArm) -> ShotJoints:
+    """The samples' joints; what these err by is the arm's, whatever warmed it in between."""
+    return ShotJoints(samples[0].thermal.arm(nominal), np.array([sample.q for sample in samples]))
 
 
 def _solved_tracker(
@@ -256,14 +261,14 @@ def _solved_tracker(
     )
     noise = TrackerNoise(config.tracker_sigma_m, config.joint_sigma_rad, config.joint_sigma_m)
     target: Any = target_of(data.target)
-    result = solve_tracker(measured, target, noise, method, config.limit_m)
+    result = solve_tracker(measured, target, noise, method, config.limit_m, config.joint_error_rad)
     handles = {f"{m} {i}": str(one.handle) for m in ROLES for i, one in enumerate(of[m], 1)}
     rejected = {handles.get(name, name): why for name, why in result.rejected.items()}
     return replace(result, rejected=rejected)
 
 
 def _solved_camera(
-    data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
+    data: DataSet, samples: Samples, nominal: SerialArm, method: Method, config: HandEyeConfig
 ) -> HandEyeResult:
     """From the corners of a board in images, or from poses of the target."""
     from robocal_ros.hand_eye.boards import board_pairs, boards_of_corners, intrinsics_document
@@ -272,12 +277,14 @@ def _solved_camera(
     from robocal_ros.hand_eye.camera_fit import GivenNoise
 
     names = tuple(str(sample.handle) for sample in samples)
+    T_base_flange = sample_poses(samples, nominal)
     noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)
-    settings = CameraSettings(method, noise, config.limit_m)
+    settings = CameraSettings(method, noise, config.limit_m, config.joint_error_rad)
+    joints = shot_joints(samples, nominal)
     if data.topic != IMAGE:
         seen = np.concatenate([sample.values for sample in samples])
         T_camera_board = frames.transform_from_quat(seen[:, :3], seen[:, 3:])
-        pairs = PosePairs(T_base_flange, T_camera_board, names, data.mount)
+        pairs = PosePairs(T_base_flange, T_camera_board, names, data.mount, joints=joints)
         return calibrate_camera(pairs, settings)
     target = board_of(data.target)
     corners = [sample.values[1:] for sample in samples]
@@ -285,7 +292,7 @@ def _solved_camera(
     size = int(width), int(height)
     boards = boards_of_corners(names, corners, target.board, size, target.intrinsics)
     return calibrate_camera(
-        board_pairs(boards, names, T_base_flange, data.mount),
+        board_pairs(boards, names, T_base_flange, data.mount, joints),
         settings,
         rejected=boards.rejected,
         more={"intrinsics": intrinsics_document(boards, target.intrinsics is None)},

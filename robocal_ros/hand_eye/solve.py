@@ -18,7 +18,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.hand_eye.erring import judged_with_joints
+from robocal_ros.hand_eye.erring import mount_errors, said_of_joints
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
     LARGEST_POSE_M,
@@ -65,7 +65,8 @@ from robocal_ros.hand_eye.result import (
     judge_residuals,
     shots_of,
 )
-from robocal_ros.hand_eye.tasks import HandEyeData, Read, ShotJoints, Task, read_with
+from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task, read_with
+from robocal_ros.kinematics.joint_errors import ShotJoints
 
 Part = tuple[Task, HandEyeData]
 
@@ -156,7 +157,10 @@ def _result_of(
         verdict=verdict,
         more=more,
     )
-    return judged_with_joints(found_one, fit, data.joints, settings)
+    joints, size_rad, erring = data.joints, settings.joint_error_rad, None
+    if joints is not None and size_rad > 0.0:
+        erring = mount_errors(fit, fit.covariance[:6, :6], joints, size_rad, settings.noise())
+    return said_of_joints(found_one, erring)
 
 
 def _bent(fit: MountFit, reads: Sequence[Read], linearity: SensorLinearity) -> tuple[Array, Array]:

@@ -43,7 +43,7 @@ from robocal_ros.hand_eye.mount_problem import (
 from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.result import PoseNoise, TargetKind
 from robocal_ros.hand_eye.targets import LineTarget, SphereTarget
-from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_errors import ShotJoints
 
 Fit = TypeVar("Fit")
 
@@ -77,14 +77,6 @@ DIRECTIONS = 60  # directions of an unknown line that are tried
 KEPT_LINES = 8
 ALIKE_M = 1e-6  # small, so that the descent goes to the very minimum
 SEED = 5  # of the fixed set of trials
-
-
-@dataclass(frozen=True, eq=False)
-class ShotJoints:
-    """Readings (m, n) of joints at m shots, rad (prismatic: m), and the arm that poses are of."""
-
-    arm: SerialArm
-    q: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ they move it along its path.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.ground.frames import Array
+from robocal_ros.hand_eye.erring import PoseRows, said_of_joints
 from robocal_ros.hand_eye.mount_problem import moved, tangents
 from robocal_ros.hand_eye.result import (
     HandEyeResult,
@@ -48,6 +50,7 @@ from robocal_ros.hand_eye.tracker_scan import (
     fit_lines,
     solve_classic,
 )
+from robocal_ros.kinematics.joint_errors import JointErrors, flange_errors
 
 FLANGE, SENSOR = slice(0, 6), slice(6, 12)
 REFLECTOR, CENTRE = slice(12, 15), slice(15, 18)
@@ -105,18 +108,6 @@ class TrackerUnknowns:
     def sensor_poses(self, motion: Array) -> Array:
         """T_tracker_sensor (m, 4, 4) of the profiles, from their T_flange0_flange (m, 4, 4)."""
         return np.asarray(self.T_tracker_flange @ motion @ self.T_flange_sensor)
-
-
-def adjoint(T: Array) -> Array:
-    """(..., 6, 6): twists (v, w) given on the right of a frame, on the left of T (..., 4, 4).
-
-    ``exp(adjoint(T) x) T = T exp(x)``.
-    """
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    found = np.zeros((*T.shape[:-2], 6, 6))
-    found[..., :3, :3] = found[..., 3:, 3:] = R
-    found[..., :3, 3:] = frames.skew(t) @ R
-    return found
 
 
 # The axes of a real arm stand to each other a little otherwise than its model says. Both are taken
@@ -182,7 +173,7 @@ class AxisPair:
 
     def twists(self, carried: Array, share: float) -> Array:
         """Left twists (n, 6, 2) of carried motions by the mismatch."""
-        return np.asarray(share * (self.screws - adjoint(carried) @ self.screws))
+        return np.asarray(share * (self.screws - frames.adjoint(carried) @ self.screws))
 
 
 OF_FACE = 2  # rows of a profile for each face; then come those of the sphere
@@ -293,7 +284,7 @@ class TrackerProblem:
         twist = np.concatenate([part[1] for part in parts], axis=1)
         J = np.concatenate([part[2] for part in parts], axis=1)
         J[..., SENSOR] = twist
-        J[..., FLANGE] = twist @ adjoint(frames.invert(motion @ state.T_flange_sensor))
+        J[..., FLANGE] = twist @ frames.adjoint(frames.invert(motion @ state.T_flange_sensor))
         J[..., MISMATCH] = J[..., FLANGE] @ self.axes.twists(motion, share)
         return residual, J, twist
 
@@ -327,7 +318,7 @@ class TrackerProblem:
     def _whitening(self) -> Array:
         """Inverse square root (m, 7, 7) of the profiles' covariance."""
         twist = self._profiles(self.start)[2] * self._seen[..., None]
-        to_sensor = adjoint(frames.invert(self.start.T_flange_sensor))
+        to_sensor = frames.adjoint(frames.invert(self.start.T_flange_sensor))
         G = twist @ to_sensor @ self._joint_errors(self.data.q)
         return np.linalg.inv(np.linalg.cholesky(np.eye(G.shape[1]) + G @ np.swapaxes(G, 1, 2)))
 
@@ -342,6 +333,40 @@ class TrackerProblem:
             G = R @ (v - frames.skew(self.start.reflector) @ w)
             covariance = self.noise.tracker_m**2 * np.eye(3) + G @ np.swapaxes(G, 1, 2)
             found.append((T, np.linalg.inv(np.linalg.cholesky(covariance))))
+        return found
+
+    @property
+    def readings(self) -> Array:
+        """Of the joints (g, dof): at the points of the arcs, then at the profiles."""
+        return np.concatenate([*(arc.q for arc in self.data.arcs), self.data.q])
+
+    def pose_rows(self, state: TrackerUnknowns) -> tuple[Array, Array]:
+        """What whitened rows at the readings move by: (g, 7, 26) unknowns, (g, 7, 6) the flange.
+
+        By its (v, w), own axes. Rows that a reading lacks are zero.
+        """
+        R, points = state.T_tracker_flange[:3, :3], []
+        for arc, (motion, white) in zip(self.data.arcs, self._arc_motions, strict=True):
+            T = self.axes.carried(motion, state.mismatch, self.axes.share_of(arc.q))
+            lever = np.concatenate([np.eye(3), -frames.skew(state.reflector)], axis=1)
+            points.append(white @ R @ T[:, :3, :3] @ lever)
+        twist = self._whitening @ self._profiles(state)[2]
+        by_pose = twist @ frames.adjoint(frames.invert(state.T_flange_sensor))
+        arcs = np.concatenate(points)
+        by_arcs = np.zeros((len(arcs), *by_pose.shape[1:]))
+        by_arcs[:, :3] = arcs
+        return (
+            self.of_readings(self.linearise(state)[1][:, 0]),
+            np.concatenate([by_arcs, by_pose * self._seen[..., None]]),
+        )
+
+    def of_readings(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Those of all rows (r, ...) that belong to `readings`: (g, 7, ...), zero where none is."""
+        points = sum(len(arc.points) for arc in self.data.arcs)
+        there = np.zeros((len(self.readings), self._seen.shape[1]), dtype=np.bool_)
+        there[:points, :3], there[points:] = True, self._seen
+        found = np.zeros((*there.shape, *rows.shape[1:]), dtype=rows.dtype)
+        found[there] = np.concatenate([rows[: 3 * points], rows[len(rows) - self._seen.sum() :]])
         return found
 
     def _joint_errors(self, q: Array) -> Array:
@@ -459,8 +484,12 @@ def solve_tracker(
     noise: TrackerNoise,
     method: Method = "best",
     limit_m: float = LIMIT_M,
+    joint_error_rad: float = 0.0,
 ) -> HandEyeResult:
-    """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted."""
+    """Calibrate; ``limit_m``: largest error to expect at the working distance that is accepted.
+
+    ``joint_error_rad``: see `HandEyeSettings`.
+    """
     classic = solve_classic(data, target, noise)
     problem, estimate = solve_best(data, target, noise, classic)
     best = _result(data, target, classic, estimate.state, "best")
@@ -490,7 +519,36 @@ def solve_tracker(
     }
     verdict = judge_tracker(estimate, working_m, limit_m)
     best = replace(best, working_error_m=working_m, verdict=verdict, more=more)
+    erring = joint_errors(problem, estimate, joint_error_rad) if joint_error_rad else None
+    best = said_of_joints(best, erring)
     return _classic(data, target, classic, best, limit_m) if method == "classic" else best
+
+
+def joint_errors(
+    problem: TrackerProblem, estimate: Estimate[TrackerUnknowns], size_rad: float
+) -> JointErrors | None:
+    """What joints that err by ``size_rad`` add to a sensor's covariance.
+
+    None where the model holds what they err by. The noise of tracker, sensor and joints is known:
+    what residuals show beyond it is by joints that err, and widens the covariance that is told.
+    Where they would add more to the residuals than these show, they err by less.
+    """
+    data = problem.data
+    errors = flange_errors(data.arm, size_rad, problem.readings)
+    if errors is None:
+        return None
+    known = estimate.covariance / estimate.scale**2
+    J, G = problem.pose_rows(estimate.state)
+    used = problem.of_readings(~estimate.rejected)[..., None]
+    by_joints = PoseRows(J, G * used, known, SENSOR).of_mount(errors)
+    squared = PoseRows(J, G, known, SENSOR).squared(errors)  # rejected ones show the most
+    left = estimate.residual.size - len(estimate.names)
+    seen = max(float(np.sum(estimate.residual**2)) - left, 0.0)
+    if seen < squared:
+        by_joints, size_rad = by_joints * seen / squared, size_rad * float(np.sqrt(seen / squared))
+    widened = (estimate.scale**2 - 1.0) * known[SENSOR, SENSOR]
+    told = estimate.covariance[SENSOR, SENSOR]
+    return JointErrors.beside(size_rad, by_joints - widened, told)
 
 
 def _classic(

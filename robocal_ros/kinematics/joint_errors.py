@@ -12,12 +12,24 @@ import numpy as np
 
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground.documents import JointErrorsDocument
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.kinematics.arm import SerialArm
 
 ALIKE_RAD = float(np.radians(3.5))  # of a UR10, between 1 and 4 deg (docs/simulation.md)
 SIZE_URAD = 300.0  # rms of a UR10's joints, 240 to 380 (docs/simulation.md)
 HONEST = 1.25  # squared error over what is told of it; beyond, it is said
+
+
+@dataclass(frozen=True, eq=False)
+class ShotJoints:
+    """Readings (m, n) of joints at m shots, rad (prismatic: m), and the arm that poses are of."""
+
+    arm: SerialArm
+    q: Array
+
+    def take(self, rows: Index) -> "ShotJoints":
+        """Those at some shots."""
+        return replace(self, q=self.q[rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import hand_eye_sets
 from bench.hand_eye_cell import TruePose
+from bench.hand_eye_joints import NARROW_RAD, camera_cell, camera_pairs, ur10
 from robocal_ros.cli.main import main
 from robocal_ros.hand_eye.camera import distances
 from robocal_ros.hand_eye.camera_data import CLOSED_FORMS
@@ -74,6 +75,28 @@ def test_board_poses_give_the_camera(robocal) -> None:
     known = robocal(*pairs, "--robot-sigma-mm", "0.1", "--robot-sigma-deg", "0.0115")
     assert known["noise"]["robot_turn_deg"] == pytest.approx(0.0115)
     assert near(known)
+
+
+def test_joints_that_err_are_said_where_the_joints_are_known(robocal, tmp_path) -> None:
+    rng = np.random.default_rng(4)
+    pairs = camera_pairs(camera_cell("in-hand"), ur10(rng), NARROW_RAD, rng)
+    arm, q = pairs.joints.arm, pairs.joints.q
+    poses, boards = tmp_path / "poses.csv", tmp_path / "boards.csv"
+    write_pose_table(poses, pairs.T_base_flange, names=pairs.names, joints=(arm, q))
+    write_pose_table(boards, pairs.T_camera_board, names=pairs.names)
+    given = ("--poses", poses, "--measured", boards)
+    found = robocal(*given, "--robot", "ur10")
+    factor = found["joint_errors"]["factor"]
+    assert factor > 1.15
+    assert found["verdict"]["reason"].endswith(f"to the mount's sigma: count {factor:.1f} of it")
+    silent = robocal(*given, "--robot", "ur10", "--joint-error-urad", 0)
+    assert silent["joint_errors"] is None
+    assert silent["covariance"] == found["covariance"]
+    assert robocal(*given)["joint_errors"] is None  # poses alone
+    refused = robocal(*given, "--joint-error-urad", 50, status=2)
+    assert "needs the joints of each pose" in refused["error"]["message"]
+    streams = ("--poses", "stream_poses.csv", "--measured", "stream_boards.csv")
+    assert robocal(*streams)["joint_errors"] is None
 
 
 def test_every_start_gives_the_same_camera(robocal) -> None:

@@ -15,6 +15,7 @@ from robocal_ros.ground import frames
 from robocal_ros.hand_eye.files import read_tracker_points
 from robocal_ros.hand_eye.targets import read_tracker_target
 from robocal_ros.hand_eye.tracker import solve_tracker
+from robocal_ros.hand_eye.tracker_data import TrackerNoise
 from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
@@ -63,6 +64,19 @@ def test_both_methods_find_the_sensor(folder):
     assert classic["covariance"] is None
     distance = np.subtract(classic["T_flange_sensor"]["xyz_mm"], truth[:3, 3] * 1e3)
     assert np.linalg.norm(distance) < 1.0  # four times the published 0.25 mm
+
+
+def test_joints_that_err_are_said_as_far_as_residuals_show_them(folder):
+    """Of this arm, which has no gears, what its scatter hides; more where sigmas are too small."""
+    found, scatter_urad = run(folder), 1e6 * TrackerNoise().joint_rad
+    assert found["joint_errors"]["size_urad"] < 2.0 * scatter_urad
+    told = run(folder, "--joint-sigma-deg", 1e-4, "--joint-sigma-mm", 1e-4)
+    factor = told["joint_errors"]["factor"]
+    assert factor > found["joint_errors"]["factor"]
+    assert told["verdict"]["reason"].endswith(f"count {factor:.1f} of it")
+    silent = run(folder, "--joint-error-urad", 0)
+    assert silent["joint_errors"] is None
+    assert silent["covariance"] == found["covariance"]
 
 
 def test_the_files_hold_what_was_measured(tmp_path):

@@ -218,7 +218,7 @@ def test_the_tables_hold_the_same_shots(script, recordings, tmp_path, kind):
     script.write_csv(recordings[kind], tmp_path)
     table = read_pose_table(tmp_path / "poses.csv", UR10)
     # joints are written to 12 digits, 5e-10 degrees at most; six of them turn the flange
-    assert table.T_base_flange == pytest.approx(UR10.fk(table.q), abs=1e-10)
+    assert table.T_base_flange == pytest.approx(UR10.fk(table.joints.q), abs=1e-10)
     if kind == "step":
         assert list(table.mark) == [mark for _, mark in sampled(kind)]
     else:

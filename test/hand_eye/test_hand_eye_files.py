@@ -65,7 +65,7 @@ def test_poses_are_read_in_si(path):
     assert table.files == ("a.csv", "deep/b.csv")
     assert table.mark == ("near", "far")
     assert table.stamp_ns.tolist() == [10_500_000_000, 11_000_000_001]
-    assert table.q is None
+    assert table.joints is None
     assert table.T_base_flange[1] == pytest.approx(
         np.array([[1, 0, 0, 0.81], [0, -1, 0, -0.01], [0, 0, -1, 0.305], [0, 0, 0, 1]]), abs=1e-15
     )
@@ -84,10 +84,10 @@ def test_what_is_written_is_read(path):
     )
     table = read_pose_table(path, UR10)
     assert table.T_base_flange == pytest.approx(T, abs=1e-11)
-    assert table.q == pytest.approx(q, abs=1e-12)
+    assert table.joints.q == pytest.approx(q, abs=1e-12)
     assert table.stamp_ns.tolist() == stamps.tolist()
     assert (table.names, table.files, table.mark) == (tuple("abcde"), tuple(files), tuple(marks))
-    assert read_pose_table(path).q is None  # joints beside poses need no robot
+    assert read_pose_table(path).joints is None  # joints beside poses need no robot
 
 
 def test_a_shot_without_a_name_has_that_of_its_file(path):

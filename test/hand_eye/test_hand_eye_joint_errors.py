@@ -17,8 +17,13 @@ from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount
 from robocal_ros.hand_eye.mount_problem import MountState, TargetView, pivot_of
 from robocal_ros.hand_eye.result import PoseNoise, increment
 from robocal_ros.hand_eye.solve import features, look
-from robocal_ros.hand_eye.tasks import ShotJoints
-from robocal_ros.kinematics.joint_errors import ALIKE_RAD, HONEST, JointErrors, flange_errors
+from robocal_ros.kinematics.joint_errors import (
+    ALIKE_RAD,
+    HONEST,
+    JointErrors,
+    ShotJoints,
+    flange_errors,
+)
 from robocal_ros.kinematics.joint_functions import JointFunctions
 from robocal_ros.kinematics.robots import load_robot
 

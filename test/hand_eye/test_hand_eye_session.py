@@ -41,6 +41,7 @@ from robocal_ros.hand_eye.tasks import HandEyeData
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL, hand_eye_kind
 from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.joint_errors import HONEST
 from robocal_ros.session import events
 from robocal_ros.session.events import (
     arguments_text,
@@ -171,7 +172,8 @@ MOUNTS = {
 def test_a_camera_is_calibrated_from_poses_of_its_target(history, mount):
     """Board poses with 0.05 mm and 0.02 deg of noise, from the poses of the sphere's shots."""
     parent, see = MOUNTS[mount]
-    driver, X = driver_of(history), sphere_set()[0].T_flange_sensor
+    driver = driver_of(history, joint_error_rad=3e-4)
+    X = sphere_set()[0].T_flange_sensor
     rng = np.random.default_rng(2)
     driver.robot.rest(0.1)
     assert driver.ask(events.START, **(CAMERA | {"mount": mount})).done
@@ -186,6 +188,10 @@ def test_a_camera_is_calibrated_from_poses_of_its_target(history, mount):
     model = history.model(outcome.calibration_id)
     assert (model["parent"], model["child"]) == (parent, FRAME)
     assert off_m(history, outcome, X, 0.5) < LIMIT_M
+    said = outcome.document["joint_errors"]
+    assert 0.0 < said["size_urad"] <= 300.0
+    words = f"to the mount's sigma: count {said['factor']:.1f} of it"
+    assert (words in outcome.message) == (said["factor"] ** 2 > HONEST)
 
 
 @pytest.mark.parametrize("name", list(TARGETS))
