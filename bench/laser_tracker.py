@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.cell_sim.robot import shift, turn
+from robocal_ros.cell_sim.robot import turn
 from robocal_ros.cell_sim.sensors import Ball, ProfileSensor, ScannedBody, Scene, block
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.profiles import profile_of
@@ -29,6 +29,13 @@ T_TRACKER_BASE = frames.transform(
 CUBE_M = 0.08
 FEWEST_LIT = 60  # points of a profile that is kept
 GRID = np.linspace(-0.3, 0.3, 3) * CUBE_M  # where the reflector touches a face
+
+
+def shift(axis: int, length: Array) -> Array:
+    """Translations (m, 4, 4) along a coordinate axis, m."""
+    T = np.tile(np.eye(4), (len(length), 1, 1))
+    T[:, axis, 3] = length
+    return T
 
 
 def true_flange(arm: SerialArm, q: Array) -> Array:

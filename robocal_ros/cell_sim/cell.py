@@ -16,7 +16,7 @@ straight way keeps clear of everything that stands in the cell.
 
 from bisect import insort
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -250,14 +250,21 @@ def worked_for(hours: float) -> Warmth:
     return kr150.WARM_UP.step(Warmth.cold(len(DUTY)), DUTY, hours * HOUR_S)
 
 
+@cache
+def _warming() -> tuple[Warmth, ...]:
+    """After each half hour of a shift."""
+    states = [Warmth.cold(len(DUTY))]
+    for _ in range(round(2.0 * SHIFT_H)):
+        states.append(kr150.WARM_UP.step(states[-1], DUTY, 1800.0))
+    return tuple(states[1:])
+
+
 def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:
     """Scale the drift: what is small grows in proportion to it."""
     whole, state = replace(robot, effects=Effects()), Warmth.cold(robot.nominal.n)
     p = robot.nominal.T_flange_tool[:3, 3]
-    cold, moved = whole.point(working, state, p), []
-    for _ in range(round(2.0 * SHIFT_H)):
-        state = kr150.WARM_UP.step(state, DUTY, 1800.0)
-        moved.append(np.abs(whole.point(working, state, p) - cold))
+    cold = whole.point(working, state, p)
+    moved = [np.abs(whole.point(working, warm, p) - cold) for warm in _warming()]
     factor = THRESHOLD_M / float(np.quantile(moved, UNCORRECTED))
     return replace(robot, motor_gain=factor * robot.motor_gain, link_gain=factor * robot.link_gain)
 

@@ -62,12 +62,13 @@ class BacklashPlay:
 
     def follow(self, time_s: Array, q: Array) -> None:
         """Readings (m, n) at times (m,), the first of which is the last one of before."""
-        joint, behind = self._joint, np.empty_like(q)
-        for row, reading in enumerate(q):
-            joint = np.clip(joint, reading - self._half, reading + self._half)
-            behind[row] = reading - joint
-        self._joint = joint
-        self._passes = [*self._passes[-1:], (time_s, behind)]
+        joint, low, high = np.empty_like(q), q - self._half, q + self._half
+        before = self._joint
+        for here, least, most in zip(joint, low, high, strict=True):
+            np.minimum(np.maximum(before, least, out=here), most, out=here)
+            before = here
+        self._joint = before.copy()
+        self._passes = [*self._passes[-1:], (time_s, q - joint)]
 
     def at(self, time_s: Array) -> Array:
         """How far (m, n), rad, at times (m,) of the last two passes."""

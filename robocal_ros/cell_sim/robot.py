@@ -57,17 +57,18 @@ class WarmUp:
         count = max(1, int(np.ceil(duration_s / LONGEST_STEP_S)))
         keep_motor = np.exp(-duration_s / count / self.motor_tau_s)
         keep_link = np.exp(-duration_s / count / self.link_tau_s)
-        motor, link = warmth.motor, warmth.link
+        motor, link = np.append(warmth.motor, warmth.motor[-1]), warmth.link  # the last one twice
         goal = self.motor_rise * np.asarray(duty, dtype=np.float64)
+        goal, half_share = np.append(goal, goal[-1]), 0.5 * self.link_share
         for _ in range(count):
-            ends = 0.5 * (motor + np.append(motor[1:], motor[-1]))
+            link_goal = half_share * (motor[:-1] + motor[1:])
             motor = goal + keep_motor * (motor - goal)
-            link_goal = self.link_share * ends
             link = link_goal + keep_link * (link - link_goal)
-        return Warmth(motor, link)
+        return Warmth(motor[:-1], link)
 
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
+ABOUT_GRAVITY = np.cross(np.eye(3), GRAVITY)  # v @ it: v x gravity
 
 
 @dataclass(frozen=True)
@@ -207,8 +208,10 @@ class TrueRobot:
         moved = nominal.sign * joint if sag is None else nominal.sign * joint + sag
         along = np.where(slides, mdh[:, 0] + moved, mdh[:, 0])
         about = np.where(slides, mdh[:, 1], mdh[:, 1] + moved)
-        drive = shift(2, along.ravel()) @ turn(2, about.ravel())
-        fixed = shift(0, mdh[:, 2]) @ turn(0, mdh[:, 3]) @ turn(1, mdh[:, 4])
+        drive = turn(2, about.ravel())
+        drive[:, 2, 3] = along.ravel()
+        fixed = turn(0, mdh[:, 3]) @ turn(1, mdh[:, 4])
+        fixed[:, 0, 3] = mdh[:, 2]
         steps = drive.reshape(*joint.shape, 4, 4) @ fixed
         frames = [np.broadcast_to(np.array(nominal.T_base_root), (len(joint), 4, 4))]
         for i in range(nominal.n):
@@ -217,10 +220,8 @@ class TrueRobot:
 
     def _load(self, frames: list[Array]) -> Array:
         """Torque (m, n) of gravity about each joint's axis, N m (prismatic: force along it, N)."""
-        centres = [
-            (T @ np.append(centre, 1.0))[:, :3]
-            for T, centre in zip(frames[1:], self.body.centre, strict=True)
-        ]
+        spots = np.column_stack([self.body.centre, np.ones(len(self.body.centre))])
+        centres = [(T @ spot)[:, :3] for T, spot in zip(frames[1:], spots, strict=True)]
         driven = np.array(frames[:-1])
         axes, origins = driven[:, :, :3, 2], driven[:, :, :3, 3]
         pull = np.empty_like(axes)
@@ -229,15 +230,8 @@ class TrueRobot:
             mass, moment = mass + self.body.mass[i], moment + self.body.mass[i] * centres[i]
             pull[i] = mass * GRAVITY if self.nominal.prismatic[i] else moment - mass * origins[i]
         turns = ~self.nominal.prismatic
-        pull[turns] = np.cross(pull[turns], GRAVITY)
+        pull[turns] = pull[turns] @ ABOUT_GRAVITY
         return np.asarray(np.sum(axes * pull, axis=2).T)
-
-
-def shift(axis: int, length: Array) -> Array:
-    """Translations (m, 4, 4) along a coordinate axis, m."""
-    T = np.tile(np.eye(4), (len(length), 1, 1))
-    T[:, axis, 3] = length
-    return T
 
 
 def turn(axis: int, angle: Array) -> Array:

@@ -107,6 +107,7 @@ class SampledPath:
         long_s = np.diff(self._knots)
         long_s[0] = max(long_s[0], 1e-9)
         self._polynomials = _coefficients(long_s[:, None], rows, kind)
+        self._quintic = bool(np.any(kind == WITH_BOTH))
         self._last = np.stack([part[-1] for part in rows])
 
     def sample(self, time_s: Array) -> tuple[Array, Array, Array, Index]:
@@ -117,9 +118,14 @@ class SampledPath:
         if stretch[0] == stretch[-1]:  # times increase, but for what is asked a cycle ahead
             stretch = stretch[:1]
         c = self._polynomials[:, stretch]
-        q = c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * (c[4] + t * c[5]))))
-        qd = c[1] + t * (2.0 * c[2] + t * (3.0 * c[3] + t * (4.0 * c[4] + t * 5.0 * c[5])))
-        qdd = 2.0 * c[2] + t * (6.0 * c[3] + t * (12.0 * c[4] + t * 20.0 * c[5]))
+        if self._quintic:
+            q = c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * (c[4] + t * c[5]))))
+            qd = c[1] + t * (2.0 * c[2] + t * (3.0 * c[3] + t * (4.0 * c[4] + t * 5.0 * c[5])))
+            qdd = 2.0 * c[2] + t * (6.0 * c[3] + t * (12.0 * c[4] + t * 20.0 * c[5]))
+        else:
+            q = c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+            qd = c[1] + t * (2.0 * c[2] + t * (3.0 * c[3]))
+            qdd = 2.0 * c[2] + t * (6.0 * c[3])
         over = past == len(self._points_s)
         if over.any():
             q[over], qd[over], qdd[over] = self._last

@@ -55,8 +55,9 @@ class JointPlan:
 
     def _since(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Factors (4, ..., n) of the cubics at times, and the times (..., 1) since they begin."""
-        t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)
-        k = np.clip(np.searchsorted(self.time_s, t, side="right") - 1, 0, len(self.time_s) - 2)
+        # each 20 ms while a robot moves: np.clip costs thrice as much
+        t = np.minimum(np.maximum(np.asarray(time_s, dtype=np.float64), 0.0), self.duration_s)
+        k = np.minimum(np.searchsorted(self.time_s, t, side="right") - 1, len(self.time_s) - 2)
         return self._cubics[:, k], (t - self.time_s[k])[..., None]
 
     def places(self, time_s: ArrayLike) -> Array:

@@ -3,10 +3,8 @@
 
 import math
 import secrets
-from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
-from operator import itemgetter
 
 import numpy as np
 
@@ -215,7 +213,7 @@ class RobotWatch:
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
-        self._arm, self._driving = arm, driving
+        self._arm, self._driving, self._turns = arm, driving, ~arm.prismatic
         self._fastest = driving.limits.of_joints(arm)[0]
         self.silence = Silence()
         self.scaling, self.unpaused, self.held_s = 1.0, 1.0, -np.inf
@@ -363,9 +361,11 @@ class RobotWatch:
         if plan is None or not self._readings:
             return True
         self.away()
-        there = np.all(np.abs(plan.q[-1] - self._readings[-1][1]) < start_near(self._arm))
         came = plan.duration_s - self._reached_s <= min(NEARLY_S, 0.5 * plan.duration_s)
-        ended = bool(self.driven_s(now_s) >= plan.duration_s and there and came)
+        ended = came and self.driven_s(now_s) >= plan.duration_s
+        if ended:
+            off = np.abs(plan.q[-1] - self._readings[-1][1])
+            ended = bool(np.all(off < start_near(self._arm)))
         self._ended_s = min(self._ended_s, now_s) if ended else np.inf
         return ended
 
@@ -400,7 +400,7 @@ class RobotWatch:
         last_s = max(min(last_s, plan.duration_s), first_s)
         times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / APART_S)) + 1)
         planned = plan.places(times)
-        joints = np.max(np.abs(planned - q) * ~self._arm.prismatic, axis=1)
+        joints = np.max(np.abs(planned - q) * self._turns, axis=1)
         T = cell.arm.fk(np.vstack([planned, q]))
         tips = T[:, :3, :3] @ cell.tool.p_tip + T[:, :3, 3]
         tip = np.linalg.norm(tips[:-1] - tips[-1], axis=1)
@@ -530,11 +530,15 @@ class RobotWatch:
 
     def _since(self, span_s: float) -> list[tuple[float, Array]] | None:
         """Readings of the last ``span_s``; None before there are enough."""
-        readings = list(self._readings)
-        first_s = readings[-1][0] - span_s if readings else np.inf
-        if not readings or readings[0][0] > first_s:
+        readings = self._readings
+        if not readings or readings[0][0] > (first_s := readings[-1][0] - span_s):
             return None
-        return readings[bisect_right(readings, first_s, key=itemgetter(0)) - 1 :]
+        recent = []
+        for reading in reversed(readings):
+            recent.append(reading)
+            if reading[0] <= first_s:
+                break
+        return recent[::-1]
 
 
 LONGEST_GAP_S = 86_400.0

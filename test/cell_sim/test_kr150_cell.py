@@ -23,6 +23,7 @@ from kr150_shift import (
 )
 
 from bench.cell_samples import SPIN_RAD, CellSamples, programme
+from bench.laser_tracker import shift
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.cell import (
     DUTY,
@@ -36,7 +37,7 @@ from robocal_ros.cell_sim.cell import (
     kr150_cell,
     poses,
 )
-from robocal_ros.cell_sim.robot import Effects, Warmth, shift, turn
+from robocal_ros.cell_sim.robot import Effects, Warmth, turn
 from robocal_ros.cell_sim.sensors import ProfileSensor
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
