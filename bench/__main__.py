@@ -41,6 +41,7 @@ PARTS = {
     "fault_checks": "closed_loop.checks",
     "knocks": "closed_loop.knocks",
     "fixture": "fixture",
+    "programs": "programs",
     "files": "files",
     "urdf": "urdf",
     "replay_speed": "replay_speed",
@@ -59,6 +60,7 @@ TOGETHER = (
     "hand_eye_camera",
     "hand_eye_tracker",
     "fixture",
+    "programs",
 )
 
 Made = tuple[Sequence[Table] | None, float]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from command import conforms
 from history_workers import SERIAL, proposal
-from robot_programs import (
+
+from bench.robot_programs import (
     KUKA_FRAMES,
     NOMINAL,
     T_BASE_FRAME,
@@ -17,7 +18,6 @@ from robot_programs import (
     krl,
     postures,
 )
-
 from robocal_ros.cli.main import main
 from robocal_ros.ground.frames import log_rotation, transform_from_quat
 from robocal_ros.history.calibrations import CalibrationHistory

@@ -15,13 +15,13 @@ from hand_eye_bag import hand_eye_bag
 from hand_eye_tables import TRUE, hand_eye_tables
 from joint_errors import with_joint_errors
 from recordings import plain_bag, recorded_bag, shift
-from robot_programs import KUKA_FRAMES, krl, postures
 from tool_runs import run_tables
 from tool_tables import tool_tables
 from tracker_files import SCAN, tracker_files
 
 from bench.laser_tracker import prp_cell
 from bench.live.opc_ua import security_folder
+from bench.robot_programs import KUKA_FRAMES, krl, postures
 from robocal_ros.cli.commands import COMMANDS
 from robocal_ros.ground.frames import transform_document
 from robocal_ros.kinematics.robots import load_description, load_robot, save_robot

@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
-from robot_programs import NOMINAL, T_FLANGE_TOOL, drifted, postures
 from std_srvs.srv import Trigger
 
+from bench.robot_programs import NOMINAL, T_FLANGE_TOOL, drifted, postures
 from robocal_ros.ground import frames
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import robot_programs
-from robot_programs import (
+from scipy.spatial.transform import Rotation
+
+from bench.robot_programs import (
     FRAME_TURN,
     NOMINAL,
     T_BASE_FRAME,
@@ -20,8 +22,6 @@ from robot_programs import (
     programs,
     side_view,
 )
-from scipy.spatial.transform import Rotation
-
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics.arm import inverse
 from robocal_ros.programs.correcting import (

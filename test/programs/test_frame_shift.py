@@ -1,112 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames shifted and programs corrected for a robot that warms up: how much of its work is right.
 
-The robot is the simulator's (`cell_sim.robot`): elastic, with gears that err, its drift of the
-published size. What corrects it knows only what a sphere sensor measured, six poses a cycle.
+Five robots stand on docs/programs.md, by `bench programs`; two of them are looked at here.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from robot_programs import NOMINAL, T_BASE_FRAME, drifted, krl, poses_in, postures
-from robot_programs import T_FLANGE_TOOL as TAUGHT
 
-from bench.measured_shifts import MEASURING, TOOL, DriftingCell, Warmth, record
-from bench.thermal_shifts import Measured, cell_of
-from robocal_ros.cell_sim.robot import Effects
+from bench.programs import (
+    OF_BEST,
+    OF_PROGRAM,
+    T_FLANGE_TOOL,
+    measured_shift,
+    program_share,
+    shift_shares,
+)
+from bench.robot_programs import NOMINAL, drifted, postures
 from robocal_ros.ground import frames
-from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse
-from robocal_ros.programs.correcting import CorrectionModels, ProgramCorrection, dialect_of
+from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import best_shift, shifted_joints
-from robocal_ros.thermal.accuracy import EarlierShift, learn_process
-from robocal_ros.thermal.screening import share_within
-
-T_FLANGE_TOOL = frames.transform(np.eye(3), TOOL)
-COLD = Warmth.cold(NOMINAL.n)
-SOME = slice(3, None, 6)  # of the 90 cycles of a shift
-
-
-@dataclass(frozen=True)
-class MeasuredShift:
-    """A cell, and of some cycles of a shift the warmth and the arm that was identified then."""
-
-    cell: DriftingCell
-    states: list[Warmth]
-    arms: list[SerialArm]
-
-    def error(self, k: int, q: np.ndarray) -> np.ndarray:
-        """Where the tool stands at commanded joints (m, n), from where the cold robot's stood."""
-        robot, meant = self.cell.robot, self.cell.check
-        return robot.point(q, self.states[k], TOOL) - robot.point(meant, COLD, TOOL)
-
-
-@cache
-def measured_shift(seed: int) -> MeasuredShift:
-    cell = cell_of(seed, Effects())
-    shifts = [record(cell, cell.plans[i], np.random.default_rng([seed, i])) for i in (0, 2)]
-    teacher = Measured.of(NOMINAL, shifts[1], range(len(cell.sphere)))
-    taught = [replace(cycle, sigma=None) for cycle in teacher.cycles]
-    process = learn_process([EarlierShift(teacher.spots, taught, teacher.time_s)])
-    seen, arms = Measured.of(NOMINAL, shifts[0], MEASURING), []
-    tracker = process.tracker(seen.spots)  # as thermal_node follows a drift
-    for cycle, time_s in zip(seen.cycles, seen.time_s.tolist(), strict=True):
-        tracker.take(replace(cycle, sigma=None), time_s)
-        drift = tracker.drift(time_s)[0]
-        arms.append(NOMINAL.with_mdh(NOMINAL.parameters.add(NOMINAL.mdh, drift)))
-    states = [state for _, state in cell.plans[0].warmths()]
-    return MeasuredShift(cell, states[SOME], arms[SOME])
-
-
-def true_best(shift: MeasuredShift, k: int) -> np.ndarray:
-    """The error (c, 3) that the best shift leaves, by the truth: linear least squares.
-
-    A tool's turn does not move its tip: nine numbers.
-    """
-    T, error = NOMINAL.fk(shift.cell.check) @ T_FLANGE_TOOL, shift.error(k, shift.cell.check)
-    moved = [
-        np.concatenate([np.eye(3), -frames.skew(one[:3, 3]), one[:3, :3]], axis=1) for one in T
-    ]
-    A = np.concatenate(moved)
-    return error - (A @ np.linalg.lstsq(A, error.ravel(), rcond=None)[0]).reshape(-1, 3)
 
 
 @pytest.mark.parametrize("seed", [1, 8])
 def test_a_shift_of_frames_does_nearly_what_any_could(seed):
-    shift = measured_shift(seed)
-    q, left, best, without = shift.cell.check, [], [], []
-    for k, arm in enumerate(shift.arms):
-        models = CorrectionModels(NOMINAL, arm, NOMINAL)
-        found = best_shift(models, q, T_FLANGE_TOOL)
-        moved, there = shifted_joints(
-            models, q, T_FLANGE_TOOL, found.T_base_shift, found.T_tool_shift
-        )
-        assert np.all(there)
-        left.append(shift.error(k, moved))
-        best.append(true_best(shift, k))
-        without.append(shift.error(k, q))
-    assert share_within(np.array(without)) == pytest.approx(0.45, abs=0.03)
-    assert share_within(np.array(left)) >= 0.95 * share_within(np.array(best))
+    shares = shift_shares(measured_shift(seed))
+    assert shares.as_taught == pytest.approx(0.45, abs=0.03)
+    assert shares.shifted >= OF_BEST * shares.best
 
 
 @pytest.mark.parametrize("seed", [1, 8])
 def test_of_a_corrected_program_98_percent_is_right(seed):
-    """Its text goes through the file: corrected, read by a controller, driven by the robot."""
-    shift, left = measured_shift(seed), []
-    q = shift.cell.check
-    text = krl(q, np.empty((0, 6)))
-    assert len(dialect_of(".dat").read(text).points) == len(q)
-    known = {"TOOL_DATA[3]": TAUGHT, "BASE_DATA[5]": T_BASE_FRAME}
-    for k in range(1, len(shift.arms), 4):
-        models = CorrectionModels(NOMINAL, shift.arms[k], NOMINAL)
-        done = ProgramCorrection(dialect_of(".dat"), models, known).correct(text)
-        assert not [one.reason for one in done.points if one.reason]
-        told = poses_in("kuka", done.text)[0]
-        commanded = [inverse(NOMINAL, T[None], near)[0] for T, near in zip(told, q, strict=True)]
-        left.append(shift.error(k, np.array(commanded)))
-    assert share_within(np.array(left)) >= 0.98
+    shift = measured_shift(seed)
+    assert 100.0 * program_share(shift, range(1, len(shift.arms), 4)) >= OF_PROGRAM
 
 
 def test_what_is_a_shift_of_frames_is_found_to_nothing():

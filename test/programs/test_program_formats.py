@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from robot_programs import NOMINAL, postures, programs
 from scipy.spatial.transform import Rotation
 
+from bench.robot_programs import NOMINAL, postures, programs
 from robocal_ros.ground import frames
 from robocal_ros.programs.conventions import numbers_of, pose_of
 from robocal_ros.programs.correcting import DIALECTS, dialect_of

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robot_programs import NOMINAL
 
+from bench.robot_programs import NOMINAL
 from robocal_ros.programs.correcting import DIALECTS, CorrectionModels, ProgramCorrection, report
 from robocal_ros.programs.points import Dialect
 
