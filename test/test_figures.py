@@ -142,3 +142,11 @@ def test_the_readme_has_the_kept_figures_of_the_real_robot():
     text = (DOCS.parent / "README.md").read_text()
     quoted = re.findall(r"(\d\.\d\d)\N{EN DASH}(\d\.\d\d) mm", text)
     assert quoted == [(f"{min(kept):.2f}", f"{max(kept):.2f}") for kept in means]
+
+
+def test_the_shares_of_programs_and_frames_are_the_kept_ones_robot_by_robot():
+    numbers, _ = figures("programs", "frame_shift")
+    _, taught, shifted, best, _, program, _ = zip(*numbers, strict=True)
+    found = rows_quoted("simulated shift of a KR 150 that warms up, 34 poses, tool", "programs.md")
+    for (_, cell), kept in zip(found, (taught, shifted, best, program), strict=True):
+        assert cell.strip(" %").split(", ") == [f"{value:.1f}" for value in kept]

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import robot_programs
 from scipy.spatial.transform import Rotation
 
+from bench import robot_programs
 from bench.robot_programs import (
     FRAME_TURN,
     NOMINAL,
