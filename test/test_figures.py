@@ -25,6 +25,11 @@ LIKE_FOR_LIKE = [
     ("arm", "hand_eye_tracker", "hand_eye_erring", slice(2, None), 4),
     ("target", "hand_eye", "hand_eye_count", slice(1, None), 1),
 ]
+# Of the pages of hand-eye calibration by camera and by laser tracker.
+JOINTS = [
+    ("camera", "hand_eye_camera", "hand_eye_camera_joints"),
+    ("arcs and scan", "hand_eye_tracker", "hand_eye_tracker_joints"),
+]
 CLOSED_FORMS = [
     ("accuracy.md", r"closed\s+forms\s+are\s+at\s+([\d.]+)\s+to\s+([\d.]+\d)"),
     ("hand_eye_camera.md", r"the\s+closed\s+forms\s+([\d.]+)\s+to\s+([\d.]+\d)"),
@@ -68,6 +73,14 @@ def test_a_table_has_the_kept_figures(first, part, name, rows):
         quoted = [found[0] for cell in cells[1:] for found in NUMBER.finditer(cell)]
         assert quoted, cells
         assert [text for text in quoted if not shown(text, numbers)] == [], (cells[0], numbers)
+
+
+@pytest.mark.parametrize(("first", "part", "name"), JOINTS)
+def test_a_table_of_joints_that_err_has_the_kept_figures(first, part, name):
+    numbers, rows = figures(part, name)
+    for kept, row, cells in zip(numbers, rows, rows_quoted(first, f"{part}.md"), strict=True):
+        assert cells[1].strip() == row[1]
+        assert all(shown(cell.strip(), kept) for cell in cells[2:]), (cells, kept)
 
 
 def kept_or_skipped(part, name):
