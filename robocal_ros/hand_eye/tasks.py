@@ -48,6 +48,8 @@ from robocal_ros.kinematics.joint_errors import ShotJoints
 Fit = TypeVar("Fit")
 
 FEWEST_SPHERES = 5  # profiles
+LEAST_TOLD = 1e-9  # of an unknown, over the most
+FEWEST_LINEAR = 5  # profiles for the twelve unknowns of M and t
 SUBSET = 6  # profiles whose sides are tried in all patterns
 TOO_LARGE = 0.1  # of the radius, by which an arc exceeds the sphere and is something else
 DRAWS = 24  # one of them holds no wrong pair, very likely, even with four among 15
@@ -337,13 +339,13 @@ class SphereTask(Task):
         m, T = len(s.names), s.T_base_flange
         R, origin = T[:, :3, :3], T[:, :3, 3]
         patterns = np.array([(1.0, *rest) for rest in product((1.0, -1.0), repeat=m - 1)])
-        M, _ = _linear_mounts(T, self._on_sides(s, patterns))
+        M = _mounts_by_patterns(T, self._on_sides(s, patterns[:1])[0], patterns)
         turn = frames.nearest_rotation(np.concatenate([M, M * MIRROR]))  # of the opposite too
         centres = self._on_sides(s, np.concatenate([patterns, -patterns]))
         # With a rotation held the rest is linear: R_i t - c = -(R_i M s_i + t_i)
         lhs = np.concatenate([R, np.broadcast_to(-np.eye(3), (m, 3, 3))], axis=2).reshape(3 * m, 6)
         rhs = np.einsum("mij,pjk,pmk->pmi", R, turn, centres) + origin
-        inverse = np.linalg.pinv(lhs, rcond=1e-9)
+        inverse = np.linalg.pinv(lhs, rcond=LEAST_TOLD)
         solution = -(inverse @ rhs.reshape(len(centres), 3 * m).T).T
         X, place = frames.transform(turn, solution[:, :3]), solution[:, 3:]
         miss = _misses(T, X, place, centres)
@@ -421,8 +423,37 @@ def _linear_mounts(T_base_flange: Array, centres: Array) -> tuple[Array, Array]:
                         np.broadcast_to(R, (p, m, 3, 3))], axis=3)  # fmt: skip
     A = (A - A.mean(axis=1, keepdims=True)).reshape(p, 3 * m, 12)
     b = -(place - place.mean(axis=0)).reshape(-1)
-    solution = np.linalg.pinv(A, rcond=1e-9) @ b
+    solution = np.linalg.pinv(A, rcond=LEAST_TOLD) @ b
     return solution[:, :9].reshape(p, 3, 3), solution[:, 9:]
+
+
+def _mounts_by_patterns(T_base_flange: Array, centres: Array, patterns: Array) -> Array:
+    """M (p, 3, 3) of `_linear_mounts`, for patterns (p, m) of sides that are +1 in ``centres``.
+
+    ``centres`` (m, 3): only their y changes with the side, and with it the equations of M's second
+    column. All other unknowns are eliminated once for all patterns (Frisch and Waugh 1933).
+    """
+    R, place, m = T_base_flange[:, :3, :3], T_base_flange[:, :3, 3], len(centres)
+    if m < FEWEST_LINEAR:  # of all solutions the shortest
+        turned = np.repeat(centres[None], len(patterns), axis=0)
+        turned[:, :, 1] *= patterns
+        return _linear_mounts(T_base_flange, turned)[0]
+    x, y, z = centres.T[:, :, None, None]
+    known = (place.mean(axis=0) - place).reshape(-1)
+    fixed = np.concatenate([x * R, z * R, R], axis=2)
+    fixed = (fixed - fixed.mean(axis=0)).reshape(3 * m, 9)
+    of_each = (np.eye(m)[:, :, None, None] - 1.0 / m) * (y * R)[:, None]
+    of_each = of_each.reshape(m, 3 * m, 3)  # what a profile's y has in all equations
+    inverse = np.linalg.pinv(fixed, rcond=LEAST_TOLD)
+    shared, alone = inverse @ of_each, inverse @ known
+    U, size, Vt = np.linalg.svd(
+        np.tensordot(patterns, of_each - fixed @ shared, 1), full_matrices=False
+    )
+    told = size > LEAST_TOLD * np.linalg.norm(of_each)
+    part = np.where(told, (known - fixed @ alone) @ U, 0.0) / np.where(told, size, 1.0)
+    second = np.einsum("pij,pi->pj", Vt, part)
+    others = alone - np.einsum("pm,mij,pj->pi", patterns, shared, second)
+    return np.stack([others[:, :3], second, others[:, 3:6]], axis=2)
 
 
 def _misses(T_base_flange: Array, X: Array, place: Array, centres: Array) -> Array:
