@@ -30,9 +30,8 @@ Array = NDArray[np.float64]
 RATE_HZ = 250
 CHANGE_S = 10.0  # between two models
 SETTLED_S = 4.0  # after this a model is in force: twice 0.3 deg at 2 deg/s, and stalls
-STALL_S = 0.02  # the probe sees outputs so much closer together than they went out
-# A longer silence is a stall, which is caught up with in 20 times as long (5 % faster than the
-# stream), and some more: what lags is no correction.
+# A longer silence of the node is a stall, which is caught up with in 20 times as long (5 % faster
+# than the stream), and some more: what lags is no correction.
 SILENCE_S, LAGS = 2.0 / RATE_HZ, 25.0
 LARGEST_M = 0.5e-3
 WARM = 2  # models until caches are full
@@ -43,10 +42,13 @@ EXACT_RAD = 1e-9
 class Watch:
     """Judges each corrected target by the models that were offered last.
 
+    When the node put one out is not known, but that it was between its way there and back: so the
+    time since the one before is at most that from sending that one to this one's coming back.
+
     Attributes
     ----------
     worst : largest step of a joint's correction from one message to the next, in units of what the
-        limiter lets it do in the time between them and a stall of the probe.
+        limiter lets it do in at most the time between them.
     stale : targets that the last model did not make, `SETTLED_S` after it was offered.
     checked : targets that were compared with it.
     """
@@ -55,28 +57,26 @@ class Watch:
         self._arm, self._rate_rad_s = arm, CorrectionConfig().turning.motion
         self.change(arm)
         self._last: tuple[float, Array] | None = None
-        self._since_s = self._clear_s = time.monotonic()
+        self._since_s = self._clear_s = time.perf_counter()
         self.worst, self.stale, self.checked = 0.0, 0, 0
 
     def change(self, model: SerialArm) -> None:
         """From now on another model is wanted."""
         models = pack_model(self._arm), pack_model(model)
         self._model = correction_between(*models, self._arm, CorrectionConfig())
-        self._since_s = time.monotonic()
+        self._since_s = time.perf_counter()
 
-    def look(self, taught: Array, corrected: Array) -> None:
+    def look(self, sent_s: float, now_s: float, taught: Array, corrected: Array) -> None:
         """Judge one target that came back."""
-        now_s, shift = time.monotonic(), corrected - taught
-        if self._last is not None and now_s - self._last[0] > SILENCE_S:
-            self._clear_s = max(self._clear_s, now_s + LAGS * (now_s - self._last[0]))
+        last, shift = self._last, corrected - taught
+        self._last = sent_s, shift
+        if last is not None and now_s - last[0] > SILENCE_S:
+            self._clear_s = max(self._clear_s, now_s + LAGS * (now_s - last[0]))
         if now_s < self._clear_s:
-            self._last = now_s, shift
             return
-        if self._last is not None:
-            before_s, before = self._last
-            allowed = self._rate_rad_s * (now_s - before_s + STALL_S)
-            self.worst = max(self.worst, float(np.max(np.abs(shift - before))) / allowed)
-        self._last = now_s, shift
+        if last is not None:
+            allowed = self._rate_rad_s * (now_s - last[0])
+            self.worst = max(self.worst, float(np.max(np.abs(shift - last[1]))) / allowed)
         if now_s - self._since_s > SETTLED_S:
             self.checked += 1
             wanted = self._model.correct(taught[None]).q[0] - taught
@@ -136,7 +136,8 @@ def _judged(
         ("what", "value", "goal"),
         "Steps: of a joint's correction from one message to the next, in units of what the "
         "limiter lets it do in that time. Stale: targets that the last model did not make, "
-        f"{SETTLED_S:g} s after it was offered. Memory: resident, after the first {WARM} models. "
+        f"{SETTLED_S:g} s after it was offered, and later than a stall of the node is caught up "
+        f"with. Memory: resident, after the first {WARM} models. "
         f"Load of the machine in the last minute: {os.getloadavg()[0]:.2f}; {os.cpu_count()} CPUs.",
     )
     ms = np.array(stream.took[TARGETS]) * 1e3

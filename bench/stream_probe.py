@@ -171,7 +171,8 @@ class Stream:
     robot : joints that were put out last: the robot is where it is sent.
     took : seconds from publishing to coming back, by topic; since `forget`.
     sent : how many went out, by topic; since `forget`.
-    watch : called with the taught and the corrected positions of each target that comes back.
+    watch : called with when a target that comes back went out and came back (`time.perf_counter`),
+        and with its taught and corrected positions.
     """
 
     def __init__(self, probe: "Probe", subject: Subject, names: Sequence[str]) -> None:
@@ -180,7 +181,7 @@ class Stream:
         self.t = 0.0
         self._pending: dict[tuple[str, int], tuple[float, Array]] = {}
         self.robot = path(0.0)[0]
-        self.watch: Callable[[Array, Array], object] = lambda taught, corrected: None
+        self.watch: Callable[[float, float, Array, Array], object] = lambda *_: None
         self.forget()
         self._publishers = {}
         for topic in (TARGETS, STATES):
@@ -221,7 +222,7 @@ class Stream:
             self.took[topic].append(now - begun)
             if topic == TARGETS:
                 self.robot = self._buffer.joints(data)[0].copy()  # the robot is where it is sent
-                self.watch(taught, self.robot)
+                self.watch(begun, now, taught, self.robot)
 
         return come_back
 
