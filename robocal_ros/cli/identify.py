@@ -102,7 +102,7 @@ def show_identification(console: "Console", document: Document) -> None:
     console.print(
         f"Uncertainty of the model itself: {predicted['model_rms_mm']:.3f} mm rms at these poses, "
         f"{predicted['workspace_rms_mm']:.3f} mm{of} throughout the joint limits. "
-        f"Noise: {document['noise_mm']:.3f} mm per coordinate.",
+        f"Noise: {document['noise_mm']:.3f} mm per coordinate." + _bound_words(document),
         soft_wrap=True,
     )
     console.print()
@@ -117,6 +117,12 @@ def show_identification(console: "Console", document: Document) -> None:
             then = f"'robocal history accept {number}', for the same serial, brings it into force"
         print_words(console, f"Kept as calibration {number} of the history: {then}.")
     print_output(console, document)
+
+
+def _bound_words(document: Document) -> str:
+    if "bound_sigmas" not in document:  # of a drift
+        return ""
+    return f" 95 % of errors stay within {document['bound_sigmas']:.2f} of their sigmas."
 
 
 _JOINT_HEADS = (

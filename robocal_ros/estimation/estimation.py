@@ -240,6 +240,13 @@ def chi2_quantile(probability: float, dof: float) -> float:
     return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
+def found_noise_quantile(probability: float, dof: float, freedom: float) -> float:
+    """The same in units of a noise that was itself found from ``freedom`` numbers."""
+    from scipy.special import fdtri
+
+    return dof * float(fdtri(dof, freedom, probability))
+
+
 @dataclass(frozen=True)
 class Descent(Generic[S]):
     """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known.

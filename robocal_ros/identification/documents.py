@@ -26,6 +26,11 @@ from robocal_ros.ground.documents import (
 FittedParts = Annotated[list[Literal["base", "tool", "geometry"]], keywords(uniqueItems=True)]
 ParameterName = Annotated[str, keywords(pattern="^(d|a)[0-9]+_mm$|^(theta|alpha|beta)[0-9]+_deg$")]
 
+BOUND_SIGMAS = (
+    "95 % of position errors at other poses stay within so many of their sigmas, covariance and "
+    "noise together; 2.80 where errors are normal and their size is well known."
+)
+
 
 class PlannedPoseDocument(TypedDict):
     pose: str
@@ -162,6 +167,7 @@ class IdentificationDocument(PlacedModelDocument):
             "What the residuals are, beside the stated sigma_mm; 1 where none was stated.",
         ]
     ]
+    bound_sigmas: NotRequired[Annotated[NotNegative, BOUND_SIGMAS]]
 
 
 class IdentifiedDataDocument(TypedDict):
@@ -207,6 +213,7 @@ class IdentifiedDocument(PlacedModelDocument):
     noise_over_sigma: Annotated[
         NotNegative, "What the residuals are, beside the stated sigma_mm; 1 where none was stated."
     ]
+    bound_sigmas: Annotated[NotNegative, BOUND_SIGMAS]
 
 
 class PoseAccuracyDocument(TypedDict):

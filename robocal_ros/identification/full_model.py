@@ -35,7 +35,7 @@ from robocal_ros.identification.known_model import (
     sparse,
     with_turns,
 )
-from robocal_ros.identification.solve import Identification, Method, identify
+from robocal_ros.identification.solve import BOUND, Identification, Method, identify
 from robocal_ros.kinematics import SerialArm
 
 _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry alone
@@ -320,7 +320,9 @@ def identify_full(
         if foretold is None:
             return rival.start
         squared = np.where(np.isnan(foretold), squared, foretold)
-    return full.reported(_stretch(squared, full.keep))
+    stretch = _stretch(squared, full.keep)
+    bound = bound_squared(squared, full.keep) / stretch**2
+    return replace(full.reported(stretch), bound_squared=bound)
 
 
 def _foretold(
@@ -358,7 +360,6 @@ def _foretold(
 def _stretch(squared: Array, keep: Mask) -> float:
     """By how much sigmas grow, for left-out errors whose squares (m,) over covariances are given.
 
-
     Errors that no model explains have longer tails than the normal distribution: sigmas that fit
     their squares are too small for bounds of 95 %, those that fit bounds too large for the squares.
     Between the two, nearer to the bounds; the farthest in a hundred is left out of the squares. One
@@ -369,6 +370,23 @@ def _stretch(squared: Array, keep: Mask) -> float:
     by_squares = float(np.mean(inner)) / INNER_SQUARES
     by_bounds = float(np.quantile(np.append(squared[keep], tail), 0.95)) / chi2_quantile(0.95, 3)
     return float(max(1.0, (by_squares * by_bounds**2) ** (1.0 / 6.0)))
+
+
+def bound_squared(squared: Array, keep: Mask) -> float:
+    """What the square of a new error stays below in 95 % of cases, by those left out (m,).
+
+    No normal distribution is asked for, only that a new pose is drawn as these were: it has any
+    rank among the m + 1 with the same chance (split conformal prediction: Vovk, Gammerman and
+    Shafer, Algorithmic Learning in a Random World, 2005; of samples left out in turn Barber,
+    Candes, Ramdas and Tibshirani, Predictive inference with the jackknife+, Annals of Statistics
+    49, 2021). Samples that are not kept (m,) have the highest ranks. Where the rank is theirs, or
+    fewer than 19 have none such, it is the farthest one that is kept.
+
+    Tails shorter than normal ones are chance: it is no less than normal errors have.
+    """
+    own = np.sort(squared[keep])
+    rank = min(int(np.ceil(BOUND * (len(squared) + 1))), len(own))
+    return max(float(own[rank - 1]), chi2_quantile(BOUND, 3))
 
 
 def _solved(

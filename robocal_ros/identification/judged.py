@@ -592,6 +592,7 @@ def identification_document(judged: JudgedIdentification) -> "IdentificationDocu
         **cell_document(result.cell),
         "noise_mm": result.noise_m * 1e3,
         "noise_over_sigma": result.sigma_ratio,
+        "bound_sigmas": float(np.sqrt(result.bound_squared)),
         "samples": len(result.estimate.rejected),
         "rank": seen.rank,
         "unknowns": len(result.layout.names) + len(result.held),

@@ -74,6 +74,7 @@ def fitted_prior(arm: SerialArm, found: Array, covariance: Array) -> Array:
 
 Method = Literal["map", "lsq"]
 
+BOUND = 0.95  # share of errors that a stated bound holds
 _NAMED_TARGET_M = 0.01  # from here on what is known of a held target is said
 _STILL_RAD = float(np.radians(5.0))
 _STILL_M = 0.01
@@ -99,6 +100,8 @@ class Identification:
     sigma_ratio : found noise over given sigmas; 1 where none were given.
     noise_m : standard deviation of a measured coordinate, as given or as found.
     lever_m : length by which a turn in rad counted as a position error.
+    bound_squared : squared length of a position error at a pose that was not used, over its
+        predicted covariance (`predicted_variance` and noise), that 95 % stay below.
     """
 
     nominal: SerialArm
@@ -115,6 +118,7 @@ class Identification:
     rejected: tuple[str, ...]
     noise_m: float
     lever_m: float
+    bound_squared: float
 
     def sigma(self) -> dict[str, float]:
         """Standard deviation, SI, of each unknown by name."""
@@ -382,6 +386,7 @@ def _report(
     known = data.sigma
     used = estimate.residual[~estimate.rejected][:, :3]
     told = min(max(estimate.freedom, 1.0), used.size)
+    trusted = known is not None and estimate.scale <= 1.0
     return Identification(
         nominal=arm,
         cell=estimate.state,
@@ -397,4 +402,9 @@ def _report(
         rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
         noise_m=estimate.scale * (1.0 if known is None else float(np.sqrt(np.mean(known**2)))),
         lever_m=lever,
+        bound_squared=(
+            estimation.chi2_quantile(BOUND, 3)
+            if trusted
+            else estimation.found_noise_quantile(BOUND, 3, told)
+        ),
     )

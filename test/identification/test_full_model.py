@@ -9,7 +9,8 @@ import pytest
 from bent_robot import COMPLIANCE, LOWER, NOISE_M, TIP, UPPER, BentRobot
 from long_form import amount, more
 from scipy.linalg import null_space
-from scipy.stats import binom
+from scipy.stats import beta, binom, chi2
+from scipy.stats import f as fisher
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.cell_sim.robot import Effects, Warmth
@@ -221,6 +222,61 @@ def test_outliers_do_not_widen_what_is_stated_of_the_others(size_m):
         expected = np.trace(variance, axis1=1, axis2=2) + 3.0 * found.noise_m**2
         ratios.append(np.mean(np.sum(found.cell.residual(check) ** 2, axis=1) / expected))
     assert 0.8 < np.mean(ratios) < 1.25
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+@pytest.mark.parametrize("count", [12, 19, 40, 120, 700])
+def test_a_bound_is_missed_by_one_new_error_in_twenty(count, heavy):
+    """Normal errors and those with the tails of Student's t of 4: squares over their variance.
+
+    A rank among so many holds a share by a beta distribution; normal errors are always held.
+    """
+    draws, rng = 4000, np.random.default_rng(count)
+    spread, keep = fisher(3, 4) if heavy else chi2(3, scale=1.0 / 3.0), np.full(count, True)
+    held = [
+        spread.cdf(full_model.bound_squared(3.0 * own, keep) / 3.0)
+        for own in spread.rvs((draws, count), random_state=rng)
+    ]
+    rank = min(int(np.ceil(0.95 * (count + 1))), count)
+    by_rank = beta(rank, count + 1 - rank).rvs(100 * draws, random_state=rng)
+    expected = np.maximum(by_rank, spread.cdf(chi2_quantile(0.95, 3) / 3.0))
+    assert np.mean(held) == pytest.approx(np.mean(expected), abs=3.5 * np.std(held) / draws**0.5)
+    if count >= 19:
+        assert np.mean(held) > 0.945
+
+
+def test_rejected_samples_do_not_pull_a_bound_out():
+    """They have the highest ranks; one in ten of any size leaves the farthest one that is kept."""
+    squared = np.random.default_rng(0).chisquare(3, 200)
+    few, many = np.full(200, True), np.full(200, True)
+    few[:6], many[:20] = False, False
+    for keep, rank in ((few, 191), (many, 180)):
+        squared[~keep] = 1e6
+        own = np.sort(squared[keep])
+        assert full_model.bound_squared(squared, keep) == own[rank - 1]
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+@pytest.mark.parametrize("count", [120, 300])
+def test_stated_bounds_hold_95_percent_whatever_the_noise(count, heavy):
+    """One draw's bound holds 95 % give or take what a rank among so many poses scatters.
+
+    Heavy: points by Student's t of 3, of which bounds by normal errors hold 92.5 %.
+    """
+    inside, seeds, others = [], amount(4, 16), 1500
+    for robot in map(BentRobot, range(seeds)):
+        data, check = (robot.measured(robot.poses(n), 0.0) for n in (count, others))
+        noise = NOISE_M * robot.rng.standard_normal((count + others, 3))
+        if heavy:
+            noise /= np.sqrt(robot.rng.chisquare(3, (len(noise), 1)) / 3.0)
+        found = identify_full(robot.nominal, replace(data, position=data.position + noise[:count]))
+        error = found.cell.residual(replace(check, position=check.position + noise[count:]))
+        variance = found.predicted_variance(check.q, np.zeros(others, dtype=np.int64))
+        variance = variance + found.noise_m**2 * np.eye(3)
+        squared = np.sum(error * np.linalg.solve(variance, error[..., None])[..., 0], axis=1)
+        inside.append(np.mean(squared < found.bound_squared))
+    scatter = np.sqrt(0.95 * 0.05 * (1.0 / count + 1.0 / others) / seeds)
+    assert abs(np.mean(inside) - 0.95) < 2.58 * scatter
 
 
 def test_a_robot_that_only_sags_has_compliances_alone():

@@ -10,7 +10,6 @@ from long_form import amount, more
 
 from robocal_ros.bags.ur10_campaigns import halves, load_campaign
 from robocal_ros.estimation.assessment import pose_groups
-from robocal_ros.estimation.estimation import chi2_quantile
 from robocal_ros.ground.errors import Code
 from robocal_ros.identification import identify, identify_and_judge, judged
 from robocal_ros.identification.full_model import identify_full
@@ -107,7 +106,7 @@ def test_full_model_from_half_of_a_campaign(halved, series):
     variance = found.predicted_variance(check.q, np.zeros(len(check), dtype=np.int64))
     variance = variance + found.noise_m**2 * np.eye(3)
     squared = np.sum(error * np.linalg.solve(variance, error[..., None])[..., 0], axis=1)
-    inside = np.mean(squared < chi2_quantile(0.95, 3.0))
+    inside = np.mean(squared < found.bound_squared)
     assert abs(inside - 0.95) < 0.02 + 1.96 * np.sqrt(0.95 * 0.05 / len(check))
     ratio = np.sum(error**2, axis=1) / np.trace(variance, axis1=1, axis2=2)
     inner = np.sort(ratio)[: int(0.99 * len(ratio))]
@@ -224,7 +223,7 @@ def test_the_error_stated_from_few_poses_comes_true(halved):
         variance = found.predicted_variance(check.q, np.zeros(len(check), dtype=np.int64))
         variance = variance + found.noise_m**2 * np.eye(3)
         squared = np.sum(error * np.linalg.solve(variance, error[..., None])[..., 0], axis=1)
-        inside.append(np.mean(squared < chi2_quantile(0.95, 3.0)))
+        inside.append(np.mean(squared < found.bound_squared))
         ratio = np.sum(error**2, axis=1) / np.trace(variance, axis1=1, axis2=2)
         ratios.append(np.mean(np.sort(ratio)[: int(0.99 * len(ratio))]))
     assert 0.8 < np.mean(ratios) < 1.25
