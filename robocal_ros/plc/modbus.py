@@ -71,6 +71,12 @@ INPUTS = (
     Register(42, "LastCycle.FixtureId", "I", "Its candidate of that cycle; 0: none"),
     Register(44, "LastCycle.StationId", "I", "Candidate of the beams that were found again"),
     Register(46, "LastCycle.StationCode", "H", "Of the beams that were found again; 0: not"),
+    Register(47, "Tool.State", "H", "CANDIDATE 1, ACCEPTED 2; 0: taught, or none said"),
+    Register(48, "Tool.Revision", "I", "Of the tool in force; 0: taught"),
+    Register(50, "Tool.XMm", "f", "The tool in force, in the flange frame, mm"),
+    Register(52, "Tool.YMm", "f", "The same"),
+    Register(54, "Tool.ZMm", "f", "The same"),
+    Register(56, "Accuracy.ToleranceMm", "f", "The process allows, mm"),
 )
 HOLDINGS = (
     Register(HEARTBEAT_AT, "Heartbeat", "I", "Beat while the robot may be moved, else 0"),
@@ -79,7 +85,7 @@ HOLDINGS = (
     Register(5, "Request.GapS", "H", "Length of the gap, s"),
     Register(6, "Request.Cycle", "I", "Number of the cycle; its id"),
 )
-INPUT_WORDS = 47
+INPUT_WORDS = 58
 
 
 class Image(Protocol):

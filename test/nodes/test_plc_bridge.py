@@ -340,6 +340,8 @@ def test_a_gap_by_the_register_map_of_modbus(line):
     assert until(lambda found: found["Answer.Number"] == 1)["Answer.Status"] == Code.ACCEPT
     ended = until(lambda found: found[CYCLE] == 815 and found["LastCycle.Code"])
     assert (ended["LastCycle.Code"], ended["Valid"], ended["Active"]) == (Code.ACCEPT, 1, 1)
+    tool = [ended[f"Tool.{name}"] for name in ("Revision", "State", "ZMm")]
+    assert tool == [3, ToolFrame.ACCEPTED, pytest.approx(150.5)]
     assert line.call("Status", "815")[4] == Code.ACCEPT
     request[:] = struct.unpack(">6H", struct.pack(">IHHI", 2, CANCEL, 0, 0))
     assert until(lambda found: found["Answer.Number"] == 2)["Answer.Status"] == Code.CONFLICT
