@@ -78,9 +78,14 @@ def test_a_make_and_other_formats_tell_the_same_mount(sets, results, tmp_path):
 
 
 def test_two_targets_tell_one_mount(results):
+    """Across the beam; along it they are as far apart as docs/hand_eye.md says."""
     sphere, edge = results["experiments_sphere"], results["experiments_edge"]
-    off = (sphere.T_flange_sensor - edge.T_flange_sensor)[:2, 3]
-    assert np.all(np.abs(off) < 6e-4)
+    off = np.abs(sphere.T_flange_sensor - edge.T_flange_sensor)[:3, 3]
+    assert np.all(off[:2] < 6e-4)
+    apart_m = apart(
+        sphere.T_flange_sensor, edge.T_flange_sensor, field_of(real.read_set("experiments_edge"))
+    )
+    assert (off[2], apart_m) == pytest.approx((1.9e-3, 1.8e-3), abs=5e-5)
 
 
 def test_a_weak_answer_holds_what_the_shop_reports(results):

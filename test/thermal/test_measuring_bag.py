@@ -23,7 +23,7 @@ from robocal_ros.thermal.session import ThermalSession
 BAG = Path(__file__).parents[2] / "bags" / "measuring_shift.mcap"
 EVENT_TOPIC = "/thermal_node/session_events"
 POINTS = 12  # of the part, in each cycle
-LAMBDA, LIMIT_M = 0.95, 1e-4  # what the issue of corrected points asks for
+LAMBDA, LIMIT_M = 0.95, 1e-4  # share of points, and within what
 
 
 @pytest.fixture(scope="module")
