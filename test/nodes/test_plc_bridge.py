@@ -7,10 +7,7 @@ processes, and the robot stands.
 
 import contextlib
 import json
-import os
-import shutil
 import struct
-import subprocess
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from datetime import UTC, datetime, timedelta
@@ -19,9 +16,9 @@ from typing import Any
 
 import pytest
 from asyncua import ua
-from cryptography.hazmat.primitives.serialization import Encoding
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from other_stack import gap_by_another_stack
 from pymodbus.client import ModbusTcpClient
 from robocal_msgs.msg import (
     AccuracyState,
@@ -35,7 +32,7 @@ from std_srvs.srv import Trigger
 from structured_text import StructuredText, samples
 from test_maintenance_calls import Plc, candidates, process
 
-from bench.live.opc_ua import OPERATOR, PlcClient, free_port, security_folder
+from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
@@ -427,30 +424,9 @@ def test_a_gap_by_the_program_of_the_page_and_modbus(line):
 
 
 def test_a_gap_by_another_stack(line, tmp_path):
-    """node-opcua, which shares no code with asyncua: what asyncua's own client would not notice."""
-    node = shutil.which("node")
-    look = [str(node), "-e", "require('node-opcua-client')"]
-    if node is None or subprocess.run(look, capture_output=True, check=False).returncode:
-        pytest.skip("no node-opcua-client: npm install it, and name its node_modules in NODE_PATH")
-    own = line.folder / access.CLIENTS / "line.der"
-    pem = tmp_path / "line.pem"
-    pem.write_bytes(access.read_certificate(own).public_bytes(Encoding.PEM))
+    """What asyncua's own client would not notice."""
     line.quiet()
-    script = Path(__file__).parents[1] / "plc" / "other_stack.cjs"
-    url, key = f"opc.tcp://127.0.0.1:{line.port}/robocal", own.with_name("line_key.pem")
-    with (tmp_path / "seen").open("w") as output, (tmp_path / "said").open("w") as errors:
-        plc = subprocess.Popen(
-            [node, script, url, pem, key, *OPERATOR, "4715"],
-            env=os.environ | {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)},
-            stdout=output,
-            stderr=errors,
-        )
-    try:
-        line.graph.spin_until(lambda: plc.poll() is not None, "the other stack", 150.0)
-    finally:
-        plc.kill()
-    assert plc.returncode == 0, (tmp_path / "said").read_text()
-    seen = json.loads((tmp_path / "seen").read_text())
+    seen = gap_by_another_stack(line.graph, line.folder, line.port, tmp_path, "4715", 30.0)
     assert {"Accuracy", "Maintenance", "LastCycle", "Gap", "Methods"} <= {*seen["objects"]}
     assert seen["codes"] == [code.name for code in Code]
     assert (seen["wrongType"], seen["readOnly"]) == ("BadTypeMismatch", "BadNotWritable")

@@ -14,6 +14,7 @@ import pytest
 from asyncua import ua
 from long_form import more
 from maintenance_live import HOME_DEG, SERIAL, LiveCell
+from other_stack import gap_by_another_stack
 from robocal_msgs.msg import MaintenanceStatus, ToolFrame
 from test_maintenance_calls import proposed
 from test_plc_bridge import DISAPPEARS_S, refused
@@ -21,10 +22,12 @@ from test_plc_bridge import DISAPPEARS_S, refused
 from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.plc.inputs import CONTEST_S
 from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 GAP_S = 150.0
+ANSWERED_MS = 500.0  # what a PLC waits for the answer of a call (docs/plc.md)
 TRIES = 3  # of a cycle that a busy machine breaks off
 # A way to the beams, then the first circle: so many motions of a cycle have begun.
 ON_ITS_WAY, MEASURES = 1, 2
@@ -67,6 +70,10 @@ class KilledBridge:
     def start(self) -> None:
         """Start the bridge; its clients come back, as PLCs do."""
         self.bridge = self.graph.start("plc_bridge_node", self.settings)
+        self.comes_back()
+
+    def comes_back(self) -> None:
+        """Its clients begin sessions anew."""
         for client in (self.plc, self.ada):
             self.do(client, client.connect_once_there())
 
@@ -175,6 +182,27 @@ def test_a_whole_gap_by_opc_ua_alone(line: KilledBridge) -> None:
     tools = line.graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
     line.graph.spin_until(lambda: tools, "the tool in force")
     assert line.do(line.plc, line.plc.read("Tool.Name")) == tools[-1].child_frame_id != ""
+
+
+def test_a_whole_gap_by_another_stack(line: KilledBridge, tmp_path: Path) -> None:
+    """It gives the gap, calls, and follows the robot that moves; asyncua's PLC is silent."""
+    for again in range(TRIES):
+        line.plc.beating = False
+        line.graph.spin_until(lambda: line.status.doing, "the gap is closed", 5.0)
+        line.graph.spin_for(CONTEST_S)
+        sent, cycle = len(line.cell.goals), f"other{'+' * again}"
+        folder, port = line.plc.folder, line.plc.port
+        seen = gap_by_another_stack(line.graph, folder, port, tmp_path, cycle, GAP_S)
+        if seen["lastCode"] == Code.ACCEPT and len(line.cell.goals) >= sent + MEASURES:
+            break
+        line.comes_back()
+        line.made_good()
+    assert seen["run"][:3] == ["Good", True, Code.ACCEPT]
+    assert (seen["lastCode"], seen["status"][:2]) == (Code.ACCEPT, ["Good", True])
+    assert max(seen["calledMs"]) <= ANSWERED_MS
+    assert len(line.cell.goals) >= sent + MEASURES
+    assert line.cell.at_home()
+    assert (line.status.last.cycle_id, line.status.last.tool_code) == (cycle, Code.ACCEPT)
 
 
 @pytest.mark.parametrize("is_open", [True, *more(False)])

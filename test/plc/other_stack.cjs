@@ -1,17 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 // A PLC by node-opcua, which shares no code with the bridge's asyncua: a gap, a call, types, refusals.
 //
-//   NODE_PATH=.../node_modules node other_stack.cjs URL CERTIFICATE.pem KEY.pem USER PASSWORD CYCLE
+//   NODE_PATH=.../node_modules node other_stack.cjs \
+//     URL CERTIFICATE.pem KEY.pem USER PASSWORD CYCLE GAP_S
 //
-// What it has seen goes to standard output as one JSON object.
+// What it has seen goes to standard output as one JSON object, in the last line.
 "use strict";
 const {
   AttributeIds, ClientMonitoredItem, DataType, MessageSecurityMode, OPCUAClient, SecurityPolicy,
   StatusCodes, TimestampsToReturn, UserTokenType, Variant,
 } = require("node-opcua-client");
 
-const [url, certificateFile, privateKeyFile, userName, password, cycle] = process.argv.slice(2);
-const SAMPLED_MS = 20, PROGRAM_MS = 50, WITHIN_MS = 60000;
+const [url, certificateFile, privateKeyFile, userName, password, cycle, gap] =
+  process.argv.slice(2);
+const SAMPLED_MS = 20, PROGRAM_MS = 50, WITHIN_MS = 30000 + 1000 * gap;
 const cell = (path) => `ns=2;s=Cell.${path}`;
 const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 
@@ -25,6 +27,7 @@ async function main() {
   });
   await client.connect(url);
   const session = await client.createSession({ type: UserTokenType.UserName, userName, password });
+  const seen = { calledMs: [] };
   const read = async (path) => (await session.read({ nodeId: cell(path) })).value.value;
   const write = async (path, dataType, value) =>
     (await session.write({
@@ -32,8 +35,9 @@ async function main() {
       value: { value: new Variant({ dataType, value }) },
     })).name;
   const call = async (name, inputArguments) => {
-    const methodId = cell(`Methods.${name}`);
+    const methodId = cell(`Methods.${name}`), begun = performance.now();
     const found = await session.call({ objectId: cell("Methods"), methodId, inputArguments });
+    seen.calledMs.push(performance.now() - begun);
     return [found.statusCode.name, ...(found.outputArguments || []).map((one) => one.value)];
   };
   const until = async (what, holds) => {
@@ -45,7 +49,6 @@ async function main() {
       await sleep(PROGRAM_MS);
     }
   };
-  const seen = {};
   const browsed = await session.browse(cell("Accuracy").replace(".Accuracy", ""));
   seen.objects = browsed.references.map((one) => one.browseName.name);
   const kind = await session.read({
@@ -83,7 +86,7 @@ async function main() {
   })();
   await until("an open gap", async () => beat && (await read("Maintenance.Doing")) === "");
   const arguments_ = [
-    { dataType: DataType.String, value: cycle }, { dataType: DataType.Double, value: 30 },
+    { dataType: DataType.String, value: cycle }, { dataType: DataType.Double, value: Number(gap) },
   ];
   seen.run = await until("a cycle that begins", async () => {
     const answer = await call("Run", arguments_);
@@ -98,7 +101,7 @@ async function main() {
   await subscription.terminate();
   await session.close();
   await client.disconnect();
-  process.stdout.write(JSON.stringify(seen));
+  process.stdout.write(`\n${JSON.stringify(seen)}`);
 }
 
 main().then(() => process.exit(0), (error) => { console.error(error); process.exit(1); });
