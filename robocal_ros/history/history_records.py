@@ -40,7 +40,7 @@ FIXTURE = "fixture"  # where a fixture stands; see `fixture_kind`
 BEFORE_ANY = {
     THERMAL: "the nominal model",
     TOOL: "the taught tool",
-    FRAME_SHIFT: "the frames as they were",
+    FRAME_SHIFT: "what the frames were before any shift",
 }
 
 

@@ -316,7 +316,7 @@ def test_a_shift_is_kept_verified_and_rolled_back(cell):
     assert history("rollback", "--kind", "frame_shift")[0] == 0
     assert shift("--in-force")[1]["text"] == first["text"]
     _, document = history("rollback", "--kind", "frame_shift", "--to", "nominal")
-    assert "the frames as they were" in document["verdict"]["reason"]
+    assert "what the frames were before any shift" in document["verdict"]["reason"]
     assert shift("--in-force")[1]["text"] == (
         "$TOOL={X 0.0000,Y 0.0000,Z 0.0000,A 0.00000,B 0.00000,C 0.00000}\n"
         "$BASE={X 0.0000,Y 0.0000,Z 0.0000,A 0.00000,B 0.00000,C 0.00000}"
