@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What pip makes of the source tree: a wheel that needs no ROS, and says what it needs."""
 
+import importlib.util
 import os
 import re
 import shutil
@@ -137,3 +138,21 @@ def test_its_command_works_without_ros(wheel: Path, tmp_path: Path) -> None:
         [python, "-c", here], env=given, cwd=tmp_path, capture_output=True, text=True
     )
     assert said.stdout == "True\n"
+
+
+def test_libraries_that_several_wheels_bring_are_one_file(tmp_path: Path) -> None:
+    """What pip takes away with one wheel stays for the others; what differs is left."""
+    spec = importlib.util.spec_from_file_location("mend", ROOT / "tools" / "mend_wheels.py")
+    assert spec is not None
+    assert spec.loader is not None
+    mend = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(mend)
+    one, two, other = (tmp_path / f"{name}.libs" / "libx.so.1" for name in ("a", "b", "c"))
+    for path, text in ((one, "x"), (two, "x"), (other, "y")):
+        path.parent.mkdir()
+        path.write_text(text)
+    assert mend.share(tmp_path) == 1
+    assert one.samefile(two)
+    assert mend.share(tmp_path) == 0
+    one.unlink()
+    assert (two.read_text(), other.read_text()) == ("x", "y")

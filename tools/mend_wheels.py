@@ -2,11 +2,13 @@
 """Point the ROS wheels' CMake files at this machine's Python and NumPy headers.
 
 The wheels were built elsewhere and name that machine's paths. A wheel holds no links either: of a
-library that has several names it holds as many copies, which become links to one. Run once with the
-venv's Python; a second run finds nothing to do.
+library that has several names it holds as many copies, and eight wheels bring the same ones: these
+become links to one. CMake's ctest and cpack go: nothing here runs them. Run once with the venv's
+Python; a second run finds nothing to do.
 """
 
 import filecmp
+import os
 import sys
 import sysconfig
 from pathlib import Path
@@ -51,6 +53,25 @@ def link(folder: Path) -> int:
     return linked
 
 
+def share(packages: Path) -> int:
+    """Keep one file of libraries that several wheels bring under one name; how many were spared.
+
+    Hard links: what pip takes away with one wheel stays for the others.
+    """
+    first: dict[str, Path] = {}
+    spared = 0
+    for path in sorted(packages.glob("*.libs/*.so*")):
+        other = first.setdefault(path.name, path)
+        if not other.samefile(path) and filecmp.cmp(other, path, shallow=False):
+            path.unlink()
+            os.link(other, path)
+            spared += 1
+    return spared
+
+
 if __name__ == "__main__":
+    packages = Path(sysconfig.get_path("platlib"))
     print(f"mended {mend(Path(sys.prefix, 'share'))} CMake files")
-    print(f"made links of {link(Path(sys.prefix, 'lib'))} copies of libraries")
+    print(f"made links of {link(Path(sys.prefix, 'lib')) + share(packages)} copies of libraries")
+    for unused in ("ctest", "cpack"):
+        (packages / "cmake" / "data" / "bin" / unused).unlink(missing_ok=True)
