@@ -192,7 +192,8 @@ LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this muc
 
 NO_LOAD = (
     "the robot file has no load, so what gravity winds the joints by was not looked for: on heavy "
-    "robots that is most of the error; add the masses and centres of the links, and the payload"
+    "robots that is most of the error; add the masses and centres of the links, and the payload: "
+    "rough ones do where it stays the same"
 )
 Model = Literal["full", "geometric"]
 

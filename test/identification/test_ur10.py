@@ -13,11 +13,14 @@ from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.ground.errors import Code
 from robocal_ros.identification import identify, identify_and_judge, judged
 from robocal_ros.identification.full_model import identify_full
+from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.data
 
 UR10 = load_robot("ur10")
+WITHOUT_LOAD = replace(UR10, load=None)
+LOAD_AT_FLANGE = replace(UR10, load=ArmLoad(10.0 * np.eye(6)[5], np.zeros((6, 3))))
 
 LARGEST_MEAN_MM = {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365}
 LARGEST_LATER_MEAN_MM = {"B": 0.455, "C": 0.52, "D": 0.40}
@@ -141,6 +144,18 @@ def test_full_model_of_july_holds_for_months(campaigns, halved, series):
     assert result.candidate.n == POSES[series]
     assert result.candidate.mean_m * 1e3 <= LARGEST_FULL_LATER_MEAN_MM[series]
     assert result.verdict.code is Code.ACCEPT
+
+
+def test_rough_masses_do_for_one_payload(campaigns, halved):
+    """10 kg at the flange and links of none are nearer to the maker's masses than to no masses."""
+    none, rough, stated = (
+        identify_and_judge(
+            arm, halved["A"][0], campaigns["D"],
+            model="full", check_refit=("base", "tool"),
+        ).candidate.mean_m
+        for arm in (WITHOUT_LOAD, LOAD_AT_FLANGE, UR10)
+    )  # fmt: skip
+    assert rough < 0.5 * (none + stated)
 
 
 @pytest.mark.parametrize(("count", "gain"), [(60, 0.25), *more((120, 0.45), (250, 0.60))])
