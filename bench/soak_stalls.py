@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ CELL, NODE = "stalls", "joint_correction_node"
 DIRECT_RUNS = 10
 MOST = 1.1  # of the largest step of the direct runs
 STALLED_AT = BEGIN[0] + 0.8
-STALLS = (0.05, False), (0.15, False), (0.5, False), (0.05, True), (0.15, True)  # s, corrected
+LENGTHS_S = 0.05, 0.15, 0.5  # of the stalls, each with the correction off and on
 MADE_GOOD_S = 0.05  # what is caught up with on the way that the stream still has
 ARRIVES_RAD = 0.02
 LARGEST_M = 0.5e-3
@@ -118,7 +119,7 @@ def soak(direct_runs: int) -> Table:
         for words, step in (("smallest", min(steps)), ("largest", largest)):
             degrees = float(np.degrees(step))
             table.add(f"direct, {words} of all", None, degrees, step / largest, None)
-        for stall_s, on in STALLS:
+        for on, stall_s in product((False, True), LENGTHS_S):
             with started(probe, on) as node:
                 places = run(probe, f"{NODE}/{TARGETS}", node, stall_s)
             step = largest_step(places)
