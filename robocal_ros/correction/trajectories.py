@@ -135,8 +135,8 @@ class TrajectoryCorrector:
         """
         output, limiter = self._output, self._output.limiter
         left, withheld = output.path, limiter.withheld
-        if output.path is None and self._state.stands(index, now_s):  # a stream's that is over
-            limiter.state[OFFSET_RATE] = 0.0
+        if output.path is None and self._state.stands(index, now_s):  # what has come in stays so
+            limiter.state[OFFSET_RATE, withheld == 0.0] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
             here, rates = q[0].copy(), (command.velocity, command.acceleration)
             here[index] = driven(times, q[:, index], *rates, 0.0)

@@ -261,6 +261,7 @@ def slow_down(robot: Robot, watch: Watch) -> None:
     st.sampled_from(range(len(MODES))),
 )  # fmt: skip
 @example([("on", 0, 1), ("tool", 1, 1), ("pause", 0, 1), ("on", 0, 1)], 0.25, False, 0)
+@example([("on", 0, 1), ("model", 1, 4), ("midway", 0, 1)], 0.0, False, 0)  # still on its way in
 @example([("on", 0, 9), ("full", 2, 60), ("off", 0, 9), ("on", 0, 60)], 1.0, True, 0)
 @example([("full", 5, 9), ("tool", 3, 9), ("on", 0, 60), ("off", 0, 60)], 0.0, True, 1)
 @example([("model", 5, 9), ("on", 0, 60), ("tool", 3, 60), ("off", 0, 60)], 1.0, True, 2)
