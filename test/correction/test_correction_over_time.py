@@ -80,11 +80,17 @@ class Watch:
                 assert abs(x - before) <= fastest * longest + ROUNDING, (NAMES[j], x - before)
             self.last[j] = now, x
 
-    def offset(self, names: tuple[str, ...], taught: np.ndarray, out: np.ndarray) -> None:
-        """The same, of targets as they were followed; where none moves, the limits at rest."""
+    def offset(
+        self, names: tuple[str, ...], taught: np.ndarray, out: np.ndarray, way: bool = False
+    ) -> None:
+        """The same, of targets as they were followed; where none moves, the limits at rest.
+
+        On a ``way`` between two points of a trajectory that is in motion the limits are those of
+        motion from its first instant on.
+        """
         now, index = self.robot.now, [NAMES.index(name) for name in names]
         ways = [abs(q - self.came.get(j, q)) for j, q in zip(index, taught, strict=True)]
-        moves = max(ways) > STILL * self.elapsed_s
+        moves = way or max(ways) > STILL * self.elapsed_s
         for name, j, q, x in zip(names, index, taught, out, strict=True):
             offset, self.came[j] = x - q, q
             if j in self.offsets:
@@ -227,7 +233,7 @@ def midway(robot: Robot, watch: Watch, seed: int, steps: int, q: np.ndarray) -> 
         robot.now += DT
         at, robot.at = (spline(robot.now - begin_s) for spline in splines)
         watch.out(NAMES, robot.at)
-        watch.offset(NAMES, at, robot.at)
+        watch.offset(NAMES, at, robot.at, seed > 0)
         robot.read(robot.at)
     stop = robot.session.stop(robot.now, 0.05)
     assert stop is not None
