@@ -33,7 +33,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
-from robocal_ros.correction.limiter import STILL
+from robocal_ros.correction.limiter import LONGEST_STEP_S, STILL
 from robocal_ros.correction.sent_path import SentPath
 
 WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
@@ -58,7 +58,7 @@ class Watch:
         self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
         self.came: dict[int, float] = {}  # joint: its target, as it was followed
         self.offsets: dict[int, tuple[float, float, float]] = {}  # when, offset, rate
-        self.begun: set[int] = set()  # joints of which one step is known since they stood
+        self.begun: dict[int, float] = {}  # joints with one step since they stood, and how long
         self.taught = np.full(6, np.nan)  # the last target, as it was followed
 
     def out(self, names: tuple[str, ...], out: np.ndarray, stood: np.ndarray | None = None) -> None:
@@ -107,13 +107,13 @@ class Watch:
                 held = dt > 2.0 * self.period_s + ROUNDING
                 if np.isfinite(rate):
                     # the step that began at rest is one of the rate's already
-                    begun = REST_A * self.period_s if j in self.begun else 0.0
+                    begun = REST_A * self.begun.get(j, 0.0)
                     goes_on = abs(new - rate) <= change * dt + begun + 2.0 * ROUNDING / dt
                     from_rest = abs(offset - before) <= LARGEST_A * dt * dt + ROUNDING
                     assert goes_on or (held and from_rest), name
-                self.begun.discard(j)
-                if rate == BEGINS:
-                    self.begun.add(j)
+                self.begun.pop(j, None)
+                if rate == BEGINS:  # after a pause as the longest step, whatever the period
+                    self.begun[j] = LONGEST_STEP_S if held else self.period_s
                 self.offsets[j] = now, offset, 0.0 if rate == BEGINS else np.nan if held else new
             else:
                 self.offsets[j] = now, offset, 0.0
@@ -268,6 +268,7 @@ def slow_down(robot: Robot, watch: Watch) -> None:
 )  # fmt: skip
 @example([("on", 0, 1), ("tool", 1, 1), ("pause", 0, 1), ("on", 0, 1)], 0.25, False, 0)
 @example([("on", 0, 1), ("model", 1, 4), ("midway", 0, 1)], 0.0, False, 0)  # still on its way in
+@example([("on", 0, 2), ("backwards", 0, 2), ("pause", 0, 1), ("on", 0, 1)], 0.375, False, 0)
 @example([("on", 0, 9), ("full", 2, 60), ("off", 0, 9), ("on", 0, 60)], 1.0, True, 0)
 @example([("full", 5, 9), ("tool", 3, 9), ("on", 0, 60), ("off", 0, 60)], 0.0, True, 1)
 @example([("model", 5, 9), ("on", 0, 60), ("tool", 3, 60), ("off", 0, 60)], 1.0, True, 2)
