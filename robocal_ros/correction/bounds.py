@@ -370,6 +370,28 @@ class DesiredOffset:
         self.figures[REMAINING] = result.remaining_m.max()
         return offset, result
 
+    def follow(
+        self,
+        q: Array,
+        velocity: Array,
+        elapsed: float,
+        limiter: OffsetLimiter,
+        active: Array,
+        speeds: Array,
+    ) -> bool:
+        """As `put_out`, where nothing is out of the ordinary; else False, and nothing has changed.
+
+        What is said of the target may have, and is said anew by `put_out`.
+        """
+        memory, given = limiter.memory, self._whole_step
+        if given is None:
+            return False
+        share = step_out(
+            q, velocity, elapsed, elapsed, memory, limiter.limits, active, speeds, *given
+        )
+        self.made = fits = bool(0.0 <= share <= 1.0 + ROUNDING)
+        return fits
+
     def put_out(
         self,
         q: Array,

@@ -296,10 +296,10 @@ def step_out(
         figures[LARGEST] = max(figures[LARGEST], abs(memory[WANTED, j]))
         if memory[OFFSET, j] != 0.0:
             figures[ADDS] = 1.0
-    if not whole:
-        figures[REDUCED] += 1.0
     if not 0.0 <= share <= 1.0 + ROUNDING:
         return share
+    if not whole:
+        figures[REDUCED] += 1.0
     out, exact = memory[VELOCITY], True
     for j in range(n):
         exact = exact and memory[OFFSET, j] == memory[DESIRED, j]

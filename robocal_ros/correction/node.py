@@ -320,9 +320,9 @@ class JointCorrectionNode(RobotNode):
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message, now)
 
-        opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
-        if senders:
-            senders.inputs[topic] = opened
+        count = None if senders is None else partial(senders.matched, topic)
+        raw = topic != COMMANDS
+        self.add_input(KINDS[topic], topic, receive, profile, raw=raw, matched=count)
 
     def _refuse_message(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
         """Refuse a message; a stream that it is of is ended in order."""
@@ -340,6 +340,7 @@ class JointCorrectionNode(RobotNode):
         try:
             self._put_out(topic, message, command, self._session.target(command, now))
         finally:
+            self._session.stream.settle()
             self._arm_tail()
         self._tell_offset(STREAM, now)
 

@@ -51,6 +51,7 @@ Answer = TypeVar("Answer")
 
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
+TARGET: tuple[str, tuple[str, ...]] = "target", ()  # their order is one for all sources
 MOST_SOURCES = 64  # of so many drivers the order in time is watched one by one
 AHEAD_S = 0.02  # a source's clock may run ahead by so much from one message to the next
 # What is dropped without ending a stream, as it is not the stream's: unless nothing came for so
@@ -214,10 +215,14 @@ class CorrectionSession:
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream of joint targets; itself where nothing is added.
 
-        A `RefusedError` ends a stream that runs: its `tail` slows the robot down.
+        A `RefusedError` ends a stream that runs: its `tail` slows the robot down. What was seen of
+        it can be noted by the stream's `settle`, when it is out.
         """
+        followed = self._follow(command, now_s)
+        if followed is not None:
+            return followed
         try:
-            self._require_order("target", command, (), now_s)
+            self._require_order(TARGET[0], command, TARGET[1], now_s)
             for reason, detail in self._held.items():
                 raise RefusedError(reason, detail)
             index = self.robot.index(command.names)
@@ -233,6 +238,20 @@ class CorrectionSession:
                 self.stream.end(error, now_s)
             raise self._count(error) from None
         self._goal[:] = q
+        return corrected
+
+    def _follow(self, command: JointCommand, now_s: float) -> JointCommand | None:
+        """The next target of a stream as usual; None where it is for `target`, or refused there."""
+        self.stream.settle()
+        stamp, (last, came_s) = command.stamp_ns, self._stamps.get(TARGET, (0, -np.inf))
+        in_order = not stamp or (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9)
+        if not in_order or self._held or self._config.shadow:
+            return None
+        corrected = self.stream.follow(command, now_s)
+        if corrected is not None:
+            self._goal[:] = command.position
+            if stamp:
+                self._stamps[TARGET] = stamp, now_s
         return corrected
 
     def trajectory(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stream of joint targets: as new as its newest message, within the speeds, ended in order."""
 
+import math
 from bisect import bisect_right
 from collections import deque
 from dataclasses import replace
@@ -84,7 +85,7 @@ class TargetStream:
         self.period_s, self._as_usual = np.nan, 0  # and so many intervals since it was found
         self._step_period_s = LONGEST_STEP_S  # it, or what stands for it before two messages came
         self._command: JointCommand | None = None
-        self._index = np.zeros(0, dtype=np.int64)
+        self._index, self._whole = np.zeros(0, dtype=np.int64), False  # of all joints, in order
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used
         # targets of the last `SPEED_S`, and what went out lately, but for the last
@@ -92,6 +93,8 @@ class TargetStream:
         self._sent: deque[tuple[float, Array]] = deque(maxlen=MOST_KEPT)
         self._step_s = 0.0  # time that the last output used
         self._before = np.full(arm.n, np.nan)  # what was put out before it
+        # of the last message, while it is not noted: when, what came, what was put out before
+        self._unnoted: tuple[float, Array, Array, float] | None = None
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
         self._lasts_s, self._slowed_s = 0.0, 0.0
@@ -139,6 +142,52 @@ class TargetStream:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
         return elapsed_s > HELD_PERIODS * self._step_period_s
 
+    def follow(self, command: JointCommand, now_s: float) -> JointCommand | None:
+        """As `take`, for the next message of a stream of all joints that runs as usual.
+
+        None, and nothing has changed, where it is anything else. It is noted by `settle`, which
+        can wait until it is out; the one before it has been.
+        """
+        last, output, limiter = self._command, self._output, self._output.limiter
+        q, velocity, elapsed = command.position, command.velocity, now_s - output.out_s
+        if (
+            last is None
+            or self.phase is not StreamPhase.RUNNING
+            or self._held_up
+            or self.lag_s > 0.0
+            or not 0.0 < elapsed <= HELD_PERIODS * self._step_period_s
+            or now_s - self._came_s > self._config.stream_gap_s
+            or output.path is not None
+            or output.mismatch
+            or not self._whole
+            or command.names != last.names
+            or command.mark != last.mark
+            or len(q) != len(last.names)
+        ):
+            return None
+        if velocity is not None and not (
+            len(velocity) == len(q) and math.isfinite(sum(velocity.tolist()))
+        ):
+            return None
+        self._velocity[:] = 0.0 if velocity is None else velocity
+        q, before, given = q.copy(), output.out.copy(), (self._active, self._speeds)
+        if not self._desired.follow(q, self._velocity, elapsed, limiter, *given):
+            return None
+        self._unnoted = now_s, q, before, now_s - elapsed
+        self._goal, self._command = q, command
+        self._came_s = output.out_s = now_s
+        output.stage = self._desired.stage
+        return self._message(command)
+
+    def settle(self) -> None:
+        """Note the last message."""
+        if self._unnoted is not None:
+            now_s, q, before, before_s = self._unnoted
+            self._unnoted = None
+            self._note_interval(now_s)
+            self._note(self._way, q, now_s)
+            self._note(self._sent, before, before_s)
+
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
 
@@ -166,7 +215,7 @@ class TargetStream:
                 self._begin(new, q, now_s)
             self._active[:] = 0.0
             self._active[index] = 1.0
-            self._index = index
+            self._index, self._whole = index, np.array_equal(index, np.arange(self._arm.n))
         self._goal, velocity = q, command.velocity
         self._note(self._way, q, now_s)
         if velocity is not None and len(index) == len(q):
@@ -216,6 +265,7 @@ class TargetStream:
 
     def come_to_rest(self, now_s: float) -> None:
         """The offset stands where nothing went out for so long that the controller holds."""
+        self.settle()
         if self.phase is not StreamPhase.ENDING and self._holds(now_s - self._output.out_s):
             self._output.limiter.state[OFFSET_RATE] = 0.0
 
@@ -335,7 +385,8 @@ class TargetStream:
             velocity = self._velocity_out()
         if self.lag_s == 0.0 and not self._desired.figures[ADDS]:
             return command
-        position = self._output.out[index]
+        out = self._output.out
+        position = out.copy() if self._whole else out[index]
         return JointCommand(command.names, position, velocity, command.stamp_ns, CORRECTED)
 
     def _velocity_out(self) -> Array:
@@ -348,7 +399,8 @@ class TargetStream:
         if self.lag_s > 0.0 and self._step_s > 0.0:
             velocity = (output.out - self._before)[index] / self._step_s
         else:
-            velocity = output.limiter.memory[VELOCITY][index]
+            velocity = output.limiter.memory[VELOCITY]
+            velocity = velocity.copy() if self._whole else velocity[index]
             if not self._desired.figures[TOO_FAST]:
                 return velocity
         names = [self._arm.joint_names[i] for i in index]
@@ -361,6 +413,7 @@ class TargetStream:
         After a silence the controller has held the last target since: the robot stands, and
         nothing more goes out, which would set it in motion again.
         """
+        self.settle()
         if self.phase is not StreamPhase.RUNNING:
             return
         output, index, self._why = self._output, self._index, why
@@ -387,6 +440,7 @@ class TargetStream:
 
     def tail(self, now_s: float) -> JointCommand | None:
         """What must go out now without a message; None when nothing must."""
+        self.settle()
         if self._command is None:
             return None
         if self.phase is StreamPhase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):

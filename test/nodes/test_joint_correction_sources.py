@@ -20,8 +20,8 @@ SLOW = {"stream_gap_s": 2.0}
 
 
 def two_on(line: Line, topic: str) -> None:
-    publishers = line.node._senders[topic].inputs[topic].get_publisher_count
-    line.graph.spin_until(lambda: publishers() == 2, "two publishers")
+    publishers = line.node._senders[topic].publishers
+    line.graph.spin_until(lambda: publishers[topic] == 2, "two publishers")
 
 
 def test_a_stream_of_two_publishers_is_refused_until_one_is_left(graph: Any) -> None:
