@@ -247,6 +247,8 @@ class JointMessage:
     finite: many drivers have none. Raises `InputError` when it cannot be read.
     """
 
+    __slots__ = "_command", "_data", "_message", "_wire"
+
     def __init__(self, wire: JointWire, data: bytes) -> None:
         self._wire, self._data = wire, data
         self._command = wire.read(data)

@@ -52,6 +52,7 @@ Answer = TypeVar("Answer")
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
 TARGET: tuple[str, tuple[str, ...]] = "target", ()  # their order is one for all sources
+NEVER = 0, -math.inf
 MOST_SOURCES = 64  # of so many drivers the order in time is watched one by one
 AHEAD_S = 0.02  # a source's clock may run ahead by so much from one message to the next
 # What is dropped without ending a stream, as it is not the stream's: unless nothing came for so
@@ -243,7 +244,7 @@ class CorrectionSession:
     def _follow(self, command: JointCommand, now_s: float) -> JointCommand | None:
         """The next target of a stream as usual; None where it is for `target`, or refused there."""
         self.stream.settle()
-        stamp, (last, came_s) = command.stamp_ns, self._stamps.get(TARGET, (0, -np.inf))
+        stamp, (last, came_s) = command.stamp_ns, self._stamps.get(TARGET, NEVER)
         in_order = not stamp or (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9)
         if not in_order or self._held or self._config.shadow:
             return None
