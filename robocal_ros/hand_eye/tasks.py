@@ -320,43 +320,45 @@ class SphereTask(Task):
         """The most promising, each from a few profiles, judged on all of them."""
         s, rng = view.sightings, np.random.default_rng(0)
         m, T = len(s.names), s.T_base_flange
-        parts = []
-        for draw in range(DRAWS if m > SUBSET else 1):
-            if m <= SUBSET:
-                rows = np.arange(m)
-            elif draw == 0:  # spread over the whole set
-                rows = np.linspace(0, m - 1, SUBSET).round().astype(np.int64)
-            else:
-                rows = np.sort(rng.permutation(m)[:SUBSET])
-            parts.append(self._by_patterns(s.take(rows)))
-        X, place = (np.concatenate(part) for part in zip(*parts, strict=True))
-        centres = self._on_sides(s, _sides(T, X, place))
+        rows = np.arange(m)[None]
+        if m > SUBSET:
+            spread = np.linspace(0, m - 1, SUBSET).round().astype(np.int64)  # over the whole set
+            drawn = [np.sort(rng.permutation(m)[:SUBSET]) for _ in range(DRAWS - 1)]
+            rows = np.stack([spread, *drawn])
+        X, place = self._by_patterns(T[rows], s.value[rows])
+        centres = self._on_sides(s.value, _sides(T, X, place))
         score = np.median(_misses(T, X, place, centres), axis=1)
         return [MountState(X[i], (place[i],)) for i in np.argsort(score)[:KEPT_SPHERES]]
 
-    def _by_patterns(self, s: Sightings) -> tuple[Array, Array]:
-        """The best poses (p, 4, 4) and spheres (p, 3) from these profiles, over all patterns."""
-        m, T = len(s.names), s.T_base_flange
-        R, origin = T[:, :3, :3], T[:, :3, 3]
-        patterns = np.array([(1.0, *rest) for rest in product((1.0, -1.0), repeat=m - 1)])
-        M = _mounts_by_patterns(T, self._on_sides(s, patterns[:1])[0], patterns)
-        turn = frames.nearest_rotation(np.concatenate([M, M * MIRROR]))  # of the opposite too
-        centres = self._on_sides(s, np.concatenate([patterns, -patterns]))
-        # With a rotation held the rest is linear: R_i t - c = -(R_i M s_i + t_i)
-        lhs = np.concatenate([R, np.broadcast_to(-np.eye(3), (m, 3, 3))], axis=2).reshape(3 * m, 6)
-        rhs = np.einsum("mij,pjk,pmk->pmi", R, turn, centres) + origin
-        inverse = np.linalg.pinv(lhs, rcond=LEAST_TOLD)
-        solution = -(inverse @ rhs.reshape(len(centres), 3 * m).T).T
-        X, place = frames.transform(turn, solution[:, :3]), solution[:, 3:]
-        miss = _misses(T, X, place, centres)
-        best = np.argsort(np.sum(miss**2, axis=1))[:KEPT_SPHERES]
-        return X[best], place[best]
+    def _by_patterns(self, T_base_flange: Array, value: Array) -> tuple[Array, Array]:
+        """The best poses (b, 4, 4) and spheres (b, 3) of each draw of profiles, over all patterns.
 
-    def _on_sides(self, s: Sightings, sides: Array) -> Array:
-        """Sphere centres (p, m, 3), sensor frame, for many patterns of sides (p, m)."""
-        value = np.broadcast_to(s.value, (*sides.shape, 3)).reshape(-1, 3)
-        centres = circle_centres(value, self.target.radius_m, sides.ravel())
-        return centres.reshape(*sides.shape, 3)
+        ``T_base_flange`` (d, m, 4, 4), ``value`` (d, m, 3): of m profiles in each of d draws.
+        """
+        draws, m = value.shape[:2]
+        R, origin = T_base_flange[..., :3, :3], T_base_flange[..., :3, 3]
+        patterns = np.array([(1.0, *rest) for rest in product((1.0, -1.0), repeat=m - 1)])
+        M = _mounts_by_patterns(T_base_flange, self._on_sides(value, np.ones(m)), patterns)
+        turn = frames.nearest_rotation(np.concatenate([M, M * MIRROR], axis=1))  # the opposite too
+        centres = self._on_sides(value[:, None], np.concatenate([patterns, -patterns]))
+        # With a rotation held the rest is linear: R_i t - c = -(R_i M s_i + t_i)
+        lhs = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape)], axis=3)
+        inverse = np.linalg.pinv(lhs.reshape(draws, 3 * m, 6), rcond=LEAST_TOLD)
+        turned = centres @ np.swapaxes(turn, 2, 3)
+        rhs = (R[:, None] @ turned[..., None])[..., 0] + origin[:, None]
+        solution = -(rhs.reshape(draws, -1, 3 * m) @ np.swapaxes(inverse, 1, 2))
+        X, place = frames.transform(turn, solution[..., :3]), solution[..., 3:]
+        miss = _misses(T_base_flange, X, place, centres)
+        best = np.argsort(np.sum(miss**2, axis=2), axis=1)[:, :KEPT_SPHERES]
+        of_each = np.arange(draws)[:, None], best
+        return X[of_each].reshape(-1, 4, 4), place[of_each].reshape(-1, 3)
+
+    def _on_sides(self, value: Array, sides: Array) -> Array:
+        """Sphere centres (..., m, 3), sensor frame, of circles (..., m, 3) on sides (..., m)."""
+        shape = np.broadcast_shapes(value.shape[:-1], sides.shape)
+        circles = np.broadcast_to(value, (*shape, 3)).reshape(-1, 3)
+        side = np.broadcast_to(sides, shape).ravel()
+        return circle_centres(circles, self.target.radius_m, side).reshape(*shape, 3)
 
     def classic(self, view: TargetView, near: MountState) -> MountState:
         """The closed form from all profiles, their sides as in a state near the solution."""
@@ -428,38 +430,46 @@ def _linear_mounts(T_base_flange: Array, centres: Array) -> tuple[Array, Array]:
 
 
 def _mounts_by_patterns(T_base_flange: Array, centres: Array, patterns: Array) -> Array:
-    """M (p, 3, 3) of `_linear_mounts`, for patterns (p, m) of sides that are +1 in ``centres``.
+    """M (d, p, 3, 3) of `_linear_mounts`, for patterns (p, m) of sides that are +1 in ``centres``.
 
-    ``centres`` (m, 3): only their y changes with the side, and with it the equations of M's second
-    column. All other unknowns are eliminated once for all patterns (Frisch and Waugh 1933).
+    ``T_base_flange`` (d, m, 4, 4), ``centres`` (d, m, 3): of each draw of profiles. Only the
+    centres' y changes with the side, and with it the equations of M's second column. All other
+    unknowns are eliminated once for all patterns (Frisch and Waugh 1933).
     """
-    R, place, m = T_base_flange[:, :3, :3], T_base_flange[:, :3, 3], len(centres)
+    draws, m = centres.shape[:2]
     if m < FEWEST_LINEAR:  # of all solutions the shortest
-        turned = np.repeat(centres[None], len(patterns), axis=0)
-        turned[:, :, 1] *= patterns
-        return _linear_mounts(T_base_flange, turned)[0]
-    x, y, z = centres.T[:, :, None, None]
-    known = (place.mean(axis=0) - place).reshape(-1)
-    fixed = np.concatenate([x * R, z * R, R], axis=2)
-    fixed = (fixed - fixed.mean(axis=0)).reshape(3 * m, 9)
-    of_each = (np.eye(m)[:, :, None, None] - 1.0 / m) * (y * R)[:, None]
-    of_each = of_each.reshape(m, 3 * m, 3)  # what a profile's y has in all equations
+        turned = np.repeat(centres[:, None], len(patterns), axis=1)
+        turned[..., 1] *= patterns
+        pairs = zip(T_base_flange, turned, strict=True)
+        return np.stack([_linear_mounts(T, own)[0] for T, own in pairs])
+    R, place = T_base_flange[..., :3, :3], T_base_flange[..., :3, 3]
+    x, y, z = np.moveaxis(centres, 2, 0)[..., None, None]
+    known = (place.mean(axis=1, keepdims=True) - place).reshape(draws, 3 * m, 1)
+    fixed = np.concatenate([x * R, z * R, R], axis=3)
+    fixed = (fixed - fixed.mean(axis=1, keepdims=True)).reshape(draws, 3 * m, 9)
+    of_each = (np.eye(m)[:, :, None, None] - 1.0 / m) * (y * R)[:, :, None]
+    of_each = of_each.reshape(draws, m, 3 * m, 3)  # what a profile's y has in all equations
     inverse = np.linalg.pinv(fixed, rcond=LEAST_TOLD)
-    shared, alone = inverse @ of_each, inverse @ known
-    U, size, Vt = np.linalg.svd(
-        np.tensordot(patterns, of_each - fixed @ shared, 1), full_matrices=False
-    )
-    told = size > LEAST_TOLD * np.linalg.norm(of_each)
-    part = np.where(told, (known - fixed @ alone) @ U, 0.0) / np.where(told, size, 1.0)
-    second = np.einsum("pij,pi->pj", Vt, part)
-    others = alone - np.einsum("pm,mij,pj->pi", patterns, shared, second)
-    return np.stack([others[:, :3], second, others[:, 3:6]], axis=2)
+    shared, alone = inverse[:, None] @ of_each, inverse @ known
+
+    def by_pattern(parts: Array) -> Array:
+        summed = patterns @ parts.reshape(draws, m, -1)
+        return summed.reshape(draws, len(patterns), *parts.shape[2:])
+
+    seen = by_pattern(of_each - fixed[:, None] @ shared)
+    U, size, Vt = np.linalg.svd(seen, full_matrices=False)
+    told = size > LEAST_TOLD * np.linalg.norm(of_each.reshape(draws, -1), axis=1)[:, None, None]
+    left = (np.swapaxes(U, 2, 3) @ (known - fixed @ alone)[:, None])[..., 0]
+    part = np.where(told, left, 0.0) / np.where(told, size, 1.0)
+    second = np.swapaxes(Vt, 2, 3) @ part[..., None]
+    others = (alone[:, None] - by_pattern(shared) @ second)[..., 0]
+    return np.stack([others[..., :3], second[..., 0], others[..., 3:6]], axis=3)
 
 
 def _misses(T_base_flange: Array, X: Array, place: Array, centres: Array) -> Array:
-    """Distances (p, m) of centres (p, m, 3), put into base, from each sphere (p, 3)."""
-    T = T_base_flange[None] @ X[:, None]
-    return np.asarray(np.linalg.norm(frames.apply(T, centres) - place[:, None], axis=2))
+    """Distances (..., p, m) of centres (..., p, m, 3), put into base, from spheres (..., p, 3)."""
+    T = T_base_flange[..., None, :, :, :] @ X[..., None, :, :]
+    return np.asarray(np.linalg.norm(frames.apply(T, centres) - place[..., None, :], axis=-1))
 
 
 def _sides(T_base_flange: Array, X: Array, place: Array) -> Array:
