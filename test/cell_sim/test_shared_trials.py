@@ -8,31 +8,34 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import pytest
-from long_form import more
+from long_form import amount, more
 
-from bench.closed_loop.faults import Trial
 from bench.closed_loop.shift import Incident, ShiftPlan, Worker, run_shift
 from bench.closed_loop.trials import TrialError, run_alike, run_all
 
 SEED = 3
 FAULTS = ("collision", *more("sensor_knocked", "frozen_clock"))
+EVERY_S, SHARED_S = 160.0, amount(0.0, 160.0)  # after a commissioning, or a gap too
 EARLY, LATE = (Incident(at_s, "collision", 2.0) for at_s in (170.0, 330.0))
-PLAN = ShiftPlan(hours=480.0 / 3600.0, every_s=160.0)
+PLAN = ShiftPlan(hours=3.0 * EVERY_S / 3600.0, every_s=EVERY_S)
 
 
 def test_a_trial_from_a_shared_begin_is_the_trial_run_whole():
     """Bit for bit: a child writes into a history of its own, and draws what the trial draws."""
-    plans = [Trial(fault, 0.0, SEED, gaps=1).plan for fault in FAULTS]
-    other = Trial("wrong_tool", 0.0, SEED, gaps=1).plan  # comes before: must leave no trace
+    hours = (SHARED_S + EVERY_S) / 3600.0
+    other, *plans = (  # the first must leave no trace
+        replace(PLAN, hours=hours, incidents=(Incident(SHARED_S, fault),))
+        for fault in ("wrong_tool", *FAULTS)
+    )
     _, *shared = run_alike([other, *plans], SEED, suite=True)
     for plan, record in zip(plans, shared, strict=True):
         assert pickle.dumps(record) == pickle.dumps(run_shift(plan, SEED))
 
 
 def test_what_goes_wrong_at_different_times_is_shared_until_the_first():
-    plans = [replace(PLAN, incidents=one) for one in ((), (EARLY,), (LATE,), (EARLY, LATE))]
+    plans = [replace(PLAN, incidents=one) for one in ((), (EARLY, LATE), (LATE,))]
     jobs = [(plan, SEED, False) for plan in plans]
-    jobs[1:1] = [(plan, 4, False) for plan in plans[1:3]]  # of another seed, in between
+    jobs.insert(1, (plans[1], 4, False))  # of another seed, in between
     with ProcessPoolExecutor(1) as pool:
         found = run_all(pool, jobs)
     assert list(map(pickle.dumps, (found[job] for job in jobs))) == [

@@ -50,7 +50,6 @@ from robocal_ros.hand_eye.targets import LineTarget
 from robocal_ros.kinematics.robots import load_robot, save_robot
 
 FOLDERS = ("sphere", "step", "line", "groove")
-LEFT_HANDED = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, -1.0], *np.ones((2, 4))])
 JOINT_RAD = 2e-5  # by which joints of a robot like the shipped ones do not repeat: 0.02 mm
 FAR_OFF = float(chi2.ppf(0.9999, 6))  # one in ten thousand is farther from the truth
 
@@ -294,13 +293,6 @@ class TestMistakes:
         np.savetxt(file, table, delimiter=",", header="x_mm,z_mm", comments="")
         found = self.refused("BAD_INPUT", "a thousand times too small", run=self.sphere(folder))
         assert found["error"]["file"].endswith("s3.csv")
-
-    def test_poses_that_fit_when_put_right(self, tmp_path):
-        """One of the mistakes of test_hand_eye_solve."""
-        some = shots_of("sphere")
-        write_part(tmp_path, "poses", some, range(SHOTS), some.T_base_flange[:SHOTS] * LEFT_HANDED)
-        words = "y of their positions negated: they come from a left-hand"
-        self.refused("RESIDUAL_TOO_LARGE", words, run=self.sphere(tmp_path))
 
     def test_a_left_handed_target(self, made, tmp_path):
         target = tmp_path / "target.yaml"

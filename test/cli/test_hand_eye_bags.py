@@ -3,13 +3,15 @@
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hand_eye_command import HEIGHTS, chi_square, pose_of, robocal, shots, target
+from long_form import more
 from scipy.stats import chi2
 
 from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter, write_data_set
@@ -62,6 +64,12 @@ def from_bag(kind: str, file: Path | None = None) -> list[object]:
     return [kind, "--bag", file or bag(kind), *ROBOT, *known(kind), *HEIGHTS]
 
 
+@cache
+def recorded(kind: str) -> Any:
+    """What the bag of the repository gives."""
+    return robocal(*from_bag(kind))
+
+
 def copied(
     kind: str, path: Path, without: tuple[str, ...] = (EVENTS,), names: dict[str, str] | None = None
 ) -> Path:
@@ -79,10 +87,17 @@ def apart_m(one: Any, other: Any) -> float:
     return float(np.linalg.norm((pose_of(one) - pose_of(other))[:3, 3]))
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: Any) -> Any:
+    """Of the sphere without the session's events."""
+    path = copied("sphere", tmp_path_factory.mktemp("plain") / "plain.mcap")
+    return robocal(*from_bag("sphere", path))
+
+
 class TestRecorded:
     @pytest.mark.parametrize("kind", KINDS)
     def test_a_bag_and_its_tables_tell_the_same(self, tables, kind):
-        found = robocal(*from_bag(kind))
+        found = recorded(kind)
         assert found["verdict"]["accept"]
         assert chi_square(found) < FAR_OFF
         assert {MOVED, BLIND, REMOVED} <= set(found["rejected"])
@@ -95,20 +110,20 @@ class TestRecorded:
         assert found["working_error_mm"] == pytest.approx(same["working_error_mm"], rel=0.1)
 
     def test_what_is_no_shot_is_named_with_the_reason(self):
-        because = robocal(*from_bag("sphere"))["rejected_because"]
+        because = recorded("sphere")["rejected_because"]
         assert list(because) == [MOVED, BLIND, REMOVED]
         assert because[MOVED].startswith("not at standstill: ")
         assert "moved by" in because[MOVED]
         assert "has 0 points" in because[BLIND]
         assert "removed, in the recorded session" in because[REMOVED]
 
-    def test_without_a_session_each_standstill_gives_a_shot(self, tmp_path):
-        found = robocal(*from_bag("sphere", copied("sphere", tmp_path / "plain.mcap")))
+    def test_without_a_session_each_standstill_gives_a_shot(self, once):
+        found = once
         assert found["rejected"] == [MOVED, BLIND]
         assert len(found["residual_mm"]["per_sample"]) == 15
         assert chi_square(found) < FAR_OFF
 
-    def test_a_sensor_that_runs_freely_gives_one_shot_for_each_standstill(self, tmp_path):
+    def test_a_sensor_that_runs_freely_gives_one_shot_for_each_standstill(self, once, tmp_path):
         """Ten profiles a second would make one pose error look like many."""
         path = tmp_path / "free.mcap"
         with BagReader(bag("sphere")) as reader, BagWriter(path) as writer:
@@ -120,7 +135,6 @@ class TestRecorded:
                         stamp.sec, stamp.nanosec = divmod(at_ns, 10**9)
                         writer.write(m.topic, m.msgtype, m.message, m.log_time_ns + late_ns)
         many = robocal(*from_bag("sphere", path))
-        once = robocal(*from_bag("sphere", copied("sphere", tmp_path / "plain.mcap")))
         assert many["covariance"] == once["covariance"]
         because = many["rejected_because"]
         assert because["shot_02"] == "taken at the same standstill as shot_01"
@@ -172,9 +186,13 @@ def numbered(reader: BagReader) -> Iterator[tuple[int, BagMessage]]:
         yield number, m
 
 
-class TestSaved:
-    def saved(self, path: Path, kind: str) -> Path:
-        """The data set that the recorded session held in the end, as the node saves it."""
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: Any) -> Callable[[str], Path]:
+    """The data set that a recorded session held in the end, as the node saves it."""
+
+    @cache
+    def of(kind: str) -> Path:
+        path = tmp_path_factory.mktemp(kind) / "saved.mcap"
         with (
             CalibrationHistory.open("K1", state_dir=path.parent) as history,
             BagReader(bag(kind)) as reader,
@@ -186,10 +204,13 @@ class TestSaved:
         write_data_set(path, session.data.document(), session.data.topic, "laser", UR10)
         return path
 
-    @pytest.mark.parametrize("kind", ["sphere", "step"])
-    def test_a_data_file_tells_what_its_recording_does(self, tmp_path, kind):
-        found = robocal(*from_bag(kind, self.saved(tmp_path / "saved.mcap", kind)))
-        same = robocal(*from_bag(kind))
+    return of
+
+
+class TestSaved:
+    @pytest.mark.parametrize("kind", ["step", *more("sphere")])  # with marks
+    def test_a_data_file_tells_what_its_recording_does(self, saved, kind):
+        found, same = robocal(*from_bag(kind, saved(kind))), recorded(kind)
         assert found["T_flange_sensor"] == same["T_flange_sensor"]
         assert found["covariance"] == same["covariance"]
         assert not {MOVED, BLIND, REMOVED} & set(found["rejected"])
@@ -207,10 +228,9 @@ class TestSaved:
         refused = robocal(*from_bag("sphere", path), status=2)["error"]
         assert "holds shots of a camera" in refused["message"]
 
-    def test_of_another_robot(self, tmp_path):
-        path = self.saved(tmp_path / "saved.mcap", "sphere")
-        words = ["--bag", path, "--robot", "kr150_r3100", *known("sphere")]
-        assert robocal("sphere", *words, status=2)["error"]["code"] == "WRONG_ROBOT"
+    def test_of_another_robot(self, saved):
+        words = ["--bag", saved("step"), "--robot", "kr150_r3100", *known("step")]
+        assert robocal("step", *words, status=2)["error"]["code"] == "WRONG_ROBOT"
 
 
 class TestRefused:

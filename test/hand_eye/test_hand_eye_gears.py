@@ -26,9 +26,9 @@ from robocal_ros.kinematics.joint_errors import HONEST
 Make = Callable[[HandEyeCell, np.random.Generator], Calibration]
 GEARS_RAD = 3e-4  # rms of a UR10's joints, 240 to 380 urad (docs/simulation.md)
 DRAWS: dict[Make, int] = {
-    step_set: amount(30, 200),
-    sphere_set: amount(30, 200),
-    edge_set: amount(10, 60),
+    step_set: amount(16, 200),
+    sphere_set: amount(16, 200),
+    edge_set: amount(6, 60),
 }
 
 

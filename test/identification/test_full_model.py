@@ -294,7 +294,7 @@ def test_each_term_is_there_where_a_heavy_robot_has_it(gears, sag):
 
     Its last joint is loaded by little: what that one winds up cannot be seen.
     """
-    draws, wrong = amount(5, 20), 0
+    draws, wrong = amount(3, 20), 0
     count = 250 if gears else 120  # gears take more poses
     nominal, load = load_robot("kr150_r3100"), ArmLoad(kr150.BODY.mass, kr150.BODY.centre)
     effects = replace(Effects.none(), static=True, noise=True, compliance=sag, gears=gears)
@@ -431,7 +431,7 @@ def test_without_a_load_there_are_functions_alone(bent):
     assert np.any(found.known.terms.count)
 
 
-@pytest.mark.parametrize("visits", [1, 2])
+@pytest.mark.parametrize("visits", [1, *more(2)])
 def test_a_target_of_a_single_pose_is_foretold_by_nothing(bent, visits):
     """The folds of few poses leave out none of it, and it costs the others nothing."""
     robot, _, check, _ = bent

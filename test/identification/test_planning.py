@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from bent_robot import LOWER, UPPER, BentRobot
+from long_form import amount
 
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.identification import planning
@@ -43,7 +44,7 @@ def test_planned_poses_leave_less_than_random_ones(plan):
     assert plan.predicted_rms_m[-1] < 0.9 * plan.random_rms_m
     assert len(np.unique(plan.chosen)) == 120
     squares = {"planned": [], "random": []}
-    for seed in range(4):
+    for seed in range(amount(2, 4)):
         robot = BentRobot(20 + seed)
         check = robot.measured(robot.poses(300), 0.0)
         draws = {"planned": plan.q, "random": robot.rng.permutation(CANDIDATES)[:120]}

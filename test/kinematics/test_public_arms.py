@@ -204,7 +204,7 @@ def _joint(name, kind, parent, child, xyz, rpy="0 0 0", inside="") -> str:
 @pytest.mark.parametrize("name", [*UR_LENGTHS, *PUBLIC])
 def test_the_flange_is_where_the_public_description_has_it(name):
     arm, links = load_description(name).arm, described(name)
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 6))
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (50, 6))
     there = np.array([links.fk(row) for row in q])
     assert np.abs(arm.fk(q) - there).max() < EXACT
 
@@ -214,7 +214,7 @@ def test_a_public_description_becomes_a_model_and_a_description_again(name):
     links = described(name)
     model = arm_of(links).arm
     again = chain(read_urdf(urdf_of(model), name))
-    q = np.random.default_rng(2).uniform(-np.pi, np.pi, (1000, 6))
+    q = np.random.default_rng(2).uniform(-np.pi, np.pi, (50, 6))
     there = np.array([links.fk(row) for row in q])
     assert len(model.parameters) == 24
     assert np.abs(model.fk(q) - there).max() < EXACT

@@ -164,7 +164,7 @@ def test_shipped_robots_go_there_and_back(name):
     assert np.allclose(back.arm.lower[known], arm.lower[known])
     other = changed(arm, 3)
     again = chain(read_urdf(urdf_with(urdf_of(arm), links, other), name))
-    assert max(np.abs(again.fk(row) - other.fk(row)).max() for row in q[:100]) < EXACT
+    assert max(np.abs(again.fk(row) - other.fk(row)).max() for row in q[:20]) < EXACT
     assert np.abs(arm_of(again).arm.fk(q) - other.fk(q)).max() < EXACT
 
 

@@ -521,8 +521,9 @@ def witnessed(tmp_path_factory) -> Kept:
     return Kept(folder, cell.now_s, rng=cell.rng)
 
 
-@pytest.mark.parametrize("rejected", [False, True])
-@pytest.mark.parametrize("knocked", [True, False])
+@pytest.mark.parametrize(
+    ("knocked", "rejected"), [(True, False), (False, False), (False, True), *more((True, True))]
+)
 def test_a_mandrel_settles_in_the_cycle_what_has_changed(witnessed, tmp_path, knocked, rejected):
     """A shift of 0.3 mm of the station or of the tool, which the tool's own run cannot tell.
 

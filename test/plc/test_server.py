@@ -275,13 +275,20 @@ def test_many_calls_that_nobody_answers_end_with_the_first(served: Served) -> No
     served.works()
 
 
-@pytest.fixture
-def beating(tmp_path: Path) -> Iterator[Served]:
-    """A server of its own, whose PLC has begun to write heartbeats."""
-    made = Served(tmp_path)
+@pytest.fixture(scope="module")
+def for_beats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server of its own, whose PLC alone writes heartbeats."""
+    made = Served(tmp_path_factory.mktemp("beats"))
     yield made
     made.plc.close()
     made.thread.stop()
+
+
+@pytest.fixture
+def beating(for_beats: Served) -> Served:
+    """The same, of which nothing was handed over yet."""
+    for_beats.forget()
+    return for_beats
 
 
 def beats_pass(served: Served, count: int) -> None:

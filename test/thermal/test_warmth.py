@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
+from long_form import amount
 
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.thermal.identification import drift_prior
 from robocal_ros.thermal.reference import DriftShare, capture_reference, drift_share
 
-POSES, ROUNDS, TRIALS = 10, 3, 100
+POSES, ROUNDS, TRIALS = 10, 3, amount(40, 100)
 KNOCK = frames.transform(frames.exp_rotation([0.0, 0.02, 0.01]), [6e-3, 0.0, -3e-3])
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from beam_cell import make_cell
 from command import beyond_rounding, robocal_json
+from long_form import amount
 from scipy.stats import chi2
 from tool_driver import NOISE, START_NS, TAUGHT, Driver, config_of
 
@@ -24,7 +25,7 @@ from robocal_ros.tool.touch_points import PLUNGE
 TRUTH = bent(TAUGHT, [0.0015, -0.001, 0.0006], [0.012, 0.018, 0.0])
 POLLED = TrueInput(latency_s=0.004, sample_period_s=0.002)
 RADIUS_M = 0.0025
-RUNS = 20
+RUNS = amount(12, 40)
 ROOT = Path(__file__).parents[2]
 
 

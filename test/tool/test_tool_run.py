@@ -204,7 +204,7 @@ def test_edges_that_scatter_more_than_told_widen_all_that_is_told_once(step_m):
     """Three times, over the runs; the scatter is found from about 20 residuals, so that a squared
     error over its covariance is n F(n, 20), of mean n 20 / 18 for n numbers.
     """
-    runs, free, true = amount(25, 60), 20, bent(TAUGHT, [0.002, -0.001, 0.001], [0.02, -0.01, 0.0])
+    runs, free, true = amount(16, 60), 20, bent(TAUGHT, [0.002, -0.001, 0.001], [0.02, -0.01, 0.0])
     squared = {"tool": 0.0, "latency": 0.0, "radius": 0.0}
     for seed in range(runs):
         cell = make_cell(exact=False, noise=TrueNoise(step_m, 6e-6))

@@ -39,7 +39,7 @@ from robocal_ros.tool.station import (
 RADIUS_M = 2.5e-3
 MANDREL = frames.transform(frames.exp_rotation([0.01, -0.02, 0.0]), [0.03, -0.02, 0.14])
 ROBOT = RobotNoise(NOISE.step_m, NOISE.edge_m)
-RUNS = amount(60, 200)
+RUNS = amount(40, 200)
 
 
 def knocked(cell: ToolCell, shift_m, turn_rad=(0.0, 0.0, 0.0)) -> ToolCell:
