@@ -153,16 +153,6 @@ class TestAnswer:
         assert document["noise_over_sigma"] == pytest.approx(10.0, rel=0.2)
         assert any("sigma_mm" in words for words in document["warnings"])
 
-    def test_a_ball_seen_from_the_flange(self, folder: Path, identify) -> None:
-        q = measured(60).q
-        seen = np.linalg.inv(true_arm().fk(q)) @ np.array([1.5, 0.4, 0.6, 1.0])
-        ball = replace(measured(60, q=q), position=seen[:, :3])
-        for sigma in (None, np.full(60, NOISE_M)):
-            path = table(folder / "flange.csv", replace(ball, sigma=sigma))
-            status, document = identify("--data", path)
-            assert status == 2
-            assert "the sensor sits on the flange" in document["error"]["message"]
-
     def test_another_set_up_unsaid_is_no_calibration_error(
         self, data: Path, folder: Path, identify
     ) -> None:
@@ -223,19 +213,6 @@ class TestAnswer:
         assert document["verdict"]["accept"]
         assert document["noise_mm"] == pytest.approx(NOISE_M * 1e3)
 
-    def test_an_outlier_is_named(self, data: Path, folder: Path, identify) -> None:
-        clean = measured(100)
-        position = clean.position.copy()
-        position[[7, 30]] += [0.0, 0.0, 2e-3]
-        path = table(folder / "outlier.csv", replace(clean, position=position))
-        check = table(folder / "clean.csv", measured(60, 9))
-        _, document = identify("--data", path, "--check", check)
-        assert document["rejected"] == ["1-7", "1-30"]
-        assert document["verdict"]["accept"]
-        _, without = identify("--data", data, "--check", check)
-        gained = document["calibrated"]["held_out"]["rms_mm"]
-        assert gained == pytest.approx(without["calibrated"]["held_out"]["rms_mm"], rel=0.05)
-
     def test_least_squares_names_what_it_holds(self, data: Path, identify) -> None:
         _, document = identify("--data", data, "--method", "lsq")
         assert document["method"] == "lsq"
@@ -250,26 +227,6 @@ class TestAnswer:
         assert "geometry stays" in document["verdict"]["reason"]
         assert document["calibrated"]["held_out"] == document["nominal"]["held_out"]
         assert all(row["sigma"] is None for row in document["parameters"].values())
-
-    def test_a_good_model_is_not_replaced_by_chance(self, folder: Path, identify) -> None:
-        nominal = load_robot(ROBOT)
-        path = table(folder / "nominal.csv", measured(60, 2, arm=nominal))
-        status, document = identify("--data", path)
-        assert status == 0
-        assert document["verdict"]["code"] in ("WORSE_THAN_CURRENT", "NO_SIGNIFICANT_GAIN")
-
-    def test_a_joint_that_never_moved(self, folder: Path, identify) -> None:
-        still = measured(80, 6)
-        q = still.q.copy()
-        q[:, 2] = 0.4
-        path = table(folder / "still.csv", measured(80, 6, q=q))
-        _, document = identify("--data", path)
-        assert document["verdict"]["code"] == "POSES_NOT_INFORMATIVE"
-        status, document = identify("--data", path, "--method", "lsq")
-        assert status == 3
-        assert document["error"]["code"] == "RANK_DEFICIENT"
-        assert "joint_a3 moves only 0 deg" in document["error"]["message"]
-        assert document["unobservable"]
 
     def test_orientations_in_one_file_only(self, data: Path, folder: Path, identify) -> None:
         turned = with_rotations(measured(40, 9), true_arm())
@@ -491,17 +448,11 @@ class TestRefusals:
         ("spoil", "words"),
         [
             (lambda p: renamed(p, x_mm="x_m", y_mm="y_m", z_mm="z_m"), "1000 times too large"),
-            (lambda p: edited(p, "y_mm", lambda y: str(-float(y))), "left-handed"),
             (lambda p: renamed(p, q2_deg="q3_deg", q3_deg="q2_deg"), "joints 2 and 3 are swapped"),
-            (lambda p: renamed(p, x_mm="y_mm", y_mm="x_mm"), "left-handed"),
-            (lambda p: edited(p, "q4_deg", lambda q: str(-float(q))), "joint 4 (joint_a4) counts"),
-            (
-                lambda p: renamed(p, **{f"q{i}_deg": f"q{i}_rad" for i in range(1, 7)}),
-                "degrees given as radians",
-            ),
         ],
     )
     def test_mistakes_are_named(self, data: Path, identify, spoil, words) -> None:
+        """Two of those of test_mismatch."""
         path = spoil(data)
         status, document = identify("--data", path)
         assert status == 2
@@ -535,16 +486,6 @@ class TestRefusals:
 
 
 class TestTooLittle:
-    def test_too_few_rows(self, folder: Path, identify) -> None:
-        path = table(folder / "few.csv", measured(6))
-        status, document = identify("--data", path)
-        assert status == 3
-        assert document["error"]["code"] == "TOO_FEW_SAMPLES"
-
-    def test_one_row(self, folder: Path, identify) -> None:
-        status, document = identify("--data", table(folder / "row.csv", measured(1)))
-        assert (status, document["error"]["code"]) == (3, "TOO_FEW_SAMPLES")
-
     def test_rows_held_out_are_told_where_too_few_are_left(self, folder: Path, identify) -> None:
         path = table(folder / "few.csv", measured(8))
         status, document = identify("--data", path)

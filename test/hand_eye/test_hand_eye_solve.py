@@ -184,10 +184,6 @@ class TestMistakes:
     def test_poses(self, few, change, words):
         self.refused(replace(few, T_base_flange=change(few.T_base_flange)), *words)
 
-    @pytest.mark.parametrize("radius_m", [0.025, *more(0.0195)])
-    def test_wrong_radius(self, data, radius_m):
-        self.refused(data, "radius", error=RobocalError, target=SphereTarget(radius_m))
-
     def test_no_rotation_at_all(self):
         cell = replace(CELL, tilt_rad=0.0, roll_rad=0.0)
         self.refused(sphere_data(5, 15, cell), "translation", "turn the flange about two axes",
@@ -272,7 +268,7 @@ class TestLine:
     def test_starts_that_are_given_up_lead_to_no_better_place(self, known):
         """Nor to another that is nearly as good: each start followed to its end."""
         task = line_task(LINE if known else None)
-        for seed in range(amount(2, 10)):
+        for seed in range(amount(1, 10)):
             shots = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng([4, seed])))
             view = features(task, shots).view
             squares = []

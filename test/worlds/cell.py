@@ -7,7 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel, SessionEvent
 from robocal_msgs.srv import (
     BeginCycle,
@@ -28,11 +28,6 @@ from robocal_ros.thermal.node import ThermalNode
 
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 DEEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED_EVENTS = QoSProfile(
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 TOPICS = {
     "joint_states": JointState,
     "measured_point": PointStamped,
