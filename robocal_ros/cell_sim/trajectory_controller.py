@@ -551,22 +551,28 @@ class JointMotion:
 
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Joints (k, n) and their velocities at times (k,), of which `KEPT` cycles are known."""
-        t = np.asarray(time_s, dtype=np.float64) / CYCLE_S
-        number = np.floor(t * (1.0 + 1e-12)).astype(np.int64)
-        self._run(int(np.max(number, initial=-1)) + 1)
-        number = np.minimum(np.maximum(number, self._begin), self._count - 1)
-        s = np.minimum(np.maximum(t - number, 0.0), 1.0)[:, None]
-        row, rows = number - self._begin, self._rows
-        q0, v0, q1, v1 = rows[row, 0], rows[row, 1], rows[row + 1, 0], rows[row + 1, 1]
-        # Drives interpolate between two cycles as the controller does between two points.
-        way, v0, v1 = q1 - q0, v0 * CYCLE_S, v1 * CYCLE_S
-        c2, c3 = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
+        s, q0, v0, c2, c3 = self._cubics(time_s)
         qd = (v0 + s * (2.0 * c2 + s * 3.0 * c3)) / CYCLE_S
         return q0 + s * (v0 + s * (c2 + s * c3)), qd
 
     def joints(self, time_s: Array) -> Array:
         """The joints (k, n) alone."""
-        return self.at(time_s)[0]
+        s, q0, v0, c2, c3 = self._cubics(time_s)
+        return np.asarray(q0 + s * (v0 + s * (c2 + s * c3)))
+
+    def _cubics(self, time_s: ArrayLike) -> tuple[Array, Array, Array, Array, Array]:
+        """Share (k, 1) of the cycle at times (k,), and the factors (k, n) of its cubic."""
+        t = np.asarray(time_s, dtype=np.float64) / CYCLE_S
+        number = np.floor(t * (1.0 + 1e-12)).astype(np.int64)
+        self._run(int(np.max(number, initial=-1)) + 1)
+        number = np.minimum(np.maximum(number, self._begin), self._count - 1)
+        s = np.minimum(np.maximum(t - number, 0.0), 1.0)[:, None]
+        row = number - self._begin
+        before, after = self._rows[row, :2], self._rows[row + 1, :2]
+        # Drives interpolate between two cycles as the controller does between two points.
+        q0, way = before[:, 0], after[:, 0] - before[:, 0]
+        v0, v1 = before[:, 1] * CYCLE_S, after[:, 1] * CYCLE_S
+        return s, q0, v0, 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
 
     def last(self) -> tuple[float, Array]:
         """Of the last cycle: its time in the trajectory, and rows (7, n).

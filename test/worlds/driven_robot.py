@@ -7,7 +7,7 @@ import numpy as np
 from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import RoundTool, joints_at
-from robocal_ros.cell_sim.trajectory_controller import JointMotion
+from robocal_ros.cell_sim.trajectory_controller import CYCLE_S, JointMotion
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.motion.cell import DrivingConfig, Housing, ToolBody
 from robocal_ros.motion.plan import JointPlan
@@ -37,7 +37,17 @@ class AheadMotion(JointMotion):
             self.pass_to(now_s - LAG_S)
             self.ahead_s = now_s + AHEAD_S
             self.joints(np.array([self.ahead_s]))
-        return self.joints(np.array([now_s]))[0]
+        # As `at`, which costs thrice as much for a single time.
+        t = now_s / CYCLE_S
+        number = int(t * (1.0 + 1e-12))
+        self._run(number + 1)
+        number = min(max(number, self._begin), self._count - 1)
+        s = min(max(t - number, 0.0), 1.0)
+        row = number - self._begin
+        (q0, v0), (q1, v1) = self._rows[row : row + 2, :2]
+        way, v0, v1 = q1 - q0, v0 * CYCLE_S, v1 * CYCLE_S
+        c2, c3 = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
+        return q0 + s * (v0 + s * (c2 + s * c3))
 
 
 class Robot:
