@@ -398,18 +398,22 @@ class RobotWatch:
         last_s = self._reached_s + since_s + UNSAID_S
         last_s = min(last_s, self.driven_s(heard_s) + UNSAID_S * self.scaling_known(heard_s))
         last_s = max(min(last_s, plan.duration_s), first_s)
-        times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / APART_S)) + 1)
+        # at each reading while a robot moves: np.linspace, vstack and norm cost twice as much
+        count = math.ceil((last_s - first_s) / APART_S)
+        times = first_s + np.arange(count + 1) * ((last_s - first_s) / max(count, 1))
+        times[count] = last_s
         planned = plan.places(times)
-        joints = np.max(np.abs(planned - q) * self._turns, axis=1)
-        T = cell.arm.fk(np.vstack([planned, q]))
+        joints = (np.abs(planned - q) * self._turns).max(axis=1)
+        T = cell.arm.fk(np.concatenate([planned, q[None]]))
         tips = T[:, :3, :3] @ cell.tool.p_tip + T[:, :3, 3]
-        tip = np.linalg.norm(tips[:-1] - tips[-1], axis=1)
+        off = tips[:-1] - tips[-1]
+        tip = np.sqrt((off * off).sum(axis=1))
         driving = self._driving
         shares = np.hypot(tip / driving.deviation_m, joints / driving.deviation_rad)
         nearest = int(np.argmin(shares))
         # where the plan rests all its instants are as near: it is as far as its clock
         as_near = (shares <= shares[nearest] + AS_NEAR) & (times <= self.driven_s(heard_s))
-        nearest = max(nearest, int(np.max(np.flatnonzero(as_near), initial=0)))
+        nearest = max([nearest, *np.flatnonzero(as_near)[-1:].tolist()])
         found = float(tip[nearest]), float(joints[nearest])
         if self.keeps(*found) and times[nearest] > self._reached_s:
             self._reached_s = float(times[nearest])
