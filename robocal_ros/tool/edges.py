@@ -5,6 +5,7 @@ Order is judged beam by beam: two beams' shadows may overlap, so nothing follows
 edges of different beams.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -343,7 +344,8 @@ class StepWatch:
         while len(self._recent) > 1 and self._recent[1][0] <= time_s - REST_S:
             self._recent.popleft()
         first_s, first = self._recent[0]
-        still = first_s <= time_s - REST_S and float(np.linalg.norm(flange - first)) < REST_M
+        away = flange - first
+        still = first_s <= time_s - REST_S and math.sqrt(away @ away) < REST_M
         if not still:
             self._rest_since_s = None
             return 0.0

@@ -2,6 +2,7 @@
 """What is compiled before the first command is all that a correction ever calls."""
 
 import gc
+import itertools
 import os
 import subprocess
 import sys
@@ -63,13 +64,12 @@ def main() -> None:
     """As a node: print which kernels were compiled, or loaded, later than they should."""
     load_kernels(NOMINAL)
     before = compiled()
-    for policy in Policy:
-        for free_axis in (False, True):
-            try:
-                use(policy, free_axis)
-            except RefusedError as refused:
-                print("refused", policy, free_axis, refused)
-                raise
+    for policy, free_axis in zip(Policy, itertools.cycle((False, True)), strict=False):
+        try:
+            use(policy, free_axis)
+        except RefusedError as refused:
+            print("refused", policy, free_axis, refused)
+            raise
     after = compiled()
     assert sum(after.values()) > 5
     print(sorted(name for name, count in after.items() if count > before.get(name, 0)))

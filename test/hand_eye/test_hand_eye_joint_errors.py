@@ -30,7 +30,7 @@ from robocal_ros.kinematics.robots import load_robot
 ARM = load_robot("ur10")
 SIZE_RAD = 3e-4
 REPEAT_M, REPEAT_RAD = 3e-5, 1e-5  # of a pose, anew each time
-DRAWS = amount(60, 120)
+DRAWS = amount(32, 120)
 DRAW_ALIKE = 1e-3  # chance of either end of the chi-squares
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from histories import BY, in_process, reopened
 from history_workers import SERIAL, proposal
+from long_form import amount
 
 from robocal_ros.ground.errors import InputError, StorageError, WrongRobotError
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -106,7 +107,7 @@ class TestManyProcesses:
             assert history.damaged is None
 
     def test_killed_at_any_moment(self, tmp_path: Path) -> None:
-        rounds = 100
+        rounds = amount(40, 400)
         seen = in_process("kill_while_accepting", tmp_path, rounds, 1)
         before = 0
         for killed, told, found in seen:
@@ -129,8 +130,9 @@ class TestManyProcesses:
         assert {path.name for path in tmp_path.iterdir()} == {"KR-7.sqlite", "KR-7.sqlite.lock"}
 
     def test_two_accepts_at_once_leave_one_winner(self, tmp_path: Path) -> None:
-        outcomes = in_process("race", tmp_path, 200)
-        assert len(outcomes) == 200
+        rounds = amount(60, 400)
+        outcomes = in_process("race", tmp_path, rounds)
+        assert len(outcomes) == rounds
         assert all(sorted(outcome) == ["CONFLICT", "done"] for outcome in outcomes)
 
     def test_many_open_a_new_history_at_once(self, tmp_path: Path) -> None:

@@ -543,10 +543,10 @@ def test_a_mandrel_settles_in_the_cycle_what_has_changed(witnessed, tmp_path, kn
         session, rejections = cell.maintenance, []
 
         def reject() -> None:
-            waiting = history.pending(TOOL, 1)
-            if rejected and waiting and "witness" in session.status(cell.now_s).doing:
-                rejections.append(waiting[0].id)
-                session.decide(REJECT, waiting[0].id, "a person", "", cell.wall_ns)
+            if rejected and "witness" in session.status(cell.now_s).doing:
+                for waiting in history.pending(TOOL, 1):
+                    rejections.append(waiting.id)
+                    session.decide(REJECT, waiting.id, "a person", "", cell.wall_ns)
 
         result = cell.maintain("c1", 1.5 * GAP_S, reject)
         if rejected:

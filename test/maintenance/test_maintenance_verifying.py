@@ -57,8 +57,9 @@ def broken_off(cell: Cell, how: str) -> None:
         cell.silent = True
 
 
-@pytest.mark.parametrize("how", ["cancelled", "closed", "silent"])
-@pytest.mark.parametrize("answer", [bent(), wrong_tool()])
+@pytest.mark.parametrize(
+    ("how", "answer"), [("cancelled", bent()), ("closed", wrong_tool()), ("silent", bent())]
+)
 def test_what_a_check_found_outlives_a_run_that_breaks_off_on_the_way_home(history, how, answer):
     cell = opened(history)
     assert cell.ran("c0").tool_answer == "pass"

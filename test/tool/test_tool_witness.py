@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from long_form import more
+from long_form import amount, more
 from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 
 from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
@@ -23,7 +23,7 @@ from robocal_ros.tool.session import ToolSession
 RULE = BendRule(nearest_m=0.055, farthest_m=0.15)
 TIP_M, TILT_RAD = 3.5e-5, np.radians(0.06)  # scatter in each direction of the change of two runs
 COVARIANCE = np.diag(np.square([TIP_M, TIP_M, TIP_M, TILT_RAD, TILT_RAD]))
-TRIALS = 4000
+TRIALS = amount(1000, 4000)
 
 
 def directions(rng: np.random.Generator, dimensions: int) -> np.ndarray:
