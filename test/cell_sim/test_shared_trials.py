@@ -16,6 +16,7 @@ from bench.closed_loop.trials import TrialError, run_alike, run_all
 SEED = 3
 FAULTS = ("collision", *more("sensor_knocked", "frozen_clock"))
 EVERY_S, SHARED_S = 160.0, amount(0.0, 160.0)  # after a commissioning, or a gap too
+GAP_S = amount(65.0, 90.0)  # for drift and a check of the tool, or a full measurement too
 EARLY, LATE = (Incident(at_s, "collision", 2.0) for at_s in (170.0, 330.0))
 PLAN = ShiftPlan(hours=3.0 * EVERY_S / 3600.0, every_s=EVERY_S)
 
@@ -24,7 +25,7 @@ def test_a_trial_from_a_shared_begin_is_the_trial_run_whole():
     """Bit for bit: a child writes into a history of its own, and draws what the trial draws."""
     hours = (SHARED_S + EVERY_S) / 3600.0
     other, *plans = (  # the first must leave no trace
-        replace(PLAN, hours=hours, incidents=(Incident(SHARED_S, fault),))
+        replace(PLAN, hours=hours, gap_s=GAP_S, incidents=(Incident(SHARED_S, fault),))
         for fault in ("wrong_tool", *FAULTS)
     )
     _, *shared = run_alike([other, *plans], SEED, suite=True)
