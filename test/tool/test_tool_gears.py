@@ -9,7 +9,6 @@ at others is foretold of robots of that kind.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from long_form import amount
 from scipy.stats import chi2
 
@@ -18,7 +17,6 @@ from bench.tool_erring import ErringStation, geared
 from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, beams_of, bent
 from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.gears import ur10_gears
-from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.tool.crossed_model import Held, RobotNoise
 from robocal_ros.tool.judging import tip_errors
@@ -29,7 +27,7 @@ GEARS_RAD = 3e-4  # rms of a UR10's joints, 240 to 380 urad (docs/simulation.md)
 DRAW_ALIKE = 1e-3  # chance of either end of the chi-squares
 
 
-def change_of_tip(seed: int, with_gears: bool) -> tuple[float, float, float]:
+def change_of_tip(seed: int) -> tuple[float, float, float]:
     """Squared error of a tip's change over what both runs tell of it, and with joints that err.
 
     Last the square of how many of the sigmas that they tell it is said to be off.
@@ -39,7 +37,7 @@ def change_of_tip(seed: int, with_gears: bool) -> tuple[float, float, float]:
     gears = ur10_gears()
     gears = replace(gears, phase=rng.uniform(-np.pi, np.pi, gears.phase.shape))
     effects = replace(true.effects, gears=True)
-    robot = geared(replace(true, gears=gears, effects=effects)) if with_gears else None
+    robot = geared(replace(true, gears=gears, effects=effects))
     source = TrueInput(latency_s=0.004, sample_period_s=0.002)
     station = ErringStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), source, NOISE, robot)
     cell = ToolCell(
@@ -64,19 +62,12 @@ def change_of_tip(seed: int, with_gears: bool) -> tuple[float, float, float]:
     return squares[0], squares[1], erring.factor**2
 
 
-@pytest.fixture(scope="module")
-def erring() -> Array:
-    return np.array([change_of_tip(seed, True) for seed in range(DRAWS)])
+def test_with_gears_it_is_off_by_as_many_sigmas_as_is_said():
+    """Their part is foretold of the kind of robot, and holds both ways.
 
-
-def test_the_change_of_a_tip_holds_what_is_told_of_it():
-    """Without gears what the runs tell is enough: by chi-square of three numbers a draw."""
-    squared = [change_of_tip(seed, False)[0] for seed in range(DRAWS)]
-    assert np.sum(squared) < chi2.ppf(1.0 - DRAW_ALIKE, 3 * DRAWS)
-
-
-def test_with_gears_it_is_off_by_as_many_sigmas_as_is_said(erring):
-    """Their part is foretold of the kind of robot, and holds both ways."""
+    That without gears what the runs tell is enough: test_tool_judging.
+    """
+    erring = np.array([change_of_tip(seed) for seed in range(DRAWS)])
     runs_alone, with_joints, factor2 = erring.mean(axis=0) / [3.0, 3.0, 1.0]
     print(f"alone {runs_alone:.2f}, said {factor2:.2f}; with them {with_joints:.2f}")
     low, high = chi2.ppf([DRAW_ALIKE, 1.0 - DRAW_ALIKE], 3 * DRAWS) / (3 * DRAWS)
