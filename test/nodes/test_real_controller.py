@@ -135,6 +135,9 @@ def test_it_goes_between_points_as_the_polynomials_do(controller, rows):
     assert len(inside) > 40  # of a hundred; a busy machine leaves some out
     assert np.max(np.abs(found - wanted)) < 1e-6
     assert np.max(np.abs(speed - wanted_speed)) < 1e-4
+    ahead, *_ = path.sample(np.array([times[i] + PERIOD_S for i in inside]))
+    sent = np.array([states[i].output.positions for i in inside])
+    assert np.max(np.abs(sent - ahead)) < 1e-6  # where the robot shall be a cycle later
 
 
 # ---- stop, replace, jump -------------------------------------------------------------------------
@@ -295,7 +298,7 @@ def test_a_goal_ends_when_its_robot_is_there(controller):
     assert controller.stands() == pytest.approx(HOME + STEP, abs=1e-9)
     at_s, sent = controller.sent(begin_s)
     arrived_s = at_s[np.max(np.abs(sent - HOME - STEP), axis=1) < 1e-9][0]
-    assert 1.0 < arrived_s - begin_s < 1.5
+    assert 1.0 - PERIOD_S < arrived_s - begin_s < 1.5  # commanded a cycle ahead
     assert arrived_s - PERIOD_S < ended_s < arrived_s + 0.5
 
 
