@@ -266,13 +266,6 @@ class TestDeciding:
         assert sorted(document["verdict"]["code"] for document in said) == ["ACCEPT", "CONFLICT"]
         assert head(state) == (2, 2)
 
-    def test_seen_by_others_within_a_second(self, state):
-        with CalibrationHistory.open(SERIAL, state_dir=state) as history:
-            seen = history.data_version()
-            robocal_json("history.decision.json", "history", "accept", "2", "--state", state)
-            assert history.data_version() != seen
-            assert history.head().revision == 2
-
 
 class TestTrouble:
     def test_damaged_file_is_reported_and_not_touched(self, state):

@@ -107,7 +107,7 @@ class TestManyProcesses:
             assert history.damaged is None
 
     def test_killed_at_any_moment(self, tmp_path: Path) -> None:
-        rounds = amount(40, 400)
+        rounds = amount(40, 100)
         seen = in_process("kill_while_accepting", tmp_path, rounds, 1)
         before = 0
         for killed, told, found in seen:
@@ -130,7 +130,7 @@ class TestManyProcesses:
         assert {path.name for path in tmp_path.iterdir()} == {"KR-7.sqlite", "KR-7.sqlite.lock"}
 
     def test_two_accepts_at_once_leave_one_winner(self, tmp_path: Path) -> None:
-        rounds = amount(60, 400)
+        rounds = amount(60, 200)
         outcomes = in_process("race", tmp_path, rounds)
         assert len(outcomes) == rounds
         assert all(sorted(outcome) == ["CONFLICT", "done"] for outcome in outcomes)
