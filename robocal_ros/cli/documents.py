@@ -23,7 +23,7 @@ from robocal_ros.ground.documents import (
     printed,
     rules,
 )
-from robocal_ros.identification.documents import IdentificationDocument
+from robocal_ros.identification.documents import IdentificationDocument, Masses
 
 REPLAY_FAILS = (
     "Where the samples were read but a reference or every identification failed, the document has "
@@ -140,6 +140,7 @@ class PredictedErrorDocument(TypedDict):
 
 @printed("joint-functions")
 class FunctionsOfJointsDocument(RobotDocument):
+    masses: Masses
     joints: Annotated[list[FunctionOfJointDocument], keywords(minItems=1)]
     predicted: Annotated[
         PredictedErrorDocument | None,
@@ -262,6 +263,9 @@ class LoadDocument(TypedDict):
     payload_mass: NotNegative
     payload_centre: Three
     gravity: Three
+    found: NotRequired[
+        Annotated[bool, "No masses were known: those here are units of products, no kilograms."]
+    ]
 
 
 class FinalModelDocument(TypedDict):

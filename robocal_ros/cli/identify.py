@@ -13,6 +13,7 @@ import numpy as np
 from robocal_ros import __version__
 from robocal_ros.cli.main import (
     DONE,
+    FOUND_MASSES,
     NO_ANSWER,
     PARTS,
     ROBOT_HELP,
@@ -35,10 +36,9 @@ from robocal_ros.ground.errors import Code, InputError, TooFewSamplesError
 from robocal_ros.ground.files import nearest, quoted
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification import JudgedIdentification, identify_and_judge
-from robocal_ros.identification.full_model import FullIdentification
+from robocal_ros.identification.full_model import FullIdentification, without_masses
 from robocal_ros.identification.judged import (
     CYCLES,
-    NO_LOAD,
     another_set_up,
     contradicted,
     explain_mismatch,
@@ -168,6 +168,8 @@ def _show_joints(console: "Console", document: Document) -> None:
         for key in ("gaps_deg", "gaps_mm")
         if row.get(key)
     ]
+    if document["masses"] == "found":
+        print_words(console, FOUND_MASSES)
     if gaps:
         print_words(console, f"In between not measured: {'; '.join(gaps)}.")
     if part := document["coverage"]["not_covered"]:
@@ -329,9 +331,10 @@ def run_identify(args: argparse.Namespace) -> CliResult:
         with model_history(args, robot.arm, create=True) as history:
             head = head_without_reference(history)
         in_force = None if head.model is None else arm_of(head.model, robot.arm)
-    if args.model == "full" and "geometry" in args.fit and robot.arm.load is None:
-        warnings.append(f"{robot.path}: {NO_LOAD} (--model geometric looks for none)")
     judged, data, document = _identified(robot.arm, args, warnings, in_force)
+    sought = args.model == "full" and "geometry" in args.fit
+    if sought and (words := without_masses(robot.arm, judged.identification)):
+        warnings.append(f"{robot.path}: {words}")
     verdict = judged.verdict
     document["output"] = None
     if args.output is not None and verdict.accept:  # a script may use it at once

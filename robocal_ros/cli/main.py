@@ -394,6 +394,9 @@ def print_table(
     console.print(table)
 
 
+FOUND_MASSES = "Compliances count with masses that were found: they are no kilograms of links."
+
+
 def print_words(console: "Console", words: str, style: str = "") -> None:
     """Print a line as it is: no markup, and wrapped by the terminal alone."""
     from rich.text import Text

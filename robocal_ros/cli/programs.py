@@ -32,7 +32,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.kinematics.arm import arm_of, payload_note
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
 from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
@@ -136,6 +136,8 @@ def given_models(args: argparse.Namespace) -> tuple[CorrectionModels, list[str]]
     nominal = robot.arm
     actual = given_model(args, nominal)
     reference = nominal if args.reference is None else read_model(args.reference, nominal)
+    if actual.masses == "found" and (note := payload_note(actual, actual.load, nominal.load)):
+        warnings.append(note)
     return CorrectionModels(nominal, actual, reference), warnings
 
 

@@ -12,12 +12,14 @@ import numpy as np
 import yaml
 
 from robocal_ros.cli.main import (
+    FOUND_MASSES,
     ROBOT_HELP,
     CliResult,
     Document,
     describe_robot,
     print_output,
     print_table,
+    print_words,
 )
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import quoted, read_text, write_text
@@ -213,6 +215,7 @@ def run_joint_functions(args: argparse.Namespace) -> CliResult:
     document: FunctionsOfJointsDocument = {
         "robot": arm.name,
         "model_hash": arm.model_hash,
+        "masses": arm.masses,
         "joints": joints,
         "predicted": _predicted(known, arm, args.data) if known and args.data else None,
         "figures": None,
@@ -265,6 +268,8 @@ def _show_joint_functions(console: "Console", document: Document) -> None:
         "compliance µrad/(N m)",
     )
     print_table(console, title, head, rows)
+    if document["masses"] == "found":
+        print_words(console, FOUND_MASSES)
     if told := document["predicted"]:
         away = told["not_covered"]
         console.print(

@@ -504,7 +504,7 @@ class CorrectionGate:
         if len(places):
             self._require_small(model, arm, places)
         self._model, self.revision = model, model.revision
-        self.payload = payload_note(arm, model.load)
+        self.payload = payload_note(arm, model.load, self._reference.load)
         self.survey = survey(self._reference, arm, self._config.thermal)
 
     def watch_age(self, now_ns: int) -> bool:

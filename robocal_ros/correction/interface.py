@@ -252,7 +252,9 @@ def _layer(message: Any, n: int) -> tuple[JointFunctions | None, ArmLoad | None]
                 np.array([v.x, v.y, v.z]) for v in (message.payload_centre, message.gravity)
             )
             centres = np.array(message.link_centre, dtype=np.float64).reshape(n, 3)
-            load = ArmLoad(message.link_mass, centres, message.payload_mass, centre, pull)
+            found = math.isnan(message.payload_mass)
+            carried = 0.0 if found else message.payload_mass
+            load = ArmLoad(message.link_mass, centres, carried, centre, pull, found)
             if len(load.mass) != n:
                 raise ValueError(f"masses of {len(load.mass)} links, {n} joints")
         if functions is not None and load is None and np.any(functions.compliance):

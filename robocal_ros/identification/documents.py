@@ -31,6 +31,12 @@ BOUND_SIGMAS = (
     "noise together; 2.80 where errors are normal and their size is well known."
 )
 
+Masses = Annotated[
+    Literal["given", "found"] | None,
+    "What compliances count with: masses of the robot file, or where it has none one at the flange "
+    "with which they were found; null where there are no compliances.",
+]
+
 
 class PlannedPoseDocument(TypedDict):
     pose: str
@@ -156,6 +162,7 @@ class IdentificationDocument(PlacedModelDocument):
             "want none.",
         ]
     ]
+    masses: NotRequired[Masses]
     joints: NotRequired[list[IdentifiedJointDocument]]
     check_outside: NotRequired[
         Annotated[Share, "Share of the check poses that have a joint where it was not measured."]
@@ -205,6 +212,7 @@ class IdentifiedDocument(PlacedModelDocument):
         "What was found: full with joint functions or compliances, geometric where the data "
         "want none.",
     ]
+    masses: Masses
     joints: list[IdentifiedJointDocument]
     check_outside: Annotated[
         Share, "Share of the check poses that have a joint where it was not measured."

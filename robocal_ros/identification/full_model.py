@@ -37,6 +37,7 @@ from robocal_ros.identification.known_model import (
 )
 from robocal_ros.identification.solve import BOUND, Identification, Method, identify
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_functions import ArmLoad
 
 _ROBUST_ROUNDS = 2  # by Huber's loss; the first judges samples by the geometry alone
 # Huber's loss still lets one that is off by 0.1 m tell more than many sound ones: beyond 8 sigma a
@@ -283,6 +284,29 @@ def _turn_share(residual: Array) -> float:
     return min(1.0, turn / shift) if shift > 0.0 else 1.0
 
 
+def without_masses(arm: SerialArm, found: Identification) -> str:
+    """Say what was done where the arm's masses are not known, and what they would give; or empty.
+
+    ``found``: by `identify_full` of this arm.
+    """
+    if arm.load is not None and not arm.load.found:
+        return ""
+    sought = (
+        "1 kg at the flange of an upright arm" if arm.load is None else "those that it calls found"
+    )
+    told = "none was worth it, with masses it is sought better"
+    if found.cell.arm.masses:
+        told = (
+            "that holds for the payload and the mounting that were measured; with masses it holds "
+            "for others too, and leaves less"
+        )
+    return (
+        "the robot file has no masses of the links, so compliances were sought with "
+        f"{sought}: {told}; add the masses and centres of the links, and the payload: a factor on "
+        "all masses does no harm"
+    )
+
+
 def bare(arm: SerialArm) -> SerialArm:
     """Return the arm without joint functions."""
     return arm.with_model(arm.mdh, None, arm.load)
@@ -299,7 +323,8 @@ def identify_full(
 
     Where it wants none, or the geometry is not in ``fit``, the answer is that of `identify`.
     Functions that ``arm`` has are found anew, or held where the data tell less of them.
-    Compliances need the arm's ``load``.
+    Without a ``load`` of the arm compliances are those of a mass at the flange (`ArmLoad.unknown`),
+    which is the load of what is found.
 
     Raises
     ------
@@ -394,9 +419,8 @@ def _solved(
 ) -> tuple["_Solved | None", _FullProblem]:
     """The full model, where the evidence wants one, and the problem of the geometric model."""
     start = identify(bare(arm), data, fit=fit, method=method)
-    torque = gravity_torque(arm, data.q)
-    q = np.ascontiguousarray(data.q)
-    data = replace(data, q=q)
+    load = arm.load or ArmLoad.unknown(arm.n)
+    data = replace(data, q=np.ascontiguousarray(data.q))
     problem = _FullProblem(start, data, start.lever_m)
     before, rival = len(start.layout.names), problem
     if arm.functions is not None:
@@ -407,17 +431,18 @@ def _solved(
     if 3.0 * len(data) < FEWEST_NUMBERS * before or start.estimate.creeping:
         return None, rival
     try:
-        return _by_rounds(problem, torque), rival
+        return _by_rounds(problem, load), rival
     except np.linalg.LinAlgError:  # data without noise, of which rounding alone is left
         return None, rival
 
 
-def _by_rounds(problem: _FullProblem, torque: Array | None) -> "_Solved | None":
-    """The full model, of poses with these gravity torques (m, n), where the evidence wants one."""
+def _by_rounds(problem: _FullProblem, load: ArmLoad) -> "_Solved | None":
+    """The full model, of an arm with this load, where the evidence wants one."""
     start, q = problem.start, problem.data.q
-    before = len(start.layout.names)
+    before, arm = len(start.layout.names), start.cell.arm
+    torque = gravity_torque(replace(start.nominal, load=load), q)
     at = _Solution(
-        start.cell,
+        replace(start.cell, arm=arm.with_model(arm.mdh, None, load)),
         JointTerms.cover(q, torque, before, coarse=True),
         FunctionPrior.typical(start.nominal.n, start.estimate.scale),
     )
@@ -554,5 +579,6 @@ def _known(problem: _FullProblem, at: _Solution, weight: Array, stretch: float) 
         0.0 if data.rotation is None else problem.problem.lever_m,
         sigma,
     )
-    arm = cell.arm.with_model(cell.arm.mdh, replace(functions, identified_from=told), cell.arm.load)
+    load = cell.arm.load if np.any(at.terms.bends) else start.nominal.load
+    arm = replace(cell.arm, functions=replace(functions, identified_from=told), load=load)
     return replace(known, cell=replace(cell, arm=arm))

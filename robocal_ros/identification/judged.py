@@ -43,7 +43,11 @@ from robocal_ros.identification.cell_model import (
     linear_start,
     place_base_and_points,
 )
-from robocal_ros.identification.full_model import FullIdentification, identify_full
+from robocal_ros.identification.full_model import (
+    FullIdentification,
+    identify_full,
+    without_masses,
+)
 from robocal_ros.identification.solve import Identification, Method, identify, still_joints
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document, parameters_document
@@ -190,11 +194,6 @@ MOVED = 2.0  # errors over those with base and targets placed anew: then most is
 LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
 
 
-NO_LOAD = (
-    "the robot file has no load, so what gravity winds the joints by was not looked for: on heavy "
-    "robots that is most of the error; add the masses and centres of the links, and the payload: "
-    "rough ones do where it stays the same"
-)
 Model = Literal["full", "geometric"]
 
 
@@ -275,8 +274,8 @@ def identify_and_judge(
         doubt = too_narrow(workspace_m, change_m, summarise(before[sound]).rms_m, SPREAD_POSES)
     inside = ~np.any(away, axis=1)
     verdict = _decided(result, fit, before, after, pose_groups(check.q), doubt, sound, inside)
-    missing = model == "full" and "geometry" in fit and arm.load is None
-    verdict = _explained(verdict, _not_covered(result, away), NO_LOAD if missing else "")
+    masses = without_masses(arm, result) * (model == "full" and "geometry" in fit)
+    verdict = _explained(verdict, _not_covered(result, away), masses)
     errors = {"nominal": plain, "in_force": before, "calibrated": after}
     return JudgedIdentification(
         identification=result,
@@ -585,6 +584,7 @@ def identification_document(judged: JudgedIdentification) -> "IdentificationDocu
         "model_hash": result.nominal.model_hash,
         "method": result.method,
         "model": "full" if isinstance(result, FullIdentification) else "geometric",
+        "masses": result.cell.arm.masses,
         "joints": joints_document(judged),
         "check_outside": judged.check_outside,
         "coverage": _coverage_document(judged),

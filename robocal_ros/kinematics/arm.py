@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -227,6 +227,13 @@ class SerialArm:
             packed[n, CENTRE:TABLE] = load.payload_centre
         return packed
 
+    @property
+    def masses(self) -> Literal["given", "found"] | None:
+        """With which masses its compliances count (`ArmLoad`); None where it has none."""
+        if self.load is None or self.functions is None or not np.any(self.functions.compliance):
+            return None
+        return "found" if self.load.found else "given"
+
     @cached_property
     def parameters(self) -> ParameterSet:
         """The model's free parameters, derived from its geometry."""
@@ -237,17 +244,19 @@ class SerialArm:
         """Identity of the model (16 hex digits): its numbers to 1e-9 m or rad, and its joints.
 
         The same file gives the same hash on every machine; name, limits, tool, payload and
-        mounting do not enter. Compliances do to 1e-15 rad/(N m), the links' mass with them.
+        mounting do not enter. Compliances do to 1e-15 rad/(N m), with them the links' mass and
+        whether it was found.
         """
         parts = [self.mdh, self.T_base_root[:3]]
         if self.functions is not None:
             f = self.functions
             parts += [f.first, f.step, f.coefficients, 1e6 * f.compliance]
-            parts += [self.load.mass, self.load.centre] if self.load and any(f.compliance) else []
+            parts += [self.load.mass, self.load.centre] if self.load and self.masses else []
         numbers = np.round(np.hstack([part.ravel() for part in parts]), 9) + 0.0
         joints = zip(self.joint_names, self.sign, self.prismatic, strict=True)
         words = [f"{name}{sign:+.0f}{int(slides)}" for name, sign, slides in joints]
-        text = "|".join([*words, *(f"{x:.9f}" for x in numbers)])
+        found = ["found"] if self.masses == "found" else []
+        text = "|".join([*words, *(f"{x:.9f}" for x in numbers), *found])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def with_mdh(self, mdh: ArrayLike) -> "SerialArm":
@@ -417,18 +426,23 @@ def layer_of(model: Mapping[str, Any]) -> tuple[JointFunctions | None, ArmLoad |
 _POSES = 2000  # over the joints' range, among which the largest shift is sought
 
 
-def payload_note(arm: SerialArm, identified: ArmLoad | None) -> str:
+def payload_note(arm: SerialArm, identified: ArmLoad | None, present: ArmLoad | None) -> str:
     """What it may cost that an arm carries, or hangs, otherwise than when it was identified.
 
-    Empty where it does not, or where one of the loads is not known.
+    ``present``: of the robot file that the model is used with. Empty where the loads are the same,
+    or where one is not known.
     """
-    load = arm.load
-    if load is None or identified is None or _same_load(load, identified):
+    if present is None or identified is None or _same_load(present, identified):
         return ""
     note = (
         f"the model was identified with a payload of {_in_words(identified)}, "
-        f"the robot file says {_in_words(load)}"
+        f"the robot file says {_in_words(present)}"
     )
+    if identified.found or present.found:
+        return (
+            f"{note}: without masses the model cannot follow, and stays as it was measured; "
+            "identify it anew with the masses of the links and the payload"
+        )
     if arm.functions is None or not np.any(arm.functions.compliance):
         return f"{note}: how far that bends the arm is not in the model"
     far = np.pi  # where a joint has no limits
@@ -443,7 +457,8 @@ def payload_note(arm: SerialArm, identified: ArmLoad | None) -> str:
 
 
 def _same_load(a: ArmLoad, b: ArmLoad) -> bool:
-    pulled = a.payload_mass == b.payload_mass and np.array_equal(a.gravity, b.gravity)
+    carried = (a.found, a.payload_mass) == (b.found, b.payload_mass)
+    pulled = carried and np.array_equal(a.gravity, b.gravity)
     return pulled and (a.payload_mass == 0.0 or np.array_equal(a.payload_centre, b.payload_centre))
 
 
@@ -451,7 +466,10 @@ def _in_words(load: ArmLoad) -> str:
     centre, pull = (
         ", ".join(f"{x:.4g}" for x in v) for v in (1e3 * load.payload_centre, load.gravity)
     )
-    return f"{load.payload_mass:.4g} kg at ({centre}) mm and gravity along ({pull})"
+    carried = f"{load.payload_mass:.4g} kg at ({centre}) mm"
+    if load.found:
+        carried = "what nobody stated"
+    return f"{carried} and gravity along ({pull})"
 
 
 def parameters_document(

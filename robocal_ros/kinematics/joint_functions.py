@@ -152,10 +152,12 @@ class ArmLoad:
 
     ``mass`` (n,): of the links, kg. ``centre`` (n, 3): of mass, m, each in the frame behind its
     joint (of the last: the flange). ``payload_mass``: kg. ``payload_centre`` (3,): m, in the
-    flange. ``gravity`` (3,): m/s², in the base.
+    flange. ``gravity`` (3,): m/s², in the base. ``found``: no masses were known; compliances were
+    found with the ones here, which make units of products and are no kilograms of links. Links and
+    what is carried are in them together, so there is no payload beside them.
 
-    Raises `ValueError` for shapes that do not fit, numbers that are not finite, or a mass below
-    zero.
+    Raises `ValueError` for shapes that do not fit, numbers that are not finite, a mass below zero,
+    or a payload beside masses that were found.
     """
 
     mass: Array
@@ -163,6 +165,7 @@ class ArmLoad:
     payload_mass: float = 0.0
     payload_centre: Array = field(default_factory=lambda: np.zeros(3))
     gravity: Array = field(default_factory=lambda: np.array([0.0, 0.0, -STANDARD_GRAVITY]))
+    found: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.mass)
@@ -175,14 +178,27 @@ class ArmLoad:
             object.__setattr__(self, name, value)
         if not (np.all(self.mass >= 0.0) and 0.0 <= self.payload_mass < np.inf):
             raise ValueError("load: a mass must not be below 0")
+        if self.found and self.payload_mass:
+            raise ValueError(
+                f"load: a payload of {self.payload_mass:g} kg beside masses that were found, of "
+                "which it is a part: identify the robot anew with the masses of its links"
+            )
+
+    @classmethod
+    def unknown(cls, n: int) -> "ArmLoad":
+        """1 kg at the flange of an upright arm of n joints whose masses nobody knows.
+
+        Compliances are fitted: only their products with the mass count.
+        """
+        return cls(np.eye(n)[-1], np.zeros((n, 3)), found=True)
 
     def carrying(self, present: "ArmLoad | None") -> "ArmLoad":
         """These links with the payload and the mounting of another load; None: their own.
 
         A compliance belongs to the mass of the links that it was identified with. What the arm
-        carries and how it is mounted may have changed since.
+        carries and how it is mounted may have changed since: masses that were found cannot follow.
         """
-        if present is None:
+        if present is None or self.found or present.found:
             return self
         return replace(
             self,

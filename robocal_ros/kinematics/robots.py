@@ -335,13 +335,7 @@ def save_robot(
             xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
             document[key] = {"xyz_mm": xyz, "quat_xyzw": frames.quat_xyzw(T).tolist()}
     if arm.load is not None:
-        document["load"] = {
-            "masses_kg": arm.load.mass.tolist(),
-            "centres_mm": [[_shown(x, MM) for x in row] for row in arm.load.centre.tolist()],
-            "payload_kg": arm.load.payload_mass,
-            "payload_centre_mm": [_shown(x, MM) for x in arm.load.payload_centre.tolist()],
-            "gravity_m_s2": arm.load.gravity.tolist(),
-        }
+        document["load"] = _load_document(arm.load)
     if arm.functions is not None:
         document["functions"] = _functions_document(arm, arm.functions)
         if arm.functions.identified_from is not None:
@@ -426,9 +420,25 @@ _FUNCTION_KEYS = {
 _MICRO = 1e-6
 
 
+def _load_document(load: ArmLoad) -> dict[str, Any]:
+    carried: dict[str, Any] = {
+        "payload_kg": load.payload_mass,
+        "payload_centre_mm": [_shown(x, MM) for x in load.payload_centre.tolist()],
+    }
+    return {
+        "masses_kg": load.mass.tolist(),
+        "centres_mm": [[_shown(x, MM) for x in row] for row in load.centre.tolist()],
+        **({"found": True} if load.found else carried),
+        "gravity_m_s2": load.gravity.tolist(),
+    }
+
+
 def _load(fields: Fields, n: int) -> ArmLoad:
-    fields.only("masses_kg", "centres_mm", "payload_kg", "payload_centre_mm", "gravity_m_s2")
-    centres = fields.rows("centres_mm", n, 3)
+    keys = ("masses_kg", "centres_mm", "payload_kg", "payload_centre_mm", "gravity_m_s2", "found")
+    fields.only(*keys)
+    centres, found = fields.rows("centres_mm", n, 3), fields.values.get("found", False)
+    if not isinstance(found, bool):
+        fields.fail(f"must be true or false, not {_kind(found)}", "found")
     try:
         return ArmLoad(
             np.array(fields.numbers("masses_kg", n)),
@@ -436,6 +446,7 @@ def _load(fields: Fields, n: int) -> ArmLoad:
             fields.number("payload_kg", 0.0),
             np.array(fields.numbers("payload_centre_mm", 3, (0.0, 0.0, 0.0))) * MM,
             np.array(fields.numbers("gravity_m_s2", 3, (0.0, 0.0, -STANDARD_GRAVITY))),
+            found,
         )
     except ValueError as error:
         fields.fail(f"cannot be: {error}")

@@ -498,7 +498,8 @@ class SessionNode(RobotNode, Generic[SessionT]):
             if self._payload[0] != head.revision:
                 model, note = head.model, ""
                 if model is not None:
-                    note = payload_note(arm_of(model, self._nominal), layer_of(model)[1])
+                    arm, (_, load) = arm_of(model, self._nominal), layer_of(model)
+                    note = payload_note(arm, load, self._nominal.load)
                 self._payload = head.revision, note
             return self._payload[1]
         except RobocalError:  # told as the session's fault

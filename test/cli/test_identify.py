@@ -250,9 +250,9 @@ class TestAnswer:
         q[3, 1] = 0.1
         path = table(folder / "beyond.csv", measured(60, q=q))
         _, document = identify("--data", path)
-        load, limits = document["warnings"]
+        limits, masses = document["warnings"]
         assert "joint 2 (joint_a2): 1 of 60 readings beyond -140" in limits
-        assert "the robot file has no load" in load
+        assert "the robot file has no masses of the links, so compliances were sought" in masses
         _, document = identify("--data", path, "--model", "geometric")
         assert document["warnings"] == [limits]
 

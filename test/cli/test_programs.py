@@ -2,12 +2,15 @@
 """``robocal correct-program`` and ``frame-shift`` on files: what is written, whose model it is."""
 
 import json
+from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import conforms
 from history_workers import SERIAL, proposal
+from joint_errors import with_joint_errors
 
 from bench.robot_programs import (
     KUKA_FRAMES,
@@ -19,9 +22,11 @@ from bench.robot_programs import (
     postures,
 )
 from robocal_ros.cli.main import main
+from robocal_ros.cli.programs import given_models
 from robocal_ros.ground.frames import log_rotation, transform_from_quat
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.tables import joint_texts, write_cells
 from robocal_ros.programs.correcting import dialect_of
@@ -153,6 +158,17 @@ def test_the_model_is_a_robot_file_a_shown_calibration_or_the_one_in_force(folde
     for other in (of_json, of_history):
         for one, two in zip(of_file["points"], other["points"], strict=True):
             assert one["shift_mm"] == pytest.approx(two["shift_mm"], abs=1e-6)
+
+
+def test_a_payload_that_a_model_without_masses_does_not_follow_is_told(folder: Path):
+    cold = with_joint_errors(ACTUAL, 1)
+    save_robot(replace(cold, load=ArmLoad.unknown(6)), folder / "found.yaml")
+    save_robot(replace(NOMINAL, load=cold.load), folder / "weighed.yaml")
+    for robot, said in (("kr150_r3100", False), ("weighed.yaml", True)):
+        args = Namespace(robot=robot, model=folder / "found.yaml", reference=None)
+        models, warnings = given_models(args)
+        assert models.actual.masses == "found"
+        assert any("without masses the model cannot follow" in w for w in warnings) == said
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from robocal_ros.correction.six_axis import GOES, LANES, SAID
 from robocal_ros.correction.six_functions import CONSTANTS, ROWS
 from robocal_ros.correction.solution import SETTINGS, correct_staged
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.joint_functions import ArmLoad
 
 NM = 1e-9
 WIDE = CorrectionConfig(thermal=CorrectionConfig().tool)
@@ -213,4 +214,9 @@ def test_another_payload_than_the_models_is_told_with_what_it_may_cost() -> None
     session = CorrectionSession(carries, carries, "s1", CorrectionConfig(thermal=WIDE.thermal))
     session.offer_model(offer(cold))
     words = session.status().payload
+    told = "payload of what nobody stated .* without masses the model cannot follow"
+    found = replace(cold, load=ArmLoad.unknown(6))
+    session = CorrectionSession(carries, carries, "s1", CorrectionConfig(thermal=WIDE.thermal))
+    session.offer_model(offer(found))
+    assert re.search(told, session.status().payload)
     assert re.search(r"payload of 10 kg .* the robot file says 120 kg .* up to [0-9.]+ mm", words)

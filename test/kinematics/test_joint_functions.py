@@ -205,13 +205,44 @@ def test_a_model_is_used_with_what_the_robot_file_says_it_carries_and_tells_what
     assert used.load.payload_mass == 5.0
     q = np.random.default_rng(1).uniform(used.lower / 2.0, used.upper / 2.0, (5000, 6))
     moved = np.linalg.norm((used.fk(q) - identified.fk(q))[:, :3, 3], axis=1)
-    note = payload_note(used, load)
+    note = payload_note(used, load, carries)
     found = re.search(r"payload of 0 kg .* says 5 kg .* up to ([0-9.]+) mm", note)
     # the largest of so many poses, in words of two digits
     assert float(found[1]) == pytest.approx(1e3 * np.max(moved), rel=0.15)
-    assert payload_note(identified, load) == payload_note(nominal, load) == ""
+    assert payload_note(identified, load, load) == payload_note(nominal, load, None) == ""
     bare = replace(used, functions=None)
-    assert payload_note(bare, load).endswith("how far that bends the arm is not in the model")
+    words = "how far that bends the arm is not in the model"
+    assert payload_note(bare, load, carries).endswith(words)
+
+
+def test_masses_that_were_found_carry_no_payload_and_follow_no_other_mounting():
+    """They are a unit: what a robot file says in kilograms does not go with them, and is told."""
+    nominal = replace(load_robot("ur10"), load=None)
+    found = ArmLoad.unknown(6)
+    identified = replace(with_layer(nominal, 7), load=found)
+    assert identified.masses == "found"
+    document = json.loads(json.dumps(model_document(identified)))
+    q = np.random.default_rng(1).uniform(-2.0, 2.0, (100, 6))
+    real = load_robot("ur10").load
+    hung = replace(real, payload_mass=5.0, gravity=np.array([0.0, 9.8, 0.0]))
+    for present in (None, real, hung):
+        used = arm_of(document, replace(nominal, load=present))
+        np.testing.assert_array_equal(used.fk(q), identified.fk(q))
+        assert used.model_hash == identified.model_hash
+        assert used.load.found
+        note = payload_note(used, found, present)
+        assert (note == "") == (present is None)
+        told = "payload of what nobody stated .* without masses the model cannot follow"
+        assert note == "" or re.search(told, note)
+    said = replace(identified, load=replace(found, found=False))
+    assert said.model_hash != identified.model_hash
+    assert replace(said, functions=None).masses is None
+    with pytest.raises(ValueError, match="a payload of 5 kg beside masses that were found"):
+        replace(found, payload_mass=5.0)
+    # a model with masses keeps its own, and its payload, where the robot file's were found
+    assert real.carrying(found) is real
+    del document["load"]["found"]  # a document of before, whose masses were given
+    assert not arm_of(document, nominal).load.found
 
 
 def parts(**changed):

@@ -225,6 +225,24 @@ def test_joint_functions_and_load_are_saved_and_read_back(tmp_path: Path) -> Non
             np.testing.assert_allclose(found, getattr(load, field), rtol=1e-15)
 
 
+def test_masses_that_were_found_are_marked_in_the_file_and_take_no_payload(tmp_path: Path) -> None:
+    path, bare = tmp_path / "found.yaml", replace(load_robot("ur10"), load=ArmLoad.unknown(6))
+    save_robot(bare, path)
+    text = path.read_text()
+    assert "found: true" in text
+    assert "payload" not in text
+    load = load_robot(path).load
+    assert load.found
+    assert load.mass.tolist() == [0.0] * 5 + [1.0]
+    assert not load_robot("ur10").load.found
+    path.write_text(text.replace("found: true", "found: true\n  payload_kg: 5"))
+    with pytest.raises(InputError, match="payload of 5 kg beside masses that were found"):
+        load_robot(path)
+    path.write_text(text.replace("found: true", "found: 3"))
+    with pytest.raises(InputError, match="load, found must be true or false, not 3"):
+        load_robot(path)
+
+
 def test_the_links_of_the_ur10_weigh_no_more_than_the_arm_and_lie_within_its_reach() -> None:
     load = load_robot("ur10").load
     assert 25.0 < np.sum(load.mass) < 28.9  # kg: the whole arm, by its user manual

@@ -16,7 +16,7 @@ from robocal_ros.correction.interface import OfferedModel, Reason, RefusedError,
 from robocal_ros.ground.errors import InputError
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
-from robocal_ros.kinematics.joint_functions import IdentifiedFrom
+from robocal_ros.kinematics.joint_functions import ArmLoad, IdentifiedFrom
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.conversions import kinematic_model
 
@@ -47,9 +47,10 @@ KNOWN = IdentifiedFrom(
     base_sigma=1.0, target_sigma=0.5, length=np.full(6, 0.06), amplitude=np.arange(6) * 1e-4,
 )  # fmt: skip
 IDENTIFIED = replace(COLD, functions=replace(COLD.functions, identified_from=KNOWN))
+FOUND = replace(IDENTIFIED, load=ArmLoad.unknown(6))
 
 
-@pytest.mark.parametrize("arm", [NOMINAL, COLD, IDENTIFIED, replace(NOMINAL, load=None)])
+@pytest.mark.parametrize("arm", [NOMINAL, COLD, IDENTIFIED, FOUND, replace(NOMINAL, load=None)])
 def test_it_is_the_same_arm_behind_the_wire(arm: SerialArm) -> None:
     offered = read(message_of(arm))
     bare = replace(NOMINAL, load=None)
@@ -61,6 +62,7 @@ def test_it_is_the_same_arm_behind_the_wire(arm: SerialArm) -> None:
             given = getattr(KNOWN, part.name)
             np.testing.assert_array_equal(getattr(back.functions.identified_from, part.name), given)
     if arm.load is not None:
+        assert back.load.found == arm.load.found
         assert back.load.payload_mass == arm.load.payload_mass
         np.testing.assert_array_equal(back.load.payload_centre, arm.load.payload_centre)
 

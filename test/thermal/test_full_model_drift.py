@@ -25,18 +25,22 @@ CALIBRATION, POSES, KELVIN = 300, 8, 15.0
 
 
 class Robot(DriftingRobot):
-    """One with joint errors as a real UR10's, and a file that knows the load.
+    """One with joint errors as a real UR10's, and a file that knows the load, or not.
 
     Calibrated, with its full model in force, and the cold reference captured.
+
+    ``softer``: how many times as far its joints wind.
 
     ``parts``: what was measured and the command that used it, each with what was in force before.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, weighed: bool = True, softer: float = 1.0) -> None:
         super().__init__(folder, ThermalConfig(sigma_m=NOISE_M, hold_out=0.2), POSES)
         self.history.close()
-        self.cold = with_joint_errors(built(self.nominal), 1)
-        self.nominal = replace(self.nominal, load=self.cold.load)
+        cold = with_joint_errors(built(self.nominal), 1)
+        winds = replace(cold.functions, compliance=softer * cold.functions.compliance)
+        self.cold = replace(cold, functions=winds)
+        self.nominal = replace(self.nominal, load=self.cold.load if weighed else None)
         self.start()
         self.check = postures(self.nominal, 60, seed=9)
         self.parts: list[tuple[Command, list[Sample], Outcome]] = []
@@ -97,8 +101,13 @@ def test_the_drift_comes_on_top_of_the_full_model(robot):
     assert model_document(robot.session.current.arm) == in_force
 
 
-@pytest.mark.parametrize("begun", [0, 1, 2], ids=["calibration", "reference", "cycle"])
-def test_a_replay_gives_the_same_wherever_the_recording_began(robot, tmp_path, begun):
+@pytest.mark.parametrize(
+    ("begun", "weighed"),
+    [(0, True), (1, True), (2, True), (2, False)],
+    ids=["calibration", "reference", "cycle", "cycle, masses found"],
+)
+def test_a_replay_gives_the_same_wherever_the_recording_began(tmp_path, begun, weighed):
+    robot = Robot(tmp_path / "live", weighed=weighed, softer=1.0 if weighed else 10.0)
     robot.take(robot.visit(events.IDENTIFY, robot.q, KELVIN, 2.0))
     with CalibrationHistory.open(
         "s1", model_hash=robot.nominal.model_hash, state_dir=tmp_path / "again"
@@ -149,7 +158,32 @@ def test_a_drift_keeps_the_load_that_the_compliances_were_found_with(robot, tmp_
     found = robot.visit(events.IDENTIFY, robot.q, KELVIN, 2.0)
     _, load = layer_of(robot.history.model(found.calibration_id))
     assert load.payload_mass == found_with.payload_mass
-    assert "identified with a payload of 10 kg" in payload_note(robot.session.current.arm, load)
+    note = payload_note(robot.session.current.arm, load, present)
+    assert "identified with a payload of 10 kg" in note
+
+
+def test_a_drift_comes_on_top_of_compliances_that_were_found_without_masses(tmp_path):
+    """They are held, also where the file states a payload later: that is told, and not added."""
+    robot = Robot(tmp_path / "live", weighed=False, softer=10.0)
+    assert robot.calibrated.document["masses"] == "found"
+    cold, held = robot.session.current.arm, robot.session.reference.cell.arm.functions
+    assert cold.load.found
+    found = robot.visit(events.IDENTIFY, robot.q, KELVIN, 2.0)
+    robot.take(found)
+    functions, load = layer_of(robot.history.model(found.calibration_id))
+    np.testing.assert_array_equal(functions.compliance, held.compliance)
+    assert load.found
+    warm, cold_m = robot.session.current.arm, robot.error_m(cold, 0.0)
+    known_m = 3e-3 * found.document["calibrated"]["predicted"]["workspace_rms_mm"]  # 99.7 %
+    assert robot.error_m(warm, KELVIN) < np.hypot(cold_m, known_m) < robot.error_m(cold, KELVIN)
+
+    robot.history.close()
+    stated = replace(robot.cold.load, payload_mass=80.0)
+    robot.nominal = replace(robot.nominal, load=stated)
+    robot.start()
+    used = robot.session.current.arm
+    np.testing.assert_array_equal(used.fk(robot.check), warm.fk(robot.check))
+    assert "without masses the model cannot follow" in payload_note(used, load, stated)
 
 
 def test_other_joint_functions_than_the_references_are_not_put_out_of_force(robot):
