@@ -163,3 +163,66 @@ def test_the_shares_of_programs_and_frames_are_the_kept_ones_robot_by_robot():
     found = rows_quoted("simulated shift of a KR 150 that warms up, 34 poses, tool", "programs.md")
     for (_, cell), kept in zip(found, (taught, shifted, best, program), strict=True):
         assert cell.strip(" %").split(", ") == [f"{value:.1f}" for value in kept]
+
+
+def rounded(cell, kept):
+    """A kept number as a cell has it, with as many decimals."""
+    found = NUMBER.search(cell)
+    return f"{kept:.{len(found[1] or '')}f}" == found[0]
+
+
+def test_the_shares_within_a_tenth_of_a_millimetre_are_the_kept_ones():
+    """Shift by shift with the worst robot's; the mean of three shifts is of one decimal each."""
+    (_, real), (_, plain) = (figures("thermal", f"thermal_shares{k}") for k in ("", "_modelled"))
+    for cells, own, without in zip(rows_quoted("method"), real, plain, strict=True):
+        quoted = [cell.strip(" *") for cell in cells[1:]]
+        assert quoted[:3] == own[1:4]
+        assert rounded(quoted[3], own[4])
+        mean = sum(float(words.split()[0]) for words in without[1:4]) / 3.0
+        assert float(quoted[4]) == pytest.approx(mean, abs=0.05 + 0.05)
+        assert quoted[5].replace(",", "") == (own[5] or "")
+
+
+def test_what_a_line_goes_by_between_cycles_has_the_kept_figures():
+    numbers, rows = figures("thermal", "thermal_between")
+    assert rows[-1][0] == "all"
+    held, tracker, warm, ratio, warm_ratio, *_ = numbers[-1]
+    quoted = rows_quoted("what the line goes by")
+    for cells, kept in zip(quoted, ((held, 1), (tracker, ratio), (warm, warm_ratio)), strict=True):
+        assert all(rounded(cell, k) for cell, k in zip(cells[1:], kept, strict=True)), cells
+
+
+def test_whether_bounds_of_a_drift_are_true_has_the_kept_figures():
+    _, rows = figures("thermal", "thermal_bounds")
+    for cells, row in zip(rows_quoted("errors inside the 95 % bound"), rows, strict=True):
+        kept = (row[1], row[5], row[6], row[8])
+        assert all(rounded(cell, k) for cell, k in zip(cells[1:], kept, strict=True)), cells
+
+
+def test_the_real_arm_in_the_order_of_time_has_the_kept_figures():
+    _, rows = figures("thermal", "ur10_tracked")
+    kept = {(row[0], row[1]): row[2] for row in rows}
+    places = {"the first ten hours": "first 10 hours", "every": "every second pose"}
+    for cells in rows_quoted("known from"):
+        place = next(name for words, name in places.items() if words in cells[0])
+        model = {"geometry": "geometric"}.get(cells[1].strip(), cells[1].strip())
+        quoted = zip(("static", "tracked", "refitted"), cells[2:], strict=True)
+        told = [(way, cell) for way, cell in quoted if cell.strip()]
+        assert told
+        for way, cell in told:
+            assert rounded(cell, kept[place, f"{way}, {model}"]), cells
+    told = re.search(
+        r"static model is nearer in (\d+ of \d+) blocks", (DOCS / "accuracy.md").read_text()
+    )
+    assert told[1] == rows[5][5]
+
+
+def test_what_compliances_without_masses_leave_has_the_kept_figures():
+    (_, heavy), (_, real) = (figures("masses", name) for name in ("heavy", "ur10_masses"))
+    few, many, quoted = heavy[:3], heavy[3:], rows_quoted("compliances", "identify.md")
+    for (_, _, *cells), *rows in zip(quoted, few, many, real, strict=True):
+        kept = (rows[0][2], rows[1][2], *rows[2][1:3])
+        assert all(rounded(cell, k) for cell, k in zip(cells, kept, strict=True)), cells
+    told = r"flange\]\(identify.md#the-full-model\): ([\d.]+) mm instead\s+of ([\d.]+), of 12 such"
+    quoted = re.search(told, (DOCS / "accuracy.md").read_text()).groups()
+    assert all(rounded(one, row[2]) for one, row in zip(quoted, few[1:], strict=True))

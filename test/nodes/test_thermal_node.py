@@ -31,6 +31,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import acknowledge
 from robocal_ros.history.history_records import THERMAL, CalibrationState, Head, Proposal
 from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.robots import load_robot, save_robot
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.ros import endpoints
@@ -387,19 +388,28 @@ def test_every_node_says_that_a_history_was_set_aside_until_it_is_acknowledged(g
     assert history_notice({"serial": "s1", "state_dir": ""}) == ""
 
 
-def test_every_node_tells_what_another_payload_than_the_models_may_cost(graph, nominal, tmp_path):
+FOUND = "what nobody stated .* without masses the model cannot follow"
+GIVEN = "10 kg .* up to [0-9.]+ mm at the flange"
+
+
+@pytest.mark.parametrize("told", [GIVEN, FOUND], ids=["masses given", "masses found"])
+def test_every_node_tells_what_another_payload_than_the_models_may_cost(
+    graph, nominal, tmp_path, told
+):
     model = with_joint_errors(nominal, 1)
     path = tmp_path / "loaded.yaml"
     save_robot(replace(nominal, load=replace(model.load, payload_mass=120.0)), path)
     arm = load_robot(path)
+    if told == FOUND:
+        model = replace(model, load=ArmLoad.unknown(6))
     graph.state.mkdir()
     with CalibrationHistory.open("s1", model_hash=arm.model_hash, state_dir=graph.state) as history:
         bring_into_force(history, THERMAL, arm, model_document(model), "test")
     for kind in (ThermalNode, HandEyeNode):
         health = graph.add(kind, {"serial": "s1", "robot": str(path)}).health()
         assert health.level != endpoints.OK
-        told = r"payload of 10 kg .* the robot file says 120 kg .* up to [0-9.]+ mm at the flange"
-        assert re.search(told, health.message)
+        assert re.search(f"payload of {told}", health.message)
+        assert "the robot file says 120 kg" in health.message
 
 
 def test_a_history_that_vanishes_fails_calls_and_not_the_node(graph):
