@@ -219,10 +219,10 @@ class CorrectionSession:
         A `RefusedError` ends a stream that runs: its `tail` slows the robot down. What was seen of
         it can be noted by the stream's `settle`, when it is out.
         """
-        followed = self._follow(command, now_s)
-        if followed is not None:
-            return followed
         try:
+            followed = self._follow(command, now_s)
+            if followed is not None:
+                return followed
             self._require_order(TARGET[0], command, TARGET[1], now_s)
             for reason, detail in self._held.items():
                 raise RefusedError(reason, detail)
@@ -248,8 +248,7 @@ class CorrectionSession:
         in_order = not stamp or (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9)
         if not in_order or self._held or self._config.shadow:
             return None
-        corrected = self.stream.follow(command, now_s)
-        if corrected is not None:
+        if (corrected := self.stream.follow(command, now_s)) is not None:
             self._goal[:] = command.position
             if stamp:
                 self._stamps[TARGET] = stamp, now_s

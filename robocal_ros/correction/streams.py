@@ -55,6 +55,9 @@ class StreamPhase(Enum):
     ENDING = "the robot is slowed down"
 
 
+RUNNING = StreamPhase.RUNNING  # of an enumeration each look takes its time
+
+
 class TargetStream:
     """Targets of a stream, each corrected and put out at once.
 
@@ -73,6 +76,7 @@ class TargetStream:
         self._arm, self._config, self._state = arm, config, state
         self._desired, self._output = desired, output
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
+        self._pause_s = config.stream_gap_s
         self._unlimited = ~np.isfinite(self._fastest)
         self._speeds = np.tile(config.velocity_limits, (2, 1))  # of the joints, in a step and ever
         self._velocity = np.zeros(arm.n)  # of the newest message
@@ -84,7 +88,9 @@ class TargetStream:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self.period_s, self._as_usual = np.nan, 0  # and so many intervals since it was found
         self._step_period_s = LONGEST_STEP_S  # it, or what stands for it before two messages came
+        # its last message, and the same where it is of all joints and went out as it was wanted
         self._command: JointCommand | None = None
+        self._usual: JointCommand | None = None
         self._index, self._whole = np.zeros(0, dtype=np.int64), False  # of all joints, in order
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used
@@ -145,38 +151,40 @@ class TargetStream:
     def follow(self, command: JointCommand, now_s: float) -> JointCommand | None:
         """As `take`, for the next message of a stream of all joints that runs as usual.
 
-        None, and nothing has changed, where it is anything else. It is noted by `settle`, which
-        can wait until it is out; the one before it has been.
+        None, and nothing went out, where it is anything else. Where it led is noted by `settle`,
+        which can wait until it is out; the one before it has been.
         """
-        last, output, limiter = self._command, self._output, self._output.limiter
-        q, velocity, elapsed = command.position, command.velocity, now_s - output.out_s
+        usual, output, velocity = self._usual, self._output, command.velocity
+        elapsed = now_s - output.out_s
         if (
-            last is None
-            or self.phase is not StreamPhase.RUNNING
-            or self._held_up
-            or self.lag_s > 0.0
-            or not 0.0 < elapsed <= HELD_PERIODS * self._step_period_s
-            or now_s - self._came_s > self._config.stream_gap_s
+            usual is None
+            or command.names != usual.names
+            or command.mark != usual.mark
+            or self.phase is not RUNNING
+            or not 0.0 < elapsed <= self._pause_s
             or output.path is not None
             or output.mismatch
-            or not self._whole
-            or command.names != last.names
-            or command.mark != last.mark
-            or len(q) != len(last.names)
+            or len(command.position) != len(usual.names)
         ):
             return None
-        if velocity is not None and not (
-            len(velocity) == len(q) and math.isfinite(sum(velocity.tolist()))
-        ):
+        if velocity is None:
+            self._velocity[:] = 0.0
+        elif len(velocity) == len(usual.names) and math.isfinite(sum(velocity.tolist())):
+            self._velocity[:] = velocity
+        else:
             return None
-        self._velocity[:] = 0.0 if velocity is None else velocity
-        q, before, given = q.copy(), output.out.copy(), (self._active, self._speeds)
-        if not self._desired.follow(q, self._velocity, elapsed, limiter, *given):
+        self._note_interval(now_s)
+        if self._holds(elapsed):
+            return None
+        q, before, desired = command.position.copy(), output.out.copy(), self._desired
+        if not desired.follow(
+            q, self._velocity, elapsed, output.limiter, self._active, self._speeds
+        ):
             return None
         self._unnoted = now_s, q, before, now_s - elapsed
         self._goal, self._command = q, command
         self._came_s = output.out_s = now_s
-        output.stage = self._desired.stage
+        output.stage = desired.stage
         return self._message(command)
 
     def settle(self) -> None:
@@ -184,7 +192,6 @@ class TargetStream:
         if self._unnoted is not None:
             now_s, q, before, before_s = self._unnoted
             self._unnoted = None
-            self._note_interval(now_s)
             self._note(self._way, q, now_s)
             self._note(self._sent, before, before_s)
 
@@ -226,6 +233,8 @@ class TargetStream:
         output.path = None
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self._advance(now_s)
+        usual = self._whole and self.lag_s == 0.0 and not self._held_up
+        self._usual = command if usual else None
         return self._message(command)
 
     def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
@@ -445,6 +454,7 @@ class TargetStream:
             return None
         if self.phase is StreamPhase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
             command = replace(self._command, position=self._goal[self._index], velocity=None)
+            self._usual = None
             self._note(self._way, self._goal, now_s)
             try:
                 self._advance(now_s)

@@ -12,13 +12,16 @@ from hypothesis import strategies as st
 
 from robocal_ros.correction import limiter
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
-from robocal_ros.correction.streams import TargetStream
+from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.streams import StreamPhase, TargetStream
 
 PERIODS = [1.0, 1.0, 1.0, 1.1, 0.9, 0.4, 2.1, 6.0, 30.0, 300.0]
-EVENTS = [*12 * ["target"], "jump", "part", "late", "nan", "marked", "model", "tool", "enable"]
-EVENTS += ["disable", "path", "stop", "hold", "tail", "acknowledge"]
-STEPS = st.lists(st.tuples(st.sampled_from(PERIODS), st.sampled_from(EVENTS)), max_size=80)
+EVENTS = [*4 * ["target"], "jump", "part", "late", "nan", "marked", "model", "tool", "enable"]
+EVENTS += ["disable", "path", "rejected", "stop", "hold", "tail", "acknowledge", "fast"]
+# An even stream of so many targets, and after so many periods something else.
+PARTS = st.lists(
+    st.tuples(st.integers(0, 30), st.sampled_from(PERIODS), st.sampled_from(EVENTS)), max_size=12
+)
 
 
 class Twin:
@@ -29,9 +32,18 @@ class Twin:
         self.robots = Robot(thermal=wide), Robot(thermal=wide)
         self.robots[1].session.stream.follow = _takes_none  # type: ignore[method-assign]
 
-    def does(self, act: Callable[[Robot], object]) -> None:
-        """The same of both comes to the same, to the last bit, and leaves them the same."""
-        usual, long_way = (_came(robot, act) for robot in self.robots)
+    def does(self, act: Callable[[Robot], object], after_s: float = 0.0) -> None:
+        """The same of both comes to the same, to the last bit."""
+        usual, long_way = (_came(robot, act, after_s) for robot in self.robots)
+        assert usual == long_way
+
+    def is_one(self) -> None:
+        """What both tell of themselves is the same."""
+        with np.printoptions(floatmode="unique"):
+            usual, long_way = (
+                [repr(robot.session.status(robot.now)), repr(robot.session.offset(robot.now))]
+                for robot in self.robots
+            )
         assert usual == long_way
 
 
@@ -39,26 +51,30 @@ def _takes_none(command: JointCommand, now_s: float) -> None:
     return None
 
 
-def _came(robot: Robot, act: Callable[[Robot], object]) -> tuple[str, ...]:
-    with np.printoptions(floatmode="unique"):
-        try:
-            told = repr(act(robot))
-        except RefusedError as refusal:
-            told = str(refusal)
-        session, now = robot.session, robot.now
-        memory = session.output.limiter.memory[: limiter.VELOCITY]
-        left = session.status(now), session.offset(now), memory, session.stream.has_tail
-        return told, *map(repr, left)
-
-
-def _passes(robot: Robot, seconds: float) -> None:
-    robot.now += seconds
+def _came(robot: Robot, act: Callable[[Robot], object], after_s: float) -> tuple[object, ...]:
+    robot.now += after_s
     robot.read(robot.at)
+    try:
+        with np.printoptions(floatmode="unique"):
+            told = repr(act(robot))
+    except RefusedError as refusal:
+        told = str(refusal)
+    robot.session.release(Reason.LEASED)
+    memory = robot.session.output.limiter.memory[: limiter.VELOCITY]
+    return told, memory.tobytes(), robot.session.stream.has_tail
 
 
 def _sends(robot: Robot, target: JointCommand) -> object:
     out = robot.session.target(target, robot.now)
     robot.go(out)
+    return out
+
+
+def _is_rejected(robot: Robot, path: TrajectoryCommand) -> object:
+    out = robot.session.trajectory(path, robot.now, may_be_rejected=True)
+    sent = robot.session.output.path
+    assert sent is not None
+    robot.session.reject(sent)
     return out
 
 
@@ -72,14 +88,15 @@ def _act(event: str, q: np.ndarray, speed: np.ndarray, rates: bool) -> Callable[
         "enable": lambda robot: robot.session.enable(True),
         "disable": lambda robot: robot.session.enable(False),
         "path": lambda robot: robot.session.trajectory(path, robot.now),
+        "rejected": lambda robot: _is_rejected(robot, path),
         "stop": lambda robot: robot.session.stop(robot.now, 0.1),
         "hold": lambda robot: robot.session.hold(Reason.LEASED, "a lease", robot.now),
         "tail": lambda robot: robot.session.stream.tail(robot.now),
         "acknowledge": lambda robot: robot.session.acknowledge(robot.now),
     }
     target = JointCommand(NAMES, q, speed if rates else None)
-    if event == "nan":
-        target = replace(target, velocity=np.full(6, np.nan))
+    if event in ("nan", "fast"):
+        target = replace(target, velocity=np.full(6, np.nan if event == "nan" else 100.0))
     elif event == "part":
         target = JointCommand(NAMES[:3], q[:3])
     elif event == "marked":
@@ -94,22 +111,28 @@ def _act(event: str, q: np.ndarray, speed: np.ndarray, rates: bool) -> Callable[
 
 
 @settings(max_examples=60)
-@given(STEPS, st.booleans(), st.integers(0, 2**16))
+@given(PARTS, st.booleans(), st.integers(0, 2**16))
 def test_a_usual_target_comes_to_what_the_long_way_comes_to(
-    steps: list[tuple[float, str]], rates: bool, seed: int
+    parts: list[tuple[int, float, str]], rates: bool, seed: int
 ) -> None:
     rng, twin = np.random.default_rng(seed), Twin()
     q, speed = HOME.copy(), np.zeros(6)
     for event in ("model", "enable"):
         twin.does(_act(event, q, speed, rates))
-    for periods, event in steps:
-        speed = 0.8 * speed + rng.normal(0.0, 0.1, 6)
-        q = q + speed * min(periods * DT, 0.1)
-        if event == "jump":
-            q = q + rng.normal(0.0, 0.05, 6)
-        twin.does(lambda robot, seconds=periods * DT: _passes(robot, seconds))
-        twin.does(_act(event, q, speed, rates))
-        twin.does(lambda robot: robot.session.release(Reason.LEASED))
+    for count, periods, what in parts:
+        steps = [(rng.uniform(0.7, 1.3), "target") for _ in range(count)]
+        for share, event in [*steps, (periods, what)]:
+            speed = 0.9 * speed + rng.normal(0.0, 0.05, 6)
+            q = q + speed * min(share * DT, 0.1)
+            if event == "jump":
+                q = q + rng.normal(0.0, 0.05, 6)
+            twin.does(_act(event, q, speed, rates), share * DT)
+        twin.is_one()
+        if twin.robots[0].session.stream.phase is not StreamPhase.RUNNING:  # it begins anew
+            for _ in range(30):
+                twin.does(_act("tail", q, speed, rates), 0.02)
+            twin.does(_act("acknowledge", q, speed, rates))
+            q, speed = twin.robots[0].at.copy(), np.zeros(6)
 
 
 def test_of_an_even_stream_all_targets_but_the_first_two_are_usual(
