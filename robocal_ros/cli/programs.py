@@ -32,7 +32,8 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of, payload_note
+from robocal_ros.kinematics.arm import arm_of, layer_of, payload_note
+from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
 from robocal_ros.programs.conventions import COUNT, base_text, tool_text
 from robocal_ros.programs.correcting import (
@@ -134,27 +135,35 @@ def given_models(args: argparse.Namespace) -> tuple[CorrectionModels, list[str]]
     """The models of `add_model_options`, and warnings."""
     robot, warnings = describe_robot(args.robot)
     nominal = robot.arm
-    actual = given_model(args, nominal)
-    reference = nominal if args.reference is None else read_model(args.reference, nominal)
-    if actual.masses == "found" and (note := payload_note(actual, actual.load, nominal.load)):
-        warnings.append(note)
+    actual = given_model(args, nominal, warnings)
+    reference = nominal if args.reference is None else read_model(args.reference, nominal)[0]
     return CorrectionModels(nominal, actual, reference), warnings
 
 
-def given_model(args: argparse.Namespace, nominal: SerialArm) -> SerialArm:
-    """The model of `add_given_model`. Raises as `given_models`."""
+def given_model(args: argparse.Namespace, nominal: SerialArm, warnings: list[str]) -> SerialArm:
+    """The model of `add_given_model`, with payload and mounting of the nominal arm's file.
+
+    ``warnings`` takes what it may cost that these were others. Raises as `given_models`.
+    """
     if args.model:
-        return read_model(args.model, nominal)
-    with model_history(args, nominal) as history:
-        chosen = history.head(THERMAL).calibration_id
-        if chosen is None:
-            words = f"no model is in force for {args.robot_serial}: accept one first"
-            raise InputError(words, file=str(history.path))
-        return arm_of(history.model(chosen), nominal)
+        arm, identified = read_model(args.model, nominal)
+    else:
+        with model_history(args, nominal) as history:
+            chosen = history.head(THERMAL).calibration_id
+            if chosen is None:
+                words = f"no model is in force for {args.robot_serial}: accept one first"
+                raise InputError(words, file=str(history.path))
+            model = history.model(chosen)
+        arm, (_, identified) = arm_of(model, nominal), layer_of(model)
+    if note := payload_note(arm, identified, nominal.load):
+        warnings.append(note)
+    return arm
 
 
-def read_model(path: Path, nominal: SerialArm) -> SerialArm:
-    """A robot as identified, from a robot file or a document with a ``model``.
+def read_model(path: Path, nominal: SerialArm) -> tuple[SerialArm, ArmLoad | None]:
+    """A robot as identified, carrying what the nominal arm does, and what it was identified with.
+
+    ``path``: a robot file, or a document with a ``model``.
 
     Raises `InputError` when it is neither, `WrongRobotError` for other joints than the nominal's.
     """
@@ -163,17 +172,20 @@ def read_model(path: Path, nominal: SerialArm) -> SerialArm:
             document = json.loads(read_text(path, "model"))
             model = document.get("model", document)
             names, arm = tuple(model["joint_names"]), arm_of(model, nominal)
+            _, identified = layer_of(model)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"holds no model: {error!r}", file=str(path)) from error
     else:
         arm = describe_robot(str(path))[0].arm
-        names = arm.joint_names
+        names, identified = arm.joint_names, arm.load
+        if identified is not None:
+            arm = replace(arm, load=identified.carrying(nominal.load))
     if names != nominal.joint_names or np.any(arm.prismatic != nominal.prismatic):
         raise WrongRobotError(
             f"{path}: its joints are {', '.join(names)}, those of {nominal.name} are "
             f"{', '.join(nominal.joint_names)}"
         )
-    return arm
+    return arm, identified
 
 
 def model_history(

@@ -294,7 +294,10 @@ def without_masses(arm: SerialArm, found: Identification) -> str:
     sought = (
         "1 kg at the flange of an upright arm" if arm.load is None else "those that it calls found"
     )
-    told = "none was worth it, with masses it is sought better"
+    told = (
+        "none was worth it; an arm on a wall or a ceiling needs gravity_m_s2, and with masses it "
+        "is sought better"
+    )
     if found.cell.arm.masses:
         told = (
             "that holds for the payload and the mounting that were measured; with masses it holds "

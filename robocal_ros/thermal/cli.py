@@ -593,7 +593,7 @@ def add_correct_points(parser: argparse.ArgumentParser) -> None:
 
 def run_correct_points(args: argparse.Namespace) -> CliResult:
     robot, warnings = describe_robot(args.robot)
-    arm, mount = given_model(args, robot.arm), _mount(args, robot.arm)
+    arm, mount = given_model(args, robot.arm, warnings), _mount(args, robot.arm)
     lost: list[str] = []
     if args.data is not None:
         data = read_measurements(args.data, robot.arm)

@@ -2,6 +2,7 @@
 """``robocal correct-program`` and ``frame-shift`` on files: what is written, whose model it is."""
 
 import json
+import re
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -169,6 +170,24 @@ def test_a_payload_that_a_model_without_masses_does_not_follow_is_told(folder: P
         models, warnings = given_models(args)
         assert models.actual.masses == "found"
         assert any("without masses the model cannot follow" in w for w in warnings) == said
+
+
+def test_a_model_carries_what_the_robot_file_states_and_what_that_costs_is_told(folder: Path):
+    cold = with_joint_errors(ACTUAL, 1)
+    save_robot(cold, folder / "cold.yaml")
+    (folder / "cold.json").write_text(json.dumps({"model": model_document(cold)}))
+    save_robot(replace(NOMINAL, load=replace(cold.load, payload_mass=60.0)), folder / "heavy.yaml")
+    save_robot(replace(NOMINAL, load=cold.load), folder / "same.yaml")
+    loaded = replace(cold, load=replace(cold.load, payload_mass=60.0))
+    q = postures(3, 5)
+    for model in (folder / "cold.yaml", folder / "cold.json"):
+        for robot, truth in (("heavy.yaml", loaded), ("same.yaml", cold), ("kr150_r3100", cold)):
+            args = Namespace(robot=robot, model=model, reference=model)
+            models, warnings = given_models(args)
+            for arm in (models.actual, models.reference):
+                np.testing.assert_allclose(arm.fk(q), truth.fk(q), rtol=0.0, atol=1e-8)
+            words = r"payload of 10 kg .* says 60 kg .* up to [0-9.]+ mm at the flange"
+            assert any(re.search(words, w) for w in warnings) == (truth is loaded)
 
 
 @pytest.mark.parametrize(
