@@ -248,10 +248,10 @@ class CorrectionSession:
         in_order = not stamp or (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9)
         if not in_order or self._held or self._config.shadow:
             return None
+        if stamp:
+            self._stamps[TARGET] = stamp, now_s
         if (corrected := self.stream.follow(command, now_s)) is not None:
             self._goal[:] = command.position
-            if stamp:
-                self._stamps[TARGET] = stamp, now_s
         return corrected
 
     def trajectory(

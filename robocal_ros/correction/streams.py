@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stream of joint targets: as new as its newest message, within the speeds, ended in order."""
 
-import math
 from bisect import bisect_right
 from collections import deque
 from dataclasses import replace
@@ -152,7 +151,8 @@ class TargetStream:
         """As `take`, for the next message of a stream of all joints that runs as usual.
 
         None, and nothing went out, where it is anything else. Where it led is noted by `settle`,
-        which can wait until it is out; the one before it has been.
+        which can wait until it is out; the one before it has been. Raises `RefusedError` when it
+        is no whole target, or its velocities are too high.
         """
         usual, output, velocity = self._usual, self._output, command.velocity
         elapsed = now_s - output.out_s
@@ -164,15 +164,10 @@ class TargetStream:
             or not 0.0 < elapsed <= self._pause_s
             or output.path is not None
             or output.mismatch
-            or len(command.position) != len(usual.names)
         ):
             return None
-        if velocity is None:
-            self._velocity[:] = 0.0
-        elif len(velocity) == len(usual.names) and math.isfinite(sum(velocity.tolist())):
-            self._velocity[:] = velocity
-        else:
-            return None
+        self._state.require_target(command, self._index)
+        self._velocity[:] = 0.0 if velocity is None else velocity
         self._note_interval(now_s)
         if self._holds(elapsed):
             return None
@@ -232,6 +227,7 @@ class TargetStream:
             self._velocity[index] = 0.0 if velocity is None else velocity
         output.path = None
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
+        self._usual = None
         self._advance(now_s)
         usual = self._whole and self.lag_s == 0.0 and not self._held_up
         self._usual = command if usual else None

@@ -18,6 +18,7 @@ from robocal_ros.correction.streams import StreamPhase, TargetStream
 PERIODS = [1.0, 1.0, 1.0, 1.1, 0.9, 0.4, 2.1, 6.0, 30.0, 300.0]
 EVENTS = [*4 * ["target"], "jump", "part", "late", "nan", "marked", "model", "tool", "enable"]
 EVENTS += ["disable", "path", "rejected", "stop", "hold", "tail", "acknowledge", "fast"]
+EVENTS += ["no place", "early"]
 # An even stream of so many targets, and after so many periods something else.
 PARTS = st.lists(
     st.tuples(st.integers(0, 30), st.sampled_from(PERIODS), st.sampled_from(EVENTS)), max_size=12
@@ -60,8 +61,10 @@ def _came(robot: Robot, act: Callable[[Robot], object], after_s: float) -> tuple
     except RefusedError as refusal:
         told = str(refusal)
     robot.session.release(Reason.LEASED)
-    memory = robot.session.output.limiter.memory[: limiter.VELOCITY]
-    return told, memory.tobytes(), robot.session.stream.has_tail
+    session, stream = robot.session, robot.session.stream
+    memory = session.output.limiter.memory[: limiter.VELOCITY]
+    noted = stream.has_tail, repr(stream.period_s), repr(session._stamps)
+    return told, memory.tobytes(), *noted
 
 
 def _sends(robot: Robot, target: JointCommand) -> object:
@@ -101,7 +104,9 @@ def _act(event: str, q: np.ndarray, speed: np.ndarray, rates: bool) -> Callable[
         target = JointCommand(NAMES[:3], q[:3])
     elif event == "marked":
         target = replace(target, mark="base_link")
-    late_s = 0.5 if event == "late" else 0.0
+    elif event == "no place":
+        target = replace(target, position=np.full(6, np.nan))
+    late_s = {"late": 0.5, "early": -0.5}.get(event, 0.0)
 
     def send(robot: Robot) -> object:
         stamp_ns = round((robot.now - late_s) * 1e9) if rates else 0
