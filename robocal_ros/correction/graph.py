@@ -6,13 +6,14 @@ of the graph stands in `ros.graph`.
 """
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from robocal_ros.correction.interface import Reason
@@ -235,7 +236,7 @@ class CommandSources:
     """
 
     def __init__(self, at_once_s: float) -> None:
-        self.publishers = Counter[str]()  # of each topic
+        self.inputs: dict[str, Subscription] = {}  # by topic
         self._at_once_s = at_once_s
         self._topic = ""
         self._heard_s = -math.inf
@@ -243,16 +244,13 @@ class CommandSources:
         self._rivals_s = -math.inf
         self._gone = ""
 
-    def matched(self, topic: str, event: Any) -> None:
-        """Note how many publishers a topic has."""
-        self.publishers[topic] = event.current_count
-
     def hear(self, topic: str, now_s: float) -> str:
         """Note a command; why it must not be acted on, empty when it may."""
         last, before_s = self._topic, self._heard_s
         self._topic, self._heard_s, self._gone = topic, now_s, ""
         if now_s - before_s <= self._at_once_s:
-            count = self.publishers[topic]
+            # asked for each: an events executor tells of a publisher after its first message
+            count = self.inputs[topic].get_publisher_count()
             if topic != last:
                 self._rivals = f"commands come on {last} and {topic} at once: stop one of them"
                 self._rivals_s = now_s
@@ -263,7 +261,7 @@ class CommandSources:
 
     def look(self) -> None:
         """Notice that the publisher of a stream has gone; to be called now and then."""
-        if self._topic and not self.publishers[self._topic]:
+        if self._topic and not self.inputs[self._topic].get_publisher_count():
             self._gone = f"nobody publishes {self._topic} any more"
 
     def words(self, now_s: float) -> str:

@@ -320,9 +320,9 @@ class JointCorrectionNode(RobotNode):
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message, now)
 
-        count = None if senders is None else partial(senders.matched, topic)
-        raw = topic != COMMANDS
-        self.add_input(KINDS[topic], topic, receive, profile, raw=raw, matched=count)
+        opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
+        if senders:
+            senders.inputs[topic] = opened
 
     def _refuse_message(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
         """Refuse a message; a stream that it is of is ended in order."""

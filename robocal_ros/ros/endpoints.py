@@ -188,7 +188,6 @@ class EndpointNode(LifecycleNode):
         raw: bool = False,
         timed: bool = False,
         numbered: bool = False,
-        matched: Callable[[Any], None] | None = None,
     ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
 
@@ -196,8 +195,7 @@ class EndpointNode(LifecycleNode):
         the callback is given the serialized message; ``timed``: also what rclpy knows of it, its
         ``source_timestamp`` (ns) among that. ``numbered``: what was lost is counted by the
         publisher's numbers, also what the queue had no room for. Neither goes with an events
-        executor, which ends at a callback of two arguments (rclpy 7). ``matched`` is told of
-        publishers that come and go, before those that have come are heard.
+        executor, which ends at a callback of two arguments (rclpy 7).
         """
         count = self.inputs.setdefault(topic, InputCount())
 
@@ -230,7 +228,7 @@ class EndpointNode(LifecycleNode):
             topic,
             take_numbered if numbered else take_timed if timed else take,
             own(profile),
-            event_callbacks=SubscriptionEventCallbacks(message_lost=lose, matched=matched),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             qos_overriding_options=overridable(),
             raw=raw,
         )

@@ -5,12 +5,15 @@ import time
 from typing import Any
 
 import numpy as np
+from conftest import DISCOVERY_S
 from joint_correction_live import HOME, NAMES, NODE, NOMINAL, Line, joints, trajectory
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.correction.interface import Reason
 from robocal_ros.correction.trajectories import AHEAD_S
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import WARN
@@ -20,8 +23,8 @@ SLOW = {"stream_gap_s": 2.0}
 
 
 def two_on(line: Line, topic: str) -> None:
-    publishers = line.node._senders[topic].publishers
-    line.graph.spin_until(lambda: publishers[topic] == 2, "two publishers")
+    publishers = line.node._senders[topic].inputs[topic].get_publisher_count
+    line.graph.spin_until(lambda: publishers() == 2, "two publishers")
 
 
 def test_a_stream_of_two_publishers_is_refused_until_one_is_left(graph: Any) -> None:
@@ -47,6 +50,32 @@ def test_a_stream_of_two_publishers_is_refused_until_one_is_left(graph: Any) -> 
 
     graph.spin_until(alone, "the one that is left is heard")
     line.told(commanders="")
+
+
+def test_the_first_command_of_a_second_publisher_is_refused(graph: Any) -> None:
+    """Also in the events executor, which hears it before it is told who publishes it."""
+    line = Line(graph, **SLOW)
+    line.target()
+    graph.executor.remove_node(line.node)
+    executor = EventsExecutor(context=graph.context)
+    executor.add_node(line.node)
+    other = Node("teleop", context=graph.context)
+    also = other.create_publisher(JointState, "joint_targets", endpoints.RELIABLE)
+    until_s = time.monotonic() + DISCOVERY_S
+    while not also.get_subscription_count() and time.monotonic() < until_s:
+        line.to_target.publish(joints(HOME))
+        executor.spin_once(timeout_sec=0.01)
+    also.publish(joints(HOME + 1e-6))
+    heard = line.node.inputs["joint_targets"]
+    count = heard.received
+    while heard.received == count and time.monotonic() < until_s:
+        executor.spin_once(timeout_sec=0.01)
+    assert heard.received > count
+    assert line.node._session.status().refused[Reason.TWO_SOURCES] > 0
+    assert line.node._session.output.taught[0] == HOME[0]
+    executor.remove_node(line.node)
+    graph.executor.add_node(line.node)
+    other.destroy_node()
 
 
 def test_two_streams_at_once_are_refused(graph: Any) -> None:
