@@ -37,7 +37,8 @@ class PublishedSet:
 
     ``commit``: the state of the repository that was used here. ``size``: of the files that are
     needed. ``parts``: of a folder. ``convert``: a part of it, to a folder. ``commands``: what
-    to do then; OUT stands for that folder, DATA for the set's own.
+    to do then; OUT stands for that folder, DATA for the set's own, PART for a part, ``example``
+    where none is chosen.
     """
 
     title: str
@@ -50,6 +51,7 @@ class PublishedSet:
     convert: Callable[[str, Path, Path], Converted]
     commands: tuple[str, ...]
     citation: str = ""
+    example: str = ""
 
 
 def _campaign(series: str, folder: Path, out: Path) -> Converted:
@@ -130,12 +132,13 @@ SETS = {
         lambda folder: ["A", "B", "C", "D"],
         _campaign,
         (
-            "robocal identify --robot ur10 --data OUT/B_train.csv --check OUT/B_check.csv",
-            "robocal replay OUT/B.mcap --robot ur10 --auto",
-            "robocal hand-eye camera --poses OUT/B_flange.csv --measured OUT/B_tmac.csv "
+            "robocal identify --robot ur10 --data OUT/PART_train.csv --check OUT/PART_check.csv",
+            "robocal replay OUT/PART.mcap --robot ur10 --auto",
+            "robocal hand-eye camera --poses OUT/PART_flange.csv --measured OUT/PART_tmac.csv "
             "--mount to-hand",
         ),
         "Landgraf, Ernst, Schleth, Fabritius, Huber, IEEE CASE 2021",
+        "B",
     ),
     "ur5e_factory": PublishedSet(
         "the factory calibration of a UR5e, and what its controller makes of it",
@@ -231,7 +234,7 @@ def run_data(args: argparse.Namespace) -> CliResult:
     names = [args.name] if args.name else list(SETS)
     document: DataDocument = {
         "folder": given or None,
-        "sets": [_told(name, root, args.out) for name in names],
+        "sets": [_told(name, root, args.out, args.part) for name in names],
         "written": written,
     }
     return CliResult(document, _show_written if written else _show_one if args.name else _show_all)
@@ -262,14 +265,19 @@ def _convert(
     return written
 
 
-def _told(name: str, root: Path | None, out: Path | None) -> "DataSetDocument":
+def _told(
+    name: str, root: Path | None, out: Path | None, chosen: list[str] | None
+) -> "DataSetDocument":
     one = SETS[name]
     folder = None if root is None else root / name
     here = f"${VARIABLE}/{name}"
+    commands = [command.replace("PART", (chosen or [one.example])[0]) for command in one.commands]
     if out is None:
-        commands = [f"robocal data {name} --out OUT", *one.commands]
+        commands = [f"robocal data {name} --out OUT", *commands]
     else:
-        commands = [command.replace("OUT/", f"{out}/") for command in one.commands]
+        if chosen:  # what is of others is not there
+            commands = [command for command in commands if _has_files(command, out)]
+        commands = [command.replace("OUT/", f"{out}/") for command in commands]
     return {
         "name": name,
         "title": one.title,
@@ -286,6 +294,12 @@ def _told(name: str, root: Path | None, out: Path | None) -> "DataSetDocument":
             for command in commands
         ],
     }  # fmt: skip
+
+
+def _has_files(command: str, out: Path) -> bool:
+    """Whether the converted files that a command names are there."""
+    files = [word.removeprefix("OUT/") for word in command.split() if word.startswith("OUT/")]
+    return all((out / file).exists() for file in files)
 
 
 def _show_all(console: "Console", document: Document) -> None:
