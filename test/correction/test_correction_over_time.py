@@ -58,7 +58,7 @@ class Watch:
         self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
         self.came: dict[int, float] = {}  # joint: its target, as it was followed
         self.offsets: dict[int, tuple[float, float, float]] = {}  # when, offset, rate
-        self.begun: dict[int, float] = {}  # joints with one step since they stood, and how long
+        self.begun: dict[int, float] = {}  # joints with one step since they stood: its rate at most
         self.taught = np.full(6, np.nan)  # the last target, as it was followed
 
     def out(self, names: tuple[str, ...], out: np.ndarray, stood: np.ndarray | None = None) -> None:
@@ -107,13 +107,15 @@ class Watch:
                 held = dt > 2.0 * self.period_s + ROUNDING
                 if np.isfinite(rate):
                     # the step that began at rest is one of the rate's already
-                    begun = REST_A * self.begun.get(j, 0.0)
+                    begun = self.begun.get(j, 0.0)
                     goes_on = abs(new - rate) <= change * dt + begun + 2.0 * ROUNDING / dt
                     from_rest = abs(offset - before) <= LARGEST_A * dt * dt + ROUNDING
                     assert goes_on or (held and from_rest), name
                 self.begun.pop(j, None)
-                if rate == BEGINS:  # after a pause as the longest step, whatever the period
-                    self.begun[j] = LONGEST_STEP_S if held else self.period_s
+                if rate == BEGINS:  # after a pause as one of its period, the longest where unknown
+                    period_s = self.robot.session.stream.period_s
+                    step_s = np.fmin(period_s, LONGEST_STEP_S) if held else self.period_s
+                    self.begun[j] = (LARGEST_A if moves else REST_A) * step_s
                 self.offsets[j] = now, offset, 0.0 if rate == BEGINS else np.nan if held else new
             else:
                 self.offsets[j] = now, offset, 0.0
