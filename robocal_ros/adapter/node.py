@@ -181,11 +181,8 @@ class AdapterNode(HouseNode):
             take = partial(self._take_levels, kind, dict(zip(beams, sources, strict=True)))
             self._listen(message, TOPICS[kind], take, endpoints.RELIABLE, timed=True)
 
-    def _listen(
-        self, kind: type, topic: str, act: Any, profile: Any, *, timed: bool = False
-    ) -> None:
-        heard = self.add_input(kind, topic, act, profile, timed=timed)
-        self._topics[topic] = heard.topic_name, kind
+    def _listen(self, kind: type, topic: str, act: Any, profile: Any, **how: bool) -> None:
+        self._topics[topic] = self.add_input(kind, topic, act, profile, **how).topic_name, kind
 
     def _take_levels(self, kind: str, of: dict[str, str], message: Any, info: Any) -> None:
         beams = {beam: (self._levels[beam], source) for beam, source in of.items()}

@@ -252,7 +252,7 @@ def _layer(message: Any, n: int) -> tuple[JointFunctions | None, ArmLoad | None]
                 np.array([v.x, v.y, v.z]) for v in (message.payload_centre, message.gravity)
             )
             centres = np.array(message.link_centre, dtype=np.float64).reshape(n, 3)
-            found = math.isnan(message.payload_mass)
+            found = message.payload_mass == -1.0
             carried = 0.0 if found else message.payload_mass
             load = ArmLoad(message.link_mass, centres, carried, centre, pull, found)
             if len(load.mass) != n:

@@ -123,7 +123,7 @@ def kinematic_model(
     if load is not None:
         message.link_mass = load.mass.tolist()
         message.link_centre = load.centre.ravel().tolist()
-        message.payload_mass = math.nan if load.found else float(load.payload_mass)
+        message.payload_mass = -1.0 if load.found else float(load.payload_mass)
         for part, values in (
             (message.payload_centre, load.payload_centre),
             (message.gravity, load.gravity),

@@ -153,6 +153,16 @@ class TestAnswer:
         assert document["noise_over_sigma"] == pytest.approx(10.0, rel=0.2)
         assert any("sigma_mm" in words for words in document["warnings"])
 
+    def test_a_ball_seen_from_the_flange(self, folder: Path, identify) -> None:
+        q = measured(60).q
+        seen = np.linalg.inv(true_arm().fk(q)) @ np.array([1.5, 0.4, 0.6, 1.0])
+        ball = replace(measured(60, q=q), position=seen[:, :3])
+        for sigma in (None, np.full(60, NOISE_M)):
+            path = table(folder / "flange.csv", replace(ball, sigma=sigma))
+            status, document = identify("--data", path)
+            assert status == 2
+            assert "the sensor sits on the flange" in document["error"]["message"]
+
     def test_another_set_up_unsaid_is_no_calibration_error(
         self, data: Path, folder: Path, identify
     ) -> None:

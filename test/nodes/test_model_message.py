@@ -80,7 +80,8 @@ def set_to(name: str, values: Any) -> Callable[[Any], None]:
         (set_to("function_step", [float("nan")] * 6), "step holds a number that is not finite"),
         (set_to("link_mass", [1.0] * 5), "load: centre must be"),
         (set_to("link_mass", []), "compliances without masses"),
-        (set_to("payload_mass", -1.0), "mass must not be below 0"),
+        (set_to("payload_mass", -2.0), "mass must not be below 0"),  # -1 says none is known
+        (set_to("payload_mass", np.nan), "mass must not be below 0"),
         (set_to("identified_q", [0.0] * 7), "cannot reshape"),
         (set_to("identified_noise", float("nan")), "noise holds a number that cannot be"),
         (set_to("identified_target", [2] * 50), "a target or a length is not told"),
