@@ -379,8 +379,8 @@ class Descent(Generic[S]):
 
     def quantiles(self, probability: float) -> Array:
         """Quantile (m,) of each sample's chi-square distribution."""
-        values = {int(n): chi2_quantile(probability, int(n)) for n in np.unique(self.sizes)}
-        return np.array([values[int(n)] for n in self.sizes])
+        sizes, which = np.unique(self.sizes, return_inverse=True)
+        return np.array([chi2_quantile(probability, int(n)) for n in sizes])[which]
 
     def posterior(self, normal: Array, scale: float) -> Array:
         """Covariance (k, k) of the unknowns from the data's normal matrix.
@@ -442,7 +442,8 @@ def _found(left: Freedom, total: float) -> float:
 def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
     scaled = normal * np.outer(scale, scale)
-    scaled[np.diag_indices_from(scaled)] += damping
+    if damping:
+        np.einsum("ii->i", scaled)[:] += damping
     try:
         step = np.linalg.solve(scaled, -gradient * scale)
     except np.linalg.LinAlgError:  # nothing shows a direction: it is left alone

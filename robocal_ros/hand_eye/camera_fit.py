@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maximum likelihood of a hand-eye calibration, with the noise of both sides."""
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -258,7 +258,8 @@ class PairNoise:
     @property
     def variances(self) -> Array:
         """(6,): the squares."""
-        return np.square(astuple(self))
+        place = self.position_m, self.turn_rad
+        return np.square([*place, self.tilt_rad, self.roll_rad, self.depth_m, self.excess])
 
     @property
     def camera_scale(self) -> float:
@@ -448,7 +449,7 @@ def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed:
     cost = weigh(seen.rows, *split, theta, step, slope, bend, drift)
     some = theta[chosen]
     bent = np.outer(some, some) * bend[np.ix_(chosen, chosen)]
-    bent[np.diag_indices_from(bent)] += _PRIOR  # at the top, where the likelihood rises as steeply
+    np.einsum("ii->i", bent)[:] += _PRIOR  # at the top, where the likelihood rises as steeply
     return _Weighed(
         cost - _PRIOR * float(np.sum(np.log(some))),
         some * slope[chosen] - _PRIOR,
