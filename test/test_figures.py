@@ -226,3 +226,36 @@ def test_what_compliances_without_masses_leave_has_the_kept_figures():
     told = r"flange\]\(identify.md#the-full-model\): ([\d.]+) mm instead\s+of ([\d.]+), of 12 such"
     quoted = re.search(told, (DOCS / "accuracy.md").read_text()).groups()
     assert all(rounded(one, row[2]) for one, row in zip(quoted, few[1:], strict=True))
+
+
+def test_what_is_said_of_streams_has_the_kept_figures():
+    page = " ".join((DOCS / "joint_correction_figures.md").read_text().split())
+    hour = (DOCS / "figures" / "soak_correction.md").read_text()
+    targets, compared = re.search(
+        r"of ([\d ]+) targets none was .*? of the ([\d ]+) that", page
+    ).groups()
+    for what, told in (
+        ("targets", targets),
+        ("targets compared with the model in force", compared),
+    ):
+        assert f"| {what} | {told.replace(' ', '')} |" in hour
+    for what in ("refused or ended: none", "of them stale"):
+        assert f"| {what} | 0 |" in hour
+    kept = {
+        (row[0], row[1]): row[2:5]
+        for row in figures("correction_stream", "correction_beside_relay")[1]
+    }
+    told = (
+        r"median is ([\d.]+) of the relay's at 500 Hz \(([\d.]+) and ([\d.]+) ms\) and ([\d.]+) at"
+    )
+    ratio, node, relay, faster = re.search(told, page).groups()
+    (relay_kept, node_kept, ratio_kept), (*_, faster_kept) = (
+        kept[rate, "median"] for rate in (500, 1000)
+    )
+    for quoted, figure in (
+        (ratio, ratio_kept),
+        (node, node_kept),
+        (relay, relay_kept),
+        (faster, faster_kept),
+    ):
+        assert rounded(quoted, figure), (quoted, figure)
