@@ -36,14 +36,15 @@ demo: setup  ## a simulated cell in closed loop through the live nodes, report i
 	$(HURRIES) $(ROS) python bags/demo.py
 
 # Live cells of up to six processes, and motions that are judged by time, come first, two at a time;
-# then the other node tests, three at a time. Where the user may, they go before whatever else runs on
-# the machine. They mostly wait: what all others compute fills their pauses, and gives way at once.
-# What failed is shown last. A node test that failed is run once again, twice where time judges, as
-# others on the machine may have starved it, and named; never one whose examples chance picks, nor
-# one whose output jumped (test/worlds/jumps.py says when it may). So is one that Fast DDS took
-# along as it crashed: each runs in a process of xdist's.
+# then the other node tests, six at a time. They mostly wait, and what all others compute fills their
+# pauses: where the user may, node tests go before whatever else runs on the machine, elsewhere the
+# others stand back a little, but get on beside what is busy for long. What failed is shown last. A
+# node test that failed is run once again, twice where time judges, as others on the machine may have
+# starved it, and named; never one whose examples chance picks, nor one whose output jumped
+# (test/worlds/jumps.py says when it may). So is one that Fast DDS took along as it crashed: each runs
+# in a process of xdist's.
 HURRIES := $(shell [ "$$(nice -n -10 nice 2>/dev/null)" -lt 0 ] && echo nice -n -10)
-GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
+GIVES_WAY := $(if $(HURRIES),,nice -n 5)
 PYTEST := $(ROS) python -m pytest -p no:cacheprovider
 AGAIN := --rerun-except '^JumpError: ' -rfER
 test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
@@ -54,7 +55,7 @@ test: setup-dev  ## all tests; TESTS="test/tool -k laser" for some
 	trap 'kill $$others 2>/dev/null || true' EXIT
 	cells=$$(grep -l 'pytest\.mark\.cell' test/nodes/test_*.py)  # the others need not be read
 	$(HURRIES) $(PYTEST) --reruns 2 $(AGAIN) -n 2 --dist worksteal -m cell $$cells 2>&1 | tee out/test_cells.txt || failed=1
-	$(HURRIES) $(PYTEST) --reruns 1 $(AGAIN) -n 3 --dist worksteal -m "not cell" test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
+	$(HURRIES) $(PYTEST) --reruns 1 $(AGAIN) -n 6 --dist worksteal -m "not cell" test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
