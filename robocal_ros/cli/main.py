@@ -83,7 +83,10 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of the command and, through ``add_subparsers``, of each command below it.
 
     Options are written in full, so that a later option cannot change what a script means.
+    ``example``: of a `CliCommand`.
     """
+
+    example: str | None = None
 
     def __init__(self, **options: Any) -> None:
         options |= {"allow_abbrev": False, "add_help": False}
@@ -97,11 +100,11 @@ class CommandParser(argparse.ArgumentParser):
         )
 
     def format_help(self) -> str:
-        """Options, and an example in one line, which can be copied."""
-        from robocal_ros.cli.examples import EXAMPLES
-
-        example = EXAMPLES.get(self.prog.removeprefix("robocal "))
-        return super().format_help() + (f"\nexample:\n  {example}\n" if example else "")
+        """Options, and the example."""
+        text = super().format_help()
+        if self.example is not None:
+            text += f"\nexample:\n  {self.prog} {self.example}".rstrip() + "\n"
+        return text
 
     def parse_known_args(  # type: ignore[override]  # of its forms the one that is called
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -535,6 +538,7 @@ def _declare(
         if isinstance(command, CliGroup):
             _declare(own, "action", command.actions, words[1:])
         else:
+            own.example = command.example
             module_name, place = command.place.split(":")
             module = import_module(f"robocal_ros.{module_name}")
             getattr(module, f"add_{place}")(own)
