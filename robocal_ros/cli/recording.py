@@ -100,12 +100,6 @@ class BagOverview:
         lacks = self.lacks_measurements
         return [*self.reader.info.notes, *([lacks] if lacks else [])]
 
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """First and last log time."""
-        info = self.reader.info
-        return info.start_ns or 0, info.end_ns or 0
-
     def require_inputs(self) -> None:
         """Refuse to obey commands whose samples are not here.
 
@@ -181,7 +175,6 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> BagOverview:
 
 
 def event_topics(info: BagInfo) -> list[str]:
-    """Topics of session events."""
     return [
         topic
         for topic, held in info.topics.items()

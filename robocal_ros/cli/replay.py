@@ -3,14 +3,14 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,10 +33,18 @@ from robocal_ros.cli.main import (
     refusal,
 )
 from robocal_ros.cli.recording import UNASKED, BagOverview, find_robot, open_recording
-from robocal_ros.fixture.session import fixture_session_as_recorded, take_fixture_message
+from robocal_ros.fixture.session import (
+    FixtureSession,
+    fixture_session_as_recorded,
+    take_fixture_message,
+)
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.frames import transform_document
-from robocal_ros.hand_eye.session import hand_eye_session_as_recorded, take_hand_eye_message
+from robocal_ros.hand_eye.session import (
+    HandEyeSession,
+    hand_eye_session_as_recorded,
+    take_hand_eye_message,
+)
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
@@ -52,18 +60,13 @@ from robocal_ros.thermal.session import (
     take_message,
     window_commands,
 )
-from robocal_ros.tool.session import take_tool_message, tool_session_as_recorded
+from robocal_ros.tool.session import ToolSession, take_tool_message, tool_session_as_recorded
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-S = TypeVar("S", bound=SessionBase)
-AsRecorded = Callable[[SerialArm, CalibrationHistory, Command, str], S]
-
-
 def seconds(stamp_ns: int | None) -> float:
-    """A stamp in s."""
     return (stamp_ns or 0) * 1e-9
 
 
@@ -105,96 +108,76 @@ def commanded_document(
     }
 
 
-def replay_commanded(
-    recording: BagOverview,
-    arm: SerialArm,
-    history: CalibrationHistory,
-    samples: Iterable[Any],
-    as_recorded: AsRecorded[S],
-    take: Callable[[S, str, Any], None],
-) -> tuple[ReplayReport, S]:
-    """Replay what a node recorded, in a session with its settings.
-
-    ``as_recorded`` makes the session; ``take`` gives it a message of an input.
-
-    Raises `InputError` or `WrongRobotError`: the bag lacks what a replay needs.
-    """
-    if recording.configured is None:
-        raise InputError("the bag holds no configuration of the node")
-    session = as_recorded(arm, history, recording.configured, __version__)
-    return replay(session, samples, recording.commands, recording.inputs, take), session
-
-
-def replay_tool(
-    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
-) -> Document:
-    """Replay what a tool node recorded: each run with its answer. Raises as `replay_commanded`."""
-    report, session = replay_commanded(
-        recording, arm, history, samples, tool_session_as_recorded, take_tool_message
-    )
-    return commanded_document(report, session, recording) | {
+def _of_tool(session: ToolSession, outcomes: Sequence[Outcome]) -> Document:
+    """What a tool node's recording gives: each run with its answer."""
+    final = transform_document(session.current.tool.T_flange_tool)
+    return {
         "runs": [
             {
                 "stamp": seconds(o.command.stamp_ns),
                 "run": o.command.arguments.get("run", 0),
                 **o.document,
             }
-            for o in report.outcomes
+            for o in outcomes
             if o.document is not None
         ],
-        "final_tool": transform_document(session.current.tool.T_flange_tool)
-        | {"revision": session.in_force.revision},
+        "final_tool": final | {"revision": session.in_force.revision},
     }
 
 
-def replay_hand_eye(
-    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
-) -> Document:
-    """Replay what a hand-eye node recorded: each calibration. Raises as `replay_commanded`."""
-    report, session = replay_commanded(
-        recording, arm, history, samples, hand_eye_session_as_recorded, take_hand_eye_message
-    )
+def _kept(outcomes: Sequence[Outcome]) -> list[Document]:
+    """Documents of what was put into the history."""
+    return [
+        {"stamp": seconds(o.command.stamp_ns), **o.document}
+        for o in outcomes
+        if o.document is not None and o.calibration_id
+    ]
+
+
+def _of_hand_eye(session: HandEyeSession, outcomes: Sequence[Outcome]) -> Document:
+    """What a hand-eye node's recording gives: each calibration."""
     final, head = None, session.in_force
     if head.model is not None:
         frames = {name: head.model[name] for name in ("parent", "child")}
         T = np.array(head.model["T_parent_sensor"])
         final = frames | transform_document(T) | {"revision": head.revision}
-    return commanded_document(report, session, recording) | {
-        "calibrations": [
-            {"stamp": seconds(o.command.stamp_ns), **o.document}
-            for o in report.outcomes
-            if o.document is not None and o.calibration_id
-        ],
-        "final_sensor": final,
-    }
+    return {"calibrations": _kept(outcomes), "final_sensor": final}
 
 
-def replay_fixture(
-    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
-) -> Document:
-    """Replay what a fixture node recorded: each frame. Raises as `replay_commanded`."""
-    report, session = replay_commanded(
-        recording, arm, history, samples, fixture_session_as_recorded, take_fixture_message
-    )
+def _of_fixture(session: FixtureSession, outcomes: Sequence[Outcome]) -> Document:
+    """What a fixture node's recording gives: each frame."""
     final, in_force = None, session.current.fixture
     if in_force is not None:
         place = transform_document(in_force.T_base_fixture)
         final = {"name": session.fixture.name, **place, "revision": session.in_force.revision}
-    return commanded_document(report, session, recording) | {
-        "fixtures": [
-            {"stamp": seconds(o.command.stamp_ns), **o.document}
-            for o in report.outcomes
-            if o.document is not None and o.calibration_id
-        ],
-        "final_fixture": final,
-    }
+    return {"fixtures": _kept(outcomes), "final_fixture": final}
+
+
+# Beside thermal nodes: what makes a session with the recorded settings, gives it a message of an
+# input, and tells what came of it.
+_OF_OTHER_NODES: Mapping[
+    str, tuple[Callable[..., Any], Callable[..., None], Callable[..., Document]]
+] = {
+    "tool": (tool_session_as_recorded, take_tool_message, _of_tool),
+    "hand_eye": (hand_eye_session_as_recorded, take_hand_eye_message, _of_hand_eye),
+    "fixture": (fixture_session_as_recorded, take_fixture_message, _of_fixture),
+}
+
+
+def _replayed(
+    recording: BagOverview, arm: SerialArm, history: CalibrationHistory, samples: "Samples"
+) -> Document:
+    """What one of them recorded, in a session with its settings."""
+    as_recorded, take, results = _OF_OTHER_NODES[session_kind(recording.configured)]
+    session = as_recorded(arm, history, recording.configured, __version__)
+    report = replay(session, samples, recording.commands, recording.inputs, take)
+    return commanded_document(report, session, recording) | results(session, report.outcomes)
 
 
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
 Samples = Iterator[BagMessage]
 Watch = Callable[[str, BagOverview], Samples]
-_OF_OTHER_NODES = {"tool": replay_tool, "hand_eye": replay_hand_eye, "fixture": replay_fixture}
 
 
 @dataclass(frozen=True)
@@ -256,20 +239,21 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
                     f"the bag is of a {kind.replace('_', '-')} node: --auto, --cold and --warm are "
                     "for thermal ones"
                 )
-            return _OF_OTHER_NODES[kind](recording, arm, history, watch("replaying", recording))
+            return _replayed(recording, arm, history, watch("replaying", recording))
         kept = _GOES_ON.format(history.path) if history.list(1) else ""
         streams = None
         if recording.configured is None:  # no node of ours, which takes each sample as it comes
             timing = stream_timing(reader, recording.inputs, arm)
             streams = StreamAverage(recording.inputs, timing) if timing else None
 
-        def read(what: str, recording: BagOverview) -> Samples:
+        def read(what: str) -> Samples:
             samples = watch(what, recording)
             return samples if streams is None else streams.of(samples)
 
-        session = _session(recording, arm, history, streams)
-        commands = _commands(request, recording, arm, history, streams, read)
-        samples = read("replaying", recording)
+        begin = partial(_session, recording, arm, history, streams)
+        session = begin()  # the first one: an empty history gets what was in force
+        commands = _commands(request, recording, begin, read)
+        samples = read("replaying")
         if request.observe is not None:
             samples = request.observe(session, recording, samples)
         report = replay(session, samples, commands, recording.inputs, take_message)
@@ -313,12 +297,10 @@ def _session(
 def _commands(
     request: ReplayRequest,
     recording: BagOverview,
-    arm: SerialArm,
-    history: CalibrationHistory,
-    streams: StreamAverage | None,
-    watch: Watch,
+    begin: Callable[[], ThermalSession],
+    read: Callable[[str], Samples],
 ) -> Commands:
-    """The user's windows, else what --auto finds, else what was recorded."""
+    """The user's windows, else what --auto finds in a session of its own, else the recorded."""
     if request.cold or request.warm:
 
         def stamps(window: Window) -> tuple[int, int]:
@@ -329,8 +311,8 @@ def _commands(
         return window_commands(cold, [stamps(window) for window in request.warm])
     if not request.auto:
         return recording.commands
-    scout = _session(recording, arm, history, streams)
-    for sample in one_by_one(scout, watch("looking for cycles", recording)):
+    scout = begin()
+    for sample in one_by_one(scout, read("looking for cycles")):
         feed(scout, sample, recording.inputs, take_message)
     observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:
@@ -534,8 +516,10 @@ def _watch(what: str, recording: "BagOverview") -> "Iterator[BagMessage]":
     from rich.progress import Progress
 
     with Progress(console=progress_console(), transient=True) as progress:
-        start_ns, end_ns = recording.span_ns
-        task = progress.add_task(what, total=(end_ns - start_ns) * 1e-9)
+        start_ns = recording.reader.info.start_ns or 0
+        task = progress.add_task(
+            what, total=seconds(recording.reader.info.end_ns) - seconds(start_ns)
+        )
         for number, sample in enumerate(recording.blocks()):
             if number % _SHOW_EVERY == 0:
                 progress.update(task, completed=(sample.log_time_ns - start_ns) * 1e-9)
