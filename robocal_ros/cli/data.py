@@ -13,12 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.main import (
-    CliResult,
-    Document,
-    print_table,
-    print_words,
-)
+from robocal_ros.cli.main import CliResult, Document, print_table, print_words
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import nearest, quoted
 
@@ -223,7 +218,6 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 
 def run_data(args: argparse.Namespace) -> CliResult:
-    """Do ``data``. Raises `InputError` where a set to be converted is not there, or damaged."""
     given = os.environ.get(VARIABLE)
     root = Path(given) if given else None
     if args.out and not args.name:

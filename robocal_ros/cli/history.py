@@ -59,7 +59,6 @@ _STYLES = {"in_force": "bold green", "pending": "bold yellow", "refused": "red"}
 
 
 def show_list(console: "Console", document: "HistoryListDocument") -> None:
-    """Print the calibrations as a table, and what is in force."""
     from rich.text import Text
 
     _show_damage(console, document)
@@ -89,7 +88,6 @@ def show_list(console: "Console", document: "HistoryListDocument") -> None:
 
 
 def show_entry(console: "Console", document: Document) -> None:
-    """Print one calibration: the record, its inputs, its decisions."""
     from rich.table import Table
     from rich.text import Text
 
@@ -112,7 +110,6 @@ def show_entry(console: "Console", document: Document) -> None:
 
 
 def show_corrections(console: "Console", document: "HistoryCorrectionsDocument") -> None:
-    """Print what the commands were corrected with, and since when."""
     from rich.text import Text
 
     _show_damage(console, document)
@@ -138,7 +135,6 @@ def show_corrections(console: "Console", document: "HistoryCorrectionsDocument")
 
 
 def show_acknowledged(console: "Console", document: "HistoryAcknowledgeDocument") -> None:
-    """Print which damaged histories somebody knows of now."""
     for path in document["acknowledged"]:
         print_words(console, f"Acknowledged by {document['by']}: {path}")
     if not document["acknowledged"]:
@@ -146,7 +142,6 @@ def show_acknowledged(console: "Console", document: "HistoryAcknowledgeDocument"
 
 
 def show_decided(console: "Console", document: "HistoryDecisionDocument") -> None:
-    """Print what was decided."""
     _show_damage(console, document)
     print_words(console, document["verdict"]["reason"].capitalize())
 
@@ -275,7 +270,8 @@ def run_history(args: argparse.Namespace) -> CliResult:
             )
         serial = serials[0]
     with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
-        return CliResult(*_ACTIONS[args.action](history, args))
+        done, shown = _ACTIONS[args.action]
+        return CliResult(done(history, args), shown)
 
 
 def _file(history: CalibrationHistory) -> "HistoryFileDocument":
@@ -287,11 +283,8 @@ def _file(history: CalibrationHistory) -> "HistoryFileDocument":
     }
 
 
-Answer = tuple[Mapping[str, Any], Callable[..., None]]
-
-
-def _list(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
-    document: HistoryListDocument = {
+def _list(history: CalibrationHistory, args: argparse.Namespace) -> "HistoryListDocument":
+    return {
         **_file(history),
         "in_force": [
             {"kind": h.kind, "revision": h.revision, "calibration_id": h.calibration_id}
@@ -299,12 +292,11 @@ def _list(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
         ],
         "calibrations": [entry.document() for entry in history.list(args.limit)],
     }
-    return document, show_list
 
 
-def _show_history(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
+def _show_history(history: CalibrationHistory, args: argparse.Namespace) -> "HistoryShowDocument":
     entry = history.get(args.id)
-    document: HistoryShowDocument = {
+    return {
         **_file(history),
         "calibration": entry.document(),
         "document": history.document(entry.id),
@@ -314,28 +306,24 @@ def _show_history(history: CalibrationHistory, args: argparse.Namespace) -> Answ
             for name, array in history.inputs(entry.id).items()
         },
     }
-    return document, show_entry
 
 
-def _corrections(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
-    document: HistoryCorrectionsDocument = {
-        **_file(history),
-        "corrections": [record.document() for record in history.corrections(args.limit)],
-    }
-    return document, show_corrections
+def _corrections(
+    history: CalibrationHistory, args: argparse.Namespace
+) -> "HistoryCorrectionsDocument":
+    records = history.corrections(args.limit)
+    return {**_file(history), "corrections": [record.document() for record in records]}
 
 
-def _acknowledge(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
-    files = acknowledge(history.path, _by(args), time.time_ns())
-    document: HistoryAcknowledgeDocument = {
-        **_file(history),
-        "acknowledged": [str(path) for path in files],
-        "by": _by(args),
-    }
-    return document, show_acknowledged
+def _acknowledge(
+    history: CalibrationHistory, args: argparse.Namespace
+) -> "HistoryAcknowledgeDocument":
+    by = _by(args)
+    files = acknowledge(history.path, by, time.time_ns())
+    return {**_file(history), "acknowledged": [str(path) for path in files], "by": by}
 
 
-def _accept(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
+def _accept(history: CalibrationHistory, args: argparse.Namespace) -> "HistoryDecisionDocument":
     head = history.accept(
         args.id,
         by=_by(args),
@@ -345,18 +333,18 @@ def _accept(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
         with_heads=measured_with(history, history.get(args.id)),
     )
     said = f"calibration {args.id} is in force as {head.kind} revision {head.revision}"
-    return _decided(history, args, head.kind, args.id, head.revision, said), show_decided
+    return _decided(history, args, head.kind, args.id, head.revision, said)
 
 
-def _reject(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
+def _reject(history: CalibrationHistory, args: argparse.Namespace) -> "HistoryDecisionDocument":
     history.reject(args.id, by=_by(args), reason=args.reason, wall_ns=time.time_ns())
     kind = history.get(args.id).kind
     revision = history.get(args.id).decisions[-1].head_after
     said = f"calibration {args.id} is rejected; {kind} revision {revision} stays in force"
-    return _decided(history, args, kind, args.id, revision, said), show_decided
+    return _decided(history, args, kind, args.id, revision, said)
 
 
-def _rollback(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
+def _rollback(history: CalibrationHistory, args: argparse.Namespace) -> "HistoryDecisionDocument":
     head = history.rollback(
         args.to,
         kind=args.kind,
@@ -369,17 +357,18 @@ def _rollback(history: CalibrationHistory, args: argparse.Namespace) -> Answer:
     start = BEFORE_ANY.get(args.kind, "nothing")
     name = start if number is None else f"calibration {number}"
     said = f"{name} is in force again, as {head.kind} revision {head.revision}"
-    return _decided(history, args, head.kind, number, head.revision, said), show_decided
+    return _decided(history, args, head.kind, number, head.revision, said)
 
 
-_ACTIONS: Mapping[str, Callable[[CalibrationHistory, argparse.Namespace], Answer]] = {
-    "list": _list,
-    "acknowledge": _acknowledge,
-    "show": _show_history,
-    "corrections": _corrections,
-    "accept": _accept,
-    "reject": _reject,
-    "rollback": _rollback,
+# What carries an action out and gives its document, and what prints that.
+_ACTIONS: Mapping[str, tuple[Callable[..., Mapping[str, Any]], Callable[..., None]]] = {
+    "list": (_list, show_list),
+    "acknowledge": (_acknowledge, show_acknowledged),
+    "show": (_show_history, show_entry),
+    "corrections": (_corrections, show_corrections),
+    "accept": (_accept, show_decided),
+    "reject": (_reject, show_decided),
+    "rollback": (_rollback, show_decided),
 }
 
 

@@ -89,7 +89,6 @@ def headline(document: Document) -> str:
 
 
 def show_identification(console: "Console", document: Document) -> None:
-    """Print an identification."""
     verdict = document["verdict"]
     print_words(console, headline(document), "bold green" if verdict["accept"] else "bold red")
     if not verdict["accept"]:
@@ -413,7 +412,6 @@ CANDIDATES, MOST_WORKING = 1500, 400
 
 
 def _planned(args: argparse.Namespace) -> CliResult:
-    """Say which poses to measure."""
     from robocal_ros.identification.planning import plan_poses
 
     robot, warnings = describe_robot(args.robot)

@@ -28,7 +28,6 @@ def add_info(parser: argparse.ArgumentParser) -> None:
 
 
 def run_info(args: argparse.Namespace) -> CliResult:
-    """Do ``info``. Raises `InputError` for a file that cannot be read, or is of no known kind."""
     path: Path = args.file
     topics: list[BagTopicDocument] = []
     if path.is_dir() or path.suffix in BAGS:

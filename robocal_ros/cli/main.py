@@ -155,6 +155,7 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
 PARTS = ("base", "tool", "geometry")
 ROBOT_HELP = "robot file, or name of a shipped robot (ur10, kr150_r3100 …)"
 SIGMA_MM = 0.03
+FOUND_MASSES = "Compliances count with masses that were found: they are no kilograms of links."
 
 
 def parts(value: str) -> tuple[str, ...]:
@@ -175,10 +176,7 @@ def positive(value: str) -> float:
 
 def from_zero(value: str) -> float:
     """Type of a finite number, zero or above."""
-    with contextlib.suppress(ValueError):
-        if float(value) == 0.0:
-            return 0.0
-    return _between(value, math.inf, "a number from 0")
+    return _between(value, math.inf, "a number from 0", zero=True)
 
 
 def share(value: str) -> float:
@@ -186,15 +184,15 @@ def share(value: str) -> float:
     return _between(value, 1.0, "a share between 0 and 1")
 
 
-def _between(value: str, most: float, what: str) -> float:
-    """A number above zero and below ``most``."""
+def _between(value: str, most: float, what: str, *, zero: bool = False) -> float:
+    """A number above zero, or ``zero`` itself, and below ``most``."""
     try:
         number = float(value)
     except ValueError:
-        number = 0.0
-    if not 0.0 < number < most:
+        number = math.nan
+    if not (0.0 < number < most or (zero and number == 0.0)):
         raise argparse.ArgumentTypeError(f"{quoted(value)} is not {what}")
-    return number
+    return abs(number)
 
 
 def count(value: str) -> int:
@@ -353,7 +351,6 @@ def tell(code: str, message: object) -> None:
 
 
 def write_json(document: Mapping[str, Any], stream: TextIO) -> None:
-    """Write the one document."""
     stream.write(json.dumps(document, indent=2, allow_nan=False) + "\n")
     stream.flush()
 
@@ -397,9 +394,6 @@ def print_table(
     console.print(table)
 
 
-FOUND_MASSES = "Compliances count with masses that were found: they are no kilograms of links."
-
-
 def print_words(console: "Console", words: str, style: str = "") -> None:
     """Print a line as it is: no markup, and wrapped by the terminal alone."""
     from rich.text import Text
@@ -413,20 +407,17 @@ def print_text(console: "Console", document: Document) -> None:
 
 
 def print_verdict(console: "Console", document: Document) -> None:
-    """Print the decision and why."""
     verdict = document["verdict"]
     style = "bold green" if verdict["accept"] else "bold red"
     print_words(console, f"{verdict['code']}: {verdict['reason']}", style)
 
 
 def print_output(console: "Console", document: Document) -> None:
-    """Print which file was written, if any."""
     if document.get("output"):
         print_words(console, f"Written: {document['output']}")
 
 
 def spaced(values: Iterable[float], digits: int, between: str = " ") -> str:
-    """Numbers in one line."""
     return between.join(f"{value:.{digits}f}" for value in values)
 
 

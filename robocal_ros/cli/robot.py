@@ -354,7 +354,6 @@ def joint_rows(arm: "SerialArm") -> "list[HayatiRowDocument]":
 
 
 def print_joints(console: "Console", title: str, joints: Sequence[Mapping[str, Any]]) -> None:
-    """Print them as a table."""
     rows = [[joint["name"], *(f"{joint[key]:z.4f}" for key in _MDH)] for joint in joints]
     print_table(console, title, ("joint", *(key.replace("_", " ") for key in _MDH)), rows)
 

@@ -104,7 +104,6 @@ def add_warm(parser: argparse.ArgumentParser) -> None:
 
 
 def run_warm(args: argparse.Namespace) -> CliResult:
-    """Do ``warm``, telling on standard error how far it is."""
     console, steps, names = progress_console(), warming(), list[str]()
     with console.status("") as status:
 

@@ -18,7 +18,6 @@ _ROLES = ("operator", "engineer")
 
 
 def add_certificates(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``plc certificates``."""
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder of certificates and users")
     parser.add_argument(
         "--host",
@@ -40,7 +39,6 @@ def add_certificates(parser: argparse.ArgumentParser) -> None:
 
 
 def run_certificates(args: argparse.Namespace) -> CliResult:
-    """Do ``plc certificates``. Raises `RobocalError` for what a user can mend."""
     access = _access()
     if not 1 <= args.days <= 36_500:
         raise InputError(f"--days {args.days} is not 1 to 36500")
@@ -53,7 +51,6 @@ def run_certificates(args: argparse.Namespace) -> CliResult:
 
 
 def add_user(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of ``plc user``."""
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder of certificates and users")
     parser.add_argument("name", metavar="NAME", help="name of the user")
     parser.add_argument(
@@ -66,7 +63,6 @@ def add_user(parser: argparse.ArgumentParser) -> None:
 
 
 def run_user(args: argparse.Namespace) -> CliResult:
-    """Do ``plc user``; the password is asked for, or the first line of standard input."""
     access = _access()
     access.read_certificate(args.folder / access.SERVER)  # a folder that is complete
     users = access.Users(args.folder)

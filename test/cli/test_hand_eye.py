@@ -30,14 +30,7 @@ from hand_eye_tables import (
 from joint_errors import with_joint_errors
 from scipy.stats import chi2
 
-from bench.hand_eye_cell import (
-    DOWN,
-    ArmRobot,
-    SimulatedShots,
-    WantedView,
-    sphere_shots,
-    view,
-)
+from bench.hand_eye_cell import DOWN, ArmRobot, SimulatedShots, WantedView, sphere_shots, view
 from bench.hand_eye_files import write_target
 from bench.hand_eye_profiles import with_gears
 from bench.measured_runs import Q_NEAR
