@@ -28,21 +28,15 @@ LONGEST_TEXT = 1000
 # Silent for so long a variable is Uncertain: its last value, which nobody stands by any more.
 SILENT = ua.StatusCodes.UncertainNoCommunicationLastUsableValue
 AWAITED = ua.StatusCodes.BadWaitingForInitialData
-TYPES = {
-    "Boolean": ua.VariantType.Boolean,
-    "UInt32": ua.VariantType.UInt32,
-    "Double": ua.VariantType.Double,
-    "String": ua.VariantType.String,
-    "DateTime": ua.VariantType.DateTime,
+# How a kind is sent, and what stands there before there is any.
+TYPES: Mapping[str, tuple[ua.VariantType, object]] = {
+    "Boolean": (ua.VariantType.Boolean, False),
+    "UInt32": (ua.VariantType.UInt32, 0),
+    "Double": (ua.VariantType.Double, 0.0),
+    "String": (ua.VariantType.String, ""),
+    "DateTime": (ua.VariantType.DateTime, datetime(1970, 1, 1, tzinfo=UTC)),
 }
-EMPTY: Mapping[ua.VariantType, object] = {
-    ua.VariantType.Boolean: False,
-    ua.VariantType.UInt32: 0,
-    ua.VariantType.Int32: 0,
-    ua.VariantType.Double: 0.0,
-    ua.VariantType.String: "",
-    ua.VariantType.DateTime: datetime(1970, 1, 1, tzinfo=UTC),
-}
+ENUMERATION = ua.VariantType.Int32, 0  # (OPC 10000-3, 8.14)
 
 
 def time_of(stamp: Any) -> datetime:
@@ -75,8 +69,8 @@ class Item:
 
     @property
     def variant_type(self) -> ua.VariantType:
-        """How it is sent; an enumeration is an Int32 (OPC 10000-3, 8.14)."""
-        return TYPES.get(self.scalar, ua.VariantType.Int32)
+        """How it is sent."""
+        return TYPES.get(self.scalar, ENUMERATION)[0]
 
     def value(self, message: Any) -> Any:
         """Its value in a message."""
@@ -93,7 +87,7 @@ class Item:
 
     def empty(self) -> ua.Variant:
         """Before there is any."""
-        return self.variant([] if self.is_array else EMPTY[self.variant_type])
+        return self.variant([] if self.is_array else TYPES.get(self.scalar, ENUMERATION)[1])
 
 
 @dataclass(frozen=True)

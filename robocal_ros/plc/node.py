@@ -30,14 +30,7 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
 from robocal_ros.ros.conversions import header
-from robocal_ros.ros.endpoints import (
-    ERROR,
-    WARN,
-    ExecutorQueue,
-    Health,
-    Refusal,
-    ServiceCalls,
-)
+from robocal_ros.ros.endpoints import ERROR, WARN, ExecutorQueue, Health, Refusal, ServiceCalls
 from robocal_ros.ros.parameters import Setting, number
 
 GAP_OPEN, EVENTS = "gap_open", "beam_events"
@@ -77,15 +70,12 @@ def enumerations() -> dict[str, dict[str, int]]:
 
 
 def _addresses(given: list[str]) -> str | None:
-    wrong = next((a for a in given if a and not _is_address(a)), None)
-    return None if wrong is None else f"'{wrong}' is no IP address"
-
-
-def _is_address(text: str) -> bool:
-    try:
-        return bool(ip_address(text))
-    except ValueError:
-        return False
+    for text in filter(None, given):
+        try:
+            ip_address(text)
+        except ValueError:
+            return f"'{text}' is no IP address"
+    return None
 
 
 def _beam_names(names: list[str]) -> str | None:
@@ -237,8 +227,7 @@ class PlcBridgeNode(HouseNode):
         A heartbeat goes out at once, as the executor may have other work; all else is carried out
         there.
         """
-        from robocal_ros.plc.cell import Notice
-        from robocal_ros.plc.inputs import Heartbeat
+        from robocal_ros.plc.cell import Heartbeat, Notice
 
         if isinstance(handed, Heartbeat):
             try:

@@ -16,7 +16,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -46,10 +46,7 @@ from robocal_ros.plc.access import (
 )
 from robocal_ros.plc.cell import ANSWER_S, Cell, Handover, Notice, RegisterImage
 from robocal_ros.plc.modbus import ModbusServer
-from robocal_ros.plc.model import (
-    ACTIVE,
-    InformationModel,
-)
+from robocal_ros.plc.model import ACTIVE, InformationModel
 
 AGAIN_S = 2.0  # between two trials to listen, or to start anew after a defect
 LOOK_S = 0.5
@@ -466,7 +463,7 @@ class ServerState:
 
     listening: bool = False
     trouble: str = "starts"
-    sessions: tuple[str, ...] = field(default_factory=tuple)
+    sessions: tuple[str, ...] = ()
 
 
 class ServerThread:

@@ -37,7 +37,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.plc import access
-from robocal_ros.plc.inputs import CONTEST_S
+from robocal_ros.plc.cell import CONTEST_S
 from robocal_ros.plc.modbus import CANCEL, CYCLE, INPUT_WORDS, INPUTS, RUN
 from robocal_ros.plc.node import PlcBridgeNode
 from robocal_ros.ros import endpoints

@@ -22,7 +22,7 @@ from test_plc_bridge import DISAPPEARS_S, refused
 from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.plc.inputs import CONTEST_S
+from robocal_ros.plc.cell import CONTEST_S
 from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell

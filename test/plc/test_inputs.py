@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robocal_ros.adapter.inputs import InputTiming
-from robocal_ros.plc.inputs import (
+from robocal_ros.plc.cell import (
     CLOCK_NS,
     CONTEST_S,
     CONTESTED,

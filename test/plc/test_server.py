@@ -21,8 +21,7 @@ from robocal_ros.adapter.inputs import InputTiming
 from robocal_ros.ground.errors import Code
 from robocal_ros.plc import access, cell
 from robocal_ros.plc import server as plc_server
-from robocal_ros.plc.cell import EdgeWritten, MethodCalled
-from robocal_ros.plc.inputs import Heartbeat
+from robocal_ros.plc.cell import EdgeWritten, Heartbeat, MethodCalled
 from robocal_ros.plc.server import (
     MOST_CALLS,
     MOST_STRANGERS,
