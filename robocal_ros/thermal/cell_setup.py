@@ -34,9 +34,9 @@ from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel, linear_start
 from robocal_ros.identification.judged import require_match
-from robocal_ros.identification.solve import identify, random_postures
+from robocal_ros.identification.solve import identify
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import read_made, write_made
+from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE, read_made, write_made
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots
 
 if TYPE_CHECKING:
@@ -200,7 +200,6 @@ def _classic(arm: SerialArm, data: Measurements) -> CellModel:
 
 
 KEYS = ("T_sensor_base", "sphere_in_flange_mm", "covariance", "robot", "model_hash")
-QUATERNION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,7 +312,7 @@ class PosePlan:
     ``q`` (m, n): joints. ``chosen`` (m,): their places among the candidates. ``predicted_rms_m``:
     error of the tool at the working poses after one cycle of them. ``random_rms_m``: the same of as
     many candidates drawn at random, median of 50 draws. ``before_rms_m``: the same of the prior,
-    without any cycle.
+    without any cycle. ``own_rms_m``: after a cycle of a user's own poses; None without.
     """
 
     q: Array
@@ -321,6 +320,7 @@ class PosePlan:
     predicted_rms_m: float
     random_rms_m: float
     before_rms_m: float
+    own_rms_m: float | None = None
 
 
 def candidate_poses(
@@ -517,20 +517,6 @@ CANDIDATES = 1000
 COLD_VISITS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedCycle:
-    """Planned poses beside a user's own.
-
-    ``own_rms_m``: predicted error of the tool after a cycle of the user's own poses; None without.
-    ``candidates``, ``working``: how many poses there were to choose from, and to judge at.
-    """
-
-    plan: PosePlan
-    own_rms_m: float | None
-    candidates: int
-    working: int
-
-
 def plan_cycle(
     arm: SerialArm,
     sensor: PlacedSensor,
@@ -538,26 +524,25 @@ def plan_cycle(
     *,
     prior: Array,
     sigma_m: float,
+    working: Array,
     count: int = POSES,
     candidates: int = CANDIDATES,
-    working: Array | None = None,
     own: Array | None = None,
     seed: int = 0,
-) -> PlannedCycle:
+) -> PosePlan:
     """Plan ``count`` poses for a placed sensor.
 
     ``prior`` (k, k): covariance of the expected drift, SI; ``sigma_m`` of one visit's coordinate.
-    ``working`` (w, n): poses where the tool must be right; None: all over the joint limits.
-    ``own`` (o, n): measuring poses to compare with, or None.
+    ``working`` (w, n): poses where the tool must be right. ``own`` (o, n): measuring poses to
+    compare with, or None.
     """
     tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
     cell = CellModel(arm, sensor.T_sensor_base, ("sphere",), tool)
     rng = np.random.default_rng(seed)
     found = candidate_poses(cell, field, candidates, rng)
-    where = random_postures(arm) if working is None else working
     every = found if own is None else np.vstack([found, own])
     point = arm.T_flange_tool[:3, 3]
-    design = Design.of(cell, every, where, point, prior, sigma_m, COLD_VISITS)
+    design = Design.of(cell, every, working, point, prior, sigma_m, COLD_VISITS)
     plan = plan_poses(design.of_first(len(found)), found, count, rng)
     theirs = list(range(len(found), len(every)))
-    return PlannedCycle(plan, design.error(theirs) if theirs else None, len(found), len(where))
+    return replace(plan, own_rms_m=design.error(theirs) if theirs else None)

@@ -34,6 +34,7 @@ from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.ground.samples import JOINTS, JointStream, joint_sample
 from robocal_ros.history.history_records import REFERENCE
 from robocal_ros.identification.cell_model import CellModel
+from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import read_measurements, stamp_texts, texts, write_cells
@@ -394,19 +395,22 @@ def run_plan_poses(args: argparse.Namespace) -> CliResult:
     arm = robot.arm
     sensor = read_sensor(args.sensor, arm)
     own = None if args.own is None else read_measurements(args.own, arm).q
-    found = plan_cycle(
+    working = random_postures(arm)
+    if args.working is not None:
+        working = read_measurements(args.working, arm).q
+    plan = plan_cycle(
         arm,
         sensor,
         SensorField(*(1e-3 * x for x in args.field_mm)),
         prior=drift_prior(arm) if args.prior is None else read_prior(args.prior, arm),
         sigma_m=args.sigma_mm * 1e-3,
+        working=working,
         count=args.poses,
         candidates=args.candidates,
-        working=None if args.working is None else read_measurements(args.working, arm).q,
         own=own,
         seed=args.seed,
     )
-    plan, unit = found.plan, np.where(arm.prismatic, 1e3, np.degrees(1.0))
+    unit = np.where(arm.prismatic, 1e3, np.degrees(1.0))
     names = [f"q{i}_{'mm' if slides else 'deg'}" for i, slides in enumerate(arm.prismatic, 1)]
     poses: list[PlannedPoseDocument] = [
         {"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, 1)
@@ -424,9 +428,9 @@ def run_plan_poses(args: argparse.Namespace) -> CliResult:
         "random_mm": plan.random_rms_m * 1e3,
         "before_mm": plan.before_rms_m * 1e3,
         "gain": 1.0 - plan.predicted_rms_m / plan.random_rms_m,
-        "working_poses": found.working,
-        "candidates": found.candidates,
-        "own_mm": None if found.own_rms_m is None else found.own_rms_m * 1e3,
+        "working_poses": len(working),
+        "candidates": args.candidates,
+        "own_mm": None if plan.own_rms_m is None else plan.own_rms_m * 1e3,
         "own_poses": None if own is None else len(own),
         "output": None if args.output is None else str(args.output),
         "warnings": warnings,

@@ -37,6 +37,7 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL
+from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.ros import conversions, endpoints
@@ -370,20 +371,20 @@ class ThermalServices:
         names = self._nominal.joint_names
         states = [joint_sample(state) for state in request.own]
         own = np.array([state.position[state.order(names)] for state in states])
-        found = plan_cycle(
+        plan = plan_cycle(
             self._nominal,
             placed_of(sensor),
             SensorField(*(1e-3 * x for x in self._settings["sensor_field_mm"])),
             prior=self._prior(),
             sigma_m=self._settings["sigma_mm"] * 1e-3,
+            working=random_postures(self._nominal),
             count=request.count or POSES,
             own=own if states else None,
         )
-        plan = found.plan
         response.poses = [JointState(name=list(names), position=q) for q in plan.q.tolist()]
         response.predicted_mm = plan.predicted_rms_m * 1e3
         response.random_mm, response.before_mm = plan.random_rms_m * 1e3, plan.before_rms_m * 1e3
-        response.own_mm = -1.0 if found.own_rms_m is None else found.own_rms_m * 1e3
+        response.own_mm = -1.0 if plan.own_rms_m is None else plan.own_rms_m * 1e3
         response.success, response.status = True, int(Code.ACCEPT)
         response.message = (
             f"{len(plan.q)} poses: {response.predicted_mm:.3f} mm rms expected after one cycle, "
