@@ -65,9 +65,8 @@ from robocal_ros.hand_eye.result import (
 )
 from robocal_ros.hand_eye.targets import ARCS, FACES, ROLES, SPHERE, target_of
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import THERMAL, Head, Proposal, hand_eye_kind
+from robocal_ros.history.history_records import THERMAL, Proposal, hand_eye_kind
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.kinematics.joint_errors import ShotJoints
 from robocal_ros.session import events
 from robocal_ros.session.events import (
@@ -130,27 +129,6 @@ class HandEyeConfig:
             return cls(standstill=rule, sensor=sensor, **values)
         except (KeyError, TypeError) as error:
             raise InputError(f"the recorded configuration cannot be read: {error}") from error
-
-
-class HandEyeInForce(HistoryFollower):
-    """What the history has in force for a sensor, as of the last look.
-
-    ``head``, ``thermal``: heads of this sensor's calibrations and of the thermal models.
-    """
-
-    def __init__(self, history: CalibrationHistory, nominal: SerialArm, sensor_frame: str) -> None:
-        self._nominal = nominal
-        super().__init__(history, hand_eye_kind(sensor_frame))
-
-    def _read(self) -> None:
-        super()._read()
-        self.thermal: Head = self._history.head(THERMAL)
-
-    @property
-    def arm(self) -> SerialArm:
-        """The arm with the thermal model in force."""
-        model = self.thermal.model
-        return self._nominal if model is None else arm_of(model, self._nominal)
 
 
 def require_known(data: DataSet, method: str) -> None:
@@ -312,8 +290,8 @@ class HandEyeSession(SessionBase):
         self, nominal: SerialArm, history: CalibrationHistory, config: HandEyeConfig, software: str
     ) -> None:
         self.config = config
-        self.current = HandEyeInForce(history, nominal, config.sensor_frame)
-        super().__init__(nominal, history, hand_eye_kind(config.sensor_frame), self.current)
+        self.current = HistoryFollower(history, hand_eye_kind(config.sensor_frame), nominal)
+        super().__init__(self.current)
         self._software = software
         self._shots = ShotLog()
         self._handle = 0

@@ -10,6 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 from robocal_ros import __version__
@@ -28,6 +29,7 @@ from robocal_ros.history.history_records import (
     Proposal,
 )
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.inputs import Between, Heard, Ignored
 
 CONFIGURE = "configure"
@@ -346,12 +348,13 @@ def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:
 class HistoryFollower:
     """Heads of a history as of the last look; a subclass reads those that it is about.
 
-    ``kind``: whose decisions are told. ``head``: of that kind. ``fault``: why the history could not
+    ``history``, ``kind``: whose decisions are told. ``nominal``: the arm without any calibration.
+    ``head``: of that kind; ``thermal``: of the thermal models. ``fault``: why the history could not
     be read at the last look; empty when it could.
     """
 
-    def __init__(self, history: CalibrationHistory, kind: str) -> None:
-        self._history, self._kind = history, kind
+    def __init__(self, history: CalibrationHistory, kind: str, nominal: SerialArm) -> None:
+        self.history, self.kind, self.nominal = history, kind, nominal
         self._version = history.data_version()
         decided = history.decisions(newest=1)
         self._seen = decided[-1].seq if decided else 0
@@ -359,7 +362,16 @@ class HistoryFollower:
         self._read()
 
     def _read(self) -> None:
-        self.head: Head = self._history.head(self._kind)
+        self.head: Head = self.history.head(self.kind)
+        own = self.kind == THERMAL
+        self.thermal: Head = self.head if own else self.history.head(THERMAL)
+        self.__dict__.pop("arm", None)
+
+    @cached_property
+    def arm(self) -> SerialArm:
+        """The arm with the thermal model in force; the same one until a look reads heads anew."""
+        model = self.thermal.model
+        return self.nominal if model is None else arm_of(model, self.nominal)
 
     def look(self, own_wall_ns: int | None = None) -> list[Decision]:
         """Take over what was decided since the last look.
@@ -368,18 +380,18 @@ class HistoryFollower:
         the caller's own. Never raises for the history's sake: see ``fault``.
         """
         try:
-            version = self._history.data_version()
+            version = self.history.data_version()
             self.fault = ""
             if version == self._version:
                 return []
-            decided = self._history.decisions(self._seen)
+            decided = self.history.decisions(self._seen)
             self._read()
         except RobocalError as error:
             self.fault = str(error)
             return []
         self._version = version
         self._seen = decided[-1].seq if decided else self._seen
-        return [d for d in decided if d.kind == self._kind and d.wall_ns != own_wall_ns]
+        return [d for d in decided if d.kind == self.kind and d.wall_ns != own_wall_ns]
 
 
 WHILE = "in force while this was recorded"
@@ -398,14 +410,12 @@ class SessionBase:
     not used. ``newest_ns``: newest stamp of each topic.
     """
 
-    def __init__(
-        self, nominal: SerialArm, history: CalibrationHistory, kind: str, current: HistoryFollower
-    ) -> None:
-        self.nominal, self._history, self._kind = nominal, history, kind
+    def __init__(self, current: HistoryFollower) -> None:
+        self.nominal, self._history, self._kind = current.nominal, current.history, current.kind
         self._followed = current
         self._queue: list[Command] = []
         self._jumps = 0
-        self.stream = JointStream(nominal.joint_names)
+        self.stream = JointStream(self.nominal.joint_names)
         self.newest_ns: dict[str, int] = {}
         self.received: Counter[str] = Counter()
         self.ignored = Ignored()

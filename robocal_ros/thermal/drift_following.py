@@ -24,7 +24,6 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, Entry
 from robocal_ros.identification import Method
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.events import HistoryFollower
 from robocal_ros.thermal.accuracy import AccuracyForecast, LearnedProcess, Work, process_of
 from robocal_ros.thermal.identification import FixedSphere, drift_prior
@@ -189,26 +188,18 @@ class InForce(HistoryFollower):
 
     ``reference``, ``reference_id``, ``reference_model``: the cold reference, its calibration, and
     what is kept of it; or None. ``reference_revision``: its, counted up where it goes too.
-    ``nominal``: the arm without any calibration.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm) -> None:
-        self.nominal = nominal
-        super().__init__(history, THERMAL)
+        super().__init__(history, THERMAL, nominal)
 
     def _read(self) -> None:
         super()._read()
-        head = self._history.head(REFERENCE)
+        head = self.history.head(REFERENCE)
         reference = None if head.model is None else reference_of(head.model, self.nominal)
         self.reference: ColdReference | None = reference
         self.reference_id, self.reference_model = head.calibration_id, head.model
         self.reference_revision = head.revision
-
-    @property
-    def arm(self) -> SerialArm:
-        """The arm with the model in force."""
-        model = self.head.model
-        return self.nominal if model is None else arm_of(model, self.nominal)
 
     @property
     def drifted(self) -> bool:
@@ -411,10 +402,8 @@ def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
 class Following:
     """The follower of the cold reference in force, made anew where another one comes into force."""
 
-    def __init__(
-        self, history: CalibrationHistory, current: InForce, config: ThermalConfig
-    ) -> None:
-        self._history, self._current, self._config = history, current, config
+    def __init__(self, current: InForce, config: ThermalConfig) -> None:
+        self._current, self._config = current, config
         self._followed: tuple[int | None, DriftFollower] | None = None
 
     @property
@@ -433,6 +422,6 @@ class Following:
             return None
         if self._followed is None or self._followed[0] != current.reference_id:
             follower = DriftFollower(current.reference, self.expected, self._config.work)
-            follower.catch_up(self._history, current.reference_id or 0)
+            follower.catch_up(current.history, current.reference_id or 0)
             self._followed = (current.reference_id, follower)
         return self._followed[1]

@@ -85,16 +85,9 @@ class Proposer:
     ``current``: what is in force, followed by the session.
     """
 
-    def __init__(
-        self,
-        nominal: SerialArm,
-        history: CalibrationHistory,
-        config: ThermalConfig,
-        software: str,
-        current: InForce,
-    ) -> None:
-        self._nominal, self._history, self._config = nominal, history, config
-        self._software, self._current = software, current
+    def __init__(self, config: ThermalConfig, software: str, current: InForce) -> None:
+        self._config, self._software, self._current = config, software, current
+        self._nominal, self._history = current.nominal, current.history
 
     def _propose(
         self,

@@ -26,7 +26,6 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import FRAME_SHIFT
-from robocal_ros.kinematics import SerialArm
 from robocal_ros.programs.correcting import CorrectionModels
 from robocal_ros.programs.frame_shift import PARTS, best_shift
 from robocal_ros.ros import endpoints
@@ -117,7 +116,6 @@ class MeasuringRobotInterface:
     ) -> None:
         self._base, self._session = base_frame, session
         self._queue: PointQueue | None = None
-        self._arm: tuple[int, SerialArm] | None = None
         for kind, topic in ((PointStamped, POINT), (PointCloud2, CLOUD)):
             node.add_input(kind, topic, partial(self._take, topic), endpoints.STREAM)
         self._pose = node.add_output(PoseStamped, "~/flange_pose", endpoints.STREAM)
@@ -133,15 +131,9 @@ class MeasuringRobotInterface:
         if newest is None:
             return
         _, q = session.desk.stream.window(newest, newest)
-        T = self._model(session).fk(q[0])
+        T = session.current.arm.fk(q[0])
         self._pose.publish(PoseStamped(header=header(newest, self._base), pose=pose_message(T)))
         self._publish(session)
-
-    def _model(self, session: ThermalSession) -> SerialArm:
-        revision = session.in_force.revision
-        if self._arm is None or self._arm[0] != revision:
-            self._arm = revision, session.current.arm
-        return self._arm[1]
 
     def _take(self, name: str, message: Any) -> None:
         session = self._session()
@@ -162,7 +154,7 @@ class MeasuringRobotInterface:
         if self._queue is None or reference is None or reference.spheres is None:
             return
         sensor = reference.spheres.T_flange_sensor
-        for shot, placed in self._queue.ready(self._model(session), sensor):
+        for shot, placed in self._queue.ready(session.current.arm, sensor):
             if isinstance(placed, PlacedShot):
                 self._send(placed)
             else:
@@ -188,7 +180,7 @@ class MeasuringRobotInterface:
         spheres, count = _placed_sensor(session), len(request.points)
         if not 0 < count <= MOST_POINTS:
             raise LimitError(f"{count} points: 1 to {MOST_POINTS} are placed at a time")
-        arm, stream = self._model(session), session.desk.stream
+        arm, stream = session.current.arm, session.desk.stream
         placed: dict[int, PlacedShot] = {}
         response.reasons = [""] * count
         for i, message in enumerate(request.points):

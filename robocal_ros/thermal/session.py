@@ -91,7 +91,7 @@ class ThermalSession(SessionBase):
     ) -> None:
         self.config = config
         self.current = InForce(history, nominal)
-        super().__init__(nominal, history, THERMAL, self.current)
+        super().__init__(self.current)
         self.desk = ObservationDesk(
             nominal.joint_names, config.standstill, config.measuring_frame or None
         )
@@ -100,8 +100,8 @@ class ThermalSession(SessionBase):
         self.temperatures = MotorTemperatures(nominal.joint_names)
         self.cycle = OpenCycle()
         self.windows = Windows(self.desk, self.cycle, self.current, config)
-        self._following = Following(history, self.current, config)
-        self._proposer = Proposer(nominal, history, config, software, self.current)
+        self._following = Following(self.current, config)
+        self._proposer = Proposer(config, software, self.current)
 
     @property
     def marks(self) -> dict[str, int]:

@@ -7,16 +7,8 @@ import numpy as np
 
 from robocal_ros.ground.frames import Array
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import (
-    HEALTHY_TOOL,
-    LASER_FRAME,
-    MANDREL,
-    THERMAL,
-    TOOL,
-    Head,
-)
+from robocal_ros.history.history_records import HEALTHY_TOOL, LASER_FRAME, MANDREL, TOOL, Head
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of
 from robocal_ros.session.events import HistoryFollower
 from robocal_ros.tool.judging import KnownTool
 from robocal_ros.tool.run import RunTraits, ToolConfig, alike, made_with
@@ -26,29 +18,21 @@ from robocal_ros.tool.station import StationMeasurement, StationTrend, measureme
 class ToolInForce(HistoryFollower):
     """What the history has in force for a tool, as of the last look.
 
-    ``head``, ``thermal``, ``healthy``, ``mandrel``, ``station``: heads of the tools, of the thermal
-    models and of the measurements of the healthy tool, of the mandrel and of the beams.
+    ``head``, ``healthy``, ``mandrel``, ``station``: heads of the tools and of the measurements of
+    the healthy tool, of the mandrel and of the beams.
     """
 
     def __init__(self, history: CalibrationHistory, nominal: SerialArm, config: ToolConfig) -> None:
-        self._nominal = nominal
         self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
         self._mandrel_radius_m = config.mandrel_radius_m
         self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
-        super().__init__(history, TOOL)
+        super().__init__(history, TOOL, nominal)
 
     def _read(self) -> None:
         super()._read()
-        self.thermal: Head = self._history.head(THERMAL)
-        self.healthy: Head = self._history.head(HEALTHY_TOOL)
-        self.mandrel: Head = self._history.head(MANDREL)
-        self.station: Head = self._history.head(LASER_FRAME)
-
-    @property
-    def arm(self) -> SerialArm:
-        """The arm with the thermal model in force."""
-        model = self.thermal.model
-        return self._nominal if model is None else arm_of(model, self._nominal)
+        self.healthy: Head = self.history.head(HEALTHY_TOOL)
+        self.mandrel: Head = self.history.head(MANDREL)
+        self.station: Head = self.history.head(LASER_FRAME)
 
     @property
     def tool(self) -> KnownTool:

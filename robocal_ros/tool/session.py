@@ -68,14 +68,7 @@ from robocal_ros.tool.judging import (
     with_mandrel,
     witness_of,
 )
-from robocal_ros.tool.run import (
-    MeasuringPlan,
-    Mode,
-    PlannedStep,
-    ToolConfig,
-    ToolRun,
-    made_with,
-)
+from robocal_ros.tool.run import MeasuringPlan, Mode, PlannedStep, ToolConfig, ToolRun, made_with
 from robocal_ros.tool.station import (
     measure_station,
     measurement_document,
@@ -105,16 +98,9 @@ class ToolResults:
     ``software``: version that made the tools.
     """
 
-    def __init__(
-        self,
-        nominal: SerialArm,
-        history: CalibrationHistory,
-        config: ToolConfig,
-        software: str,
-        current: ToolInForce,
-    ) -> None:
-        self._nominal, self._history, self._config = nominal, history, config
-        self._software, self._current = software, current
+    def __init__(self, config: ToolConfig, software: str, current: ToolInForce) -> None:
+        self._config, self._software, self._current = config, software, current
+        self._history = current.history
         self._answers: OrderedDict[tuple[str, str], Outcome] = OrderedDict()
         self._changed: KnownTool | None = None  # last one whose change is not proven the tool's
         # What the mandrel said last: its stamp, ns, and what was seen changed before it.
@@ -375,7 +361,7 @@ class ToolResults:
         return self._history.propose(
             Proposal(
                 kind=kind,
-                model_hash=self._nominal.model_hash,
+                model_hash=self._current.nominal.model_hash,
                 based_on=self._history.head(kind).revision,
                 cycle_id=run.cycle_id,
                 stamp_ns=command.stamp_ns or 0,
@@ -407,8 +393,8 @@ class ToolSession(SessionBase):
     ) -> None:
         self.config = config
         self.current = ToolInForce(history, nominal, config)
-        super().__init__(nominal, history, TOOL, self.current)
-        self._results = ToolResults(nominal, history, config, software, self.current)
+        super().__init__(self.current)
+        self._results = ToolResults(config, software, self.current)
         self._edges = EdgeLog()
         self._touches, self._sweeps = TouchLog(config), SweepLog(config)
         self._runs = 0
