@@ -373,7 +373,8 @@ def read_prior(path: Path, arm: SerialArm) -> Array:
 # ---- how far the tool may be off by now ---------------------------------------------------------
 
 HORIZON_S = 24.0 * 3600.0
-DUE_WITHIN_S = 1.0  # to which the time that is left is found
+STEPS = 2**17
+STEP_S = HORIZON_S / STEPS  # to which the time that is left is found
 
 
 class AccuracyLevel(IntEnum):
@@ -438,6 +439,7 @@ class AccuracyForecast:
         cold = tracker.spots.cell.arm
         self._tracker, self._work = tracker, work
         self._in_force = cold.parameters.read(in_force.mdh - cold.mdh)
+        self._exceeded_s = 0.0  # when the bound exceeds the tolerance, as it was found last
 
     @cached_property
     def _rows(self) -> Array:
@@ -470,18 +472,25 @@ class AccuracyForecast:
 
         At most a day, which stands for longer.
         """
-        if self.at(time_s).bound_m > tolerance_m:
+
+        def exceeds(step: int) -> bool:
+            return self.at(time_s + step * STEP_S).bound_m > tolerance_m
+
+        early, late = 0, STEPS
+        if exceeds(early):
             return 0.0
-        late, early = HORIZON_S, 0.0
-        if self.at(time_s + late).bound_m <= tolerance_m:
-            return late
-        while late - early > DUE_WITHIN_S:
-            middle = 0.5 * (early + late)
-            if self.at(time_s + middle).bound_m > tolerance_m:
-                late = middle
+        if not exceeds(late):
+            return HORIZON_S
+        near, reach = int((self._exceeded_s - time_s) / STEP_S), 1
+        while late - early > 1:  # about where it was found last, else by halves
+            middle = near if early < near < late else (early + late) // 2
+            if exceeds(middle):
+                late, near = middle, middle - reach
             else:
-                early = middle
-        return early
+                early, near = middle, middle + reach
+            reach *= 4
+        self._exceeded_s = time_s + late * STEP_S
+        return early * STEP_S
 
 
 MOST_FREEDOM = 1e6  # more of it: as good as a fixed length

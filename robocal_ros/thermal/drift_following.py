@@ -7,7 +7,7 @@ the later cycles are taken again.
 """
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -296,11 +296,17 @@ class DriftFollower:
                 self.read_ns = stamp_ns
 
     @contextmanager
-    def looking_ahead(self, temperatures: Sequence[tuple[int, Array]]) -> Iterator[None]:
-        """Within, the follower knows these temperatures too; then it forgets them again."""
+    def looking_ahead(
+        self, between: Callable[[int, int], Sequence[tuple[int, Array]]], until_ns: int
+    ) -> Iterator[None]:
+        """Within, the follower knows the temperatures ``between`` its last ones and a stamp too.
+
+        Then it forgets them again; without gains nobody asks for them.
+        """
         heat, read_ns = self._tracker.heat, self.read_ns
         try:
-            self.read(temperatures)
+            if heat is not None:
+                self.read(between(read_ns, until_ns))
             yield
         finally:
             self._tracker.heat, self.read_ns = heat, read_ns

@@ -283,7 +283,7 @@ class ThermalSession(SessionBase):
             if follower is None:
                 words = "no cold reference: how far the robot has drifted is not known; capture one"
                 return Accuracy(AccuracyLevel.EXPIRED, words)
-            with follower.looking_ahead(self.temperatures.between(follower.read_ns, stamp_ns)):
+            with follower.looking_ahead(self.temperatures.between, stamp_ns):
                 return self._judged(follower, stamp_ns)
         except RobocalError as error:
             return Accuracy(AccuracyLevel.FAULT, str(error))
@@ -305,7 +305,7 @@ class ThermalSession(SessionBase):
         static_m = reference.static_error_m
         last_ns = max(one.shot.stamp_ns for one in placed)
         found = []
-        with follower.looking_ahead(self.temperatures.between(follower.read_ns, last_ns)):
+        with follower.looking_ahead(self.temperatures.between, last_ns):
             for one in placed:
                 tip = frames.apply(frames.invert(one.T_base_flange), one.points[:1])[0]
                 forecast = follower.forecast_at(self.current.arm, one.q, tip)

@@ -119,7 +119,7 @@ def test_temperatures_tell_the_drift_between_cycles(learned):
     now_ns = learned.shift.now_ns
     arm = session.reference.cell.arm
     before = follower.state
-    with follower.looking_ahead(session.temperatures.between(follower.read_ns, now_ns)):
+    with follower.looking_ahead(session.temperatures.between, now_ns):
         told, _ = follower.forecast(session.current.arm).drift_at(follower.time_s(now_ns))
     assert follower.state is before
     true = arm.parameters.read(warmed(learned.cold, 15.0).mdh - learned.cold.mdh)
