@@ -48,7 +48,6 @@ from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_sh
 from robocal_ros.programs.points import Dialect, frame_given
 from robocal_ros.thermal.proposing import (
     ShiftedWork,
-    errors_of,
     keep_shift,
     shift_document,
     shift_in_force,
@@ -63,7 +62,6 @@ if TYPE_CHECKING:
         CorrectedProgramDocument,
         FrameShiftDocument,
         ShiftDocument,
-        ShiftInForceDocument,
     )
 
 _MODEL = (
@@ -440,10 +438,8 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     if args.output is not None:
         write_bytes(args.output, f"{words}\n".encode())
     found: ShiftDocument | None = None
-    was: ShiftInForceDocument | None = None
     verdict = Verdict(Code.ACCEPT, "no shift is in force: the frames are as they were")
-    if in_force is not None:
-        was = {"revision": in_force.revision, **errors_of(in_force.shift.after, args.limit_mm)}
+    was = None if in_force is None else in_force.document(args.limit_mm)
     if len(q):
         found = shift_document(shift, work.names, args.limit_mm)
         verdict = shift_verdict(found, was, args.in_force)

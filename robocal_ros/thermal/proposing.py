@@ -410,6 +410,10 @@ class FrameShiftInForce:
     revision: int
     shift: FrameShift
 
+    def document(self, limit_mm: float) -> "ShiftInForceDocument":
+        """What it leaves; ``limit_mm``: as of `errors_of`."""
+        return {"revision": self.revision, **errors_of(self.shift.after, limit_mm)}
+
 
 def shift_in_force(
     history: CalibrationHistory, models: CorrectionModels, q: Array, T_flange_tool: Array

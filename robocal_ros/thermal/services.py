@@ -8,7 +8,7 @@ does not command.
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
@@ -41,18 +41,9 @@ from robocal_ros.thermal.observations import (
     placed_shot,
     shot_of,
 )
-from robocal_ros.thermal.proposing import (
-    errors_of,
-    keep_shift,
-    shift_document,
-    shift_in_force,
-    shift_verdict,
-)
+from robocal_ros.thermal.proposing import keep_shift, shift_document, shift_in_force, shift_verdict
 from robocal_ros.thermal.reference import SpheresInCell
 from robocal_ros.thermal.session import ThermalSession
-
-if TYPE_CHECKING:
-    from robocal_ros.programs.documents import ShiftInForceDocument
 
 POINT, CLOUD = "point", "cloud"
 MOST_POINTS = 1000  # of a call: their doubts take a tenth of a second
@@ -268,9 +259,8 @@ class FrameShiftInterface:
         shift = best_shift(models, q, T)
         names = tuple(str(i + 1) for i in range(len(q)))
         found = shift_document(shift, names, LIMIT_MM)
-        was: ShiftInForceDocument | None = None
-        if (kept := shift_in_force(self._history, models, q, T)) is not None:
-            was = {"revision": kept.revision, **errors_of(kept.shift.after, LIMIT_MM)}
+        kept = shift_in_force(self._history, models, q, T)
+        was = None if kept is None else kept.document(LIMIT_MM)
         document = {**found, "in_force": was, "shift_frames_of": of}
         verdict = shift_verdict(found, was, only_judged=False)
         number = keep_shift(
