@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
-from rclpy.qos import QoSProfile
 from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel
 from robocal_msgs.srv import (
     BeginCycle,
@@ -54,9 +53,9 @@ from robocal_ros.ros.parameters import (
     number,
     standstill_rule,
 )
+from robocal_ros.ros.robot import RobotNode
 from robocal_ros.ros.session_node import (
     STATE_DIR,
-    AddService,
     Ask,
     DataClock,
     DecisionServices,
@@ -285,21 +284,15 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig
 class ThermalServices:
     """Services, and the Trigger twins of those that need no more than a name.
 
-    ``add``, ``ask``: create a service; give a command to the session and await its outcome.
-    ``settings``: the node's; ``prior`` tells the expected drift of the session, (k, k), SI.
+    ``ask`` gives a command to the session and awaits its outcome; ``prior`` tells the expected
+    drift of the session, (k, k), SI.
     """
 
     def __init__(
-        self,
-        add: AddService,
-        ask: Ask,
-        history: CalibrationHistory,
-        nominal: SerialArm,
-        settings: Mapping[str, Any],
-        prior: Callable[[], Array],
+        self, node: RobotNode, ask: Ask, history: CalibrationHistory, prior: Callable[[], Array]
     ) -> None:
-        self._ask, self._history, self._nominal = ask, history, nominal
-        self._settings, self._prior = settings, prior
+        self._ask, self._history, self._nominal = ask, history, node.robot.arm
+        self._settings, self._prior, add = node.settings, prior, node.add_service
         add(CaptureReference, "~/capture_reference", self._capture_reference)
         add(Identify, "~/identify", self._identify)
         add(BeginCycle, "~/begin_cycle", self._begin_cycle)
@@ -394,18 +387,11 @@ class ThermalServices:
 
 
 class ThermalOutputs:
-    """Publishers of one robot's results; ``add`` creates one."""
+    """Publishers of one robot's results; ``serial``: of the robot, as it is in use."""
 
-    def __init__(
-        self,
-        add: Callable[[type, str, QoSProfile], Any],
-        nominal: SerialArm,
-        serial: str,
-        robot_file_hash: str,
-        base_frame: str,
-    ) -> None:
-        self._nominal, self._serial, self._base_frame = nominal, serial, base_frame
-        self._robot_file_hash = robot_file_hash
+    def __init__(self, node: RobotNode, serial: str) -> None:
+        self._robot, self._serial, add = node.robot, serial, node.add_output
+        self._base_frame = node.settings["base_frame"]
         self._candidate = add(KinematicModel, "~/candidate", endpoints.LATCHED)
         self._model = add(KinematicModel, "~/model", endpoints.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", endpoints.LATCHED)
@@ -419,8 +405,8 @@ class ThermalOutputs:
         message = conversions.kinematic_model(
             model,
             serial=self._serial,
-            model_hash=self._nominal.model_hash,
-            robot_file_hash=self._robot_file_hash,
+            model_hash=self._robot.arm.model_hash,
+            robot_file_hash=self._robot.file_hash,
             revision=revision or 0,
             state=KinematicModel.CANDIDATE if candidate else KinematicModel.ACCEPTED,
             stamp=conversions.header(stamp_ns, self._base_frame),
@@ -432,7 +418,7 @@ class ThermalOutputs:
         stamp = conversions.header(outcome.command.stamp_ns or 0, frame)
         self._quality.publish(
             conversions.quality_message(
-                outcome, robot=self._nominal.name, serial=self._serial, stamp=stamp
+                outcome, robot=self._robot.arm.name, serial=self._serial, stamp=stamp
             )
         )
 
@@ -441,7 +427,7 @@ class ThermalOutputs:
         self._accuracy.publish(
             AccuracyState(
                 header=conversions.header(stamp_ns, self._base_frame),
-                robot=self._nominal.name,
+                robot=self._robot.arm.name,
                 serial=self._serial,
                 **found.document(tolerance_m),
             )
@@ -472,28 +458,20 @@ class ThermalNode(SessionNode[ThermalSession]):
         require_parameters(self._nominal, settings["drift_parameters"])
         self._config = session_config(settings, self._nominal)
         history = self.open_session(settings["command_timeout_s"])
-        self._outputs = ThermalOutputs(
-            self.add_output,
-            self._nominal,
-            self._serial_in_use,
-            self.robot.file_hash,
-            settings["base_frame"],
-        )
+        self._outputs = ThermalOutputs(self, self._serial_in_use)
         self._on_tf = SensorOnTf(self)
         self._data_clock = DataClock()
-        ask = self._desk.ask
-        ThermalServices(self.add_service, ask, history, self._nominal, settings, self._prior)
+        ThermalServices(self, self._desk.ask, history, self._prior)
         T_flange_tool, tip_m = self._nominal.T_flange_tool.copy(), self._config.tip_m
         if tip_m:
             T_flange_tool[:3, 3] = tip_m
         work = np.array(self._config.work_poses).reshape(-1, self._nominal.n)
         self._shifts = FrameShiftInterface(
-            self, history, lambda: self._session, work, T_flange_tool, settings
+            self, history, lambda: self._session, work, T_flange_tool
         )
         self._measuring: MeasuringRobotInterface | None = None
         if self._config.arrangement == FLANGE:
-            frame = settings["base_frame"]
-            self._measuring = MeasuringRobotInterface(self, frame, lambda: self._session)
+            self._measuring = MeasuringRobotInterface(self, lambda: self._session)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
 
     def new_session(self, history: CalibrationHistory) -> ThermalSession:

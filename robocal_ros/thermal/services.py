@@ -15,13 +15,7 @@ from geometry_msgs.msg import Point, PointStamped, PoseStamped, TransformStamped
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
-from robocal_ros.ground.errors import (
-    Code,
-    ConflictError,
-    InputError,
-    LimitError,
-    RobocalError,
-)
+from robocal_ros.ground.errors import Code, ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -32,6 +26,7 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import StaticTf, cloud, header, pose_message, transform_message
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.ros.graph import FrameWatch
+from robocal_ros.ros.robot import RobotNode
 from robocal_ros.ros.session_node import TWIN, trigger_answer
 from robocal_ros.session.events import ACCEPT, ONLY, ROLLBACK, Command, decide
 from robocal_ros.thermal.observations import (
@@ -99,13 +94,8 @@ class MeasuringRobotInterface:
     ``session``: of the node; None while it is inactive. It counts what cannot be placed.
     """
 
-    def __init__(
-        self,
-        node: EndpointNode,
-        base_frame: str,
-        session: Callable[[], ThermalSession | None],
-    ) -> None:
-        self._base, self._session = base_frame, session
+    def __init__(self, node: RobotNode, session: Callable[[], ThermalSession | None]) -> None:
+        self._base, self._session = node.settings["base_frame"], session
         self._queue: PointQueue | None = None
         for kind, topic in ((PointStamped, POINT), (PointCloud2, CLOUD)):
             node.add_input(kind, topic, partial(self._take, topic), endpoints.STREAM)
@@ -222,21 +212,20 @@ class FrameShiftInterface:
 
     Nothing else of the session depends on it, so that it needs no place in a recording.
 
-    ``work`` (k, n): the poses; ``T_flange_tool`` (4, 4); ``settings``: of the node.
+    ``work`` (k, n): the poses; ``T_flange_tool`` (4, 4).
     """
 
     def __init__(
         self,
-        node: EndpointNode,
+        node: RobotNode,
         history: CalibrationHistory,
         session: Callable[[], ThermalSession | None],
         work: Array,
         T_flange_tool: Array,
-        settings: Mapping[str, Any],
     ) -> None:
-        self._node, self._history, self._session = node, history, session
+        self._history, self._session = history, session
         self._work, self._T_flange_tool = work, T_flange_tool
-        self._settings, self._shown = settings, -1
+        self._settings, self._shown = node.settings, -1
         self._outputs = {
             part: node.add_output(TransformStamped, f"~/{part}_shift", endpoints.LATCHED)
             for part in PARTS

@@ -403,18 +403,10 @@ class TcfNode(SessionNode[ToolSession]):
         load_measuring(self._nominal)
         self._config = session_config(settings, laser, station, taught)
         history = self.open_session()
-        frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
-        self._outputs = TcfOutputs(
-            self.add_output,
-            self._nominal,
-            self._serial_in_use,
-            self.robot.file_hash,
-            frames,
-        )
+        self._outputs = TcfOutputs(self, self._serial_in_use)
         self._calls = TcfServices(self, self._desk.ask, history)
         if settings["motion"] == TRAJECTORY:
-            robot = self._nominal, self._serial_in_use
-            self._motion = TcfMotion(self, settings, self._desk.ask, *robot)
+            self._motion = TcfMotion(self, self._desk.ask, self._serial_in_use)
         self.add_timer(WATCH_S, self._watch, steady=True)
 
     def new_session(self, history: CalibrationHistory) -> ToolSession:

@@ -2,7 +2,7 @@
 """What the tool node publishes, and the motions that it drives itself."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from robocal_ros.ground import frames
 from robocal_ros.ground.errors import ConflictError, InputError
 from robocal_ros.ground.frames import Document
 from robocal_ros.ground.samples import joint_sample
-from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import RobotDescription
 from robocal_ros.motion.driver import (
     CONTROLLER,
     MOTION,
@@ -35,7 +35,7 @@ from robocal_ros.ros.endpoints import NotActiveError
 from robocal_ros.ros.graph import GAP_BOOL, SHORTEST_STALE_S, STATUS, CommandPath, GapSources
 from robocal_ros.ros.parameters import number
 from robocal_ros.ros.robot import RobotNode
-from robocal_ros.ros.session_node import AddOutput, SessionEvents
+from robocal_ros.ros.session_node import SessionEvents
 from robocal_ros.session.events import Command, Outcome
 from robocal_ros.tool.driving import ToolDriver
 from robocal_ros.tool.edges import RESTORE
@@ -106,9 +106,8 @@ def step_words(step: PlannedStep) -> str:
 class ToolMessages:
     """Tools of one robot as messages; ``flange``, ``tool``: names of the frames."""
 
-    nominal: SerialArm
+    robot: RobotDescription
     serial: str
-    robot_file_hash: str
     flange: str
     tool: str
 
@@ -120,10 +119,10 @@ class ToolMessages:
         return ToolFrame(
             header=header(stamp_ns, self.flange),
             child_frame_id=self.tool,
-            robot=self.nominal.name,
+            robot=self.robot.arm.name,
             serial=self.serial,
-            model_hash=self.nominal.model_hash,
-            robot_file_hash=self.robot_file_hash,
+            model_hash=self.robot.arm.model_hash,
+            robot_file_hash=self.robot.file_hash,
             revision=revision,
             thermal_revision=thermal_revision,
             tool=transform_message(known.T_flange_tool),
@@ -133,22 +132,17 @@ class ToolMessages:
 
 
 class TcfOutputs:
-    """Publishers of one tool's results; ``frames``: names of the base's, the flange's, the tool's.
+    """Publishers of one tool's results; ``serial``: of the robot, as it is in use.
 
     ``missing``: what cannot be published on this machine; empty when everything can.
     """
 
-    def __init__(
-        self,
-        add: AddOutput,
-        nominal: SerialArm,
-        serial: str,
-        robot_file_hash: str,
-        frames: tuple[str, str, str],
-    ) -> None:
-        self._base, flange, tool = frames
-        self._nominal, self._serial = nominal, serial
-        self._messages = ToolMessages(nominal, serial, robot_file_hash, flange, tool)
+    def __init__(self, node: RobotNode, serial: str) -> None:
+        add, names = node.add_output, node.settings
+        self._base, self._robot, self._serial = names["base_frame"], node.robot.arm.name, serial
+        self._messages = ToolMessages(
+            node.robot, serial, names["flange_frame"], names["tool_frame"]
+        )
         self._step = add(ToolStep, "~/next_step", endpoints.LATCHED)
         self._candidate = add(ToolFrame, "~/candidate", endpoints.LATCHED)
         self._tool = add(ToolFrame, "~/tool", endpoints.LATCHED)
@@ -203,7 +197,7 @@ class TcfOutputs:
         document = outcome.document or {}
         message = conversions.verdict_message(
             outcome,
-            robot=self._nominal.name,
+            robot=self._robot,
             serial=self._serial,
             stamp=conversions.header(outcome.command.stamp_ns or 0, self._base),
             cycle_id=str(document.get("cycle_id", "")),
@@ -242,18 +236,12 @@ UNHEARD = "gap_open is not listened to: gap_stale_s is 0"
 class TcfMotion:
     """``~/arm``, the robot's controller, and ``gap_open`` where it is listened to.
 
-    ``arm``, ``serial``: the robot. ``ask``: gives a command to the session.
+    ``ask``: gives a command to the session. ``serial``: of the robot, as it is in use.
     """
 
-    def __init__(
-        self,
-        node: RobotNode,
-        settings: Mapping[str, Any],
-        ask: Callable[[Command], object],
-        arm: SerialArm,
-        serial: str,
-    ) -> None:
+    def __init__(self, node: RobotNode, ask: Callable[[Command], object], serial: str) -> None:
         self._node, self._ask = node, ask
+        settings, arm = node.settings, node.robot.arm
         self._config = driving_config(
             settings,
             plunge_speed_m_s=settings["plunge_speed_mm_s"] * 1e-3,

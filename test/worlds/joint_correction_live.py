@@ -50,7 +50,7 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
 
 def tool_message(T: np.ndarray, revision: int = 1, **changes: Any) -> ToolFrame:
     """As tcf_node makes it."""
-    build = ToolMessages(NOMINAL, "s1", load_description("kr150_r3100").file_hash, "tool0", "tool")
+    build = ToolMessages(load_description("kr150_r3100"), "s1", "tool0", "tool")
     message = build.frame(KnownTool(T), revision, 0, ToolFrame.ACCEPTED, 0)
     for name, value in changes.items():
         setattr(message, name, value)
