@@ -40,7 +40,7 @@ from robocal_ros.kinematics.joint_errors import with_joint_errors
 from robocal_ros.programs.conventions import Load
 from robocal_ros.tool.circle import CircleMotion, classic_from_path, fit_circle
 from robocal_ros.tool.crossed_model import estimate_tool
-from robocal_ros.tool.edges import InputRule, debounced
+from robocal_ros.tool.edges import InputRule, ParallelStation, debounced
 from robocal_ros.tool.files import (
     circle_document,
     classic_run_document,
@@ -62,7 +62,7 @@ from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run, tip_error
 from robocal_ros.tool.laser_frame import LaserFile, calibrate_laser, read_laser_for, write_laser
 from robocal_ros.tool.run import alike
 from robocal_ros.tool.station import StationTrend, measurement_of, station_shift
-from robocal_ros.tool.touch_points import ParallelBeams, fit_four, fit_parallel, fit_seven
+from robocal_ros.tool.touch_points import fit_four, fit_parallel, fit_seven
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -182,7 +182,6 @@ NEEDED = ("joints", "robot", "laser")
 
 
 def add_run_options(parser: "argparse._ActionsContainer") -> None:
-    """Declare the options of a whole run."""
     parser.add_argument(
         "--joints",
         type=Path,
@@ -198,7 +197,6 @@ def add_run_options(parser: "argparse._ActionsContainer") -> None:
 
 
 def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
-    """Do it. Raises `RobocalError` for what a user can mend."""
     missing = [f"--{name}" for name in NEEDED if getattr(args, name) is None]
     if missing:
         raise InputError(
@@ -239,7 +237,6 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
 
 
 def add_figures(parser: argparse.ArgumentParser) -> None:
-    """Offer the figure of a result."""
     parser.add_argument(
         "--figures",
         type=Path,
@@ -435,9 +432,9 @@ def add_parallel(parser: argparse.ArgumentParser) -> None:
 def run_parallel(args: argparse.Namespace) -> CliResult:
     if not all(map(isfinite, (args.up_mm, args.down_mm, args.x_mm or 0.0))):
         raise InputError("--up-mm, --down-mm and --x-mm must be finite numbers")
-    beams = ParallelBeams(args.up_mm * 1e-3, args.down_mm * 1e-3)
     x_m = None if args.x_mm is None else args.x_mm * 1e-3
-    fit = fit_parallel(beams, x_m, read_sweeps(args.data))
+    station = ParallelStation(args.up_mm * 1e-3, args.down_mm * 1e-3, x_m)
+    fit = fit_parallel(station, read_sweeps(args.data))
     return CliResult(parallel_document(fit.axis, fit.tip), _show_parallel)
 
 

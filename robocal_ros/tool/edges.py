@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from robocal_ros.ground.errors import Code, InputError, RobocalError
+from robocal_ros.ground.errors import Code, InputError, RankDeficientError, RobocalError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.session.inputs import AHEAD_NS, AheadOfJoints
@@ -22,6 +22,7 @@ from robocal_ros.session.inputs import AHEAD_NS, AheadOfJoints
 Beam = Literal["x", "y", "up", "down"]
 BEAMS: tuple[Beam, Beam] = ("x", "y")  # crossed
 PARALLEL: tuple[Beam, Beam] = ("up", "down")
+SMALLEST_HEIGHT_M = 2e-3  # between them
 MOST_BOUNCES = 5  # edges of one burst; more is no contact that settles
 
 
@@ -29,13 +30,23 @@ MOST_BOUNCES = 5  # edges of one burst; more is no contact that settles
 class ParallelStation:
     """Two parallel beams along the base's y: their heights and their place along its x, m.
 
-    ``names``: of the upper and the lower beam in the edges.
+    ``x_m``: needed for the tip alone. ``names``: of the upper and the lower beam in the edges.
+
+    Raises `RankDeficientError` when they are too near each other.
     """
 
     up_m: float
     down_m: float
-    x_m: float
+    x_m: float | None
     names: tuple[str, str] = ("up", "down")
+
+    def __post_init__(self) -> None:
+        if self.up_m - self.down_m < SMALLEST_HEIGHT_M:
+            raise RankDeficientError(
+                f"the beams are {(self.up_m - self.down_m) * 1e3:.2f} mm apart in height: the tilt "
+                "needs beams further apart, the upper one first",
+                ("tilt of the tool",),
+            )
 
 
 class BeamError(RobocalError):

@@ -70,7 +70,6 @@ from robocal_ros.tool.session import (
     configuration,
     take_tool_message,
 )
-from robocal_ros.tool.touch_points import ParallelBeams
 
 PROGRAM, TRAJECTORY = "program", "trajectory"
 BY_TOUCHES = (TOUCH, SOLVE_TOUCHES, CLEAR_TOUCHES)
@@ -201,7 +200,6 @@ def parallel_station(settings: Mapping[str, Any]) -> ParallelStation | None:
         return None
     if len({*names, *settings["beams"]}) != 4:
         raise InputError(f"beams {settings['beams']} and parallel_beams {names}: two names each")
-    ParallelBeams(up, down)  # refuses them where they are too near each other
     return ParallelStation(up, down, x, (names[0], names[1]))
 
 

@@ -33,7 +33,6 @@ from robocal_ros.tool.touch_points import (
     SWEEPS,
     HandMeasured,
     Height,
-    ParallelBeams,
     fit_parallel,
     judge_tip,
     require_turn,
@@ -200,7 +199,7 @@ class SweepLog:
         station = self._config.parallel
         if station is None:
             raise ConflictError("there are no parallel beams")
-        fit = fit_parallel(ParallelBeams(station.up_m, station.down_m), station.x_m, edges)
+        fit = fit_parallel(station, edges)
         return fit.axis, np.zeros(3) if fit.tip is None else fit.tip
 
     def _upright(self, arm: SerialArm) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robocal_ros.estimation.assessment import Verdict, verdict_document
 from robocal_ros.estimation.estimation import Estimate, Problem, observability, solve
@@ -27,6 +27,7 @@ from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import JOINTS, JointStream, StandstillRule
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import Command, Outcome
+from robocal_ros.tool.edges import ParallelStation
 from robocal_ros.tool.judging import KnownTool, change_between
 from robocal_ros.tool.run import ToolConfig
 
@@ -161,88 +162,7 @@ def fit_seven(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
     )
 
 
-SMALLEST_HEIGHT_M = 2e-3
 LARGEST_LEAN_M = 3e-4  # between both beams after straightening
-
-
-@dataclass(frozen=True)
-class ParallelBeams:
-    """Heights of the upper and the lower beam in base, m."""
-
-    up_m: float
-    down_m: float
-
-    def __post_init__(self) -> None:
-        if self.up_m - self.down_m < SMALLEST_HEIGHT_M:
-            raise RankDeficientError(
-                f"the beams are {(self.up_m - self.down_m) * 1e3:.2f} mm apart in height: the tilt "
-                "needs beams further apart, the upper one first",
-                ("tilt of the tool",),
-            )
-
-
-def _middle(edges: ArrayLike, what: str) -> float:
-    places = np.asarray(edges, dtype=np.float64)
-    if places.shape != (2,) or not np.all(np.isfinite(places)):
-        raise InputError(f"{what} needs the places of its break and its restore, got {places}")
-    return float(places.mean())
-
-
-def sweep_axis(
-    beams: ParallelBeams,
-    up: ArrayLike,
-    down: ArrayLike,
-    turned_up: ArrayLike,
-    turned_down: ArrayLike,
-) -> Array:
-    """Unit tool axis (3,), flange to tip, flange frame.
-
-    ``up``, ``down`` (2,): flange x_b at break and restore of each beam; ``turned_*`` the same after
-    the turn by 90 deg. In m.
-    """
-    lean = _middle(up, "upper beam") - _middle(down, "lower beam")
-    turned = _middle(turned_up, "upper beam, turned") - _middle(turned_down, "lower beam, turned")
-    v = np.array([-lean, turned, beams.up_m - beams.down_m])
-    return np.asarray(v / np.linalg.norm(v))
-
-
-def parallel_tip(
-    beams: ParallelBeams,
-    x_beam_m: float,
-    T_straight: tuple[Array, Array],
-    x_straight: tuple[tuple[ArrayLike, ArrayLike], tuple[ArrayLike, ArrayLike]],
-    z_first_break_m: float,
-) -> Array:
-    """Tip (3,) in the flange frame, m, with the straightened tool.
-
-    Raises `ResidualError` when the re-sweep shows a tool that still leans; `RankDeficientError`
-    when both sweeps have one orientation.
-
-    ``x_beam_m``: place of both beams along x_b, m. ``T_straight``: two flange rotations (3, 3) with
-    the axis down, one turned by 90 deg about z. ``x_straight``: flange x_b at break and restore, of
-    the upper and the lower beam, at each of them. ``z_first_break_m``: flange height at the first
-    break of the upper beam, driving down: the tip is D = z - h_up below the flange (eq. 4-7).
-    """
-    rows, right = [np.array([0.0, 0.0, 1.0])], [beams.up_m - z_first_break_m]
-    frame = T_straight[0]
-    for R, (up, down) in zip(T_straight, x_straight, strict=True):
-        x_up, x_down = _middle(up, "upper beam"), _middle(down, "lower beam")
-        if abs(x_up - x_down) > LARGEST_LEAN_M:
-            raise ResidualError(
-                f"the straightened tool leans by {abs(x_up - x_down) * 1e3:.3f} mm between the "
-                f"beams (allowed {LARGEST_LEAN_M * 1e3:.1f} mm): straighten it again"
-            )
-        rows.append(np.array([1.0, 0.0, 0.0]) @ R @ frame.T)
-        right.append(x_beam_m - 0.5 * (x_up + x_down))
-    A = np.array(rows)
-    if np.linalg.cond(A) > 1e3:
-        raise RankDeficientError(
-            "both sweeps have one orientation: turn the flange by 90 deg about z in between",
-            ("place along the beams",),
-        )
-    return np.asarray(frame.T @ np.linalg.solve(A, np.array(right)))
-
-
 Height = Literal["up", "down"]
 FIRST = ("straight", "turned")
 AGAIN = ("upright", "upright_turned")
@@ -266,36 +186,54 @@ class ParallelFit:
     tip: Array | None
 
 
-def fit_parallel(beams: ParallelBeams, x_beam_m: float | None, edges: Edges) -> ParallelFit:
+def fit_parallel(station: ParallelStation, edges: Edges) -> ParallelFit:
     """Axis from the sweeps ``straight`` and ``turned``; the tip where it was straightened too.
+
+    ``edges``: flange poses T_base_flange (m, 4, 4) at the edges, by sweep and beam: break and
+    restore, or several of both; ``plunge`` of the upper beam has its first break.
 
     Raises `TooFewSamplesError` when a sweep is missing; `InputError` when edges are odd in number,
     the flange is turned otherwise than methods say, or the place of the beams is missing;
-    `ResidualError` or `RankDeficientError` as `parallel_tip`.
-
-    ``x_beam_m``: place of both beams along x_b, m; needed for the tip.
-    ``edges``: flange poses T_base_flange (m, 4, 4) at the edges, by sweep and beam: break and
-    restore, or several of both; ``plunge`` of the upper beam has its first break.
+    `ResidualError` when the re-sweep shows a tool that still leans; `RankDeficientError` when both
+    sweeps of the straightened tool have one orientation.
     """
     more = [name for name, _ in edges if name not in FIRST]
     _require(edges, [*FIRST, *AGAIN] if more else FIRST)
     for name in FIRST:
         require_turn(name, np.concatenate([edges[name, beam] for beam in HEIGHTS]))
-    axis = sweep_axis(beams, *(_across(edges, name, beam) for name in FIRST for beam in HEIGHTS))
-    if not more:
-        return ParallelFit(axis, None)
+    up, down, turned_up, turned_down = (
+        _middle(edges, name, beam) for name in FIRST for beam in HEIGHTS
+    )
+    v = np.array([-(up - down), turned_up - turned_down, station.up_m - station.down_m])
+    axis = np.asarray(v / np.linalg.norm(v))
+    return ParallelFit(axis, _tip(station, edges) if more else None)
+
+
+def _tip(station: ParallelStation, edges: Edges) -> Array:
+    """Tip (3,) of the straightened tool, which is D = z - h_up below the flange (eq. 4-7)."""
     if (PLUNGE, "up") not in edges:
         raise TooFewSamplesError("there is no plunge: drive the upright tool into the upper beam")
-    if x_beam_m is None:
+    if station.x_m is None:
         raise InputError("the tip needs the beams' place along the base's x: it is missing")
-    first, second = (edges[name, "up"][0, :3, :3] for name in AGAIN)
-    straight, turned = (
-        (_across(edges, name, "up"), _across(edges, name, "down")) for name in AGAIN
-    )
     z_m = float(edges[PLUNGE, "up"][:, 2, 3].mean())
-    return ParallelFit(
-        axis, parallel_tip(beams, x_beam_m, (first, second), (straight, turned), z_m)
-    )
+    rows, right = [np.array([0.0, 0.0, 1.0])], [station.up_m - z_m]
+    frame = edges[AGAIN[0], "up"][0, :3, :3]
+    for name in AGAIN:
+        x_up, x_down = (_middle(edges, name, beam) for beam in HEIGHTS)
+        if abs(x_up - x_down) > LARGEST_LEAN_M:
+            raise ResidualError(
+                f"the straightened tool leans by {abs(x_up - x_down) * 1e3:.3f} mm between the "
+                f"beams (allowed {LARGEST_LEAN_M * 1e3:.1f} mm): straighten it again"
+            )
+        rows.append(np.array([1.0, 0.0, 0.0]) @ edges[name, "up"][0, :3, :3] @ frame.T)
+        right.append(station.x_m - 0.5 * (x_up + x_down))
+    A = np.array(rows)
+    if np.linalg.cond(A) > 1e3:
+        raise RankDeficientError(
+            "both sweeps have one orientation: turn the flange by 90 deg about z in between",
+            ("place along the beams",),
+        )
+    return np.asarray(frame.T @ np.linalg.solve(A, np.array(right)))
 
 
 def _require(edges: Edges, names: Sequence[str]) -> None:
@@ -327,10 +265,10 @@ def require_turn(name: str, T_base_flange: Array) -> None:
         )
 
 
-def _across(edges: Edges, name: str, beam: Height) -> Array:
-    """(2,) flange x, base, m: lower and upper half of the edges, each with its mean."""
+def _middle(edges: Edges, name: str, beam: Height) -> float:
+    """Flange x, base, m: the mean of the lower and the upper half of the edges, of their means."""
     x = np.sort(edges[name, beam][:, 0, 3])
-    return np.asarray(x.reshape(2, -1).mean(axis=1))
+    return float(x.reshape(2, -1).mean(axis=1).mean())
 
 
 # ---- touches that the node records while the robot stands at each -------------------------------

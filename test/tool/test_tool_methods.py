@@ -13,14 +13,9 @@ from robocal_ros.ground.errors import (
     ResidualError,
     TooFewSamplesError,
 )
+from robocal_ros.tool.edges import ParallelStation
 from robocal_ros.tool.laser_frame import minimal_rotation
-from robocal_ros.tool.touch_points import (
-    ParallelBeams,
-    fit_four,
-    fit_seven,
-    parallel_tip,
-    sweep_axis,
-)
+from robocal_ros.tool.touch_points import Edges, fit_four, fit_parallel, fit_seven
 
 TIP = np.array([0.012, -0.034, 0.21])
 POINT = np.array([0.9, 0.2, 0.5])
@@ -115,47 +110,59 @@ def test_moves_that_give_no_axes_are_refused():
         fit_seven(turned)
 
 
-BEAMS = ParallelBeams(0.40, 0.36)
 X_BEAM = 0.8
+BEAMS = ParallelStation(0.40, 0.36, X_BEAM)
 R_FIRST = np.column_stack([[-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])  # y_e along y_b, z_e down
 R_TURNED = np.column_stack([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -1.0]])  # x_e along y_b
+QUARTER = frames.exp_rotation([0.0, 0.0, np.pi / 2.0])
 
 
-def sweep(tool: RoundTool, R: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Flange x_b at the edges of the upper and the lower beam."""
-    start = frames.transform(R, [X_BEAM - 0.03, 0.0, height])
+def sweep(name: str, tool: RoundTool, R: np.ndarray) -> Edges:
+    """Flange poses at the edges of the upper and the lower beam."""
+    start = frames.transform(R, [X_BEAM - 0.03, 0.0, 0.53])
     move = Sweep(start, np.array([0.06, 0.0, 0.0]), 1.0)
-    found = []
-    for h in (BEAMS.up_m, BEAMS.down_m):
+    found = {}
+    for at, h in (("up", BEAMS.up_m), ("down", BEAMS.down_m)):
         beam = TrueBeam(np.array([X_BEAM, -0.1, h]), np.array([X_BEAM, 0.1, h]))
         time, _ = crossings(beam, tool, move, move.window, 0.0, np.random.default_rng(0))
-        found.append(move(time)[:, 0, 3])
-    return found[0], found[1]
+        found[name, at] = move(time)
+    return found
 
 
 def test_parallel_beams_find_axis_and_tip():
     truth = bent(frames.transform(np.eye(3), [0.0, 0.0, 0.2]), [4e-3, -3e-3, 1e-3], [0.06, 0.04, 0])
     tool = RoundTool.cylinder(truth, 0.003)
-    up, down = sweep(tool, R_FIRST, 0.53)
-    turned_up, turned_down = sweep(tool, R_TURNED, 0.53)
-    v = sweep_axis(BEAMS, up, down, turned_up, turned_down)
+    first = sweep("straight", tool, R_FIRST) | sweep("turned", tool, R_TURNED)
+    v = fit_parallel(BEAMS, first).axis
     assert v == pytest.approx(truth[:3, 2], abs=1e-9)
     straight = minimal_rotation(R_FIRST @ v, [0.0, 0.0, -1.0]) @ R_FIRST
-    quarter = frames.exp_rotation([0.0, 0.0, np.pi / 2.0])
-    pair = (straight, quarter @ straight)
-    middles = tuple(sweep(tool, R, 0.53) for R in pair)
+    again = sweep("upright", tool, straight) | sweep("upright_turned", tool, QUARTER @ straight)
     z = BEAMS.up_m - (straight @ truth[:3, 3])[2]  # where the tip reaches the upper beam
-    tip = parallel_tip(BEAMS, X_BEAM, pair, middles, z)
+    plunge = {("plunge", "up"): frames.transform(straight, [X_BEAM, 0.0, z])[None]}
+    tip = fit_parallel(BEAMS, first | again | plunge).tip
     assert tip == pytest.approx(truth[:3, 3], abs=1e-8)
 
 
 def test_parallel_beams_refuse_what_they_cannot_tell():
-    edges = np.array([0.79, 0.81])
+    def swept(turned: np.ndarray, lean_m: float = 0.0) -> Edges:
+        """All sweeps of a tool that stands upright, or leans, when it was set so."""
+        found = {("plunge", "up"): frames.transform(R_FIRST, [X_BEAM, 0.0, 0.6])[None]}
+        for name, R, lean in (
+            ("straight", R_FIRST, 0.0), ("turned", R_TURNED, 0.0),
+            ("upright", R_FIRST, lean_m), ("upright_turned", turned, lean_m),
+        ):  # fmt: skip
+            for beam, off in (("up", 0.0), ("down", lean)):
+                places = np.array([[x + off, 0.0, 0.5] for x in (0.79, 0.81)])
+                found[name, beam] = frames.transform(R, places)
+        return found
+
     with pytest.raises(RankDeficientError, match=r"beams are 1\.00 mm apart in height"):
-        ParallelBeams(0.401, 0.4)
-    with pytest.raises(InputError, match="lower beam needs the places of its break"):
-        sweep_axis(BEAMS, edges, edges[:1], edges, edges)
+        ParallelStation(0.401, 0.4, X_BEAM)
+    lacking = swept(R_TURNED)
+    lacking["straight", "down"] = lacking["straight", "down"][:1]
+    with pytest.raises(InputError, match="beam down: 1 edges; each pass of the tool has a break"):
+        fit_parallel(BEAMS, lacking)
     with pytest.raises(ResidualError, match=r"leans by 1\.000 mm"):
-        parallel_tip(BEAMS, X_BEAM, (R_FIRST, R_TURNED), ((edges, edges + 1e-3),) * 2, 0.6)
+        fit_parallel(BEAMS, swept(R_TURNED, 1e-3))
     with pytest.raises(RankDeficientError, match="turn the flange by 90 deg"):
-        parallel_tip(BEAMS, X_BEAM, (R_FIRST, R_FIRST), ((edges, edges),) * 2, 0.6)
+        fit_parallel(BEAMS, swept(R_FIRST))
