@@ -522,7 +522,7 @@ def run_screen(args: argparse.Namespace) -> CliResult:
     }
     if args.best_subset:
         best = best_subset(history, args.wanted)
-        left = history.residual([history.names.index(name) for name in best.names])
+        left = history.residual(history.columns(best.names))
         share = share_within(left, limit)
         document["best_subset"] = {"names": list(best.names), "cp": best.cp, "share": share}
     if args.plot is not None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What drift to expect of one robot, learned from cycles that it has measured."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain, combinations, islice
 from typing import TYPE_CHECKING, Literal
 
@@ -76,6 +76,10 @@ class DriftHistory:
             np.array([np.concatenate([told[i][spot] for spot in other]) for i in complete]),
             _rows(spots, other),
         )
+
+    def columns(self, names: Sequence[str]) -> tuple[int, ...]:
+        """Of some parameters."""
+        return tuple(self.names.index(name) for name in names)
 
     def residual(self, chosen: Sequence[int]) -> Array:
         """What is left (t, 3c) at the check points with some parameters (columns) identified."""
@@ -198,7 +202,8 @@ class Round:
     not determine them. ``undetermined``: the directions that the poses leave open, in words.
     ``stationary``: the set S, in the order of ``names``. ``candidates``: those of which one is
     removed: S; all, if S is empty; where a direction is open those in it, because their series mean
-    nothing. ``removed``: the one that is; None in the last round.
+    nothing. ``size``: of each candidate's drift, in units of its sigma. ``removed``: the one that
+    is; None in the last round.
     """
 
     names: tuple[str, ...]
@@ -206,7 +211,25 @@ class Round:
     undetermined: tuple[str, ...]
     stationary: tuple[str, ...]
     candidates: tuple[str, ...]
-    removed: str | None
+    size: Mapping[str, float]
+    removed: str | None = None
+
+    @classmethod
+    def of(
+        cls, history: DriftHistory, names: tuple[str, ...], test: Test, threshold_m: float
+    ) -> "Round":
+        """The round of these parameters, before one is removed."""
+        left = history.columns(names)
+        if inside := entangled(history.rows, left):
+            words = open_directions(history.rows, left, history.names)
+            loose = tuple(history.names[column] for column in inside)
+            return cls(names, None, words, (), loose, dict.fromkeys(loose, 0.0))
+        found = subset_drift(history.displacement, history.rows, left, history.names)
+        tests = stationarity(found.drift)
+        passed = tests.by_count if test == "autocorrelation" else tests.by_ljung_box
+        still = tuple(name for name, calm in zip(names, passed, strict=True) if calm)
+        size = dict(zip(names, found.size.tolist(), strict=True))
+        return cls(names, _share(history, names, threshold_m), (), still, still or names, size)
 
     @property
     def note(self) -> str:
@@ -220,9 +243,6 @@ class Round:
 class Screening:
     """All rounds, from all parameters to the wanted number."""
 
-    removal: Removal
-    test: Test
-    threshold_m: float
     uncompensated: float
     rounds: tuple[Round, ...]
 
@@ -278,87 +298,36 @@ def screen(
             f"{len(history.rows) // 3} poses give {len(history.rows)} equations for "
             f"{len(history.names)} parameters: screening starts from all of them, so measure more"
         )
-    rounds = []
-    left = tuple(range(len(history.names)))
-    while True:
-        state = _State.of(history, left, test, threshold_m)
-        if len(left) == wanted:
-            rounds.append(state.round(history.names, None))
-            break
-        gone = _removed(history, state, removal, threshold_m)
-        rounds.append(state.round(history.names, gone))
-        left = tuple(column for column in left if column != gone)
+    rounds, names = [], history.names
+    while len(names) > wanted:
+        found = Round.of(history, names, test, threshold_m)
+        gone = _removed(history, found, removal, threshold_m)
+        rounds.append(replace(found, removed=gone))
+        names = tuple(name for name in names if name != gone)
+    rounds.append(Round.of(history, names, test, threshold_m))
     uncompensated = share_within(history.check, threshold_m)
-    return Screening(removal, test, threshold_m, uncompensated, tuple(rounds))
+    return Screening(uncompensated, tuple(rounds))
 
 
-@dataclass(frozen=True)
-class _State:
-    """A round before its removal; parameters by their columns."""
-
-    left: tuple[int, ...]
-    share: float | None
-    undetermined: tuple[str, ...]
-    stationary: tuple[int, ...]
-    candidates: tuple[int, ...]
-    size: dict[int, float]  # of each candidate's drift, in units of its sigma
-
-    @classmethod
-    def of(
-        cls, history: DriftHistory, left: tuple[int, ...], test: Test, threshold_m: float
-    ) -> "_State":
-        open_ones = entangled(history.rows, left)
-        if open_ones:
-            words = open_directions(history.rows, left, history.names)
-            return cls(left, None, words, (), open_ones, dict.fromkeys(open_ones, 0.0))
-        found = subset_drift(history.displacement, history.rows, left, history.names)
-        tests = stationarity(found.drift)
-        passed = tests.by_count if test == "autocorrelation" else tests.by_ljung_box
-        still = tuple(column for column, calm in zip(left, passed, strict=True) if calm)
-        return cls(
-            left=left,
-            share=_share(history, left, threshold_m),
-            undetermined=(),
-            stationary=still,
-            candidates=still or left,
-            size=dict(zip(left, found.size.tolist(), strict=True)),
-        )
-
-    def round(self, names: tuple[str, ...], removed: int | None) -> Round:
-        def named(columns: tuple[int, ...]) -> tuple[str, ...]:
-            return tuple(names[column] for column in columns)
-
-        return Round(
-            names=named(self.left),
-            share=self.share,
-            undetermined=self.undetermined,
-            stationary=named(self.stationary),
-            candidates=named(self.candidates),
-            removed=None if removed is None else names[removed],
-        )
-
-
-def _removed(history: DriftHistory, state: _State, removal: Removal, threshold_m: float) -> int:
-    """The candidate to remove."""
-
-    def after(column: int) -> float:
-        rest = tuple(c for c in state.left if c != column)
+def _removed(history: DriftHistory, found: Round, removal: Removal, threshold_m: float) -> str:
+    def after(gone: str) -> float:
+        rest = tuple(name for name in found.names if name != gone)
         return _order(_share(history, rest, threshold_m))
 
     if removal == "best":
-        return max(state.candidates, key=lambda column: (after(column), -state.size[column]))
-    shares: dict[int, float] = {}
-    for column in sorted(state.candidates, key=lambda c: _classic_place(history.names[c])):
-        shares[column] = after(column)
-        if shares[column] >= _order(state.share):
-            return column
-    return max(shares, key=lambda column: shares[column])
+        return max(found.candidates, key=lambda name: (after(name), -found.size[name]))
+    shares: dict[str, float] = {}
+    for name in sorted(found.candidates, key=_classic_place):
+        shares[name] = after(name)
+        if shares[name] >= _order(found.share):
+            return name
+    return max(shares, key=lambda name: shares[name])
 
 
-def _share(history: DriftHistory, chosen: tuple[int, ...], threshold_m: float) -> float | None:
+def _share(history: DriftHistory, names: tuple[str, ...], threshold_m: float) -> float | None:
     """Lambda of a subset; None where the poses do not determine it."""
     try:
-        return share_within(history.residual(chosen), threshold_m)
+        return share_within(history.residual(history.columns(names)), threshold_m)
     except RankDeficientError:
         return None
 
