@@ -97,9 +97,9 @@ class LearnedProcess:
     sigma_m: float
     gains: HeatGains | None = None
 
-    def tracker(self, spots: ColdSpots, time_s: float = 0.0) -> DriftTracker:
-        """Start a tracker at a cold visit."""
-        return DriftTracker(spots, self.process, self.sigma_m, time_s, self.gains)
+    def tracker(self, spots: ColdSpots) -> DriftTracker:
+        """Start a tracker at a cold visit, from which its time counts."""
+        return DriftTracker(spots, self.process, self.sigma_m, self.gains)
 
 
 def visit_noise(shifts: Sequence[EarlierShift]) -> float:

@@ -291,7 +291,7 @@ class FlangeSensorIdentification:
 
 
 def identify_flange_sensor(
-    arm: SerialArm, data: Measurements, *, geometry: bool = True, robust: bool = True
+    arm: SerialArm, data: Measurements, *, geometry: bool = True
 ) -> FlangeSensorIdentification:
     """Solve hand-eye pose and centres, and with ``geometry`` all model parameters.
 
@@ -307,13 +307,8 @@ def identify_flange_sensor(
         if variance is not None:
             prior = np.zeros((len(problem.names),) * 2)
             prior[: len(variance), : len(variance)] = np.diag(1.0 / variance)
-        return estimation.solve(
-            problem,
-            state,
-            prior_information=prior,
-            noise_known=data.sigma is not None,
-            robust=robust,
-        )
+        given = data.sigma is not None
+        return estimation.solve(problem, state, prior_information=prior, noise_known=given)
 
     if geometry:
         count = problem.count

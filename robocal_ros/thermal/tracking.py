@@ -41,8 +41,8 @@ class DriftProcess:
 
     ``covariance`` (k, k): of the parameters' steady state, SI.
     ``approach_s``, ``steady_s``: time constants; the first one is the shorter.
-    ``setup_sigma_m``, ``setup_approach_s``: standard deviation of the steady state of each of the
-    set-up's six coordinates, and how fast they approach it.
+    ``setup_sigma_m``: standard deviation of the steady state of each of the set-up's six
+    coordinates, which they approach within `SETUP_APPROACH_S`.
 
     Raises `InputError` when the steady state is forgotten before it is approached.
     """
@@ -51,12 +51,11 @@ class DriftProcess:
     approach_s: float = APPROACH_S
     steady_s: float = STEADY_TIME_S
     setup_sigma_m: float = SETUP_SIGMA_M
-    setup_approach_s: float = SETUP_APPROACH_S
 
     def __post_init__(self) -> None:
-        if not 0.0 < max(self.approach_s, self.setup_approach_s) < self.steady_s:
+        if not 0.0 < max(self.approach_s, SETUP_APPROACH_S) < self.steady_s:
             raise InputError(
-                f"approach within {self.approach_s:g} s (set-up: {self.setup_approach_s:g} s) must "
+                f"approach within {self.approach_s:g} s (set-up: {SETUP_APPROACH_S:g} s) must "
                 f"be shorter than the {self.steady_s:g} s after which the steady state is forgotten"
             )
 
@@ -97,9 +96,9 @@ class Heat:
     lag_s: float
 
     @classmethod
-    def cold(cls, n: int, time_s: float, lag_s: float) -> "Heat":
-        """At the cold visit."""
-        return cls(time_s, np.zeros(n), np.zeros(n), lag_s)
+    def cold(cls, n: int, lag_s: float) -> "Heat":
+        """At the cold visit, at time 0."""
+        return cls(0.0, np.zeros(n), np.zeros(n), lag_s)
 
     def read(self, temperature: Array, time_s: float) -> "Heat":
         """After a reading (n,), the course since the last one taken as straight.
@@ -222,7 +221,7 @@ class DriftTracker:
     ``sigma_m``: standard deviation of one coordinate of one visit (repeatability and sensor), of
     the cold visits and of warm ones that bring no covariance of their own.
     ``gains``: of the motors' temperatures, which ``read_temperatures`` then brings; the process is
-    what they leave. The cold visit is at ``time_s``.
+    what they leave. The cold visit is at time 0.
     """
 
     def __init__(
@@ -230,13 +229,12 @@ class DriftTracker:
         spots: ColdSpots,
         process: DriftProcess,
         sigma_m: float,
-        time_s: float = 0.0,
         gains: HeatGains | None = None,
     ) -> None:
         self.spots, self.process, self.sigma_m = spots, process, sigma_m
         arm, self.count = spots.cell.arm, len(process.covariance)
         self._joint = joints_of(arm)
-        self.heat = None if gains is None else Heat.cold(arm.n, time_s, gains.lag_s)
+        self.heat = None if gains is None else Heat.cold(arm.n, gains.lag_s)
         k, cold = self.count, 3 * len(spots.visits)
         learned = 0 if gains is None else SOURCES * k
         self._gains = slice(2 * k, 2 * k + learned)
@@ -251,7 +249,7 @@ class DriftTracker:
         covariance[own, own] = np.repeat(sigma_m**2 / spots.visits, 3)
         own = np.arange(self._setup + SETUP, size)
         covariance[own, own] = process.setup_sigma_m**2
-        self.state = DriftState(time_s, mean, covariance)
+        self.state = DriftState(0.0, mean, covariance)
 
     @property
     def gains(self) -> HeatGains | None:
@@ -292,7 +290,7 @@ class DriftTracker:
             (slice(2 * k), process.transition(step), process.covariance),
             (
                 setup,
-                process.transition(step, process.setup_approach_s),
+                process.transition(step, SETUP_APPROACH_S),
                 process.setup_sigma_m**2 * np.eye(SETUP),
             ),
         ):

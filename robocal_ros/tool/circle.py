@@ -9,7 +9,7 @@ to R follow from times: R itself is the commanded one, or that of the flange as 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ CircleMethod = Literal["best", "classic"]
 
 THICKEST = 0.7  # tool's radius on the circle's
 DEEPEST = 0.999  # of R: an edge where the circle hardly crosses the beam
-EDGE_SCATTER_M = RobotNoise().edge_m  # of a robot that repeats well
+EDGE_SCATTER_M = RobotNoise.edge_m  # of a robot that repeats well
 PLACES = 200  # of the flange along a circle
 SHORTEST_ARC_RAD = float(np.pi)
 SAME_TURN_RAD = 1e-3  # orientations that differ by less are one: a robot repeats far better
@@ -119,12 +119,11 @@ def label_edges(
 
 @dataclass(frozen=True)
 class CircleState:
-    """Unknowns of a circle: d_x, d_y, rho_x, rho_y (m), latency and period (s)."""
+    """Unknowns of a circle: d_x, d_y, rho_x, rho_y (m) and latency (s)."""
 
     d: Array
     rho: Array
     latency_s: float
-    period_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,14 +133,12 @@ class CircleProblem:
     motion: CircleMotion
     edges: CircleEdges
     latency_free: bool = True
-    period_free: bool = False
     scale_components: int = field(default=1, init=False)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the unknowns."""
-        free = ("latency",) * self.latency_free + ("period",) * self.period_free
-        return ("d_x", "d_y", "rho_x", "rho_y", *free)
+        return ("d_x", "d_y", "rho_x", "rho_y") + ("latency",) * self.latency_free
 
     def deviation(self, state: CircleState) -> Array:
         """No prior."""
@@ -149,10 +146,8 @@ class CircleProblem:
 
     def retract(self, state: CircleState, step: Array) -> CircleState:
         """Add the increment."""
-        rest = list(step[4:])
-        latency = state.latency_s + (rest.pop(0) if self.latency_free else 0.0)
-        period = state.period_s + (rest.pop(0) if self.period_free else 0.0)
-        return CircleState(state.d + step[:2], state.rho + step[2:4], latency, period)
+        latency = state.latency_s + (step[4] if self.latency_free else 0.0)
+        return CircleState(state.d + step[:2], state.rho + step[2:4], latency)
 
     def sine(self, state: CircleState) -> Array:
         """Of psi (m,) at each edge: the axis passes the beam at speed times the cosine."""
@@ -162,25 +157,22 @@ class CircleProblem:
 
     def linearise(self, state: CircleState) -> tuple[Array, Array]:
         """Residual (m, 1) and Jacobian (m, 1, k)."""
-        e, R = self.edges, self.motion.radius_m
-        motion = replace(self.motion, period_s=state.period_s)
+        e, motion = self.edges, self.motion
         beam_rate = np.array([motion.psi_rate(b) for b in (0, 1)])[e.beam]
         w = self.sine(state)
         turn = e.rising * beam_rate  # +1: psi = asin w, -1: psi = pi - asin w
         psi = np.where(turn > 0.0, np.arcsin(w), np.pi - np.arcsin(w))
         theta = np.where(e.beam == 0, psi, motion.beam_angle_rad - psi)
         time = (theta - motion.start_rad) / motion.rate_rad_s + state.latency_s
-        turns = np.round((e.time_s - time) / state.period_s)
-        time = time + turns * state.period_s
+        turns = np.round((e.time_s - time) / motion.period_s)
+        time = time + turns * motion.period_s
         by_w = e.rising / (abs(motion.rate_rad_s) * np.sqrt(1.0 - w**2))
-        J = np.zeros((len(time), 6))
+        J = np.ones((len(time), len(self.names)), order="F")  # by the latency
+        J[:, :4] = 0.0
         rows = np.arange(len(time))
-        J[rows, e.beam] = -by_w / R
-        J[rows, 2 + e.beam] = e.side * by_w / R
-        J[:, 4] = 1.0
-        J[:, 5] = (time - state.latency_s) / state.period_s
-        used = [0, 1, 2, 3, *([4] * self.latency_free), *([5] * self.period_free)]
-        whitened = J[:, used] / e.sigma_s[:, None]
+        J[rows, e.beam] = -by_w / motion.radius_m
+        J[rows, 2 + e.beam] = e.side * by_w / motion.radius_m
+        whitened = J / e.sigma_s[:, None]
         return ((time - e.time_s) / e.sigma_s)[:, None], whitened[:, None, :]
 
 
@@ -191,8 +183,8 @@ class CircleFit:
     ``centre`` (2,): place of the tool's axis in the beam plane, laser frame, when the flange is at
     the circle's centre, m. ``covariance`` (2, 2): of it, m^2; None for the classic method, which
     has no noise model. ``d``, ``rho``: (2,) distances from the x- and the y-beam, and the tool's
-    radius seen by each, m; the classic method does not see the radius (None). ``latency_s``,
-    ``period_s``: as estimated, or as given. ``misfit_m``: rms of the residuals along the circle, m.
+    radius seen by each, m; the classic method does not see the radius (None). ``latency_s``:
+    as estimated, or as given. ``misfit_m``: rms of the residuals along the circle, m.
     """
 
     method: CircleMethod
@@ -202,7 +194,6 @@ class CircleFit:
     rho: Array | None
     latency_s: float
     latency_sigma_s: float | None
-    period_s: float
     misfit_m: float
     estimate: Estimate[CircleState] | None = None
 
@@ -213,16 +204,13 @@ def fit_circle(
     method: CircleMethod = "best",
     *,
     latency_s: float | None = None,
-    period_free: bool = False,
-    edge_m: float = EDGE_SCATTER_M,
 ) -> CircleFit:
     """Find the tool's axis from one circle at constant speed.
 
-    ``best``: closed form from all edges, then maximum likelihood over the centre, the radii, the
-    phase (latency) and, where free, the period. ``classic``: mid-times (thesis eq. 4-8, 4-9).
-    ``latency_s`` fixes the latency; ``edge_m`` is the robot's scatter at an edge, m, beside which
-    a misfit is judged (chi-square). The covariance is that of the stamps alone, and wider where
-    they do not explain the misfit.
+    ``best``: closed form from all edges, then maximum likelihood over the centre, the radii and the
+    phase (latency). ``classic``: mid-times (thesis eq. 4-8, 4-9). ``latency_s`` fixes the latency.
+    A misfit is judged (chi-square) beside the scatter of a robot that repeats well. The covariance
+    is that of the stamps alone, and wider where they do not explain the misfit.
 
     Raises `BeamError` when edges are missing, doubled or out of order; `ResidualError` when no
     circle at constant speed explains the edges.
@@ -232,23 +220,23 @@ def fit_circle(
     if method == "classic":
         d = classic_distances(motion, labelled)
         centre = motion.centre(d)
-        return CircleFit(method, centre, None, d, None, latency, None, motion.period_s, 0.0)
+        return CircleFit(method, centre, None, d, None, latency, None, 0.0)
     if np.any(rho > THICKEST * motion.radius_m):
         raise BeamError(
             f"the shadows last for most of the turn (radius {rho.max() * 1e3:.2f} mm on a circle "
             f"of {motion.radius_m * 1e3:.2f} mm): check the input's polarity; for a tool so thick "
             "enlarge the circle"
         )
-    problem = CircleProblem(motion, labelled, latency_s is None, period_free)
-    start = CircleState(d, rho, latency if latency_s is None else latency_s, motion.period_s)
+    problem = CircleProblem(motion, labelled, latency_s is None)
+    start = CircleState(d, rho, latency if latency_s is None else latency_s)
     found = solve(problem, start, robust=False)
     state, spread = found.state, found.covariance
-    speed = 2.0 * np.pi * motion.radius_m / state.period_s
+    speed = 2.0 * np.pi * motion.radius_m / motion.period_s
     late = found.residual[:, 0] * labelled.sigma_s
     misfit = float(speed * np.sqrt(np.mean(late**2)))
     bound = chi2_quantile(SOUND_FIT, len(late) - len(found.names))
     passing = speed * np.sqrt(1.0 - problem.sine(state) ** 2)
-    variance = labelled.sigma_s**2 + (edge_m / passing) ** 2
+    variance = labelled.sigma_s**2 + (EDGE_SCATTER_M / passing) ** 2
     unexplained = float(np.sum(late**2 / variance)) > bound
     if unexplained or misfit > LARGEST_MISFIT_M or not found.converged:
         explained = speed * float(np.sqrt(bound / len(late) * variance.mean()))
@@ -267,7 +255,6 @@ def fit_circle(
         rho=state.rho,
         latency_s=state.latency_s,
         latency_sigma_s=float(np.sqrt(spread[4, 4])) if latency_s is None else None,
-        period_s=state.period_s,
         misfit_m=misfit,
         estimate=found,
     )

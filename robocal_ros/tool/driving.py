@@ -159,12 +159,6 @@ def measuring(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPla
     return plan
 
 
-def turn_s(step: PlannedStep, limits: MotionLimits) -> tuple[float, float]:
-    """Begin and end of a circle's turn at constant speed, s from the start of its plan."""
-    ride = _turn(step, limits)
-    return ride.ramp_s, ride.ramp_s + ride.cruise_s
-
-
 def _joints(cell: MotionCell, q_now: ArrayLike) -> Array:
     q = np.array(q_now, dtype=np.float64)
     if q.shape != (cell.arm.n,):

@@ -13,7 +13,7 @@ from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.ground.files import quoted
 from robocal_ros.ground.frames import Array, Document, urdf_joint, urdf_origin
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.robots import read_fields
+from robocal_ros.kinematics.robots import QUATERNION_TOLERANCE, read_fields
 from robocal_ros.kinematics.tables import (
     ORIENTATIONS,
     Cells,
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
         ToolFrameDocument,
         TouchedToolDocument,
     )
-
-QUATERNION_TOLERANCE = 1e-3
 
 
 def read_tool(path: Path, rotation: Array | None = None) -> Array:

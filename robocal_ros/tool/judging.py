@@ -367,14 +367,14 @@ class StationFinding:
     """What a mandrel says of the station.
 
     ``shift`` (3,): of the beams' crossing since the commissioning, base, m; ``covariance`` (3, 3).
+    ``change``: of the mandrel, as these beams see it.
     ``verdict``: ACCEPT: it stands. STATION_MOVED: it does not. TOO_FEW_SAMPLES: cannot be told.
     WRONG_TOOL: the mandrel itself has tilted, which no knock of the station makes of it.
     """
 
     shift: Array
     covariance: Array
-    tip_m: float
-    axis_rad: float
+    change: ToolChange
     verdict: Verdict
 
     def document(self) -> dict[str, Any]:
@@ -382,7 +382,7 @@ class StationFinding:
         return {
             "station_shift_mm": (self.shift * 1e3).tolist(),
             "sigma_mm": (np.sqrt(np.diag(self.covariance)) * 1e3).tolist(),
-            "change": {"tip_mm": self.tip_m * 1e3, "axis_deg": float(np.degrees(self.axis_rad))},
+            "change": self.change.document(),
             "verdict": verdict_document(self.verdict),
         }
 
@@ -421,7 +421,7 @@ def station_finding(
         )
     else:
         verdict = Verdict(Code.TOO_FEW_SAMPLES, f"{what}: too near the noise; measure it again")
-    return StationFinding(shift, covariance, change.tip_m, change.axis_rad, verdict)
+    return StationFinding(shift, covariance, change, verdict)
 
 
 def with_mandrel(

@@ -82,11 +82,6 @@ class LaserFrame:
         return np.asarray(along / np.linalg.norm(along, axis=1)[:, None])
 
     @cached_property
-    def length_m(self) -> Array:
-        """(2,) distance of the two points of each beam, m."""
-        return np.asarray(np.linalg.norm(self.points[[1, 3]] - self.points[[0, 2]], axis=1))
-
-    @cached_property
     def beam_angle_rad(self) -> float:
         """Angle beta from the x- to the y-beam about z; between 0 and pi, as z is their normal."""
         ux, uy = self.direction
@@ -248,13 +243,11 @@ class JointPath:
 
     ``arm``: the model in force, so that the thermal drift is in the poses. ``time_s`` (n,): stamps
     of the readings, in increasing order. ``q`` (n, joints): readings, rad (prismatic: m).
-    ``longest_gap_s``: longest pause between two readings around an edge.
     """
 
     arm: SerialArm
     time_s: Array
     q: Array
-    longest_gap_s: float = LONGEST_GAP_S
 
     def __post_init__(self) -> None:
         if len(self.time_s) < FEWEST_READINGS:
@@ -289,10 +282,10 @@ class JointPath:
             )
         gap = self.time_s[after] - self.time_s[after - 1]
         worst = int(np.argmax(gap))
-        if gap[worst] > self.longest_gap_s:
+        if gap[worst] > LONGEST_GAP_S:
             raise InputError(
                 f"joint readings pause for {gap[worst] * 1e3:.0f} ms around the edge at "
-                f"{time_s[worst]:.4f} s (allowed {self.longest_gap_s * 1e3:.0f} ms): raise the "
+                f"{time_s[worst]:.4f} s (allowed {LONGEST_GAP_S * 1e3:.0f} ms): raise the "
                 "rate of joint_states"
             )
         q, rate = self._spline(time_s), self._spline(time_s, 1)

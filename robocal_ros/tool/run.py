@@ -79,11 +79,6 @@ class MeasuringMotion:
             if not 0.0 < value < np.inf:
                 raise InputError(f"{name} = {value}: must be positive")
 
-    @property
-    def period_s(self) -> float:
-        """Of a turn."""
-        return 2.0 * np.pi * self.radius_m / self.speed_m_s
-
 
 @dataclass(frozen=True, eq=False)
 class PlannedStep:

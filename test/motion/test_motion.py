@@ -25,13 +25,19 @@ from robocal_ros.cell_sim.beams import beams_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, LimitError
 from robocal_ros.kinematics.arm import inverse
-from robocal_ros.motion.plan import MotionLimits, Ride
-from robocal_ros.tool.driving import approach, measuring, start_pose, turn_s
+from robocal_ros.motion.plan import MotionLimits, Ride, ramp_of
+from robocal_ros.tool.driving import approach, measuring, start_pose
 from robocal_ros.tool.laser_frame import LaserFrame
-from robocal_ros.tool.run import MeasuringPlan
+from robocal_ros.tool.run import MeasuringPlan, PlannedStep
 
 ROBOTS = pytest.mark.parametrize("robot", POSTURES)
 MICROMETRE = 1e-6
+
+
+def turn_s(step: PlannedStep, limits: MotionLimits) -> tuple[float, float]:
+    """Begin and end of a circle's turn at constant speed, s from the start of its plan."""
+    begin = ramp_of(step.speed_m_s, limits.tcp_acceleration_m_s2)
+    return begin, begin + 2.0 * np.pi * step.radius_m / step.speed_m_s
 
 
 def started(cell, step, robot):

@@ -188,7 +188,7 @@ def lagged(motor: np.ndarray, lag_s: float, parts: int = 500) -> np.ndarray:
 
 def test_lagged_temperatures_follow_the_straight_course_between_readings():
     motor = 20.0 * np.random.default_rng(6).uniform(size=(5, 6))
-    heat = Heat.cold(6, 0.0, 1200.0)
+    heat = Heat.cold(6, 1200.0)
     for i, (row, expected) in enumerate(zip(motor, lagged(motor, 1200.0), strict=True)):
         heat = heat.read(row, PERIOD_S * (i + 1))
         # midpoint steps of 0.6 s: (0.6/1200)^2 / 24 of 20 K and less
@@ -297,7 +297,7 @@ def test_links_that_lag_stay_within_the_bound_while_motors_are_silent(arm, silen
     process = DriftProcess(1e-18 * np.eye(k))
     tracker = DriftTracker(spots, process, SIGMA, gains=gains)
     joint = joints_of(arm)
-    warm = Heat.cold(n, 0.0, 3600.0)
+    warm = Heat.cold(n, 3600.0)
     for time_s in np.arange(PERIOD_S, 7200.0 + PERIOD_S, PERIOD_S):
         warm = warm.read(np.full(n, 15.0), time_s)
         tracker.read_temperatures(warm.motor, time_s)
