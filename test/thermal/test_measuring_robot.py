@@ -5,15 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shift import (
-    NOISE_M,
-    T_FLANGE_SENSOR,
-    DriftingRobot,
-    MeasuringShift,
-    built,
-    looking,
-    warmed,
-)
+from shift import NOISE_M, T_FLANGE_SENSOR, DriftingRobot, MeasuringShift, built, looking, warmed
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from drift_cell import postures
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
@@ -90,12 +91,6 @@ NAMES = ARM.parameters.names
 LAST = {"d6_mm", "theta6_deg", "a6_mm", "alpha6_deg"}
 TRUE = ("a2_mm", "d4_mm", "beta2_deg")
 CYCLES, SIGMA = 90, 2e-5
-
-
-def postures(count: int, seed: int = 0) -> np.ndarray:
-    middle = np.radians([5.0, -70.0, 115.0, 0.0, -60.0, 0.0])
-    reach = np.radians([8.0, 10.0, 12.0, 120.0, 50.0, 150.0])
-    return middle + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 6))
 
 
 def columns(names) -> tuple[int, ...]:

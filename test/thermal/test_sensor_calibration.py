@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from drift_cell import postures
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
@@ -13,13 +14,6 @@ from robocal_ros.thermal.cell_setup import calibrate_sensor, place_sensor
 
 SIGMA = 2e-5
 T_SENSOR_BASE, BALL = kr150.T_SENSOR_BASE, kr150.BALL
-
-
-def poses(count: int, seed: int = 0) -> np.ndarray:
-    """Postures that turn every joint, near one place."""
-    middle = np.radians([5.0, -70.0, 115.0, 0.0, -60.0, 0.0])
-    reach = np.radians([8.0, 10.0, 12.0, 120.0, 50.0, 150.0])
-    return middle + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 6))
 
 
 def visit(arm: SerialArm, q: np.ndarray, rng: np.random.Generator | None = None) -> Measurements:
@@ -35,7 +29,7 @@ def visit(arm: SerialArm, q: np.ndarray, rng: np.random.Generator | None = None)
 
 @pytest.mark.parametrize("method", ["ml", "classic"])
 def test_without_noise_both_are_exact(arm, method):
-    found = calibrate_sensor(arm, visit(arm, poses(9)), method)
+    found = calibrate_sensor(arm, visit(arm, postures(9)), method)
     assert found.T_sensor_base == pytest.approx(T_SENSOR_BASE, abs=1e-8)
     assert found.sphere_in_flange == pytest.approx(BALL, abs=1e-8)
     assert found.left_out.max() < 1e-8
@@ -43,7 +37,7 @@ def test_without_noise_both_are_exact(arm, method):
 
 def errors(arm: SerialArm, method: str, count: int) -> np.ndarray:
     """Errors (count, 9) in the order of the covariance, the first of them of the same visits."""
-    q, rows = poses(9), []
+    q, rows = postures(9), []
     for seed in range(count):
         cell, _, _ = place_sensor(arm, visit(arm, q, np.random.default_rng(seed)), method)
         turn = frames.log_rotation(cell.T_frame_base[:3, :3] @ T_SENSOR_BASE[:3, :3].T)
@@ -58,7 +52,7 @@ def test_error_reaches_the_bound_and_the_covariance_is_true(arm):
     The classic method is no better.
     """
     error = errors(arm, "ml", 300)
-    bound = calibrate_sensor(arm, visit(arm, poses(9)), "ml").covariance
+    bound = calibrate_sensor(arm, visit(arm, postures(9)), "ml").covariance
     ratio = np.sqrt(np.mean(error**2, axis=0) / np.diag(bound))
     # A standard deviation from 300 runs scatters by 4 %; the robust method rejects 1 % of visits.
     assert ratio.max() < 1.0 + 4.0 / np.sqrt(600.0)
@@ -71,7 +65,7 @@ def test_error_reaches_the_bound_and_the_covariance_is_true(arm):
 
 
 def test_moving_the_sensor_moves_the_answer(arm):
-    data = visit(arm, poses(9), np.random.default_rng(1))
+    data = visit(arm, postures(9), np.random.default_rng(1))
     found = calibrate_sensor(arm, data)
     move = frames.transform(frames.exp_rotation([0.3, -1.0, 0.7]), [1.0, 2.0, -0.5])
     moved = calibrate_sensor(
@@ -89,7 +83,7 @@ def test_moving_the_sensor_moves_the_answer(arm):
 
 
 def test_a_wrong_sample_is_named_and_does_no_harm(arm):
-    data = visit(arm, poses(12), np.random.default_rng(2))
+    data = visit(arm, postures(12), np.random.default_rng(2))
     data.position[4, 1] += 1e-3
     found = calibrate_sensor(arm, data)
     assert found.rejected == ("4",)
@@ -98,7 +92,7 @@ def test_a_wrong_sample_is_named_and_does_no_harm(arm):
 
 @pytest.mark.parametrize("method", ["ml", "classic"])
 def test_turns_about_one_axis_are_refused(arm, method):
-    q = np.tile(poses(1), (9, 1))
+    q = np.tile(postures(1), (9, 1))
     q[:, 5] += np.linspace(-2.0, 2.0, 9)
     with pytest.raises(RankDeficientError, match="second axis"):
         calibrate_sensor(arm, visit(arm, q), method)
@@ -106,4 +100,4 @@ def test_turns_about_one_axis_are_refused(arm, method):
 
 def test_four_poses_are_too_few(arm):
     with pytest.raises(TooFewSamplesError, match="4 poses"):
-        calibrate_sensor(arm, visit(arm, poses(4)))
+        calibrate_sensor(arm, visit(arm, postures(4)))

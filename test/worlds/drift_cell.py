@@ -15,6 +15,7 @@ SIGMA = 3e-5
 
 
 def postures(count: int, seed: int = 0) -> np.ndarray:
+    """That turn every joint, near one place."""
     middle = np.radians([5.0, -70.0, 115.0, 0.0, -60.0, 0.0])
     reach = np.radians([8.0, 10.0, 12.0, 120.0, 50.0, 150.0])
     return middle + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 6))

@@ -5,6 +5,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from drift_cell import postures
 
 from robocal_ros.cell_sim import kr150
 from robocal_ros.ground import frames
@@ -33,12 +34,6 @@ def drifted(share: float) -> SerialArm:
     arm = built()
     drift = np.sqrt(np.diag(drift_prior(arm))) * np.random.default_rng(4).standard_normal(24)
     return arm.with_mdh(arm.parameters.add(arm.mdh, share * drift))
-
-
-def postures(count: int, seed: int = 0) -> np.ndarray:
-    middle = np.radians([5.0, -70.0, 115.0, 0.0, -60.0, 0.0])
-    reach = np.radians([8.0, 10.0, 12.0, 120.0, 50.0, 150.0])
-    return middle + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 6))
 
 
 def visits(
