@@ -309,14 +309,13 @@ class SensorField:
 class PosePlan:
     """Chosen poses in the order of the shortest way.
 
-    ``q`` (m, n): joints. ``chosen`` (m,): their places among the candidates. ``predicted_rms_m``:
-    error of the tool at the working poses after one cycle of them. ``random_rms_m``: the same of as
-    many candidates drawn at random, median of 50 draws. ``before_rms_m``: the same of the prior,
-    without any cycle. ``own_rms_m``: after a cycle of a user's own poses; None without.
+    ``q`` (m, n): joints. ``predicted_rms_m``: error of the tool at the working poses after one
+    cycle of them. ``random_rms_m``: the same of as many candidates drawn at random, median of 50
+    draws. ``before_rms_m``: the same of the prior, without any cycle. ``own_rms_m``: after a cycle
+    of a user's own poses; None without.
     """
 
     q: Array
-    chosen: tuple[int, ...]
     predicted_rms_m: float
     random_rms_m: float
     before_rms_m: float
@@ -482,20 +481,18 @@ def _best(design: Design, chosen: list[int]) -> int:
 
 def plan_poses(design: Design, candidates: Array, count: int, rng: np.random.Generator) -> PosePlan:
     """Choose poses, and put them in the order of the shortest way."""
-    chosen = choose(design, count)
+    chosen = list(choose(design, count))
     draws = [
         design.error(rng.choice(len(candidates), count, replace=False).tolist())
         for _ in range(_DRAWS)
     ]
-    plan = PosePlan(
-        q=candidates[list(chosen)],
-        chosen=chosen,
-        predicted_rms_m=design.error(list(chosen)),
+    q = candidates[chosen]
+    return PosePlan(
+        q=q[list(shortest_way(q))],
+        predicted_rms_m=design.error(chosen),
         random_rms_m=float(np.median(draws)),
         before_rms_m=design.error([]),
     )
-    order = list(shortest_way(plan.q))
-    return replace(plan, q=plan.q[order], chosen=tuple(chosen[i] for i in order))
 
 
 def shortest_way(q: Array) -> tuple[int, ...]:

@@ -195,18 +195,16 @@ class Innovation:
     """What a cycle brought against what was expected.
 
     ``time_s``: at which the expectation was. ``squared``, ``freedom``: normalised square of the
-    innovation, and its degrees of freedom. ``limit``: the square above which a cycle is not
-    applied. ``applied``: whether it was. ``kept`` (m,): samples that agree with the others.
-    ``deviation``, ``covariance``: (3m,) measured less expected displacement, m, and (3m, 3m) what
-    the tracker expected of it. ``log_likelihood``: of all samples; those that do not fit lie
-    anywhere within a millimetre. ``whitened`` (freedom,): the innovation in units of its own
-    spread: standard normal.
+    innovation, and its degrees of freedom. ``applied``: whether it was; not, where the square is
+    above its limit. ``kept`` (m,): samples that agree with the others. ``deviation``,
+    ``covariance``: (3m,) measured less expected displacement, m, and (3m, 3m) what the tracker
+    expected of it. ``log_likelihood``: of all samples; those that do not fit lie anywhere within a
+    millimetre. ``whitened`` (freedom,): the innovation in units of its own spread: standard normal.
     """
 
     time_s: float
     squared: float
     freedom: int
-    limit: float
     applied: bool
     kept: NDArray[np.bool_]
     deviation: Array
@@ -385,7 +383,6 @@ class DriftTracker:
             time_s=time_s,
             squared=squared,
             freedom=len(v),
-            limit=limit,
             applied=bool(applied),
             kept=keep,
             deviation=deviation,

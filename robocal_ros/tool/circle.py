@@ -182,15 +182,14 @@ class CircleFit:
 
     ``centre`` (2,): place of the tool's axis in the beam plane, laser frame, when the flange is at
     the circle's centre, m. ``covariance`` (2, 2): of it, m^2; None for the classic method, which
-    has no noise model. ``d``, ``rho``: (2,) distances from the x- and the y-beam, and the tool's
-    radius seen by each, m; the classic method does not see the radius (None). ``latency_s``:
+    has no noise model. ``rho`` (2,): the tool's radius seen by the x- and the y-beam, m; the
+    classic method does not see it (None). ``latency_s``:
     as estimated, or as given. ``misfit_m``: rms of the residuals along the circle, m.
     """
 
     method: CircleMethod
     centre: Array
     covariance: Array | None
-    d: Array
     rho: Array | None
     latency_s: float
     latency_sigma_s: float | None
@@ -219,8 +218,7 @@ def fit_circle(
     d, rho, latency = closed_form(motion, labelled)
     if method == "classic":
         d = classic_distances(motion, labelled)
-        centre = motion.centre(d)
-        return CircleFit(method, centre, None, d, None, latency, None, 0.0)
+        return CircleFit(method, motion.centre(d), None, None, latency, None, 0.0)
     if np.any(rho > THICKEST * motion.radius_m):
         raise BeamError(
             f"the shadows last for most of the turn (radius {rho.max() * 1e3:.2f} mm on a circle "
@@ -251,7 +249,6 @@ def fit_circle(
         method="best",
         centre=motion.centre(state.d),
         covariance=J @ spread[:2, :2] @ J.T,
-        d=state.d,
         rho=state.rho,
         latency_s=state.latency_s,
         latency_sigma_s=float(np.sqrt(spread[4, 4])) if latency_s is None else None,

@@ -610,7 +610,8 @@ class ToolRun:
         """Of each step so far: joint readings after its first, and over what time, s."""
         return [(len(t) - 1, float(t[-1] - t[0])) for t in self._time if len(t) > 1]
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    @property
+    def inputs(self) -> dict[str, NDArray[Any]]:
         """All that was measured, for keeping."""
         edges = [(i, edge) for i, step in enumerate(self.steps) for edge in step.edges]
         return {

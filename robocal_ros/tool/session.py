@@ -373,7 +373,7 @@ class ToolResults:
                 document=document,
                 model=model
                 | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)},
-                inputs=run.arrays(),
+                inputs=run.inputs,
             )
         )
 

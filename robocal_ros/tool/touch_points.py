@@ -291,12 +291,8 @@ class HandMeasured:
     verdict: Verdict
     document: Document
     thermal_revision: int
-    inputs: Mapping[str, NDArray[Any]]
+    inputs: dict[str, NDArray[Any]]
     cycle_id: str = ""
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """What it was found from."""
-        return dict(self.inputs)
 
 
 class TouchLog:

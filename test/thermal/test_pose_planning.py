@@ -90,8 +90,8 @@ def test_planned_poses_beat_random_ones_by_a_third(arm, candidates):
     plan = plan_poses(design_of(arm, candidates), candidates, 6, np.random.default_rng(1))
     assert plan.predicted_rms_m <= 2.0 / 3.0 * plan.random_rms_m
     assert plan.predicted_rms_m < plan.before_rms_m
-    assert len(set(plan.chosen)) == 6
-    assert np.array_equal(plan.q, candidates[list(plan.chosen)])
+    assert len(plan.q) == 6
+    assert {*map(tuple, plan.q)} <= {*map(tuple, candidates)}
 
 
 def test_the_predicted_error_is_the_achieved_one(arm, candidates):
