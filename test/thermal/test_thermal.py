@@ -89,27 +89,31 @@ def test_a_reference_keeps_the_joint_functions_of_its_arm(nominal, cold):
     np.testing.assert_array_equal(commissioned.fk(q), arm.with_mdh(nominal.mdh).fk(q))
 
 
-def test_expected_error_is_the_achieved_one(nominal, cold):
+@pytest.mark.parametrize(
+    ("seed", "runs", "times", "error_of_mean"), [(11, 150, 1, 0.08), (12, 60, 10, 0.12)]
+)
+def test_expected_error_is_the_achieved_one(nominal, cold, seed, runs, times, error_of_mean):
     """Truth drawn from the prior: squared errors match the predicted variance.
 
     The cold model of the session is the true one, so that the statement is about the drift
-    alone. Each run gives about 3 effective numbers per check pose, strongly correlated; with 150
-    runs the mean ratio has a standard error below 0.08.
+    alone. Each run gives about 3 effective numbers per check pose, strongly correlated. Ten warm
+    visits of each pose share its one cold visit, and do not pass for independent ones.
     """
-    rng = np.random.default_rng(11)
+    rng = np.random.default_rng(seed)
     prior = drift_prior(nominal)
     q, check = postures(nominal, 8, rng), postures(nominal, 40, rng)
     ratio = []
-    for _ in range(150):
+    for _ in range(runs):
         warm = drifted(cold, prior, rng)
         reference = capture_reference(cold, visit(cold, q, rng))
-        found, _ = identified(reference, visit(warm, q, rng), prior, in_force=cold)
+        data = visit(warm, np.tile(q, (times, 1)), rng)
+        found, _ = identified(reference, data, prior, in_force=cold)
         error = drift_error(found.arm, cold, warm, cold, check)
         rows = reference.spots.rows(check, np.zeros(len(check), dtype=np.int64))[0]
         predicted = np.einsum("mik,kl,mil->", rows, found.covariance, rows)
         ratio.append(np.sum(error**2) / predicted)
     spread = np.std(ratio) / np.sqrt(len(ratio))
-    assert spread < 0.08
+    assert spread < error_of_mean
     assert abs(np.mean(ratio) - 1.0) < 4.0 * spread
 
 
@@ -169,29 +173,6 @@ def test_static_errors_cancel(nominal, cold):
         moved.append((found.arm.fk(check) - nominal.fk(check)) @ BALL)
     # static errors turn the drift by about 1e-3 rad: a thousandth of 0.05 mm
     assert np.abs(moved[0] - moved[1]).max() < 2e-6
-
-
-def test_repeated_visits_do_not_pass_for_independent_ones(nominal, cold):
-    """Ten warm visits of each pose share its one cold visit.
-
-    With truth drawn from the prior the squared error is the predicted one; 60 runs give the mean
-    ratio a standard error below 0.12.
-    """
-    rng = np.random.default_rng(12)
-    prior = drift_prior(nominal)
-    q, check = postures(nominal, 8, rng), postures(nominal, 40, rng)
-    ratio = []
-    for _ in range(60):
-        warm = drifted(cold, prior, rng)
-        reference = capture_reference(cold, visit(cold, q, rng))
-        found, _ = identified(
-            reference, visit(warm, np.tile(q, (10, 1)), rng), prior, in_force=cold
-        )
-        error = drift_error(found.arm, cold, warm, cold, check)
-        rows = reference.spots.rows(check, np.zeros(len(check), dtype=np.int64))[0]
-        predicted = np.einsum("mik,kl,mil->", rows, found.covariance, rows)
-        ratio.append(np.sum(error**2) / predicted)
-    assert abs(np.mean(ratio) - 1.0) < 4.0 * np.std(ratio) / np.sqrt(len(ratio))
 
 
 def test_an_outlier_neither_moves_the_model_nor_the_verdict(nominal, cold):
