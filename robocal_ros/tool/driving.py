@@ -379,15 +379,12 @@ class ToolDriver:
     def _begin(self, now_s: float) -> None:
         """Send the way to the awaited step, once the robot rests."""
         q = self.robot.resting(STANDS_S if self._driven == NO_RUN else SETTLED_S)
-        step = self._session.awaited
-        if q is None or step is None:
+        run, tool = self._session.run, self._session.current.tool.T_flange_tool
+        if q is None or run is None:
             return
         self._driven, self._said_s = self._number(), now_s
-        if self._session.run is None:
-            raise ConflictError("no run is open")
-        tool = self._session.current.tool.T_flange_tool
-        self._cell = station_cell(self._session.run, self._config, tool)
-        plan = approach(self._cell, step, q, after_circle=self._kind == "circle")
+        self._cell = station_cell(run, self._config, tool)
+        plan = approach(self._cell, run.awaited, q, after_circle=self._kind == "circle")
         self._start(plan, self._cell, DrivePhase.APPROACH, now_s)
 
     def _measure(self, now_s: float) -> None:
