@@ -58,7 +58,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.driver import HardStopService, StatedController
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits
-from robocal_ros.motion.robot_watch import BEHIND_S, SpeedScaling
+from robocal_ros.motion.robot_watch import BEHIND_S
 from robocal_ros.motion.stopping import WatchedStop
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL, POLL_S, run
@@ -117,7 +117,7 @@ class JointCorrectionNode(RobotNode):
             self._session.enable(True)
         self._arm_names = names = nominal.joint_names
         self._controller, robot = StatedController(), self._session.robot
-        robot.told = lambda now: self._controller.reference(names, now, self._scaling)
+        robot.told = lambda now: self._controller.reference(names, now)
         brakes, slides = joint_limits(self.settings, self.robot)[1], nominal.prismatic
         assumed = np.where(slides, DECELERATION[True], DECELERATION[False])
         known = np.isfinite(brakes) & (brakes > 0.0)
@@ -136,7 +136,6 @@ class JointCorrectionNode(RobotNode):
         self._commanded = self._by_action = False
         self._stream = TARGETS
         self._astray: SentPath | None = None  # a path that the robot is being stopped beside
-        self._scalings, self._scaling = SpeedScaling(), 1.0
         self._open_topics()
         self._open_action()
         self._report = CorrectionReport(
@@ -497,13 +496,7 @@ class JointCorrectionNode(RobotNode):
         now = time.monotonic()
         self._controller.hear(self._session.robot.velocity, len(self._arm_names), now)
         message = self._controller.stop_message(
-            plan,
-            names,
-            now,
-            self._scaling,
-            at_s=now - begin_s,
-            first_s=FIRST_S,
-            trusted=trusted,
+            plan, names, now, at_s=now - begin_s, first_s=FIRST_S, trusted=trusted
         )
         if self._by_action and self._proxy is not None:
             return self._proxy.stop(message, why)
@@ -565,17 +558,16 @@ class JointCorrectionNode(RobotNode):
     def _on_controller(self, message: Any) -> None:
         """Where the controller is, and how fast its clock runs."""
         now = time.monotonic()
-        self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
-        self._rescale(now)
         stamp = stamp_ns(message.header.stamp)
         age_s = (self.now_ns() - stamp) * 1e-9 if stamp else 0.0
-        self._controller.take(message, self._scaling, now, age_s)
+        self._controller.take(message, now, age_s)
+        self._rescale(now)
         self._session.robot.held_s = self._controller.held_s
         position = np.array(message.reference.positions, dtype=np.float64)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
-            self._scaling,
+            None,
             now,
             np.array(message.reference.velocities, dtype=np.float64),
             max(age_s, self._controller.lateness.late_s),
@@ -583,15 +575,15 @@ class JointCorrectionNode(RobotNode):
 
     def _on_scaling(self, message: Any) -> None:
         now = time.monotonic()
-        self._scalings.slider(float(message.data), now)
+        self._controller.scalings.slider(float(message.data), now)
         self._rescale(now)
 
     def _rescale(self, now_s: float) -> None:
         """How fast the controller's clock runs now; as planned where nobody told it lately."""
-        scaling = self._scalings.at(now_s)
-        before, self._scaling = self._scaling, 1.0 if scaling is None else scaling
-        if self._scaling != before:
-            self._session.controller((), np.empty(0), self._scaling, now_s)
+        scaling = self._controller.scalings.at(now_s)
+        scaling = 1.0 if scaling is None else scaling
+        if scaling != self._session.robot.scaling:
+            self._session.controller((), np.empty(0), scaling, now_s)
 
     def _on_lease(self, message: Any) -> None:
         self._leases.hear(message, time.monotonic())
@@ -606,9 +598,8 @@ class JointCorrectionNode(RobotNode):
     def _judge_graph(self) -> None:
         """Hold the program's commands while somebody else may move the robot."""
         now, before, lost = time.monotonic(), self._violation, self._graph.lost
-        stood_s = (
-            self._session.robot.stood_s(now) if self._scaling else 0.0
-        )  # one that pauses goes on
+        robot = self._session.robot
+        stood_s = robot.stood_s(now) if robot.scaling else 0.0  # one that pauses goes on
         found = self._violation = self._graph.look(now, stood_s)
         if self._graph.lost and not lost:
             self.get_logger().error(self._graph.lost)

@@ -72,23 +72,22 @@ AT_REST = 5e-3  # rad/s (m/s); slower references move nothing
 class StatedController:
     """What a controller says of itself; times of a steady clock.
 
-    ``velocities``: whether the hardware has any, as far as it is told. ``held_s``: when one that
-    pauses was last seen to give up a motion: its reference came to rest. ``lateness``: of states,
-    which are gone by as of when they were, not of when they came.
+    ``scalings``: how fast its clock runs. ``velocities``: whether the hardware has any, as far as
+    it is told. ``held_s``: when one that pauses was last seen to give up a motion: its reference
+    came to rest. ``lateness``: of states, which are gone by as of when they were, not of when they
+    came.
     """
 
     def __init__(self) -> None:
-        self.lateness = Lateness("states of the controller")
+        self.scalings, self.lateness = SpeedScaling(), Lateness("states of the controller")
         self._heard_s, self._ahead_s = -np.inf, np.inf
         self._stated: tuple[int, tuple[str, ...], Array, Array] | None = None
         self._paused_speed = 0.0  # of the reference, in a pause
         self.velocities, self.held_s = True, -np.inf
 
-    def take(self, message: Any, scaling: float | None, now_s: float, *ages_s: float) -> None:
-        """Take a ``JointTrajectoryControllerState``; ``scaling``: None where nobody tells it.
-
-        ``ages_s``: its age by other clocks than ``now_s``, see `Lateness`.
-        """
+    def take(self, message: Any, now_s: float, *ages_s: float) -> None:
+        """Take a ``JointTrajectoryControllerState``, of these ages by other clocks: `Lateness`."""
+        self.scalings.controller(float(getattr(message, "speed_scaling_factor", np.nan)), now_s)
         names, reference = tuple(message.joint_names), message.reference
         self._tells(np.array(message.feedback.velocities, dtype=np.float64), len(names))
         at_ns, before_s = stamp_ns(message.header.stamp), self._ahead_s
@@ -102,7 +101,7 @@ class StatedController:
         if abs(self._ahead_s - before_s) < STATED_S:
             self._stated = at_ns, names, q, qd
         before, self._paused_speed = self._paused_speed, 0.0
-        if scaling == 0.0:
+        if self.scalings.at(now_s) == 0.0:
             self._paused_speed = float(np.max(np.abs(qd), initial=0.0))
             if self._paused_speed < AT_REST <= before:
                 self.held_s = now_s
@@ -118,16 +117,14 @@ class StatedController:
     def _tells(self, speeds: Array, count: int) -> None:
         self.velocities = bool(len(speeds) == count and np.isfinite(speeds).all() and speeds.any())
 
-    def reference(
-        self, names: Sequence[str], now_s: float, scaling: float | None
-    ) -> tuple[Array, Array, float] | None:
+    def reference(self, names: Sequence[str], now_s: float) -> tuple[Array, Array, float] | None:
         """Joints and unscaled velocities (k,) where the controller is now, as of when it is known.
 
         None: not known.
         """
         if (found := self._find(names, now_s)) is None:
             return None
-        _, q, qd = found
+        (_, q, qd), scaling = found, self.scalings.at(now_s)
         gone_s = (now_s - self._heard_s) * (1.0 if scaling is None else scaling)
         return q + qd * gone_s, qd, self._heard_s
 
@@ -145,7 +142,6 @@ class StatedController:
         plan: JointPlan,
         names: Sequence[str],
         now_s: float,
-        scaling: float | None,
         *,
         at_s: float = 0.0,
         first_s: float = LEAD_S,
@@ -156,7 +152,7 @@ class StatedController:
         ``first_s``: first point of a message that is not stamped, ahead of its arrival;
         ``trusted``: whether it may be stamped.
         """
-        begin_ns = self._begin_ns(plan, names, now_s, scaling, at_s) if trusted else None
+        begin_ns = self._begin_ns(plan, names, now_s, at_s) if trusted else None
         if begin_ns is not None:
             message = joint_trajectory(names, plan.time_s, plan.q, plan.qd)
             message.header.stamp = Time(sec=begin_ns // NS, nanosec=begin_ns % NS)
@@ -177,12 +173,7 @@ class StatedController:
         return joint_trajectory(names, times, q, qd if self.velocities else None)
 
     def _begin_ns(
-        self,
-        plan: JointPlan,
-        names: Sequence[str],
-        now_s: float,
-        scaling: float | None,
-        at_s: float,
+        self, plan: JointPlan, names: Sequence[str], now_s: float, at_s: float
     ) -> int | None:
         """When the controller is where the plan begins, by its own clock; None: not known.
 
@@ -190,7 +181,7 @@ class StatedController:
         clock counts from a stamp on as if it were not.
         """
         found = self._find(names, now_s)
-        if found is None or scaling not in (None, 1.0):
+        if found is None or self.scalings.at(now_s) not in (None, 1.0):
             return None
         stated_ns, q, qd = found
         times = np.arange(-STATED_S, at_s + STATED_S, GRID_S)
@@ -437,7 +428,7 @@ class MotionDriver:
         node.add_input(Float64, "speed_scaling", self._take_scaling, endpoints.NEWEST)
         self._controller = StatedController()
         self.lateness = Lateness("joint states")
-        self._scaling, self._rejected = SpeedScaling(), False
+        self._rejected = False
         self._first = self._newest = 0  # what was sent of the present motion, or stop
         self._stop: Callable[[], JointTrajectory] | None = None  # that may have been lost
         self._copies, self._until_s = 0, 0.0
@@ -487,12 +478,7 @@ class MotionDriver:
         def message(*, trusted: bool = False) -> JointTrajectory:
             now_s = self._now()
             return self._controller.stop_message(
-                going_on,
-                self._names,
-                now_s,
-                self._scaling.at(now_s),
-                at_s=now_s - begin_s,
-                trusted=trusted,
+                going_on, self._names, now_s, at_s=now_s - begin_s, trusted=trusted
             )
 
         first = message(trusted=not self._rejected)
@@ -568,13 +554,12 @@ class MotionDriver:
                 raise InputError(f"no joint {', '.join(missing)} in this controller")
             self._index = {names: [names.index(name) for name in self._names]}
         index, count = self._index[names], len(names)
-        self._scaling.controller(getattr(message, "speed_scaling_factor", np.nan), now_s)
         age_s = (self._node.now_ns() - stamp_ns(message.header.stamp)) / NS
-        self._controller.take(message, self._scaling.at(now_s), now_s, age_s)
+        self._controller.take(message, now_s, age_s)
         now_s -= self._controller.lateness.late_s
         if robot is not None:
             robot.held_s = self._controller.held_s
-            if (scaling := self._scaling.at(now_s)) is not None:
+            if (scaling := self._controller.scalings.at(now_s)) is not None:
                 robot.scaled(scaling, now_s)
         reference = message.reference
         if len(reference.positions) != count or len(reference.velocities) != count:
@@ -605,8 +590,8 @@ class MotionDriver:
 
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()
-        self._scaling.slider(message.data, now_s)
-        if robot is not None and (scaling := self._scaling.at(now_s)) is not None:
+        self._controller.scalings.slider(message.data, now_s)
+        if robot is not None and (scaling := self._controller.scalings.at(now_s)) is not None:
             robot.scaled(scaling, now_s)
 
 

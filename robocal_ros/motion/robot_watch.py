@@ -209,7 +209,7 @@ class RobotWatch:
     as planned; 1 where nobody tells it lately; ``unpaused``: the same but for pauses, which tell
     nothing of what comes after them, and ramps into and out of them: a slower one counts once it
     was so for `PACE_S`. ``held_s``: when a controller that pauses was last seen to give up a
-    motion, as `StatedController` has it.
+    motion, as `StatedController` has it. ``heard_s``: of when the newest reading is.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
@@ -219,7 +219,7 @@ class RobotWatch:
         self.scaling, self.unpaused, self.held_s = 1.0, 1.0, -np.inf
         self._scaled_s = -np.inf  # when that was told
         self._paced_s = -np.inf  # when it was last 0, or no slower than `unpaused`
-        self._heard_s = 0.0
+        self.heard_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
         self._reference: tuple[Array, Array] | None = None
         self._reference_s = -np.inf
@@ -243,7 +243,7 @@ class RobotWatch:
                 return  # a clock that stands still is heard as silence
             self._readings.clear()
         self._readings.append((stamp_s, np.clip(q, -FARTHEST, FARTHEST)))
-        self._heard_s, self._away = now_s, None
+        self.heard_s, self._away = now_s, None
         self.silence.heard(now_s)
 
     def scaled(self, factor: float, now_s: float) -> None:
@@ -290,7 +290,7 @@ class RobotWatch:
     def slept(self, for_s: float) -> None:
         """The host was suspended for so long, and the plan with it: its controller is there too."""
         self._at_s += for_s
-        self._heard_s += for_s
+        self.heard_s += for_s
         self._looked_s += for_s
         self._away = None
 
@@ -302,11 +302,6 @@ class RobotWatch:
     def heard(self) -> bool:
         """Whether there is any reading."""
         return bool(self._readings)
-
-    @property
-    def heard_s(self) -> float:
-        """Of when the newest reading is."""
-        return self._heard_s
 
     @property
     def newest(self) -> tuple[float, Array] | None:
@@ -342,7 +337,7 @@ class RobotWatch:
         """How far the newest reading of a robot on its path was late; 0 without a plan."""
         if self._plan is None:
             return 0.0
-        driven_s = self.driven_s(min(self._heard_s, now_s))
+        driven_s = self.driven_s(min(self.heard_s, now_s))
         return min(driven_s, self._plan.duration_s) - self._reached_s
 
     def late(self, now_s: float) -> str:
@@ -391,7 +386,7 @@ class RobotWatch:
             return 0.0, 0.0
         if self._away is not None:
             return self._away
-        (at_s, q), heard_s = self._readings[-1], self._heard_s
+        (at_s, q), heard_s = self._readings[-1], self.heard_s
         first_s = max(self._reached_s - JITTER_S, 0.0)
         # readings that waited come at once: the time between them is that of their stamps
         since_s = max(heard_s - self._looked_s, at_s - self._looked_at_s, 0.0)
@@ -479,7 +474,7 @@ class RobotWatch:
         velocity = np.zeros(q.shape[1])
         if times[0] <= times[-1] - VELOCITY_S and not paused:
             velocity = self._slope(times, q)
-        since_s = times[-1] - times + np.clip(now_s - self._heard_s, 0.0, OLDEST_S)
+        since_s = times[-1] - times + np.clip(now_s - self.heard_s, 0.0, OLDEST_S)
         here = np.median(q + since_s[:, None] * velocity, axis=0)
         return here, np.clip(velocity / max(self.scaling, 0.1), -self._fastest, self._fastest)
 
@@ -495,7 +490,7 @@ class RobotWatch:
         """What the robot is sent shows so late."""
         if self.reference(now_s) is not None:
             return SEEN_S[True] + max(self.silent_s, now_s - self._reference_s)
-        return SEEN_S[False] + max(self.silent_s, now_s - self._heard_s)
+        return SEEN_S[False] + max(self.silent_s, now_s - self.heard_s)
 
     def to_stop(self, now_s: float) -> tuple[Array, Array]:
         """The `state` of a robot that did not obey a stop."""

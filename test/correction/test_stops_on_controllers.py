@@ -57,7 +57,7 @@ class Driven:
         self.motion.take(REACTION_S, Trajectory.of(NAMES, T[1:], Q[1:], QD[1:]))
         self.stated, self.lateness = StatedController(), Lateness("joint states")
         self.state = RobotState(NOMINAL, 0.2, np.full(6, 3.5e-4))
-        self.state.told = lambda now: self.stated.reference(NAMES, now, 1.0)
+        self.state.told = lambda now: self.stated.reference(NAMES, now)
         for at_s in np.arange(1.6, 2.0 - waits_s, STATES_S):
             self.pass_to(float(at_s), told)
         if waits_s:
@@ -81,7 +81,6 @@ class Driven:
                     feedback=SimpleNamespace(velocities=qd if self.velocities else []),
                     reference=SimpleNamespace(positions=desired, velocities=rate),
                 ),
-                1.0,
                 now_s,
             )
         else:
@@ -112,9 +111,7 @@ def by_its_path(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
     path = session.output.path
     planned = session.stop(now_s, AHEAD_S)
     plan = on_its_path(path, planned, now_s)
-    message = driven.stated.stop_message(
-        plan, planned.names, now_s, 1.0, at_s=AHEAD_S, first_s=FIRST_S
-    )
+    message = driven.stated.stop_message(plan, planned.names, now_s, at_s=AHEAD_S, first_s=FIRST_S)
     return driven.obeys(message, late_s), bool(message.header.stamp.sec)
 
 
@@ -123,7 +120,7 @@ def by_readings(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
     now_s, brakes = driven.robot.now, load_description("kr150_r3100").max_acceleration
     stopping = WatchedStop(NOMINAL, MotionLimits(stop_deceleration=brakes))
     plan = stopping.begin(driven.state.to_stop(now_s), now_s).going_on(REACTION_S)
-    message = driven.stated.stop_message(plan, NAMES, now_s, 1.0, first_s=FIRST_S)
+    message = driven.stated.stop_message(plan, NAMES, now_s, first_s=FIRST_S)
     return driven.obeys(message, late_s), bool(message.header.stamp.sec)
 
 
@@ -176,7 +173,7 @@ def test_from_readings_that_are_too_late_no_stop_is_planned():
     session, now_s = driven.robot.session, driven.robot.now
     assert driven.state.to_stop(now_s) is None
     assert driven.state.follows(session.output.path, now_s)
-    assert driven.stated.reference(NAMES, now_s, 1.0) is None
+    assert driven.stated.reference(NAMES, now_s) is None
 
 
 @pytest.mark.parametrize("stop", STOPS)
@@ -204,9 +201,7 @@ def own_stop(driven: Driven, deceleration: float, taken: Any) -> tuple[float, np
     for number in range(COPIES):
         at_s = number * COPY_S
         if not number or not messages[0].header.stamp.nanosec:
-            messages.append(
-                driven.stated.stop_message(plan, NAMES, driven.robot.now, 1.0, at_s=at_s)
-            )
+            messages.append(driven.stated.stop_message(plan, NAMES, driven.robot.now, at_s=at_s))
     for number in taken[:-1]:
         driven.takes(messages[min(number, len(messages) - 1)], 0.008 + number * COPY_S)
     last = messages[min(taken[-1], len(messages) - 1)]
@@ -221,7 +216,7 @@ def test_a_stop_that_is_sent_when_it_should_be_over_is_no_step(over_s, velocitie
     q, qd = driven.motion.last()[1][4:6]
     plan = stop(NOMINAL, MotionLimits(stop_deceleration=5.0), q, qd).going_on(REACTION_S)
     at_s = plan.duration_s + over_s
-    message = driven.stated.stop_message(plan, NAMES, driven.robot.now, 1.0, at_s=at_s)
+    message = driven.stated.stop_message(plan, NAMES, driven.robot.now, at_s=at_s)
     points = message.points
     assert points[0].time_from_start.nanosec * 1e-9 == pytest.approx(LEAD_S)
     assert points[-1].positions == pytest.approx(plan.q[-1])
@@ -267,7 +262,8 @@ def test_a_stop_that_a_pausing_controller_is_seen_to_take_is_over():
         qd = 0.3 * np.eye(6)[0] * (number < 100)  # unscaled
         robot.controller(HOME, qd, now_s)
         state.reference = SimpleNamespace(positions=HOME, velocities=qd)
-        controller.take(state, robot.scaling, now_s)
+        state.speed_scaling_factor = robot.scaling
+        controller.take(state, now_s)
         robot.held_s = controller.held_s
         if number == 60:
             stopping.begin((HOME, np.zeros(6)), now_s)

@@ -58,8 +58,8 @@ def scaled(line: Line, publish: Callable[[float], None]) -> None:
     line.graph.probe.create_timer(0.1, lambda: publish(told[0]))
 
     def say(scaling: float) -> None:
-        told[0] = scaling
-        line.graph.spin_until(lambda: line.node._scaling == scaling, f"scaled to {scaling}")
+        told[0], robot = scaling, line.node._session.robot
+        line.graph.spin_until(lambda: robot.scaling == scaling, f"scaled to {scaling}")
 
     line.target()
     line.take(model_message(drifted()), line.to_model, "kinematic_model")
@@ -115,8 +115,8 @@ def test_a_slider_that_dies_at_zero_is_forgotten(graph: Any) -> None:
     line.wait(line.paths)
     for percent in (100.0, 0.0):
         line.take(Float64(data=percent), slider, "speed_scaling")
-    assert line.node._scaling == 0.0
-    graph.spin_until(lambda: line.node._scaling == 1.0, "it is forgotten", 3.0)
+    assert line.node._session.robot.scaling == 0.0
+    graph.spin_until(lambda: line.node._session.robot.scaling == 1.0, "it is forgotten", 3.0)
     path = line.node._session.output.path
     graph.spin_until(lambda: not path.live(time.monotonic()), "the path ends", 3.0)
 
