@@ -24,7 +24,7 @@ def model_of(session: ThermalSession, now_ns: int) -> OfferedModel:
         nominal.joint_names,
         arm.mdh,
         arm.T_base_root,
-        now_ns,
+        stamp_ns=now_ns,
         functions=arm.functions,
         load=arm.load,
     )
@@ -34,15 +34,15 @@ def tool_of(session: ToolSession, now_ns: int) -> OfferedTool:
     """The tool in force; without a transform where that is the taught one."""
     head, nominal = session.in_force, session.nominal
     return OfferedTool(
-        setting.FLANGE,
-        None if head.model is None else session.current.tool.T_flange_tool,
-        setting.TOOL,
         nominal.name,
         setting.SERIAL,
         nominal.model_hash,
         head.revision,
         True,
-        now_ns,
+        setting.FLANGE,
+        None if head.model is None else session.current.tool.T_flange_tool,
+        setting.TOOL,
+        stamp_ns=now_ns,
     )
 
 

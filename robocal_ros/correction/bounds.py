@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.interface import OfferedModel, OfferedTool, Reason, RefusedError
+from robocal_ros.correction.interface import (
+    OfferedCalibration,
+    OfferedModel,
+    OfferedTool,
+    Reason,
+    RefusedError,
+)
 from robocal_ros.correction.joint_correction import (
     CorrectionResult,
     JointCorrection,
@@ -530,7 +536,7 @@ class CorrectionGate:
         """Of the model in use; empty without one."""
         return "" if self._model is None else self._model.serial
 
-    def _require_robot(self, offered: OfferedModel | OfferedTool) -> None:
+    def _require_robot(self, offered: OfferedCalibration) -> None:
         expected = {
             "robot": (offered.robot, self._nominal.name),
             "serial": (offered.serial, self._serial),
@@ -656,5 +662,5 @@ def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:
     return a.revision == b.revision and np.array_equal(a.T_flange_tool, b.T_flange_tool)
 
 
-def _later(a: OfferedModel | OfferedTool, b: OfferedModel | OfferedTool) -> bool:
+def _later(a: OfferedCalibration, b: OfferedCalibration) -> bool:
     return a.revision > b.revision or a.stamp_ns > b.stamp_ns

@@ -117,37 +117,36 @@ class TrajectoryCommand:
 
 
 @dataclass(frozen=True)
-class OfferedModel:
-    """A kinematic model that somebody published; ``mdh`` (n, 5) absolute, SI."""
+class OfferedCalibration:
+    """What somebody published for a robot, and with what nominal model it was made."""
 
     robot: str
     serial: str
     model_hash: str
     revision: int
     accepted: bool
+    stamp_ns: int = field(default=0, kw_only=True)
+    robot_file_hash: str = field(default="", kw_only=True)
+
+
+@dataclass(frozen=True)
+class OfferedModel(OfferedCalibration):
+    """A kinematic model; ``mdh`` (n, 5) absolute, SI."""
+
     joint_names: tuple[str, ...]
     mdh: Array
     T_base_root: Array = field(default_factory=lambda: np.eye(4))
-    stamp_ns: int = 0
-    robot_file_hash: str = ""
     functions: JointFunctions | None = None
     load: ArmLoad | None = None  # with which it was identified
 
 
 @dataclass(frozen=True)
-class OfferedTool:
-    """A measured tool that somebody published, absolute."""
+class OfferedTool(OfferedCalibration):
+    """A measured tool, absolute."""
 
     parent: str
     T_flange_tool: Array | None  # (4, 4); None: the taught tool again
     child: str
-    robot: str
-    serial: str
-    model_hash: str
-    revision: int
-    accepted: bool
-    stamp_ns: int = 0
-    robot_file_hash: str = ""
 
 
 def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:
@@ -223,19 +222,26 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
     root = message.base_root
     functions, load = _layer(message, len(names))
     return OfferedModel(
-        robot=message.robot,
-        serial=message.serial,
-        model_hash=message.model_hash,
-        revision=int(message.revision),
-        accepted=int(message.state) == accepted_state,
+        **_offered(message, accepted_state),
         joint_names=names,
         mdh=mdh,
         T_base_root=_pose(root.translation, root.rotation, Reason.NOT_FINITE),
-        stamp_ns=stamp_ns(message.header.stamp),
-        robot_file_hash=message.robot_file_hash,
         functions=functions,
         load=load,
     )
+
+
+def _offered(message: Any, *accepted_states: int) -> dict[str, Any]:
+    """The fields of `OfferedCalibration`."""
+    return {
+        "robot": message.robot,
+        "serial": message.serial,
+        "model_hash": message.model_hash,
+        "revision": int(message.revision),
+        "accepted": int(message.state) in accepted_states,
+        "stamp_ns": stamp_ns(message.header.stamp),
+        "robot_file_hash": message.robot_file_hash,
+    }
 
 
 def _layer(message: Any, n: int) -> tuple[JointFunctions | None, ArmLoad | None]:
@@ -280,16 +286,10 @@ def offered_tool(message: Any, accepted_state: int) -> OfferedTool:
     pose = message.tool
     T = None if taught else _pose(pose.translation, pose.rotation, Reason.BAD_TOOL)
     return OfferedTool(
+        **_offered(message, accepted_state, TAUGHT_TOOL),
         parent=str(message.header.frame_id),
         T_flange_tool=T,
         child=str(message.child_frame_id),
-        robot=message.robot,
-        serial=message.serial,
-        model_hash=message.model_hash,
-        revision=int(message.revision),
-        accepted=taught or int(message.state) == accepted_state,
-        stamp_ns=stamp_ns(message.header.stamp),
-        robot_file_hash=message.robot_file_hash,
     )
 
 

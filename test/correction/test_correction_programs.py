@@ -59,8 +59,8 @@ def test_a_recorded_program_is_corrected_throughout(name: str, robot: str, bent_
         OfferedModel(arm.name, "s1", arm.model_hash, 1, True, arm.joint_names, actual.mdh)
     )
     if bent_m:
-        of = arm.name, "s1", arm.model_hash
-        session.offer_tool(OfferedTool("tool0", tool, "tcp", *of, revision=1, accepted=True))
+        of = arm.name, "s1", arm.model_hash, 1, True
+        session.offer_tool(OfferedTool(*of, "tool0", tool, "tcp"))
     session.enable(True)
     now, at = 100.0, q[0]
 
