@@ -122,10 +122,6 @@ class CorrectionConfig:
     robot_file_hash: str = ""
     shadow: bool = False
 
-    def start_near(self, arm: SerialArm) -> Array:
-        """(n,) how far from where a command begins each joint may stand, rad (prismatic: m)."""
-        return np.where(arm.prismatic, self.start_m, self.start_rad)
-
 
 @dataclass(frozen=True)
 class Survey:
@@ -317,6 +313,7 @@ class DesiredOffset:
 
     def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
         self._arm, self._config = reference, config
+        self.limiter = OffsetLimiter(reference.prismatic, config.turning, config.sliding)
         self._reference = pack_model(reference)
         self._actual = self._reference
         self.stage: StagedCorrection | None = None
@@ -376,27 +373,24 @@ class DesiredOffset:
         self.figures[REMAINING] = result.remaining_m.max()
         return offset, result
 
-    def follow(
+    def step(
         self,
         q: Array,
         velocity: Array,
         elapsed: float,
-        limiter: OffsetLimiter,
+        longest: float,
         active: Array,
         speeds: Array,
-    ) -> bool:
-        """As `put_out`, where nothing is out of the ordinary; else False, and nothing has changed.
-
-        What is said of the target may have, and is said anew by `put_out`.
-        """
-        memory, given = limiter.memory, self._whole_step
+    ) -> float:
+        """As `put_out`, in one piece; `NOT_WITHIN`, and nothing has changed, where it is more."""
+        limiter, given = self.limiter, self._whole_step
         if given is None:
-            return False
+            return NOT_WITHIN
         share = step_out(
-            q, velocity, elapsed, elapsed, memory, limiter.limits, active, speeds, *given
+            q, velocity, elapsed, longest, limiter.memory, limiter.limits, active, speeds, *given
         )
-        self.made = fits = bool(0.0 <= share <= 1.0 + ROUNDING)
-        return fits
+        self.made = share != NOT_WITHIN
+        return share
 
     def put_out(
         self,
@@ -404,20 +398,17 @@ class DesiredOffset:
         velocity: Array,
         elapsed: float,
         longest: float,
-        limiter: OffsetLimiter,
         active: Array,
         speeds: Array,
     ) -> float:
         """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
 
-        In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`.
+        Raises `RefusedError` as `at`.
         """
-        memory, limits, given = limiter.memory, limiter.limits, self._whole_step
-        if given is not None:
-            share = step_out(q, velocity, elapsed, longest, memory, limits, active, speeds, *given)
-            if share != NOT_WITHIN:
-                self.made = True
-                return share
+        share = self.step(q, velocity, elapsed, longest, active, speeds)
+        if share != NOT_WITHIN:
+            return share
+        memory, limits = self.limiter.memory, self.limiter.limits
         stage, span = self.stage, self._span
         if stage is None:
             self.made, desired = False, self._nothing
@@ -425,7 +416,7 @@ class DesiredOffset:
         else:
             desired = self.at(q[None])[0][0]
         share = put_out(memory, q, desired, elapsed, longest, limits, active, speeds[0], span)
-        if isinstance(stage, ClampedCorrection) and self.made and not limiter.withheld.any():
+        if isinstance(stage, ClampedCorrection) and self.made and not self.limiter.withheld.any():
             memory[VELOCITY] = stage.velocity_one(memory[TAUGHT], velocity, memory[OUT])
         else:
             memory[VELOCITY] = velocity + memory[OFFSET_RATE]

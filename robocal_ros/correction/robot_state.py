@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset
 from robocal_ros.correction.interface import (
     JointCommand,
     Reason,
@@ -26,7 +26,6 @@ from robocal_ros.correction.limiter import (
     ROUNDING,
     SHARE,
     TAUGHT,
-    OffsetLimiter,
 )
 from robocal_ros.correction.sent_path import RESPONSE_S, SentPath
 from robocal_ros.correction.solution import ordinary
@@ -404,13 +403,16 @@ def _require_single(names: tuple[str, ...]) -> None:
 
 
 class Output:
-    """What was put out last for each joint."""
+    """What was put out last for each joint, and by what: of streams and trajectories alike."""
 
-    def __init__(self, arm: SerialArm, config: CorrectionConfig, state: RobotState) -> None:
-        self._state, self._near = state, config.start_near(arm)
-        self._fastest = config.velocity_limits
-        # the offsets of a stream, and of the begin of what comes next
-        self.limiter = OffsetLimiter(arm.prismatic, config.turning, config.sliding)
+    def __init__(self, arm: SerialArm, config: CorrectionConfig) -> None:
+        self.arm, self.config = arm, config
+        # (n,) how far from where a command begins each joint may stand, rad (prismatic: m)
+        self.near = np.where(arm.prismatic, config.start_m, config.start_rad)
+        self.robot = RobotState(arm, config.joint_state_age_s, self.near, config.velocity_limits)
+        self.desired = DesiredOffset(arm, config)
+        # of a stream, and of the begin of what comes next
+        self.limiter = self.desired.limiter
         # (n,) the last target, as it was followed, and what went out for it; NaN before any
         self.taught, self.out = self.limiter.memory[TAUGHT], self.limiter.memory[OUT]
         self.stage: StagedCorrection | None = None  # of the last target
@@ -445,7 +447,7 @@ class Output:
         Raises `RefusedError` when readings are missing, old or too few, or the robot moves and not
         by what was put out, or was read elsewhere than its controller says.
         """
-        state = self._state
+        state = self.robot
         known = state.reference(index, now_s)
         if known is not None:
             if (elsewhere := state.elsewhere(index, known, now_s)).any():
@@ -457,7 +459,7 @@ class Output:
                 )
             return known, True
         state.require_fresh(index, now_s)
-        measured, near = state.measured[index], self._near[index]
+        measured, near = state.measured[index], self.near[index]
         stands, sent = state.stands(index, now_s), self._sent(now_s)[index]
         if np.isfinite(sent).all():
             lately = [p[index] for t, p in self._track if t >= now_s - RESPONSE_S]
@@ -497,7 +499,7 @@ class Output:
         `RefusedError` as `place`, and when it is elsewhere.
         """
         place, exact = self.place(index, q[index], now_s)
-        here = self._state.measured.copy()
+        here = self.robot.measured.copy()
         here[index] = place
         told = here - self.uncorrected(here, self.correction(now_s))  # as readings are
         known = np.vstack([begins, told])
@@ -505,7 +507,7 @@ class Output:
         if np.any(beside > 1.0):
             j = int(np.argmax(beside))
             raise self.refuse(
-                f"{self._state.names[index[j]]} is at {place[j]:.6f}, and the command begins at "
+                f"{self.robot.names[index[j]]} is at {place[j]:.6f}, and the command begins at "
                 f"{q[index[j]]:.6f}, corrected at {(q + begins[0])[index[j]]:.6f}"
             )
         return offset
@@ -517,7 +519,7 @@ class Output:
 
         Readings have noise and drives sag: one that is not exact is the nearest one known.
         """
-        near = self._near[index]
+        near = self.near[index]
         known = np.vstack([self.limiter.state[OFFSET], begins])[:, index]
         beside = np.maximum(known.min(axis=0) - offset, offset - known.max(axis=0)) / near
         miss = np.max(np.abs(known - offset) / near, axis=1)
@@ -533,12 +535,12 @@ class Output:
         The taught joints are None where the controller is at its first point already. Where it is
         not known where the controller is, it is where the robot was read.
         """
-        everything, before = np.arange(self._state.count), self.mismatch
+        everything, before = np.arange(self.robot.count), self.mismatch
         try:
             place, exact = self.place(everything, q, now_s)
         except RefusedError:
             self.mismatch = before
-            place, exact = self._state.measured.copy(), False
+            place, exact = self.robot.measured.copy(), False
         offset, beside = self._taken_up(index, (place - q)[index], begins, exact=exact)
         if np.all(beside <= 1.0):
             whole = place - q
@@ -582,10 +584,10 @@ class Output:
 
 
 def hold_speeds(
-    names: Sequence[str], out: Array, dt_s: Array, fastest: Array, what: str = "would move"
+    names: Sequence[str], speed: Array, fastest: Array, what: str = "would move"
 ) -> None:
-    """Refuse steps (m, k) that take less than the joints' speeds (k,) allow in ``dt_s`` (m,)."""
-    speed = np.abs(out) / dt_s[:, None]
+    """Refuse speeds (m, k) beyond those of the joints (k,)."""
+    speed = np.abs(speed)
     over = speed > fastest * (1.0 + ROUNDING)
     if over.any():
         point, j = np.argwhere(over)[0]

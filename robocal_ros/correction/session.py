@@ -17,7 +17,7 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from robocal_ros.correction.bounds import CorrectionConfig, CorrectionGate, DesiredOffset
+from robocal_ros.correction.bounds import CorrectionConfig, CorrectionGate
 from robocal_ros.correction.interface import (
     CorrectionStatus,
     JointCommand,
@@ -37,7 +37,7 @@ from robocal_ros.correction.limiter import (
     WORST,
     WORST_OUT,
 )
-from robocal_ros.correction.robot_state import EVERY, Joints, Output, RobotState
+from robocal_ros.correction.robot_state import EVERY, Joints, Output
 from robocal_ros.correction.sent_path import WITHHELD, SentPath
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
@@ -94,12 +94,9 @@ class CorrectionSession:
         config = replace(config, velocity_limits=speed, acceleration_limits=acceleration)
         self._reference, self._config = reference, config
         self._gate = CorrectionGate(nominal, reference, serial, config)
-        near = config.start_near(reference)
-        self.robot = RobotState(reference, config.joint_state_age_s, near, speed)
-        self._desired = DesiredOffset(reference, config)
-        self.output = Output(reference, config, self.robot)
-        self.stream = TargetStream(reference, config, self.robot, self._desired, self.output)
-        self._paths = TrajectoryCorrector(reference, config, self.robot, self._desired, self.output)
+        self.output = output = Output(reference, config)
+        self.robot, self._desired = output.robot, output.desired
+        self.stream, self._paths = TargetStream(output), TrajectoryCorrector(output)
         self._enabled, self._robot_fault = False, ""
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
@@ -570,8 +567,9 @@ def load_kernels(arm: SerialArm) -> None:
     config, n = CorrectionConfig(), arm.n
     q, zeros, ones = np.zeros((2, n)), np.zeros(n), np.ones(n)
     arm.fk(q)
-    desired, offsets = DesiredOffset(arm, config), Output(arm, config, RobotState(arm, 0.0, ones))
-    given = zeros, zeros, 0.004, 0.004, offsets.limiter, ones, np.ones((2, n))
+    output = Output(arm, config)
+    desired = output.desired
+    given = zeros, zeros, 0.004, 0.004, ones, np.ones((2, n))
     desired.put_out(*given)
     desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)
     desired.put_out(*given)
@@ -579,9 +577,8 @@ def load_kernels(arm: SerialArm) -> None:
     assert stage is not None
     stage.rates(q, q, q, stage.correct(q))
     stage.taught_velocity_one(zeros, zeros, stage.uncorrect_one(zeros))
-    offsets.limiter.follow(q, np.arange(2.0), np.zeros(2), ones)
-    state = RobotState(arm, config.joint_state_age_s, config.start_near(arm))
-    state.require_target(JointCommand(arm.joint_names, q[0]), np.arange(n))
+    output.limiter.follow(q, np.arange(2.0), np.zeros(2), ones)
+    output.robot.require_target(JointCommand(arm.joint_names, q[0]), np.arange(n))
     doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
     point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
     gather_rows(doubles, places[:, 0], np.empty((1, 1)))

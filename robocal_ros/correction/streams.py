@@ -9,7 +9,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset, require_limits
+from robocal_ros.correction.bounds import require_limits
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
     ADDS,
@@ -20,10 +20,9 @@ from robocal_ros.correction.limiter import (
     TOO_FAST,
     VELOCITY,
 )
-from robocal_ros.correction.robot_state import Output, RobotState, hold_speeds
+from robocal_ros.correction.robot_state import Output, hold_speeds
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
-from robocal_ros.kinematics import SerialArm
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
@@ -64,16 +63,9 @@ class TargetStream:
     joint needs from what was put out to what came in.
     """
 
-    def __init__(
-        self,
-        arm: SerialArm,
-        config: CorrectionConfig,
-        state: RobotState,
-        desired: DesiredOffset,
-        output: Output,
-    ) -> None:
-        self._arm, self._config, self._state = arm, config, state
-        self._desired, self._output = desired, output
+    def __init__(self, output: Output) -> None:
+        self._output, self._robot, self._desired = output, output.robot, output.desired
+        self._arm, self._config = arm, config = output.arm, output.config
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
         self._pause_s = config.stream_gap_s
         self._unlimited = ~np.isfinite(self._fastest)
@@ -166,15 +158,14 @@ class TargetStream:
             or output.mismatch
         ):
             return None
-        self._state.require_target(command, self._index)
+        self._robot.require_target(command, self._index)
         self._velocity[:] = 0.0 if velocity is None else velocity
         self._note_interval(now_s)
         if self._holds(elapsed):
             return None
         q, before, desired = command.position.copy(), output.out.copy(), self._desired
-        if not desired.follow(
-            q, self._velocity, elapsed, output.limiter, self._active, self._speeds
-        ):
+        given = elapsed, elapsed, self._active, self._speeds
+        if not 0.0 <= desired.step(q, self._velocity, *given) <= 1.0 + ROUNDING:
             return None
         self._unnoted = now_s, q, before, now_s - elapsed
         self._goal, self._command = q, command
@@ -202,7 +193,7 @@ class TargetStream:
         if output.mismatch:
             raise RefusedError(Reason.START_MISMATCH, output.mismatch)
         pause = now_s - self._came_s
-        if pause > self._config.stream_gap_s and self.phase is StreamPhase.RUNNING:
+        if self.phase is StreamPhase.RUNNING and pause > self._gap_s():
             self._look_after_pause(q, pause, now_s)
         if begins := self.phase is StreamPhase.IDLE:
             self._active[:] = 0.0
@@ -220,11 +211,9 @@ class TargetStream:
             self._index, self._whole = index, np.array_equal(index, np.arange(self._arm.n))
         self._goal, velocity = q, command.velocity
         self._note(self._way, q, now_s)
-        if velocity is not None and len(index) == len(q):
+        self._velocity[:] = 0.0
+        if velocity is not None:
             self._velocity[index] = velocity
-        else:
-            self._velocity[:] = 0.0
-            self._velocity[index] = 0.0 if velocity is None else velocity
         output.path = None
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self._usual = None
@@ -238,11 +227,9 @@ class TargetStream:
 
         Else it is a new begin.
         """
-        if pause_s <= self._gap_s():
-            return
         chosen = self._active > 0.0
-        self._state.require_fresh(np.flatnonzero(chosen), now_s)
-        output, near = self._output, self._config.start_near(self._arm)[chosen]
+        self._robot.require_fresh(np.flatnonzero(chosen), now_s)
+        output, near = self._output, self._output.near[chosen]
         place, _ = output.place(np.flatnonzero(chosen), output.out[chosen], now_s)
         spare = np.maximum(self._pace() - self._own_speed(), 0.0)[chosen] * CATCH_UP_S
         ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
@@ -294,7 +281,7 @@ class TargetStream:
         q, fraction, limiter = self._goal, 1.0, output.limiter
         for _ in range(TRIES):
             share = self._desired.put_out(
-                q, self._velocity, elapsed, longest, limiter, self._active, self._speeds
+                q, self._velocity, elapsed, longest, self._active, self._speeds
             )
             if share < 0.0:
                 require_limits(limiter.memory[-1:], self._arm)
@@ -409,7 +396,7 @@ class TargetStream:
             if not self._desired.figures[TOO_FAST]:
                 return velocity
         names = [self._arm.joint_names[i] for i in index]
-        hold_speeds(names, velocity[None], np.ones(1), self._fastest[index])
+        hold_speeds(names, velocity[None], self._fastest[index])
         return velocity
 
     def end(self, why: RefusedError, now_s: float) -> None:

@@ -9,7 +9,7 @@ smoothly is a motion from where it is to rest, some tenths of a second ahead.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.correction.bounds import CorrectionConfig, DesiredOffset, require_limits
+from robocal_ros.correction.bounds import require_limits
 from robocal_ros.correction.interface import (
     Reason,
     RefusedError,
@@ -29,11 +29,10 @@ from robocal_ros.correction.limiter import (
     REST_RATE,
     STILL,
 )
-from robocal_ros.correction.robot_state import Output, RobotState, hold_speeds
+from robocal_ros.correction.robot_state import Output, hold_speeds
 from robocal_ros.correction.sent_path import SentPath, driven, spline_terms
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
-from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.plan import JointPlan
 
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
@@ -50,17 +49,9 @@ OWN = 1.25  # of a path's own accelerations, where they are larger than the limi
 class TrajectoryCorrector:
     """Corrects whole trajectories, and plans stops on the way of what was put out."""
 
-    def __init__(
-        self,
-        arm: SerialArm,
-        config: CorrectionConfig,
-        state: RobotState,
-        desired: DesiredOffset,
-        output: Output,
-    ) -> None:
-        self._arm, self._config, self._state = arm, config, state
-        self._desired, self._output = desired, output
-        self._fastest = config.velocity_limits
+    def __init__(self, output: Output) -> None:
+        self._arm, self._config, self._robot = output.arm, output.config, output.robot
+        self._output, self._desired = output, output.desired
 
     def correct(
         self, command: TrajectoryCommand, index: Index, q: Array, now_s: float, starts_in_s: float
@@ -135,7 +126,7 @@ class TrajectoryCorrector:
         """
         output, limiter = self._output, self._output.limiter
         left, withheld = output.path, limiter.withheld
-        if output.path is None and self._state.stands(index, now_s):  # what has come in stays so
+        if output.path is None and self._robot.stands(index, now_s):  # what has come in stays so
             limiter.state[OFFSET_RATE, withheld == 0.0] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
             here, rates = q[0].copy(), (command.velocity, command.acceleration)
@@ -144,7 +135,7 @@ class TrajectoryCorrector:
             limiter.state[OFFSET, index] = output.begin_at(index, here, begins, now_s)
             limiter.state[DESIRED] = begins[0]
             return None, limiter.withheld
-        self._state.require_fresh(index, now_s)
+        self._robot.require_fresh(index, now_s)
         taught, offset = output.lead_in(index, q[0], self._desired.begins(q[0]), now_s)
         limiter.state[OFFSET] = offset
         if taught is None:
@@ -238,22 +229,21 @@ class TrajectoryCorrector:
         led_from: Array | None,
     ) -> None:
         """Refuse what is too fast: between the points, as it says, or on the way to the first."""
-        fastest, names, (velocity, acceleration) = self._fastest[index], command.names, rates
+        fastest, names = self._config.velocity_limits[index], command.names
+        velocity, acceleration = rates
         if velocity is None:
-            hold_speeds(names, np.diff(out[:, index], axis=0), np.diff(times), fastest)
+            hold_speeds(names, np.diff(out[:, index], axis=0) / np.diff(times)[:, None], fastest)
         else:
-            hold_speeds(names, velocity, np.ones(len(velocity)), fastest)
+            hold_speeds(names, velocity, fastest)
             peaks = _peaks(out[:, index], velocity, acceleration, times, fastest)
-            hold_speeds(names, peaks, np.ones(len(peaks)), fastest)
+            hold_speeds(names, peaks, fastest)
         if led_from is None:
             return
         lead_s = float(times[0])
-        if velocity is not None and not (self._output.path and not self._state.scaling):
+        if velocity is not None and not (self._output.path and not self._robot.scaling):
             lead_s /= SPLINE_PEAK
-        way = np.abs(out[0, index] - led_from) - self._config.start_near(self._arm)[index]
-        hold_speeds(
-            names, np.maximum(way, 0.0)[None], np.array([lead_s]), fastest, "would be led in"
-        )
+        way = np.abs(out[0, index] - led_from) - self._output.near[index]
+        hold_speeds(names, np.maximum(way, 0.0)[None] / lead_s, fastest, "would be led in")
 
     def stop(self, now_s: float, ahead_s: float) -> tuple[TrajectoryCommand, SentPath] | None:
         """Slow down on the way of what was put out last; None where nothing moves by it.

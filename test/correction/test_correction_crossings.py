@@ -127,11 +127,11 @@ def streamed(taught: SerialArm, actual: SerialArm, q: np.ndarray) -> np.ndarray:
     """Offsets of targets (m, 6) that come one by one, `DT` apart."""
     desired = DesiredOffset(taught, CorrectionConfig())
     desired.want(actual, on=True)
-    limiter = OffsetLimiter(np.zeros(6, dtype=np.bool_), TURNING, SLIDING)
+    limiter = desired.limiter
     begin = desired.at(q[:1])[0][0]
     limiter.begin(np.arange(6), begin, begin)
     limiter.memory[TAUGHT], limiter.memory[OUT] = q[0], q[0] + begin
-    offsets, given = [begin], (limiter, np.ones(6), np.full((2, 6), 10.0))
+    offsets, given = [begin], (np.ones(6), np.full((2, 6), 10.0))
     for at in q[1:]:
         assert 0.0 <= desired.put_out(at.copy(), np.zeros(6), DT, DT, *given) <= 1.0
         offsets.append(limiter.memory[OUT] - at)
