@@ -48,7 +48,7 @@ from robocal_ros.correction.limiter import (
     put_out,
     step_out,
 )
-from robocal_ros.correction.solution import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
+from robocal_ros.correction.solution import MOST_STEPS, VELOCITY_EXACT
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
@@ -82,6 +82,13 @@ class ShiftBounds:
         return np.asarray(
             (result.tcp_shift_m <= self.tcp_m + ROUNDING)
             & (result.tcp_rotation_rad <= self.tcp_rad + ROUNDING)
+        )
+
+    def beyond(self, shift_m: float, turn_rad: float, where: str) -> str:
+        """What is more, in words."""
+        return (
+            f"{shift_m * 1e3:.3f} mm and {np.degrees(turn_rad):.3f} deg {where}, allowed "
+            f"{self.tcp_m * 1e3:g} mm and {np.degrees(self.tcp_rad):g} deg"
         )
 
 
@@ -160,16 +167,9 @@ def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialAr
     drift, bound = result.arm, config.thermal
     fine = bound.hold(drift)
     if not np.all(fine):
-        raise RefusedError(
-            Reason.TCP_BOUND,
-            f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
-            f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "
-            f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg "
-            f"(point {int(np.argmin(fine)) + 1})",
-        )
-    for part, bounds in ((drift, bound), (result.tool, config.tool)):
-        if part is None:
-            continue
+        words = bound.beyond(np.max(drift.tcp_shift_m), np.max(drift.tcp_rotation_rad), "at most")
+        raise RefusedError(Reason.TCP_BOUND, f"{words} (point {int(np.argmin(fine)) + 1})")
+    for part, bounds in zip(result.parts, (bound, config.tool), strict=False):
         largest = bounds.of_joints(arm)
         over = np.abs(part.joint_shift) > largest + ROUNDING
         if over.any():
@@ -226,7 +226,7 @@ class ClampedResult(StagedResult):
     @property
     def remaining_m(self) -> Array:
         """(m,) position error that remains at the tool, at most."""
-        shift = self.arm.tcp_shift_m + (0.0 if self.tool is None else self.tool.tcp_shift_m)
+        shift = np.sum([part.tcp_shift_m for part in self.parts], axis=0)
         return np.asarray(super().remaining_m + (1.0 - self.kept) * shift)
 
 
@@ -258,9 +258,8 @@ class ClampedCorrection(StagedCorrection):
 
     def velocity_one(self, q: Array, velocity: Array, corrected: Array) -> Array:
         """Velocities (n,) of one point's corrected joints."""
-        at = q + STEP_AHEAD_S * velocity
-        change = self.correct(at[None]).q[0] - at - (corrected - q)
-        return np.asarray(velocity + change / STEP_AHEAD_S)
+        rates, _ = self._path_rates(q[None], velocity[None], None, (corrected - q)[None])
+        return rates[0]
 
     def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
         """Velocities (n,) of one point's taught joints, of those of the corrected ones."""
@@ -274,16 +273,14 @@ class ClampedCorrection(StagedCorrection):
 
     def _shares(self, q: Array, full: StagedResult) -> dict[Reason, Array]:
         """Largest share (m,) of the shift by each bound; equation 1."""
-        arm, (of_arm, of_tool) = full.arm, self._joint_bounds
+        arm, bounds = full.arm, self._joint_bounds
         at_tool = np.minimum(
             self._thermal.tcp_m / np.maximum(arm.tcp_shift_m, TINY),
             self._thermal.tcp_rad / np.maximum(arm.tcp_rotation_rad, TINY),
         )
-        joints = np.min(of_arm / np.maximum(np.abs(arm.joint_shift), TINY), axis=1)
-        if full.tool is not None:
-            shift = np.maximum(np.abs(full.tool.joint_shift), TINY)
-            joints = np.minimum(joints, np.min(of_tool / shift, axis=1))
-        bound = of_arm + of_tool
+        shifts = [np.maximum(np.abs(part.joint_shift), TINY) for part in full.parts]
+        joints = np.min([np.min(b / x, axis=1) for b, x in zip(bounds, shifts, strict=False)], 0)
+        bound = bounds[0] + bounds[1]
         size = np.max(np.abs(full.q - q) / bound, axis=1)
         room = np.maximum(np.minimum(q - self._lower, self._upper - q), 0.0)
         limit = np.min(room / bound, axis=1) / np.maximum(FADES_WITHIN * size, TINY)
@@ -306,9 +303,10 @@ SAME_MODEL = 1e-12  # of packed models that are the same
 class DesiredOffset:
     """Corrected less taught joints, as the model and the tool in use want it.
 
-    ``stage``: the correction in use, None while nothing is to be corrected; ``known``: the same as
-    if it were on, a robot may show it that was corrected before. ``clamped``, ``passed``: how many
-    messages were corrected in part, or not at all, for what bound.
+    ``limiter``: brings it in. ``stage``: the correction in use, None while nothing is to be
+    corrected; ``known``: the same as if it were on, a robot may show it that was corrected before.
+    ``clamped``, ``passed``: how many messages were corrected in part, or not at all, for what
+    bound.
     """
 
     def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
@@ -351,11 +349,8 @@ class DesiredOffset:
         if self.stage is None:
             return np.zeros_like(q), None
         result = self.stage.correct(q)
-        solved = result.arm.converged
-        if result.tool is not None:
-            solved = solved & result.tool.converged
-        if not solved.all():
-            point = int(np.argmin(solved)) + 1
+        if not result.converged.all():
+            point = int(np.argmin(result.converged)) + 1
             detail = f"the pose is at the edge of the reach (point {point})"
             raise RefusedError(Reason.NOT_SOLVED, detail)
         policy = self._config.policy
@@ -563,13 +558,13 @@ class CorrectionGate:
         shift = JointCorrection.between(self._reference, arm).correct(places)
         if not np.all(bound.hold(shift)):
             self.waiting = model
-            raise RefusedError(
-                Reason.TCP_BOUND,
-                f"{np.max(shift.tcp_shift_m) * 1e3:.3f} mm and "
-                f"{np.degrees(np.max(shift.tcp_rotation_rad)):.3f} deg where the robot is or "
-                f"goes, allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg; "
-                f"over its joint range {survey(self._reference, arm, bound)}",
+            words = bound.beyond(
+                np.max(shift.tcp_shift_m),
+                np.max(shift.tcp_rotation_rad),
+                "where the robot is or goes",
             )
+            found = survey(self._reference, arm, bound)
+            raise RefusedError(Reason.TCP_BOUND, f"{words}; over its joint range {found}")
 
     def take_tool(self, tool: OfferedTool) -> None:
         """As `ToolGate.take`; raises `RefusedError` also when it was made for another robot."""
@@ -640,11 +635,8 @@ class ToolGate:
         shift = float(np.linalg.norm(T_flange_tool[:3, 3] - taught[:3, 3]))
         turn = float(np.linalg.norm(frames.log_rotation(T_flange_tool[:3, :3] @ taught[:3, :3].T)))
         if shift > bound.tcp_m + ROUNDING or turn > bound.tcp_rad + ROUNDING:
-            raise RefusedError(
-                Reason.TOOL_BOUND,
-                f"{shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg from the taught tool, "
-                f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
-            )
+            words = bound.beyond(shift, turn, "from the taught tool")
+            raise RefusedError(Reason.TOOL_BOUND, words)
 
 
 def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:

@@ -214,21 +214,29 @@ class StagedResult:
     tool: CorrectionResult | None
 
     @property
+    def parts(self) -> tuple[CorrectionResult, ...]:
+        """Those that were made."""
+        return (self.arm,) if self.tool is None else (self.arm, self.tool)
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """(m,) False where there is no solution."""
+        return np.all([part.converged for part in self.parts], axis=0)
+
+    @property
     def weak(self) -> NDArray[np.bool_]:
         """(m,) True where a weak direction was given up, in part or in full."""
-        return self.arm.weak if self.tool is None else self.arm.weak | self.tool.weak
+        return np.any([part.weak for part in self.parts], axis=0)
 
     @property
     def whole(self) -> NDArray[np.bool_]:
         """(m,) True where all of the correction was made."""
-        fine = self.arm.converged & ~self.weak
-        return fine if self.tool is None else fine & self.tool.converged
+        return self.converged & ~self.weak
 
     @property
     def remaining_m(self) -> Array:
         """(m,) position error that remains at the tool, at most."""
-        rest = 0.0 if self.tool is None else self.tool.position_error_m
-        return np.asarray(self.arm.position_error_m + rest)
+        return np.sum([part.position_error_m for part in self.parts], axis=0)
 
 
 def _drift_slope(models: Array) -> float:
@@ -267,28 +275,23 @@ class StagedCorrection:
         bare = actual.copy()
         bare[-1] = reference[-1]
         self.n, self.free_axis = len(reference) - 2, free_axis
-        drift = np.stack([reference, bare])
-        self._arm = JointCorrection(drift, arm_largest, free_axis, _drift_slope(drift))
-        self._tool: JointCorrection | None = None
+        drift, tool = np.stack([reference, bare]), np.stack([bare, actual])
+        self._parts = [JointCorrection(drift, arm_largest, free_axis, _drift_slope(drift))]
         if not np.array_equal(actual[-1], reference[-1]):
-            self._tool = JointCorrection(
-                np.stack([bare, actual]), tool_largest, free_axis, TOOL_SLOPE
-            )
-        parts = [self._arm] if self._tool is None else [self._arm, self._tool]
-        self.stages = len(parts)
-        self.works = np.stack([part.work for part in parts])
-        self.largest = np.stack([part.largest for part in parts])
-        self.reports = np.empty((2, self.stages, self.n + damping.REPORT))
+            self._parts.append(JointCorrection(tool, tool_largest, free_axis, TOOL_SLOPE))
+        self.works = np.stack([part.work for part in self._parts])
+        self.largest = np.stack([part.largest for part in self._parts])
+        self.reports = np.empty((2, len(self._parts), self.n + damping.REPORT))
         self._spare = np.empty((3, self.n))
-        self._back = [part.inverse() for part in reversed(parts)]
+        self._back = [part.inverse() for part in reversed(self._parts)]
         self._back_works = np.stack([part.work for part in self._back])
 
     def correct(self, q: Array) -> StagedResult:
         """Correct joints (m, n)."""
-        arm = self._arm.correct(q)
-        if self._tool is None:
+        arm = self._parts[0].correct(q)
+        if len(self._parts) == 1:
             return StagedResult(arm.q, arm, None)
-        tool = self._tool.correct(arm.q)
+        tool = self._parts[1].correct(arm.q)
         return StagedResult(tool.q, arm, tool)
 
     def uncorrect_one(self, corrected: Array) -> Array:
@@ -333,9 +336,8 @@ class StagedCorrection:
 
         ``result`` is that of `correct` at ``q``. By the chain rule where all of the correction of
         six joints is made; with a weak direction, a free axis, joint functions or other numbers of
-        joints, by
-        central differences along the path, which the two continuous derivatives of the
-        correction allow everywhere.
+        joints, by central differences along the path, which the two continuous derivatives of
+        the correction allow everywhere.
         """
         out_v, out_a = np.empty(q.shape), np.empty(q.shape)
         rough = np.ones(len(q), dtype=np.bool_)

@@ -20,7 +20,7 @@ from robocal_ros.correction.joint_correction import (
     StagedCorrection,
     pack_model,
 )
-from robocal_ros.correction.solution import MOST_OVER, RATE_STEP_S, REPORT, rates_batch
+from robocal_ros.correction.solution import MOST_OVER, RATE_STEP_S, rates_batch
 from robocal_ros.ground import frames
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
@@ -427,7 +427,7 @@ def test_rates_are_the_derivative_all_through_a_crossing() -> None:
 def test_one_point_of_a_stream_has_the_bits_of_a_batch() -> None:
     for crossing in crossings("kr150_r3100", 3):
         stage, q = crossing.stage, crossing.q
-        batch, out = stage.correct(q).q, np.empty((stage.stages, 6 + REPORT))
+        batch, out = stage.correct(q).q, np.empty_like(stage.reports[0])
         for row, expected in zip(q, batch, strict=True):
             solution.correct_staged(row, stage.largest, False, stage.works, out)
             assert np.array_equal(out[-1, :6], expected)
