@@ -86,17 +86,14 @@ class CorrectionLog:
                 noted = self._noted.get(timeout=RETRY_S)
             except queue.Empty:
                 noted = ""
-            known = ""
             if isinstance(noted, CorrectionRecord):
                 self._waiting.append(noted)
-            elif noted != END:
-                known = noted
-            self._try(known)
+            self._try(noted)
 
-    def _try(self, known: str) -> None:
+    def _try(self, noted: CorrectionRecord | str) -> None:
         try:
             self.damage = history_notice(self._settings)
-            if known and known == self.damage:
+            if self.damage and noted == self.damage:
                 acknowledge_history(self._settings, ACKNOWLEDGED_BY)
                 self.damage = ""
             if self._waiting:
