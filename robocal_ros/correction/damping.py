@@ -155,58 +155,46 @@ def _root(T: Nine) -> Nine:
 
 
 @lean
-def _spread(u: Nine, a: float, b: float, c: float) -> Nine:
-    """U diag(a, b, c) U^T."""
-    u0, u1, u2, u3, u4, u5, u6, u7, u8 = u
-    xy = a * u0 * u3 + b * u1 * u4 + c * u2 * u5
-    xz = a * u0 * u6 + b * u1 * u7 + c * u2 * u8
-    yz = a * u3 * u6 + b * u4 * u7 + c * u5 * u8
+def _spread(p: Three, q: Three, r: Three, a: float, b: float, c: float) -> Nine:
+    """A p p^T + b q q^T + c r r^T."""
+    xy = a * p[0] * p[1] + b * q[0] * q[1] + c * r[0] * r[1]
+    xz = a * p[0] * p[2] + b * q[0] * q[2] + c * r[0] * r[2]
+    yz = a * p[1] * p[2] + b * q[1] * q[2] + c * r[1] * r[2]
     return (
-        a * u0 * u0 + b * u1 * u1 + c * u2 * u2, xy, xz,
-        xy, a * u3 * u3 + b * u4 * u4 + c * u5 * u5, yz,
-        xz, yz, a * u6 * u6 + b * u7 * u7 + c * u8 * u8,
+        a * p[0] * p[0] + b * q[0] * q[0] + c * r[0] * r[0], xy, xz,
+        xy, a * p[1] * p[1] + b * q[1] * q[1] + c * r[1] * r[1], yz,
+        xz, yz, a * p[2] * p[2] + b * q[2] * q[2] + c * r[2] * r[2],
     )  # fmt: skip
 
 
 @lean
-def _turn(p: float, q: float, o: float) -> Three:
-    """Cosine, sine and tangent of Jacobi's rotation for two diagonal elements and theirs beside."""
-    apart = q - p
+def _turn(
+    a: float, b: float, o: float, y: float, z: float, p: Three, q: Three
+) -> tuple[float, float, float, float, Three, Three]:
+    """Jacobi's rotation for two diagonal elements and theirs beside, which becomes 0.
+
+    With it turn the elements that the two have with the third one, and the axes found so far.
+    """
+    apart = b - a
     t = 2.0 * o / (abs(apart) + np.sqrt(apart * apart + 4.0 * o * o) + TINY)
     t = t if apart >= 0.0 else -t
-    cosine = 1.0 / np.sqrt(t * t + 1.0)
-    return cosine, t * cosine, t
+    c = 1.0 / np.sqrt(t * t + 1.0)
+    s = t * c
+    return (
+        a - t * o, b + t * o, c * y - s * z, s * y + c * z,
+        (c * p[0] - s * q[0], c * p[1] - s * q[1], c * p[2] - s * q[2]),
+        (s * p[0] + c * q[0], s * p[1] + c * q[1], s * p[2] + c * q[2]),
+    )  # fmt: skip
 
 
 @lean
-def _both(cosine: float, sine: float, x: float, y: float) -> tuple[float, float]:
-    return cosine * x - sine * y, sine * x + cosine * y
-
-
-@lean
-def _sweep(m: Six, u: Nine) -> tuple[Six, Nine]:
+def _sweep(m: Six, p: Three, q: Three, r: Three) -> tuple[Six, Three, Three, Three]:
     """A rotation for each element beside the diagonal: ``m`` is the diagonal, then ab, ac, bc."""
     a, b, c, x, y, z = m
-    u0, u1, u2, u3, u4, u5, u6, u7, u8 = u
-    cosine, sine, t = _turn(a, b, x)
-    a, b, x = a - t * x, b + t * x, 0.0
-    y, z = _both(cosine, sine, y, z)
-    u0, u1 = _both(cosine, sine, u0, u1)
-    u3, u4 = _both(cosine, sine, u3, u4)
-    u6, u7 = _both(cosine, sine, u6, u7)
-    cosine, sine, t = _turn(a, c, y)
-    a, c, y = a - t * y, c + t * y, 0.0
-    x, z = _both(cosine, sine, x, z)
-    u0, u2 = _both(cosine, sine, u0, u2)
-    u3, u5 = _both(cosine, sine, u3, u5)
-    u6, u8 = _both(cosine, sine, u6, u8)
-    cosine, sine, t = _turn(b, c, z)
-    b, c, z = b - t * z, c + t * z, 0.0
-    x, y = _both(cosine, sine, x, y)
-    u1, u2 = _both(cosine, sine, u1, u2)
-    u4, u5 = _both(cosine, sine, u4, u5)
-    u7, u8 = _both(cosine, sine, u7, u8)
-    return (a, b, c, x, y, z), (u0, u1, u2, u3, u4, u5, u6, u7, u8)
+    a, b, y, z, p, q = _turn(a, b, x, y, z, p, q)
+    a, c, x, z, p, r = _turn(a, c, y, 0.0, z, p, r)
+    b, c, x, y, q, r = _turn(b, c, z, x, 0.0, q, r)
+    return (a, b, c, x, y, 0.0), p, q, r
 
 
 @lean
@@ -219,15 +207,15 @@ def _damp(s: float, square: float) -> float:
 @lean
 def _damped(m: Nine, square: float) -> tuple[Nine, Nine, float]:
     """Damping d(M) of a symmetric matrix, (M + d(M))^-1, and how many directions are damped."""
-    s, u = (m[0], m[4], m[8], m[1], m[2], m[5]), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    s, u = _sweep(s, u)
-    s, u = _sweep(s, u)
-    s, u = _sweep(s, u)
-    s, u = _sweep(s, u)
+    p, q, r = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    s, p, q, r = _sweep((m[0], m[4], m[8], m[1], m[2], m[5]), p, q, r)
+    s, p, q, r = _sweep(s, p, q, r)
+    s, p, q, r = _sweep(s, p, q, r)
+    s, p, q, r = _sweep(s, p, q, r)
     a, b, c = _damp(s[0], square), _damp(s[1], square), _damp(s[2], square)
     count = (1.0 if a > 0.0 else 0.0) + (1.0 if b > 0.0 else 0.0) + (1.0 if c > 0.0 else 0.0)
-    whole = _spread(u, 1.0 / (s[0] + a), 1.0 / (s[1] + b), 1.0 / (s[2] + c))
-    return _spread(u, a, b, c), whole, count
+    whole = _spread(p, q, r, 1.0 / (s[0] + a), 1.0 / (s[1] + b), 1.0 / (s[2] + c))
+    return _spread(p, q, r, a, b, c), whole, count
 
 
 @lean

@@ -34,7 +34,7 @@ from robocal_ros.correction.damping import (
     total,
     weighed,
 )
-from robocal_ros.ground.compiled import kernel, lean
+from robocal_ros.ground.compiled import inlined, kernel, lean
 from robocal_ros.kinematics.kernels import LARGEST_ANGLE, reduced_cos_sin
 
 Array = NDArray[np.float64]
@@ -131,19 +131,9 @@ def _link(c: Array, at: int, q: float, frame: Frame) -> Frame:
 
 
 @lean
-def _root(c: Array, at: int) -> Frame:
-    """Frame of the first joint."""
-    r = at + ROOT
-    return (
-        c[r], c[r + 1], c[r + 2], c[r + 3], c[r + 4], c[r + 5],
-        c[r + 6], c[r + 7], c[r + 8], c[r + 9], c[r + 10], c[r + 11],
-    )  # fmt: skip
-
-
-@lean
 def walk(c: Array, at: int, q: Six) -> Frames:
     """Frames of all joints, then the flange's axes at the tool's origin."""
-    f0 = _root(c, at)
+    f0 = frame(c, at + ROOT, 1)
     f1 = _link(c, at, q[0], f0)
     f2 = _link(c, at + 9, q[1], f1)
     f3 = _link(c, at + 18, q[2], f2)
@@ -291,43 +281,6 @@ def _joints(J: Rows, y: Six) -> Six:
 
 
 @lean
-def _begin(c: Array, q: Six) -> tuple[Six, bool, Frame, Frames, Rows, Nine, Nine, float]:
-    """Residual, whether the series serve, goal, frames and Jacobian at the joints that came.
-
-    Then the damping P and R, and how many directions have it.
-    """
-    aim, frames = goal(c, q), walk(c, ACTUAL, q)
-    error, near = residual(aim, frames[6])
-    fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
-    J = _rows(c, frames)
-    i, j, k, l, m, n = J
-    A, B, C = _product(i, j, k, i, j, k), _product(i, j, k, l, m, n), _product(l, m, n, l, m, n)
-    P, R, weak = damping(A, B, C, weighed(error), c[DAMPING], c[DAMPING + 1])
-    return error, fine, aim, frames, J, P, R, weak
-
-
-@lean
-def _two_steps(
-    c: Array, q: Six, aim: Frame, J: Rows, P: Nine, R: Nine, y: Six, x: Six, frames: Frames
-) -> tuple[Six, Six, Frames, float, float, bool]:
-    """Multipliers, shift and frames after two steps with one matrix, the steps' squares; if near.
-
-    ``frames`` are those at the joints q + x.
-    """
-    e, near = residual(aim, frames[6])
-    factor = _factor(_rows(c, frames), J, P, R)
-    y = more(y, 1.0, _step(factor, left(weighed(e), y, P, R)))
-    once = _joints(J, y)
-    first = more(once, -1.0, x)
-    e, still = residual(aim, walk(c, ACTUAL, more(q, 1.0, once))[6])
-    y = more(y, 1.0, _step(factor, left(weighed(e), y, P, R)))
-    x = _joints(J, y)
-    second = more(x, -1.0, once)
-    frames = walk(c, ACTUAL, more(q, 1.0, x))
-    return y, x, frames, dot(first, first), dot(second, second), near & still
-
-
-@lean
 def six(rows: Array, first: int, lanes: int) -> Six:
     """Six numbers of a point, from the place ``first`` on: those of ``lanes`` stand in a row."""
     return (
@@ -377,7 +330,7 @@ def frames_found(c: Array, rows: Array, k: int, lanes: int) -> Frames:
     """Frames of the actual arm at the joints found for point ``k`` of ``lanes``."""
     at, each = FRAMES * lanes + k, 12 * lanes
     return (
-        _root(c, ACTUAL), frame(rows, at, lanes), frame(rows, at + each, lanes),
+        frame(c, ACTUAL + ROOT, 1), frame(rows, at, lanes), frame(rows, at + each, lanes),
         frame(rows, at + 2 * each, lanes), frame(rows, at + 3 * each, lanes),
         frame(rows, at + 4 * each, lanes), frame(rows, at + 5 * each, lanes),
     )  # fmt: skip
@@ -401,112 +354,111 @@ def put_sizes(e: Six, rows: Array, shift: int, turn: int, k: int, lanes: int) ->
     rows[turn * lanes + k] = np.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
 
 
+# What is worked out of a point stays in its rows, so that all pairs of steps are one loop: written
+# one after the other, they would take the compiler half a minute.
+
+
 @lean
-def _end(
-    c: Array, x: Six, first: Six, last: Six, fine: bool, found: bool, weak: float, rows: Array,
-    k: int, lanes: int,
-) -> None:  # fmt: skip
+def _begin(c: Array, rows: Array, k: int, lanes: int) -> None:
+    """Residual, goal, frames and Jacobian of point ``k`` at the joints that came; the damping."""
+    q = six(rows, CAME * lanes + k, lanes)
+    aim, frames = goal(c, q), walk(c, ACTUAL, q)
+    error, near = residual(aim, frames[6])
+    fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
+    J = _rows(c, frames)
+    r, s, t, u, v, w = J
+    A, B, C = _product(r, s, t, r, s, t), _product(r, s, t, u, v, w), _product(u, v, w, u, v, w)
+    P, R, weak = damping(A, B, C, weighed(error), c[DAMPING], c[DAMPING + 1])
+    put(error, rows, ERROR * lanes + k, lanes)
+    _put_frame(aim, rows, AIM * lanes + k, lanes)
+    _put_frames(frames, rows, k, lanes)
+    at, each = JACOBIAN * lanes + k, N * lanes
+    put(J[0], rows, at, lanes)
+    put(J[1], rows, at + each, lanes)
+    put(J[2], rows, at + 2 * each, lanes)
+    put(J[3], rows, at + 3 * each, lanes)
+    put(J[4], rows, at + 4 * each, lanes)
+    put(J[5], rows, at + 5 * each, lanes)
+    _put_nine(P, rows, DAMPED * lanes + k, lanes)
+    _put_nine(R, rows, (DAMPED + 9) * lanes + k, lanes)
+    zero = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    put(zero, rows, STEPS * lanes + k, lanes)
+    put(zero, rows, (STEPS + N) * lanes + k, lanes)
+    put((1.0 if fine else 0.0, weak, 1.0, 0.0, 0.0, 0.0), rows, FINE * lanes + k, lanes)
+
+
+@lean
+def _two_steps(c: Array, rows: Array, k: int, lanes: int, beside: float) -> None:
+    """Multipliers, shift and frames of point ``k`` after two steps with one matrix.
+
+    ``beside``: what the second one's square may have besides its share of the first one's.
+    """
+    at, each = JACOBIAN * lanes + k, N * lanes
+    J = (
+        six(rows, at, lanes), six(rows, at + each, lanes), six(rows, at + 2 * each, lanes),
+        six(rows, at + 3 * each, lanes), six(rows, at + 4 * each, lanes),
+        six(rows, at + 5 * each, lanes),
+    )  # fmt: skip
+    P, R = _nine(rows, DAMPED * lanes + k, lanes), _nine(rows, (DAMPED + 9) * lanes + k, lanes)
+    y, x = six(rows, STEPS * lanes + k, lanes), six(rows, (STEPS + N) * lanes + k, lanes)
+    q, aim = six(rows, CAME * lanes + k, lanes), frame(rows, AIM * lanes + k, lanes)
+    frames = frames_found(c, rows, k, lanes)
+    e, near = residual(aim, frames[6])
+    factor = _factor(_rows(c, frames), J, P, R)
+    y = more(y, 1.0, _step(factor, left(weighed(e), y, P, R)))
+    once = _joints(J, y)
+    step = more(once, -1.0, x)
+    first = dot(step, step)
+    e, still = residual(aim, walk(c, ACTUAL, more(q, 1.0, once))[6])
+    y = more(y, 1.0, _step(factor, left(weighed(e), y, P, R)))
+    x = _joints(J, y)
+    step = more(x, -1.0, once)
+    second = dot(step, step)
+    _put_frames(walk(c, ACTUAL, more(q, 1.0, x)), rows, k, lanes)
+    put(y, rows, STEPS * lanes + k, lanes)
+    put(x, rows, (STEPS + N) * lanes + k, lanes)
+    found, good = FOUND * lanes + k, near & still & (second <= BESIDE * BESIDE * first + beside)
+    rows[found] = rows[found] if good else 0.0
+    rows[found + lanes], rows[found + 2 * lanes] = first, second
+
+
+@lean
+def _end(c: Array, rows: Array, k: int, lanes: int) -> None:
     """Keep the corrected joints of point ``k`` and their report."""
+    fine, weak, found, first, second, _ = six(rows, FINE * lanes + k, lanes)
+    solved = (found > 0.5) & (first <= NEAR * NEAR) & (second <= SHORT * SHORT)
+    x, error = six(rows, (STEPS + N) * lanes + k, lanes), six(rows, ERROR * lanes + k, lanes)
+    aim, end = frame(rows, AIM * lanes + k, lanes), frame(rows, TOOL_FRAME * lanes + k, lanes)
+    last, _ = residual(aim, end)
     # of no more than this nothing is left to do, and nothing is done
-    still = dot(first, first) <= AT_GOAL * AT_GOAL * N
-    found &= within(c, x, FAR)
+    still = dot(error, error) <= AT_GOAL * AT_GOAL * N
+    solved &= within(c, x, FAR)
     x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0) if still else x
     put(more(six(rows, CAME * lanes + k, lanes), 1.0, x), rows, GOES * lanes + k, lanes)
-    last = first if still else last
+    last = error if still else last
     put_sizes(last, rows, SAID + POSITION_ERROR, SAID + ROTATION_ERROR, k, lanes)
-    put_sizes(first, rows, SAID + TCP_SHIFT, SAID + TCP_ROTATION, k, lanes)
+    put_sizes(error, rows, SAID + TCP_SHIFT, SAID + TCP_ROTATION, k, lanes)
     rows[(SAID + ITERATIONS) * lanes + k] = 0.0 if still else 3.0 + c[LARGE]
-    rows[(SAID + CONVERGED) * lanes + k] = 1.0 if fine & (found | still) else 0.0
+    rows[(SAID + CONVERGED) * lanes + k] = 1.0 if (fine > 0.5) & (solved | still) else 0.0
     rows[(SAID + WEAK) * lanes + k] = 0.0 if still | (weak <= 0.0) else 1.0
 
 
-@kernel
-def correct_one(c: Array, rows: Array) -> None:
-    """Corrected joints of one point, and its report."""
-    q = six(rows, CAME, 1)
-    error, fine, aim, frames, J, P, R, weak = _begin(c, q)
-    y = x = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    y, x, frames, first, second, found = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    found &= second <= BESIDE * BESIDE * first
-    y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    found &= good
-    if c[LARGE] > 0.5:
-        y, x, frames, _, _, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-        found &= good
-    y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    found &= good & (first <= NEAR * NEAR) & (second <= SHORT * SHORT)
-    last, _ = residual(aim, frames[6])
-    _put_frame(aim, rows, AIM, 1)
-    _put_frames(frames, rows, 0, 1)
-    _end(c, x, error, last, fine, found, weak, rows, 0, 1)
-
-
-# Of sixteen points what is worked out stays in the rows, so that all pairs of steps are one loop:
-# written one after the other, they would take the compiler half a minute.
-
-
-@lean
-def _begin_lane(c: Array, rows: Array, k: int) -> None:
-    error, fine, aim, frames, J, P, R, weak = _begin(c, six(rows, CAME * LANES + k, LANES))
-    put(error, rows, ERROR * LANES + k, LANES)
-    _put_frame(aim, rows, AIM * LANES + k, LANES)
-    _put_frames(frames, rows, k, LANES)
-    at, each = JACOBIAN * LANES + k, N * LANES
-    put(J[0], rows, at, LANES)
-    put(J[1], rows, at + each, LANES)
-    put(J[2], rows, at + 2 * each, LANES)
-    put(J[3], rows, at + 3 * each, LANES)
-    put(J[4], rows, at + 4 * each, LANES)
-    put(J[5], rows, at + 5 * each, LANES)
-    _put_nine(P, rows, DAMPED * LANES + k, LANES)
-    _put_nine(R, rows, (DAMPED + 9) * LANES + k, LANES)
-    zero = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    put(zero, rows, STEPS * LANES + k, LANES)
-    put(zero, rows, (STEPS + N) * LANES + k, LANES)
-    put((1.0 if fine else 0.0, weak, 1.0, 0.0, 0.0, 0.0), rows, FINE * LANES + k, LANES)
-
-
-@lean
-def _two_steps_lane(c: Array, rows: Array, k: int, beside: float) -> None:
-    """`_two_steps`; ``beside``: what the second one's square may have besides its share."""
-    at, each = JACOBIAN * LANES + k, N * LANES
-    J = (
-        six(rows, at, LANES), six(rows, at + each, LANES), six(rows, at + 2 * each, LANES),
-        six(rows, at + 3 * each, LANES), six(rows, at + 4 * each, LANES),
-        six(rows, at + 5 * each, LANES),
-    )  # fmt: skip
-    P, R = _nine(rows, DAMPED * LANES + k, LANES), _nine(rows, (DAMPED + 9) * LANES + k, LANES)
-    y, x = six(rows, STEPS * LANES + k, LANES), six(rows, (STEPS + N) * LANES + k, LANES)
-    q, aim = six(rows, CAME * LANES + k, LANES), frame(rows, AIM * LANES + k, LANES)
-    frames = frames_found(c, rows, k, LANES)
-    y, x, frames, first, second, good = _two_steps(c, q, aim, J, P, R, y, x, frames)
-    good &= second <= BESIDE * BESIDE * first + beside
-    _put_frames(frames, rows, k, LANES)
-    put(y, rows, STEPS * LANES + k, LANES)
-    put(x, rows, (STEPS + N) * LANES + k, LANES)
-    found = FOUND * LANES + k
-    rows[found] = rows[found] if good else 0.0
-    rows[found + LANES], rows[found + 2 * LANES] = first, second
-
-
-@lean
-def _end_lane(c: Array, rows: Array, k: int) -> None:
-    fine, weak, found, first, second, _ = six(rows, FINE * LANES + k, LANES)
-    solved = (found > 0.5) & (first <= NEAR * NEAR) & (second <= SHORT * SHORT)
-    x, error = six(rows, (STEPS + N) * LANES + k, LANES), six(rows, ERROR * LANES + k, LANES)
-    aim, end = frame(rows, AIM * LANES + k, LANES), frame(rows, TOOL_FRAME * LANES + k, LANES)
-    last, _ = residual(aim, end)
-    _end(c, x, error, last, fine > 0.5, solved, weak, rows, k, LANES)
-
-
-@kernel
-def correct_lanes(c: Array, rows: Array) -> None:
-    """`correct_one` for sixteen points."""
-    for k in range(LANES):
-        _begin_lane(c, rows, k)
+@inlined
+def _correct(c: Array, rows: Array, lanes: int) -> None:
+    for k in range(lanes):
+        _begin(c, rows, k, lanes)
     for i in range(4 if c[LARGE] > 0.5 else 3):
         beside = 0.0 if i == 0 else np.inf
-        for k in range(LANES):
-            _two_steps_lane(c, rows, k, beside)
-    for k in range(LANES):
-        _end_lane(c, rows, k)
+        for k in range(lanes):
+            _two_steps(c, rows, k, lanes, beside)
+    for k in range(lanes):
+        _end(c, rows, k, lanes)
+
+
+@kernel
+def correct(c: Array, rows: Array, lanes: int) -> None:
+    """Corrected joints of one point or sixteen, and their reports."""
+    if lanes == 1:
+        _correct(c, rows, 1)
+    else:
+        _correct(c, rows, LANES)

@@ -34,7 +34,7 @@ from robocal_ros.correction.six_axis import (
     put_sizes,
     six,
 )
-from robocal_ros.ground.compiled import kernel, lean
+from robocal_ros.ground.compiled import inlined, kernel, lean
 from robocal_ros.kinematics.kernels import CENTRE, COMPLIANCE, MASS, spline
 
 Array = NDArray[np.float64]
@@ -187,11 +187,6 @@ def _wound_by(c: Array, load: int, a: Vectors, w: Vectors, x: Six) -> Six:
 
 
 @lean
-def _over(x: Six, y: Six) -> Six:
-    return x[0] / y[0], x[1] / y[1], x[2] / y[2], x[3] / y[3], x[4] / y[4], x[5] / y[5]
-
-
-@lean
 def _turn(c: Array, rows: Array, k: int, lanes: int) -> None:
     """What a rigid reference arm would read."""
     q = six(rows, GIVEN * lanes + k, lanes)
@@ -222,14 +217,19 @@ def _shift(c: Array, rows: Array, k: int, lanes: int) -> None:
 
 
 @lean
+def _towards(q: Six, wound: Six, rows: Array, k: int, lanes: int) -> Six:
+    """A step from joints ``q`` that load winds so far, with the functions alone."""
+    turned = more(more(q, 1.0, six(rows, VALUE * lanes + k, lanes)), 1.0, wound)
+    x = more(six(rows, GOES * lanes + k, lanes), -1.0, turned)
+    y = six(rows, SLOPE * lanes + k, lanes)
+    return x[0] / y[0], x[1] / y[1], x[2] / y[2], x[3] / y[3], x[4] / y[4], x[5] / y[5]
+
+
+@lean
 def _try(rows: Array, at: int, k: int, lanes: int) -> float:
-    """A step from joints ``at`` that load does not notice, with the functions alone; its square."""
+    """A step from joints ``at`` that load does not notice; its square."""
     q = six(rows, at * lanes + k, lanes)
-    turned = more(
-        more(q, 1.0, six(rows, VALUE * lanes + k, lanes)), 1.0, six(rows, WOUND * lanes + k, lanes)
-    )
-    step = more(six(rows, GOES * lanes + k, lanes), -1.0, turned)
-    step = _over(step, six(rows, SLOPE * lanes + k, lanes))
+    step = _towards(q, six(rows, WOUND * lanes + k, lanes), rows, k, lanes)
     put(more(q, 1.0, step), rows, TRIED * lanes + k, lanes)
     return dot(step, step)
 
@@ -240,9 +240,7 @@ def _step(c: Array, rows: Array, k: int, lanes: int) -> None:
     q, load = six(rows, TRIED * lanes + k, lanes), LOADS + LOAD
     a, w = _carried(c, ACTUAL, load, six_axis.walk(c, ACTUAL, q))
     wound = _wound(c, load, w)
-    turned = more(more(q, 1.0, six(rows, VALUE * lanes + k, lanes)), 1.0, wound)
-    step = more(six(rows, GOES * lanes + k, lanes), -1.0, turned)
-    step = _over(step, six(rows, SLOPE * lanes + k, lanes))
+    step = _towards(q, wound, rows, k, lanes)
     # a share of it is what the arm turns for the load's change, a share of that for its change
     change = _wound_by(c, load, a, w, more(step, -1.0, _wound_by(c, load, a, w, step)))
     put(more(more(q, 1.0, step), -1.0, change), rows, TRIED * lanes + k, lanes)
@@ -263,46 +261,44 @@ def _end(rows: Array, k: int, lanes: int) -> None:
     put(six(rows, TRIED * lanes + k, lanes), rows, GOES * lanes + k, lanes)
 
 
+@inlined
+def _turn_all(c: Array, layer: Array, rows: Array, lanes: int) -> None:
+    splines(layer, rows, GIVEN, lanes)
+    for k in range(lanes):
+        _turn(c, rows, k, lanes)
+
+
 @kernel
 def turn(c: Array, layer: Array, rows: Array, lanes: int) -> None:
-    """What a rigid reference arm would read at the joints given."""
+    """What a rigid reference arm would read at the joints given, of one point or sixteen."""
     if lanes == 1:
-        splines(layer, rows, GIVEN, 1)
-        _turn(c, rows, 0, 1)
-        return
-    splines(layer, rows, GIVEN, LANES)
-    for k in range(LANES):
-        _turn(c, rows, k, LANES)
+        _turn_all(c, layer, rows, 1)
+    else:
+        _turn_all(c, layer, rows, LANES)
+
+
+@inlined
+def _read(c: Array, layer: Array, rows: Array, lanes: int) -> None:
+    for k in range(lanes):
+        _wind(c, rows, k, lanes)
+    splines(layer, rows, GIVEN, lanes)
+    for k in range(lanes):
+        _shift(c, rows, k, lanes)
+    splines(layer, rows, GOES, lanes)
+    for k in range(lanes):
+        _try(rows, GOES, k, lanes)
+    splines(layer, rows, TRIED, lanes)
+    for k in range(lanes):
+        _step(c, rows, k, lanes)
+    splines(layer, rows, TRIED, lanes)
+    for k in range(lanes):
+        _end(rows, k, lanes)
 
 
 @kernel
-def read_one(c: Array, layer: Array, rows: Array) -> None:
+def read(c: Array, layer: Array, rows: Array, lanes: int) -> None:
     """Joints of what `six_axis` found, and the shift at the tool of the true arms."""
-    _wind(c, rows, 0, 1)
-    splines(layer, rows, GIVEN, 1)
-    _shift(c, rows, 0, 1)
-    splines(layer, rows, GOES, 1)
-    _try(rows, GOES, 0, 1)
-    splines(layer, rows, TRIED, 1)
-    _step(c, rows, 0, 1)
-    splines(layer, rows, TRIED, 1)
-    _end(rows, 0, 1)
-
-
-@kernel
-def read_lanes(c: Array, layer: Array, rows: Array) -> None:
-    """`read_one` for sixteen points."""
-    for k in range(LANES):
-        _wind(c, rows, k, LANES)
-    splines(layer, rows, GIVEN, LANES)
-    for k in range(LANES):
-        _shift(c, rows, k, LANES)
-    splines(layer, rows, GOES, LANES)
-    for k in range(LANES):
-        _try(rows, GOES, k, LANES)
-    splines(layer, rows, TRIED, LANES)
-    for k in range(LANES):
-        _step(c, rows, k, LANES)
-    splines(layer, rows, TRIED, LANES)
-    for k in range(LANES):
-        _end(rows, k, LANES)
+    if lanes == 1:
+        _read(c, layer, rows, 1)
+    else:
+        _read(c, layer, rows, LANES)

@@ -157,12 +157,10 @@ def prepare(
     """
     n = models.shape[1] - 2
     room, six, taught_turns = room_in(work, n), six_in(work), False
-    for i in range(n):
-        for c in range(9):
-            room.taught_links[i, c], room.links[i, c] = models[0, i, c], models[1, i, c]
-    for i in range(n + 1):
-        for c in range(room.layer.shape[1]):
-            room.taught_layer[i, c], room.layer[i, c] = models[0, i, 9 + c], models[1, i, 9 + c]
+    newton.copy(models[0, :n, :9], room.taught_links)
+    newton.copy(models[1, :n, :9], room.links)
+    newton.copy(models[0, : n + 1, 9:], room.taught_layer)
+    newton.copy(models[1, : n + 1, 9:], room.layer)
     newton.pose(models[0, n], room.taught_root)
     newton.pose(models[0, n + 1], room.taught_tool)
     newton.pose(models[1, n], room.root)
@@ -222,8 +220,7 @@ def _jacobian(free: bool, room: Workspace, J: Array) -> None:
 
 @lean
 def _weighed(room: Workspace) -> Six:
-    e = room.e
-    return damping.weighed((e[0], e[1], e[2], e[3], e[4], e[5]))
+    return damping.weighed(six_axis.six(room.e, 0, 1))
 
 
 @lean
@@ -244,14 +241,13 @@ def _add_step(q: Array, free: bool, room: Workspace, y: Six, P: Nine, R: Nine) -
 
     The shift is J^T y.
     """
-    rest, step, size = damping.left(_weighed(room), y, P, R), room.step, 0.0
-    for r in range(6):
-        step[r] = rest[r]
-    damping.substitute(room.B, room.order, step)
-    y = damping.more(y, 1.0, (step[0], step[1], step[2], step[3], step[4], step[5]))
+    size = 0.0
+    six_axis.put(damping.left(_weighed(room), y, P, R), room.step, 0, 1)
+    damping.substitute(room.B, room.order, room.step)
+    y = damping.more(y, 1.0, six_axis.six(room.step, 0, 1))
     for i in range(room.x.shape[0]):
-        before, J = room.x[i], room.J[i]
-        room.x[i] = damping.dot((J[0], J[1], J[2], J[3], J[4], J[5]), y)
+        before = room.x[i]
+        room.x[i] = damping.dot(six_axis.six(room.J[i], 0, 1), y)
         size = max(size, abs(room.x[i] - before))
     _residual_at(q, free, room)
     return y, size
@@ -316,15 +312,12 @@ def _correct(q: Array, largest: Array, free: bool, room: Workspace, out: Array) 
 
 
 @lean
-def _read(q: Array, turned: Array, free: bool, room: Workspace, out: Array) -> None:
+def _read(q: Array, free: bool, room: Workspace, out: Array) -> None:
     """Make joints of what a rigid arm would read, in ``out``, and its shift that of the true arms.
 
-    ``turned`` (n,) is what a rigid reference arm would read at ``q``.
+    The goal is that of what a rigid reference arm would read at ``q``.
     """
     n, e, back = q.shape[0], room.e, room.back
-    walk(turned, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
-    newton.at_tool(room.goal, room.taught_tool)
-    damping.swap_tool(room.goal, room.taught_tool, room.tool)
     turn_joints(q, room.links, room.root, room.layer, room.scratch)
     for i in range(n):
         back[i], room.x[i] = room.scratch[i, TURNED], 0.0
@@ -354,42 +347,32 @@ def _correct_alone(q: Array, largest: Array, free: bool, work: Array, out: Array
     for i in range(q.shape[0]):
         room.turned[i] = room.scratch[i, TURNED]
     _correct(room.turned, largest, free, room, out)
-    _read(q, room.turned, free, room, out)
+    _read(q, free, room, out)
 
 
 @lean
-def _given(six: SixJoints) -> int:
-    """From which row on the joints given stand."""
-    return GIVEN if six.settings[TURNS] > 0.5 else CAME
-
-
-@lean
-def _solve_rigid(lanes: int, six: SixJoints) -> None:
-    """Solve the points of ``lanes``, whose joints stand in the first rows."""
-    if lanes == 1:
-        six_axis.correct_one(six.constants, six.rows)
-    else:
-        six_axis.correct_lanes(six.constants, six.rows)
+def _give(q: Array, six: SixJoints, lane: int, lanes: int) -> None:
+    """Put a point (n,) where `_solve` takes it from."""
+    given = GIVEN if six.settings[TURNS] > 0.5 else CAME
+    for i in range(N):
+        six.rows[(given + i) * lanes + lane] = q[i]
 
 
 @lean
 def _solve(lanes: int, six: SixJoints, work: Array) -> None:
-    """Solve the points of ``lanes``, whose joints stand in the rows `_given`."""
-    if six.settings[TURNS] < 0.5:
-        _solve_rigid(lanes, six)
-        return
+    """Solve the points of ``lanes`` that were given."""
     constants, rows = six.constants, six.rows
+    if six.settings[TURNS] < 0.5:
+        six_axis.correct(constants, rows, lanes)
+        return
     taught_layer, layer = layers_in(work, N)
     if six.settings[TAUGHT_TURNS] > 0.5:
         six_functions.turn(constants, taught_layer, rows, lanes)
     else:
         for k in range(N * lanes):
             rows[CAME * lanes + k] = rows[GIVEN * lanes + k]
-    _solve_rigid(lanes, six)
-    if lanes == 1:
-        six_functions.read_one(constants, layer, rows)
-    else:
-        six_functions.read_lanes(constants, layer, rows)
+    six_axis.correct(constants, rows, lanes)
+    six_functions.read(constants, layer, rows, lanes)
 
 
 @lean
@@ -405,9 +388,7 @@ def _correct_one(q: Array, largest: Array, free: bool, work: Array, out: Array) 
     """A point (n,) of any arm."""
     six, solved = six_in(work), False
     if six.settings[IS_STRAIGHT] > 0.5:
-        given = _given(six)
-        for i in range(N):
-            six.rows[given + i] = q[i]
+        _give(q, six, 0, 1)
         _solve(1, six, work)
         solved = _take_over(six, 0, 1, out)
     if not solved:
@@ -431,11 +412,9 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
     ``out`` (m, n + 7): joints, then the report.
     """
     six, first = six_in(work), 0
-    given = _given(six)
     while six.settings[IS_STRAIGHT] > 0.5 and q.shape[0] - first >= LANES:
         for lane in range(LANES):
-            for i in range(N):
-                six.rows[(given + i) * LANES + lane] = q[first + lane, i]
+            _give(q[first + lane], six, lane, LANES)
         _solve(LANES, six, work)
         for lane in range(LANES):
             if not _take_over(six, lane, LANES, out[first + lane]):
