@@ -35,14 +35,9 @@ class ResidualsDocument(TypedDict):
     per_sample: dict[str, NotNegative]
 
 
-class HeldOutDocument(TypedDict):
+class HeldOutDocument(ErrorsDocument):
     """Distances of shots that were not used to solve, and which of them show nothing."""
 
-    mean_mm: NotNegative
-    rms_mm: NotNegative
-    p95_mm: NotNegative
-    max_mm: NotNegative
-    n: Ordinal
     rejected: Names
     rejected_because: dict[str, Words]
 

@@ -10,7 +10,7 @@ allows for what else the residuals of one profile share (Liang and Zeger 1986, t
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,24 +33,6 @@ SCALE = 0.01  # one sigma of the scale of z, which arcs hardly show, and the mou
 RIDGE = 1e-9  # of the trace: keeps directions solvable that nothing shows
 
 
-class SeenCurve(Protocol):
-    """Points (n, 2) of a profile on a curve of known form, sensor frame, m."""
-
-    @property
-    def points(self) -> Array:
-        """(n, 2)."""
-
-    def seen(self, towards: bool) -> tuple[Array, Array, Array]:
-        """Jacobian (n, p) of what is not known of it, residual (n,), its change with z (n,)."""
-
-
-class SeenFeature(Protocol):
-    """What a feature rests on."""
-
-    def moved(self, error: Callable[[Array], Array], towards: bool) -> Array:
-        """How the feature (3, k) moves where z of points (n, 2) grows by errors (n, k)."""
-
-
 @dataclass(frozen=True, eq=False)
 class SeenArc:
     """Points (n, 2) of a profile on a sphere, sensor frame, m, and their circle (3,): x0, z0, r."""
@@ -59,7 +41,10 @@ class SeenArc:
     circle: Array
 
     def seen(self, towards: bool) -> tuple[Array, Array, Array]:
-        """See `SeenCurve`; of the circle, as the sensor counts z."""
+        """Jacobian (n, 3) of the circle, residual (n,), its change with z (n,).
+
+        As the sensor counts z, which grows ``towards`` it or away.
+        """
         turned = mirror(towards)
         J, residual = linearised(
             np.append(self.circle[:2] * turned, self.circle[2]), self.points * turned
@@ -68,7 +53,7 @@ class SeenArc:
         return J, residual, -J[:, 1]
 
     def moved(self, error: Callable[[Array], Array], towards: bool) -> Array:
-        """See `SeenFeature`."""
+        """How the circle (3, k) moves where z of points (n, 2) grows by errors (n, k)."""
         J, _, share = self.seen(towards)
         return np.asarray(-np.linalg.pinv(J) @ (share[:, None] * error(self.points)))
 
@@ -86,7 +71,7 @@ class SeenLine:
         return middle, np.array([x, z]), np.array([-z, x])
 
     def seen(self, towards: bool) -> tuple[Array, Array, Array]:
-        """See `SeenCurve`; of a shift and a turn, whichever way z grows."""
+        """The same of a shift and a turn (n, 2), whichever way z grows."""
         middle, along, normal = self.across()
         away = self.points - middle
         J = np.column_stack([np.ones(len(away)), away @ along])
@@ -101,7 +86,7 @@ class SeenCorner:
     sides: tuple[Array, ...]
 
     def moved(self, error: Callable[[Array], Array], towards: bool) -> Array:
-        """See `SeenFeature`."""
+        """How it moves, (x, z, 0) (3, k), where z of points (n, 2) grows by errors (n, k)."""
         if not self.sides:
             own = error(self.point[None])
             return np.concatenate([0.0 * own, own, 0.0 * own])
@@ -114,6 +99,10 @@ class SeenCorner:
             normals.append(normal)
         step = np.linalg.solve(np.array(normals), np.array(shifts))
         return np.concatenate([step, np.zeros((1, step.shape[1]))])
+
+
+SeenCurve = SeenArc | SeenLine
+SeenFeature = SeenArc | SeenCorner
 
 
 def beside_corners(sides: Iterable[Array], corners: Array) -> list[SeenLine]:
