@@ -42,14 +42,18 @@ from robocal_ros.hand_eye.camera_fit import (
     sample_sizes,
     score,
 )
-from robocal_ros.hand_eye.erring import PoseRows, beside_found_noise, said_of_joints
 from robocal_ros.hand_eye.mount_problem import same_pose
 from robocal_ros.hand_eye.result import (
+    MOST_REJECTED,
     HandEyeResult,
     HandEyeSettings,
     PoseNoise,
+    PoseRows,
     apart,
+    beside_found_noise,
+    expected_error_m,
     judge_classic,
+    said_of_joints,
 )
 from robocal_ros.kinematics.joint_errors import JointErrors, flange_errors
 
@@ -236,7 +240,6 @@ def swapped(pairs: PosePairs, at: Placement, rejected: NDArray[np.bool_]) -> dic
 # ---- how good a camera's place is: leave-one-out, the error to expect, the decision -------------
 
 
-MOST_REJECTED = 1.0 / 3.0
 LARGEST_RMS_M = 5e-3
 MOST_LEFT_OUT = 50
 LEAST_REST = 1e-6  # what the others say about a sample, where they say anything
@@ -285,8 +288,7 @@ def left_out_of_form(name: str, pairs: PosePairs, at: Placement) -> Array | None
 def working_error(fit: PairFit) -> float:
     """Rms error, m, to expect of a point where the boards were on average."""
     where = fit.pairs.T_camera_board[:, :3, 3].mean(axis=0)
-    J = np.concatenate([np.eye(3), -frames.skew(where)], axis=1)
-    return float(np.sqrt(np.trace(J @ fit.covariance[:6, :6] @ J.T)))
+    return float(expected_error_m(fit.covariance[:6, :6], where[None]))
 
 
 def unsettled(fit: PairFit) -> Verdict | None:
@@ -336,8 +338,6 @@ def rms(size: Array) -> float:
 
 # ---- camera -------------------------------------------------------------------------------------
 
-
-Document = dict[str, Any]
 
 METHODS = ("best", "classic", *CLOSED_FORMS)
 LARGEST_START_M = 3e-2  # median miss beyond which no search can be trusted
@@ -545,7 +545,7 @@ def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairStat
     away_m = apart(at.X, fit.at.X, pairs.T_camera_board[:, :3, 3])
     error_m = float(np.hypot(away_m, working_error(fit)))
     words = f"{name} fits {len(size)} samples within {rms(size) * 1e3:.3f} mm rms"
-    judged = judge_classic(away_m, error_m, HandEyeSettings(limit_m=how.limit_m))
+    judged = judge_classic(away_m, error_m, how.limit_m)
     judged = Verdict(judged.code, f"{words}; {judged.reason}")
     if rms(size) > LARGEST_RMS_M:
         words += f" (allowed {LARGEST_RMS_M * 1e3:.0f} mm): use method best"

@@ -22,7 +22,16 @@ from robocal_ros.hand_eye.mount_problem import (
     in_plane,
     restricted_noise,
 )
-from robocal_ros.hand_eye.result import ARM_M, PoseNoise, apart, at_origin, increment
+from robocal_ros.hand_eye.result import (
+    ARM_M,
+    PoseNoise,
+    PoseRows,
+    apart,
+    at_origin,
+    beside_found_noise,
+    increment,
+)
+from robocal_ros.kinematics.joint_errors import JointErrors, ShotJoints, flange_errors
 
 AXES = ("the laser line (x)", "the laser plane's normal (y)", "the beam (z)")
 ALONG = 0.9  # cosine from which a direction is named after an axis
@@ -341,6 +350,28 @@ def open_directions(
     values, vectors = np.linalg.eigh(covariance * np.outer(size, size))
     open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > limit_m]
     return [describe_motion(direction / size, T_base_flange) for direction in open_ones.T]
+
+
+def mount_errors(
+    fit: MountFit, told: Array, joints: ShotJoints, size_rad: float, given: PoseNoise | None
+) -> JointErrors | None:
+    """What joints that err by ``size_rad`` add to a mount's covariance ``told`` (6, 6).
+
+    To first order, with the fit's weights; see `beside_found_noise`.
+    """
+    problem = MountProblem(fit.views, fit.noise, fit.state)
+    first = np.unique(problem.sample, return_index=True)[1]
+    shot = np.concatenate([view.sightings.shot for view in fit.views])[first]
+    errors = flange_errors(joints.arm, size_rad, joints.q[shot])
+    if errors is None:
+        return None
+    linear, k = problem.linear(fit.state), len(problem.names)
+    both = np.concatenate([linear.jacobian, linear.common[..., :6]], axis=2)
+    J, G = np.split(problem.whitened(replace(linear, jacobian=both))[1], [k], axis=2)
+    flat = J.reshape(-1, k)
+    known = np.linalg.inv(flat.T @ flat + problem.prior())
+    rows = PoseRows(J, G, np.asarray(known, dtype=np.float64), slice(0, 6))
+    return beside_found_noise(rows, errors, fit.noise, told, size_rad, given is not None)
 
 
 def without(

@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a hand-eye calibration, whatever the target, and whether it is good, in mm."""
+"""The outcome of a hand-eye calibration, whatever the target, and whether it is good, in mm.
+
+Joints that err of themselves add to it beyond what its residuals tell. Poses far apart show gears
+as scatter, which the noise that is found from the shots holds. Near one another they err alike, and
+that goes into the mount without a trace in the residuals.
+"""
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from robocal_ros.estimation.assessment import (
-    Verdict,
-    summarise,
-    verdict_document,
-)
+from robocal_ros.estimation.assessment import Verdict, summarise, verdict_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.hand_eye.linearity import SensorLinearity
+from robocal_ros.kinematics.joint_errors import JointErrors, with_joint_errors
 
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.documents import (
@@ -140,27 +143,10 @@ def at_origin(covariance: Array, pivot: Array) -> Array:
     return np.asarray(move @ covariance @ move.T)
 
 
-def point_jacobian(points: Array) -> Array:
-    """How points (n, 3), counted from the pivot, move with an increment: (n, 3, 6)."""
-    return np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], axis=2
-    )
-
-
-def point_covariance(result: HandEyeResult, points: Array) -> Array:
-    """Covariance (n, 3, 3), m^2, sensor axes, of sensor points (n, 3) once they are in the flange.
-
-    Raises `ValueError` when the method tells no covariance.
-    """
-    if result.covariance is None:
-        raise ValueError("a method without a covariance")
-    J = point_jacobian(points - result.pivot)
-    return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
-
-
 def expected_error_m(covariance: Array, points: Array) -> Array:
     """Root mean square error (...) of points (n, 3), counted from the pivot of (..., 6, 6)."""
-    J = point_jacobian(points)
+    one = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    J = np.concatenate([one, -frames.skew(points)], axis=2)  # of a point's place by an increment
     spread = J @ covariance[..., None, :, :] @ np.swapaxes(J, 1, 2)
     return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1).mean(axis=-1)))
 
@@ -180,12 +166,12 @@ def field_points(profiles: Sequence[Array]) -> Array:
     return np.array([[x.mean(), 0.0, z.mean()], *corners])
 
 
-def judge_classic(apart_m: float, error_m: float, settings: HandEyeSettings) -> Verdict:
+def judge_classic(apart_m: float, error_m: float, limit_m: float) -> Verdict:
     """The verdict on a classic estimate that is so far from the best one in the field of view."""
     words = f"a closed form, {apart_m * 1e3:.3f} mm from the best estimate in the field of view; "
     words += f"a point there is expected to be off by {error_m * 1e3:.3f} mm rms"
-    if error_m > settings.limit_m:
-        words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): use method best"
+    if error_m > limit_m:
+        words = f"{words} (allowed {limit_m * 1e3:g} mm): use method best"
         return Verdict(Code.POSES_NOT_INFORMATIVE, words)
     return Verdict(Code.ACCEPT, words)
 
@@ -202,6 +188,92 @@ def judge_residuals(
         words = f"{lost} of {shots} samples do not fit the others: see the rejected ones"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
     return None
+
+
+def said_of_joints(result: HandEyeResult, found: JointErrors | None) -> HandEyeResult:
+    """A result whose verdict and document say what the joints add to its sigma.
+
+    ``found``: None where that is not known; the document has null.
+    """
+    more = {**result.more, "joint_errors": None if found is None else found.document()}
+    return replace(result, verdict=with_joint_errors(result.verdict, found, "mount"), more=more)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """A fit's whitened residuals, linearised: r rows of each of g poses.
+
+    ``by_unknowns`` (g, r, k), of which ``mount`` are the sensor's six; ``known`` (k, k): their
+    covariance. ``by_pose`` (g, r, 6): by six numbers that a pose errs by.
+    """
+
+    by_unknowns: Array
+    by_pose: Array
+    known: Array
+    mount: slice
+
+    @cached_property
+    def _own(self) -> Array:
+        return np.swapaxes(self.by_pose, 1, 2) @ self.by_pose
+
+    @cached_property
+    def _taken(self) -> Array:
+        """(g, 6, k): what the unknowns take of the poses' errors."""
+        return np.swapaxes(self.by_pose, 1, 2) @ self.by_unknowns
+
+    @cached_property
+    def _moves(self) -> Array:
+        """(g, 6, 6): of the mount with each pose."""
+        return self.known[self.mount] @ np.swapaxes(self._taken, 1, 2)
+
+    def of_mount(self, errors: Array) -> Array:
+        """Covariance (6, 6) of the mount by that of the poses (g, 6, g, 6)."""
+        moves = self._moves
+        return np.asarray(np.einsum("gka,gahb,hlb->kl", moves, errors, moves, optimize=True))
+
+    def of_mount_anew(self) -> Array:
+        """The same by numbers of variance one, drawn anew for each pose."""
+        return np.asarray(np.einsum("gka,gla->kl", self._moves, self._moves))
+
+    def squared(self, errors: Array) -> float:
+        """What such errors of the poses add to the sum of the squared residuals."""
+        own = float(np.einsum("gagb,gab->", errors, self._own))
+        taken = self._taken
+        both = np.einsum("gak,gahb,hbl->kl", taken, errors, taken, optimize=True)
+        return own - float(np.sum(both * self.known))
+
+    def share(self, errors: Array) -> float:
+        """How much of the scatter such errors make that numbers of variance one make.
+
+        What residuals show of the poses, their own less what the unknowns take, squared: of
+        hundreds of shots its product with the errors would take minutes.
+        """
+        own, taken, poses = self._own, self._taken, len(self._own)
+        V, left = (part.reshape(-1, len(self.known)) for part in (taken, own @ taken @ self.known))
+        shown = (V @ self.known @ (V.T @ V) @ self.known - left) @ V.T - V @ left.T
+        shown = shown.reshape(poses, 6, poses, 6)
+        each = np.arange(poses)
+        shown[each, :, each, :] += own @ own
+        return float(np.sum(errors * shown) / np.einsum("gaga->", shown))
+
+
+def beside_found_noise(
+    rows: PoseRows, errors: Array, noise: PoseNoise, told: Array, size_rad: float, given: bool
+) -> JointErrors:
+    """What poses that err, (g, 6, g, 6), add where the noise of a pose was found from the shots.
+
+    Of that noise the share that such joints make is in ``told`` already, as if it were drawn anew
+    for each pose: what they make of the mount stands in its place. Where they would make more
+    scatter than the shots show, they err by less: by so much as makes all of it. Noise that is
+    ``given`` does not tell.
+    """
+    unit = np.repeat([noise.sigma_m, noise.sigma_rad], 3)
+    rows = replace(rows, by_pose=rows.by_pose * unit)  # of six numbers of variance one
+    errors = errors / unit[:, None, None] / unit
+    share, by_joints = rows.share(errors), rows.of_mount(errors)
+    if share > 1.0 and not given:
+        by_joints, size_rad = by_joints / share, size_rad / float(np.sqrt(share))
+    return JointErrors.beside(size_rad, by_joints - min(share, 1.0) * rows.of_mount_anew(), told)
 
 
 def hand_eye_document(result: HandEyeResult) -> Document:

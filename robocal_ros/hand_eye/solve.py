@@ -18,7 +18,6 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Document
-from robocal_ros.hand_eye.erring import mount_errors, said_of_joints
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
     LARGEST_POSE_M,
@@ -32,6 +31,7 @@ from robocal_ros.hand_eye.mount_fit import (
     leave_one_out,
     minima,
     misfit,
+    mount_errors,
     noise_numbers,
     noise_of,
     require_radius,
@@ -63,6 +63,7 @@ from robocal_ros.hand_eye.result import (
     field_points,
     judge_classic,
     judge_residuals,
+    said_of_joints,
     shots_of,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData, Read, Task, read_with
@@ -249,7 +250,7 @@ def _classic(
         target=task.found(state.places[0]),
         place=state.places[0],
         working_error_m=error_m,
-        verdict=refused or judge_classic(apart_m, error_m, settings),
+        verdict=refused or judge_classic(apart_m, error_m, settings.limit_m),
     )
 
 

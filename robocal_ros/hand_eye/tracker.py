@@ -20,16 +20,16 @@ from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.ground.frames import Array
-from robocal_ros.hand_eye.erring import PoseRows, said_of_joints
 from robocal_ros.hand_eye.mount_problem import moved, tangents
 from robocal_ros.hand_eye.result import (
     HandEyeResult,
-    HandEyeSettings,
     Method,
+    PoseRows,
     apart,
+    expected_error_m,
     field_points,
     judge_classic,
-    point_covariance,
+    said_of_joints,
 )
 from robocal_ros.hand_eye.targets import FACES, TrackerTarget
 from robocal_ros.hand_eye.tracker_data import (
@@ -501,15 +501,15 @@ def solve_tracker(
         name: f"misses the solution by {miss:.1f} times its noise" for name, miss in worst.items()
     }
     states = states_without(problem, estimate, [profile.name for profile in data.profiles])
+    told = estimate.covariance[SENSOR, SENSOR]
     best = replace(
         best,
-        covariance=estimate.covariance[SENSOR, SENSOR],
+        covariance=told,
         rejected={**best.rejected, **misses},
         leave_one_out_m=_left_out(data, target, classic, states),
     )
     z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
-    covariance = point_covariance(best, np.array([[0.0, 0.0, z]]))
-    working_m = float(np.sqrt(np.trace(covariance[0])))
+    working_m = float(expected_error_m(told, np.array([[0.0, 0.0, z]])))
     angle, gap_m = estimate.state.mismatch.tolist()
     more = {
         **best.more,
@@ -571,7 +571,7 @@ def _classic(
         working_error_m=error_m,
         verdict=best.verdict
         if best.verdict.code is Code.RESIDUAL_TOO_LARGE
-        else judge_classic(away_m, error_m, HandEyeSettings(limit_m=limit_m)),
+        else judge_classic(away_m, error_m, limit_m),
     )
 
 

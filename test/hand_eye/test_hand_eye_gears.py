@@ -16,8 +16,7 @@ from bench.hand_eye_cell import HandEyeCell
 from bench.hand_eye_profiles import EXACT, with_gears
 from bench.hand_eye_worlds import Calibration, X, edge_set, sphere_set, step_set
 from robocal_ros.ground.errors import Code
-from robocal_ros.hand_eye.erring import mount_errors
-from robocal_ros.hand_eye.mount_fit import fit_mount
+from robocal_ros.hand_eye.mount_fit import fit_mount, mount_errors
 from robocal_ros.hand_eye.mount_problem import pivot_of
 from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, increment
 from robocal_ros.hand_eye.solve import features, look, verify

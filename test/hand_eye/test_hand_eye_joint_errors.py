@@ -12,8 +12,7 @@ from bench.hand_eye_cell import HandEyeCell
 from bench.hand_eye_profiles import EXACT, arm
 from bench.hand_eye_worlds import CENTRE, Calibration, X, edge_set, sphere_set
 from robocal_ros.ground import frames
-from robocal_ros.hand_eye.erring import mount_errors
-from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount
+from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, mount_errors
 from robocal_ros.hand_eye.mount_problem import MountState, TargetView, pivot_of
 from robocal_ros.hand_eye.result import PoseNoise, increment
 from robocal_ros.hand_eye.solve import features, look

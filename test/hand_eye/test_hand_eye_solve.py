@@ -47,7 +47,7 @@ from robocal_ros.ground.errors import (
 )
 from robocal_ros.hand_eye.mount_fit import LARGEST_POSE_M, distances, first_look, fit_mount
 from robocal_ros.hand_eye.mount_problem import in_plane
-from robocal_ros.hand_eye.result import HandEyeSettings, apart, point_covariance
+from robocal_ros.hand_eye.result import HandEyeSettings, apart, at_origin, expected_error_m
 from robocal_ros.hand_eye.solve import (
     features,
     field_of,
@@ -149,13 +149,14 @@ class TestSphere:
         T = frames.transform(frames.exp_rotation([0.3, -0.5, 1.2]), [0.7, -2.0, 0.4])
         moved = solve(replace(data, T_base_flange=T @ data.T_base_flange))
         error = moved.T_flange_sensor - result.T_flange_sensor
-        sigma = np.sqrt(np.diag(point_covariance(result, np.zeros((1, 3)))[0]).max())
+        sigma = np.sqrt(np.diag(at_origin(result.covariance, result.pivot))[:3].max())
         assert np.linalg.norm(error[:3, 3]) < 0.02 * sigma
 
     def test_held_out_shots_of_the_same_sphere(self, result):
         other = held_out(sphere_task(), sphere_data(9, 10), result.T_flange_sensor, result.place)
-        predicted = point_covariance(result, np.array([[0.0, 0.0, 0.2]]))[0]
-        largest = np.sqrt(np.trace(predicted)) + 1e-4 + 1e-4  # the mount, the robot, the circle
+        there = np.array([[0.0, 0.0, 0.2]]) - result.pivot
+        mount_m = expected_error_m(result.covariance, there)
+        largest = mount_m + 1e-4 + 1e-4  # of the mount, the robot, the circle
         assert np.sqrt(np.mean(other.distance_m**2)) < 2.0 * largest
 
 
@@ -261,7 +262,7 @@ class TestLine:
         seen_at = (T_BASE_USER @ [0.1, 0.0, 0.0, 1.0])[:3]  # the middle of what is shown
         away = seen_at - found.place[0]
         across = away - (away @ found.place[1]) * found.place[1]
-        sigma = np.sqrt(np.trace(point_covariance(found, np.array([[0.0, 0.0, 0.2]]))[0]))
+        sigma = expected_error_m(found.covariance, np.array([[0.0, 0.0, 0.2]]) - found.pivot)
         assert np.linalg.norm(across) < 4.0 * sigma + 1e-4  # and what the robot repeats to
 
     @pytest.mark.parametrize("known", [True, False])
