@@ -37,9 +37,9 @@ from robocal_ros.hand_eye.planning import (
     PlannedSphere,
     PlannedStairs,
     PlannedTarget,
-    SensorRange,
     check_plan,
 )
+from robocal_ros.hand_eye.profiles import SensorRange
 from robocal_ros.hand_eye.result import PoseNoise, expected_error_m, increment
 from robocal_ros.hand_eye.targets import StepTarget
 
@@ -251,14 +251,14 @@ def plan_table() -> Table:
         "the noise of sensor, robot and eye. Goal: within 1.5 either way.",
     )
     for (name, draw), plan in zip(CASES.items(), planned, strict=True):
-        expected, achieved = _planned(draw, plan, sensor)
+        expected, achieved = _planned(draw, plan)
         ratio = achieved / expected
         side = Goal(ratio, 1.5) if ratio > 1.0 else Goal(ratio, 1.0 / 1.5, at_least=True)
         table.add(name, 1e3 * expected, 1e3 * achieved, ratio, side)
     return table
 
 
-def _planned(draw: Draw, plan: PlannedTarget, sensor: SensorRange) -> tuple[float, float]:
+def _planned(draw: Draw, plan: PlannedTarget) -> tuple[float, float]:
     """Expected and achieved rms error, m, in the field of view."""
     expected, achieved = [], []
     for seed in range(PLANS):
@@ -266,13 +266,13 @@ def _planned(draw: Draw, plan: PlannedTarget, sensor: SensorRange) -> tuple[floa
         world = draw(rng)
         noise = PoseNoise(world.noise.pose_m, world.noise.pose_rad, world.noise.aim_m)
         near = moved(X, NEAR * rng.standard_normal(6), np.zeros(3))
-        report = check_plan(plan, world.true_T_base_flange, near, sensor, noise, 1.0)
+        report = check_plan(plan, world.true_T_base_flange, near, noise, 1.0)
         if report.working_error_m is None:
             raise ValueError(f"the plan is refused: {report.verdict.reason}")
         expected.append(report.working_error_m**2)
         for _ in range(PLANNED_RUNS):
             step = increment(X, world.shot(rng).solve().T_flange_sensor, np.zeros(3))
-            achieved.append(expected_error_m(np.outer(step, step), sensor.field_points) ** 2)
+            achieved.append(expected_error_m(np.outer(step, step), plan.sensor.field_points) ** 2)
     return float(np.sqrt(np.mean(expected))), float(np.sqrt(np.mean(achieved)))
 
 

@@ -41,7 +41,6 @@ from robocal_ros.hand_eye.data import (
     captured_marks,
     data_set_of,
     first_of_each,
-    flange_poses,
 )
 from robocal_ros.hand_eye.files import (
     PoseTable,
@@ -60,7 +59,7 @@ from robocal_ros.hand_eye.result import (
     hand_eye_document,
     shots_of,
 )
-from robocal_ros.hand_eye.session import HandEyeConfig
+from robocal_ros.hand_eye.session import HandEyeConfig, laser_shots
 from robocal_ros.hand_eye.solve import held_out, judged, solve_joint, solve_task, verify
 from robocal_ros.hand_eye.stairs import task_of
 from robocal_ros.hand_eye.targets import (
@@ -86,8 +85,6 @@ if TYPE_CHECKING:
         TouchTestDocument,
     )
 
-
-BagShots = tuple[HandEyeData, dict[str, str]]
 
 KINDS = ("sphere", "step", "line")
 POINT: Final = "point"
@@ -168,11 +165,6 @@ def add_target(parser: argparse.ArgumentParser) -> None:
 def add_target_file(parser: argparse.ArgumentParser, help: str = "what is known of it") -> None:
     """Offer a target file."""
     parser.add_argument("--target", type=Path, metavar="YAML", help=help)
-
-
-def add_target_kind(parser: argparse.ArgumentParser) -> None:
-    """Ask for the kind of target."""
-    parser.add_argument("--target-kind", required=True, choices=KINDS, help="what the shots show")
 
 
 def add_feature(parser: argparse.ArgumentParser) -> None:
@@ -267,8 +259,7 @@ def given_shots(
         raise InputError("the shots are given twice: --bag, and --poses or --profiles; keep one")
     if arm is None:
         raise InputError("a bag holds joints, not poses: name its robot with --robot")
-    data, rejected = read_bag_shots(judges or args.bag, arm, dict(args.topic), described(args))
-    return ReadShots(data, None, rejected)
+    return read_bag_shots(judges or args.bag, arm, dict(args.topic), described(args))
 
 
 def read_shots(
@@ -314,11 +305,8 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> Las
 
 def read_bag_shots(
     path: Path, arm: SerialArm, topics: Mapping[str, str], sensor: SensorDescription
-) -> BagShots:
-    """Shots of a bag, and the profiles that are none with the reason.
-
-    ``topics``: input to topic, where given.
-    """
+) -> ReadShots:
+    """Shots of a bag; ``topics``: input to topic, where given."""
     with open_bag(path) as reader:
         if DATA_SET not in reader.info.topics:
             given = dict(topics)
@@ -326,27 +314,13 @@ def read_bag_shots(
             if len(seen) == 1:
                 given.setdefault(PROFILE, seen[0])
             return _recorded(open_recording(reader, given), arm, sensor)
-    return _saved(path, arm), {}
-
-
-def _saved(path: Path, arm: SerialArm) -> HandEyeData:
     data = data_set_of(read_data_set(path, arm), arm)
     if data.topic != PROFILE:
         raise InputError(f"holds shots of a {data.kind}, not profiles", file=str(path))
-    samples = data.chosen([])
-    names = tuple(str(sample.handle) for sample in samples)
-    marks = tuple(sample.mark for sample in samples)
-    q = np.array([sample.q for sample in samples])
-    return HandEyeData(
-        names,
-        flange_poses(q, [sample.thermal for sample in samples], arm),
-        [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
-        marks if any(marks) else None,
-        ShotJoints(samples[0].thermal.arm(arm), q),
-    )
+    return ReadShots(laser_shots(data.chosen([]), arm))
 
 
-def _recorded(recording: BagOverview, arm: SerialArm, sensor: SensorDescription) -> BagShots:
+def _recorded(recording: BagOverview, arm: SerialArm, sensor: SensorDescription) -> ReadShots:
     path = recording.reader.info.path
     if PROFILE not in recording.inputs.values():
         raise InputError(
@@ -367,13 +341,14 @@ def _recorded(recording: BagOverview, arm: SerialArm, sensor: SensorDescription)
         why = next(iter(rejected.values()), "there is none")
         raise TooFewSamplesError(f"{path}: no profile is of use, of {len(rejected)}: {why}")
     marks = tuple(one.mark for one in kept)
-    return HandEyeData(
+    data = HandEyeData(
         tuple(one.name for one in kept),
         np.array([arm.fk(one.q) for one in kept]),
         [Profile(one.shot.read(), one.name) for one in kept],
         marks if any(marks) else None,
         ShotJoints(arm, np.array([one.q for one in kept])),
-    ), rejected
+    )
+    return ReadShots(data, None, rejected)
 
 
 def _chosen(

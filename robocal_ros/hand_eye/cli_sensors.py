@@ -48,6 +48,7 @@ from robocal_ros.hand_eye.camera import (
 from robocal_ros.hand_eye.camera_data import PosePairs, stream_of
 from robocal_ros.hand_eye.camera_fit import GivenNoise
 from robocal_ros.hand_eye.cli import (
+    KINDS,
     LIMIT_MM,
     add_description,
     add_figures,
@@ -56,7 +57,6 @@ from robocal_ros.hand_eye.cli import (
     add_robot,
     add_robot_sigma,
     add_target,
-    add_target_kind,
     arm_of,
     described,
     drawn_document,
@@ -81,14 +81,14 @@ from robocal_ros.hand_eye.files import (
     write_pose_table,
 )
 from robocal_ros.hand_eye.planning import (
+    ROBOT_SIGMA_M,
     PlannedStairs,
     PlanReport,
-    SensorRange,
     check_plan,
     planned_target,
 )
 from robocal_ros.hand_eye.profiles import Profile
-from robocal_ros.hand_eye.result import HandEyeResult, PoseNoise
+from robocal_ros.hand_eye.result import HandEyeResult
 from robocal_ros.hand_eye.targets import (
     FARTHEST_MM,
     BoardTarget,
@@ -447,7 +447,6 @@ SENSOR = {
     "width": (60.0, "of the field, half way"),
     "noise": (0.037, "of a point along the beam, one sigma"),
 }
-ROBOT_SIGMA_MM = 0.05
 
 
 def add_export(parser: argparse.ArgumentParser) -> None:
@@ -480,7 +479,7 @@ def run_export(args: argparse.Namespace) -> CliResult:
 
 
 def add_check_plan(parser: argparse.ArgumentParser) -> None:
-    add_target_kind(parser)
+    parser.add_argument("--target-kind", required=True, choices=KINDS, help="what the shots show")
     parser.add_argument(
         "--poses",
         required=True,
@@ -513,7 +512,7 @@ def add_check_plan(parser: argparse.ArgumentParser) -> None:
             help=f"{words}; default: as --sensor has it, {value:g} without",
         )
     add_description(parser)
-    add_limits(parser, f"default {ROBOT_SIGMA_MM:g} mm, 0 deg")
+    add_limits(parser, f"default {1e3 * ROBOT_SIGMA_M:g} mm, 0 deg")
     parser.add_argument("--propose", type=Path, metavar="CSV", help="write the proposed poses")
 
 
@@ -523,9 +522,8 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
     told = {name: value for name, value in told.items() if value is not None}
     if len({"near_mm", "far_mm"} & set(told)) == 1:
         raise InputError("give both --near-mm and --far-mm, or none")
-    known_sensor = replace(described(args), **told)
-    near, far, width, along = known_sensor.field(*(value for value, _ in SENSOR.values()))
-    sensor = SensorRange(near, far, width, noise_m=along)
+    usual = (value for value, _ in SENSOR.values())
+    sensor = replace(described(args), **told).seen_range(*usual)
     if not 0.0 < abs(sensor.near_m - sensor.far_m) < FARTHEST_MM * 1e-3:
         raise InputError(f"--near-mm {sensor.near_m * 1e3:g} is --far-mm: the field has no depth")
     known = given_target(args.target_kind, args.target, args.radius_mm)
@@ -535,8 +533,7 @@ def run_check_plan(args: argparse.Namespace) -> CliResult:
         raise InputError("--center-mm is a sphere's")
     target = planned_target(known, sensor, centre, table.mark)
     X = read_flange_mount(args.mount).T_parent_sensor
-    noise = settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
-    report = check_plan(target, table.T_base_flange, X, sensor, noise, settings.limit_m)
+    report = check_plan(target, table.T_base_flange, X, settings.noise(), settings.limit_m)
     marks = None
     if table.mark is not None and isinstance(target, PlannedStairs):
         marks = list(target.lit(report.proposed @ X))  # on which the light is laid

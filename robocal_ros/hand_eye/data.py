@@ -28,7 +28,13 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.hand_eye.boards import find_corners, message_image
 from robocal_ros.hand_eye.camera_data import Mount
-from robocal_ros.hand_eye.profiles import DEFAULT, SensorDescription, cloud_profile, profile_of
+from robocal_ros.hand_eye.profiles import (
+    DEFAULT,
+    Profile,
+    SensorDescription,
+    cloud_profile,
+    profile_of,
+)
 from robocal_ros.hand_eye.targets import ROLES, BoardTarget, target_of
 from robocal_ros.history.history_records import Head
 from robocal_ros.kinematics import SerialArm
@@ -376,6 +382,11 @@ class HandEyeSample:
     q: Array
     values: Array
     thermal: PoseModel
+
+    @property
+    def profile(self) -> Profile:
+        """What a line laser saw, named by the handle."""
+        return Profile(self.values, str(self.handle))
 
 
 @dataclass(eq=False)

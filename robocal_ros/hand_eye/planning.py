@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from robocal_ros.estimation.assessment import Verdict
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.data import DataSet
 from robocal_ros.hand_eye.mount_fit import OPEN_M, joined, open_directions
@@ -30,7 +30,7 @@ from robocal_ros.hand_eye.mount_problem import (
     TargetView,
     same_pose,
 )
-from robocal_ros.hand_eye.profiles import Profile, SensorDescription
+from robocal_ros.hand_eye.profiles import SensorDescription, SensorRange
 from robocal_ros.hand_eye.result import HandEyeSettings, PoseNoise, at_origin, expected_error_m
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
 from robocal_ros.hand_eye.stairs import StepTask
@@ -49,6 +49,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.tables import FARTHEST_M, flange_unit_fault, joint_unit_fault
 
 VAGUE = 1.0  # m, rad: what is known without any measurement; an open direction has a large error
+ROBOT_SIGMA_M = 5e-5  # of a reported pose in each axis, where it is not given
 MOST_PROPOSED = 12
 SPARE_POSES = 2  # beyond the fewest, so that one may be lost
 
@@ -66,48 +67,6 @@ TILTS_RAD = np.radians([-25.0, 0.0, 25.0])
 ROLLS_RAD = np.radians([-60.0, 0.0, 60.0])
 ASIDE = (-0.25, 0.25)  # of the field's width
 ALONG_M = (-0.04, 0.0, 0.04)  # of an edge
-
-
-@dataclass(frozen=True)
-class SensorRange:
-    """What a line-laser sensor sees: width (m), points, noise along the beam (m).
-
-    ``near_m``, ``far_m``: z of the field's ends, in the sensor's own coordinates; where z grows
-    towards the sensor the first is the larger one.
-    """
-
-    near_m: float = 0.19
-    far_m: float = 0.21
-    width_m: float = 0.06
-    points: int = 1280
-    noise_m: float = 3.7e-5
-
-    @property
-    def middle_m(self) -> float:
-        """The distance to work at."""
-        return 0.5 * (self.near_m + self.far_m)
-
-    @property
-    def sense(self) -> float:
-        """1 where z grows away from the sensor, -1 where towards it."""
-        return 1.0 if self.far_m > self.near_m else -1.0
-
-    @property
-    def reach_m(self) -> float:
-        """Distance at which turns count."""
-        return max(abs(self.middle_m), 0.5 * self.width_m)
-
-    @property
-    def pivot(self) -> Array:
-        """The middle (3,) of its field, sensor frame, m."""
-        return np.array([0.0, 0.0, self.middle_m])
-
-    @property
-    def field_points(self) -> Array:
-        """Middle and corners (5, 3) of its field, sensor frame, m."""
-        half = 0.5 * self.width_m
-        corners = [[x, 0.0, z] for x in (-half, half) for z in (self.near_m, self.far_m)]
-        return np.array([self.pivot, *corners])
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,15 +96,16 @@ def check_plan(
     target: "PlannedTarget",
     T_base_flange: Array,
     T_flange_sensor: Array,
-    sensor: SensorRange,
-    noise: PoseNoise,
+    noise: PoseNoise | None,
     limit_m: float,
 ) -> PlanReport:
     """Judge planned flange poses (m, 4, 4), with an approximate T_flange_sensor (4, 4).
 
-    ``limit_m``: largest expected error (rms) of a point at the working distance.
+    ``noise``: of poses; None: that of a good robot. ``limit_m``: largest expected error (rms) of a
+    point at the working distance.
     """
-    place = target.place(T_base_flange @ T_flange_sensor)
+    noise = noise or PoseNoise(ROBOT_SIGMA_M, 0.0)
+    sensor, place = target.sensor, target.place(T_base_flange @ T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     whole = target.view(T_base_flange, T_flange_sensor, place)
     unseen = target.unseen(whole)
@@ -161,7 +121,7 @@ def check_plan(
     if not verdict.accept:
         wanted = target.fewest + SPARE_POSES - seen
         proposed, better = _propose(
-            target, T_base_flange, state, information, noise, sensor, limit_m, wanted
+            target, T_base_flange, state, information, noise, limit_m, wanted
         )
     return PlanReport(
         rank, len(information), tuple(words), sigma, error, unseen, proposed, better, verdict
@@ -214,7 +174,6 @@ def _propose(
     state: MountState,
     information: Array,
     noise: PoseNoise,
-    sensor: SensorRange,
     limit_m: float,
     wanted: int,
 ) -> tuple[Array, float | None]:
@@ -222,7 +181,7 @@ def _propose(
 
     ``information`` (k, k): what is known already; ``wanted``: at least so many are added.
     """
-    X, place = state.T_flange_sensor, state.places[0]
+    sensor, X, place = target.sensor, state.T_flange_sensor, state.places[0]
     candidates = target.candidates(T_base_flange @ X, place)
     view = target.view(candidates @ frames.invert(X), X, place)
     problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
@@ -312,15 +271,12 @@ def _places(sensor: SensorRange, heights: tuple[float, ...], behind_m: float = 0
 
 
 def _expected(
-    model: TargetModel, seen: Seen, T_base_flange: Array, covariance: Array
+    model: TargetModel, seen: Seen, T_base_flange: Array, shot: Index, covariance: Array
 ) -> TargetView:
-    """A view in which everything is seen as predicted."""
-    m = len(T_base_flange)
-    names = tuple(f"pose {i + 1}" for i in range(m))
-    pose = same_pose(T_base_flange)
-    return TargetView(
-        model, Sightings(names, np.arange(m), pose, T_base_flange, seen.value, covariance)
-    )
+    """A view in which everything is seen as predicted, from the poses of these shots (n,)."""
+    names = tuple(f"pose {i + 1}" for i in shot)
+    T, pose = T_base_flange[shot], same_pose(T_base_flange)[shot]
+    return TargetView(model, Sightings(names, shot, pose, T, seen.value, covariance))
 
 
 def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict[int, str]:
@@ -339,10 +295,10 @@ def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict
 class PlannedSphere:
     """A sphere; ``centre`` (3,) in base, or None: where most poses see it.
 
-    As each planned target it tells how many poses are the ``fewest`` to solve anything, its
-    ``place`` by sensor poses (m, 4, 4) that look at it, the ``view`` to expect from flange poses
-    (m, 4, 4), from which poses it is ``unseen``, and why, and ``candidates`` (n, 4, 4): sensor
-    poses that see it well, turned about those that are planned.
+    As each planned target it tells which ``sensor`` looks, how many poses are the ``fewest`` to
+    solve anything, its ``place`` by sensor poses (m, 4, 4) that look at it, the ``view`` to expect
+    from flange poses (m, 4, 4), from which poses it is ``unseen``, and why, and ``candidates``
+    (n, 4, 4): sensor poses that see it well, turned about those that are planned.
     """
 
     radius_m: float
@@ -371,9 +327,8 @@ class PlannedSphere:
         step = self.sensor.width_m / self.sensor.points
         share = np.cos(slope) * (slope[1] - slope[0])  # columns are even along the laser line
         unit = np.linalg.inv((J * share[:, None]).T @ J)
-        return _expected(
-            model, seen, T_base_flange, self.sensor.noise_m**2 * (step / r)[:, None, None] * unit
-        )
+        covariance = self.sensor.noise_m**2 * (step / r)[:, None, None] * unit
+        return _expected(model, seen, T_base_flange, np.arange(len(r)), covariance)
 
     def unseen(self, view: TargetView) -> dict[int, str]:
         """Out of the field of view, or beside the sphere."""
@@ -418,7 +373,8 @@ class PlannedLine:
         seen = model.see(T_base_flange @ T_flange_sensor, place)
         step = self.sensor.width_m / self.sensor.points
         spread = np.diag([(0.5 * step) ** 2, self.sensor.noise_m**2 / EDGE_POINTS, 1.0])
-        return _expected(model, seen, T_base_flange, np.tile(spread, (len(T_base_flange), 1, 1)))
+        shot = np.arange(len(T_base_flange))
+        return _expected(model, seen, T_base_flange, shot, np.tile(spread, (len(shot), 1, 1)))
 
     def unseen(self, view: TargetView) -> dict[int, str]:
         """Out of the field of view."""
@@ -457,15 +413,12 @@ class PlannedStairs:
         marks = self.lit(T_base_flange @ T_flange_sensor)
         corners = [self.target.corners[mark] for mark in marks]
         shot = np.repeat(np.arange(len(corners)), [len(each) for each in corners])
-        T = T_base_flange[shot]
         model = StepTask(self.target).model(np.concatenate(corners))
-        seen = model.see(T @ T_flange_sensor, place)
+        seen = model.see(T_base_flange[shot] @ T_flange_sensor, place)
         step = self.sensor.width_m / self.sensor.points
         sigma = np.array([0.5 * step, self.sensor.noise_m / np.sqrt(EDGE_POINTS), 0.0])
         spread = np.diag(sigma**2 + self.target.sigma_m**2)
-        names = tuple(f"pose {i + 1}" for i in shot)
-        pose, covariance = same_pose(T_base_flange)[shot], np.tile(spread, (len(shot), 1, 1))
-        return TargetView(model, Sightings(names, shot, pose, T, seen.value, covariance))
+        return _expected(model, seen, T_base_flange, shot, np.tile(spread, (len(shot), 1, 1)))
 
     def lit(self, T_base_sensor: Array) -> tuple[str, ...]:
         """The mark that is nearest to the laser plane of each sensor pose (m, 4, 4)."""
@@ -535,7 +488,6 @@ def planned_target(
     return PlannedLine(sensor, np.stack([target.point_base, target.direction_base]))
 
 
-ROBOT_SIGMA_M = 5e-5  # of a reported pose in each axis, where it is not given
 MOST_POSES = 200
 FEWEST_SEEN = 3  # samples that tell on which side of the laser plane a sphere lies
 # What was refused or taken back tells nothing.
@@ -647,7 +599,7 @@ def sphere_centre(
     samples = list(data.samples.values())
     if len(samples) < FEWEST_SEEN:
         return None
-    profiles = [Profile(sample.values, str(sample.handle)) for sample in samples]
+    profiles = [sample.profile for sample in samples]
     poses = arm.fk(np.array([sample.q for sample in samples]))
     task = SphereTask(target, sensor.towards)
     shots = HandEyeData(tuple(profile.name for profile in profiles), poses, profiles)
@@ -685,7 +637,6 @@ def judged_plan(
     if data.kind == "camera" or isinstance(target, BoardTarget | TrackerTarget):
         raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")
     given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
-    noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)
     middle = None if centre is None else centre.tolist()
     planned = planned_target(target, sensor, middle, tuple(marks) or None)
-    return check_plan(planned, T_base_flange, T_flange_sensor, sensor, noise, config.limit_m)
+    return check_plan(planned, T_base_flange, T_flange_sensor, given, config.limit_m)

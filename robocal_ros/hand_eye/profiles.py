@@ -85,6 +85,48 @@ def profile_of(points: ArrayLike, name: str) -> Profile:
 
 
 @dataclass(frozen=True)
+class SensorRange:
+    """What a line-laser sensor sees: width (m), points, noise along the beam (m).
+
+    ``near_m``, ``far_m``: z of the field's ends, in the sensor's own coordinates; where z grows
+    towards the sensor the first is the larger one.
+    """
+
+    near_m: float = 0.19
+    far_m: float = 0.21
+    width_m: float = 0.06
+    points: int = 1280
+    noise_m: float = 3.7e-5
+
+    @property
+    def middle_m(self) -> float:
+        """The distance to work at."""
+        return 0.5 * (self.near_m + self.far_m)
+
+    @property
+    def sense(self) -> float:
+        """1 where z grows away from the sensor, -1 where towards it."""
+        return 1.0 if self.far_m > self.near_m else -1.0
+
+    @property
+    def reach_m(self) -> float:
+        """Distance at which turns count."""
+        return max(abs(self.middle_m), 0.5 * self.width_m)
+
+    @property
+    def pivot(self) -> Array:
+        """The middle (3,) of its field, sensor frame, m."""
+        return np.array([0.0, 0.0, self.middle_m])
+
+    @property
+    def field_points(self) -> Array:
+        """Middle and corners (5, 3) of its field, sensor frame, m."""
+        half = 0.5 * self.width_m
+        corners = [[x, 0.0, z] for x in (-half, half) for z in (self.near_m, self.far_m)]
+        return np.array([self.pivot, *corners])
+
+
+@dataclass(frozen=True)
 class SensorDescription:
     """How a line laser tells its profiles; plain values, so that a recording carries them.
 
@@ -99,7 +141,7 @@ class SensorDescription:
     ``least_intensity``: a column or field; weaker points are left out. ``row``: a column or field
     that numbers the profiles, where there are several. ``ordered``: whether points follow the
     sensor's columns; else they are sorted along x. ``near_mm``, ``far_mm``, ``width_mm``,
-    ``noise_mm``: of the field and of a point along the beam; see `planning.SensorRange`; None where
+    ``noise_mm``: of the field and of a point along the beam; see `SensorRange`; None where
     nothing is told.
     """
 
@@ -133,10 +175,10 @@ class SensorDescription:
         """Whether tables are others than of ``x_mm`` and ``z_mm``."""
         return bool(self.z or self.x or self.x_pitch_mm or self.row or self.intensity)
 
-    def field(
+    def seen_range(
         self, near_mm: float, far_mm: float, width_mm: float, noise_mm: float
-    ) -> tuple[float, float, float, float]:
-        """Near and far end, width and noise, m; the numbers where nothing is told of them.
+    ) -> SensorRange:
+        """What it sees; by the numbers where nothing is told of it.
 
         Of numbers that are distances the middle counts as 0 where z grows towards the sensor.
         """
@@ -146,7 +188,8 @@ class SensorDescription:
             near_mm, far_mm = 0.5 * (far_mm - near_mm), -0.5 * (far_mm - near_mm)
         width_mm = width_mm if self.width_mm is None else self.width_mm
         noise_mm = noise_mm if self.noise_mm is None else self.noise_mm
-        return near_mm * 1e-3, far_mm * 1e-3, width_mm * 1e-3, noise_mm * 1e-3
+        ends = near_mm * 1e-3, far_mm * 1e-3
+        return SensorRange(*ends, width_mm * 1e-3, noise_m=noise_mm * 1e-3)
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "SensorDescription":
@@ -202,9 +245,7 @@ def _read_description(path: Path) -> SensorDescription:
                 top.fail("is 0: columns count from 1", key)
             told[key] = str(value) if type(value) is int and value > 0 else top.text(key)
         elif key in ("lines", "ordered"):
-            if not isinstance(top.values[key], bool):
-                top.fail("must be true or false", key)
-            told[key] = top.values[key]
+            told[key] = top.yes(key)
         elif key == "z_grows":
             told[key] = top.choice(key, Z_GROWS)
         elif key in ("unit", "cloud_unit"):

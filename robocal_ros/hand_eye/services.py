@@ -40,7 +40,6 @@ from robocal_ros.hand_eye.data import (
     data_set_begun,
     data_set_of,
 )
-from robocal_ros.hand_eye.profiles import Profile
 from robocal_ros.hand_eye.session import HandEyeSession, sample_poses, solved
 from robocal_ros.hand_eye.targets import (
     CAMERA_INFO,
@@ -549,11 +548,9 @@ class HandEyeServices:
             raise ConflictError("no data set is open: call start, so that the target is known")
         arm, joints = session.current.arm, [joint_sample(one) for one in request.joints]
         poses = planning.planned_poses(arm, joints, [_parts(pose) for pose in request.flange])
-        near, far, width = settings["sensor_range_mm"]
-        noise_mm = settings["sensor_noise_mm"]
         described = session.config.sensor
-        near, far, width, noise = described.field(near, far, width, noise_mm)
-        sensor = planning.SensorRange(near, far, width, noise_m=noise)
+        told = *settings["sensor_range_mm"], settings["sensor_noise_mm"]
+        sensor = described.seen_range(*told)
         given = [planning.pose_of(*_parts(pose), "sensor") for pose in request.sensor]
         mount, who = planning.rough_mount(
             session, self._history, next(iter(given), None), given_pose(settings, ROUGH)
@@ -608,7 +605,7 @@ class HandEyeServices:
         samples = data.chosen([])
         scanned, rejected = scanned_points(
             [one.mark for one in samples],
-            [Profile(one.values, str(one.handle)) for one in samples],
+            [one.profile for one in samples],
             sample_poses(samples, session.nominal),
             EdgeRule(session.config.sensor.towards, kind=data.feature),
         )

@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -55,7 +55,7 @@ from robocal_ros.hand_eye.data import (
     seen_corners,
     shot_of,
 )
-from robocal_ros.hand_eye.profiles import DEFAULT, Profile, SensorDescription
+from robocal_ros.hand_eye.profiles import DEFAULT, SensorDescription
 from robocal_ros.hand_eye.result import (
     METHODS,
     HandEyeResult,
@@ -80,6 +80,9 @@ from robocal_ros.session.events import (
     recorded_arguments,
     seeded,
 )
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.tasks import HandEyeData
 
 Samples = Sequence[HandEyeSample]
 
@@ -173,16 +176,7 @@ def solved(
         return _solved_camera(data, samples, nominal, cast(Method, method), config)
     from robocal_ros.hand_eye.solve import solve_task
     from robocal_ros.hand_eye.stairs import task_of
-    from robocal_ros.hand_eye.tasks import HandEyeData
 
-    names = tuple(str(sample.handle) for sample in samples)
-    shots = HandEyeData(
-        names,
-        sample_poses(samples, nominal),
-        [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
-        tuple(sample.mark for sample in samples) if data.kind == "step" else None,
-        shot_joints(samples, nominal),
-    )
     settings = HandEyeSettings(
         config.robot_sigma_m,
         config.robot_sigma_rad,
@@ -191,7 +185,21 @@ def solved(
     )
     target: Any = target_of(data.target)
     task = task_of(target, data.feature, method == "classic", config.sensor.towards)
-    return solve_task(task, shots, cast(Method, method), settings)
+    return solve_task(task, laser_shots(samples, nominal), cast(Method, method), settings)
+
+
+def laser_shots(samples: Samples, nominal: SerialArm) -> "HandEyeData":
+    """Profiles by their handles, with the poses and joints that they were taken from."""
+    from robocal_ros.hand_eye.tasks import HandEyeData
+
+    marks = tuple(sample.mark for sample in samples)
+    return HandEyeData(
+        tuple(str(sample.handle) for sample in samples),
+        sample_poses(samples, nominal),
+        [sample.profile for sample in samples],
+        marks if any(marks) else None,
+        shot_joints(samples, nominal),
+    )
 
 
 def sample_poses(samples: Samples, nominal: SerialArm) -> Array:
@@ -235,7 +243,7 @@ def _solved_tracker(
         sphere=points(SPHERE),
         faces=(points(FACES[0]), points(FACES[1])),
         q=readings(SCAN),
-        profiles=[Profile(one.values, str(one.handle)) for one in of[SCAN]],
+        profiles=[one.profile for one in of[SCAN]],
     )
     noise = TrackerNoise(config.tracker_sigma_m, config.joint_sigma_rad, config.joint_sigma_m)
     target: Any = target_of(data.target)

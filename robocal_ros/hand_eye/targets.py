@@ -315,7 +315,7 @@ def _board(top: Fields, folder: Path, marked: bool) -> BoardTarget:
             top.positive("square_mm") * 1e-3,
             dictionary=top.choice("dictionary", DICTIONARIES),
             marker_m=top.positive("marker_mm") * 1e-3,
-            legacy=_yes(top, "legacy"),
+            legacy=top.yes("legacy"),
         )
     else:
         top.only("kind", "columns", "rows", "square_mm", *camera)
@@ -327,20 +327,13 @@ def _board(top: Fields, folder: Path, marked: bool) -> BoardTarget:
         _ = board.board
     except InputError as error:
         top.fail(f"describes no board: {error}")
-    rectified = _yes(top, "rectified")
+    rectified = top.yes("rectified")
     given = top.text("intrinsics") if "intrinsics" in top.values else ""
     if given == CAMERA_INFO:
         return replace(board, camera_info=True, rectified=rectified)
     if rectified:
         top.fail(f"belongs to 'intrinsics: {CAMERA_INFO}'", "rectified")
     return board.with_intrinsics(read_intrinsics(folder / given)) if given else board
-
-
-def _yes(top: Fields, key: str) -> bool:
-    value = top.values.get(key, False)
-    if not isinstance(value, bool):
-        top.fail("must be true or false", key)
-    return value
 
 
 def _step(top: Fields) -> StepTarget:

@@ -106,6 +106,13 @@ class Fields:
             self.fail(f"is {quoted(value)}; it must be {words}{nearest(str(value), known)}", key)
         return str(value)
 
+    def yes(self, key: str) -> bool:
+        """Whether it is true; false when it is left out."""
+        value = self.values.get(key, False)
+        if not isinstance(value, bool):
+            self.fail("must be true or false", key)
+        return value
+
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
         if key not in self.values and default is not None:

@@ -30,10 +30,10 @@ from robocal_ros.hand_eye.planning import (
     PlannedLine,
     PlannedSphere,
     PlannedStairs,
-    SensorRange,
     check_plan,
     looked_at,
 )
+from robocal_ros.hand_eye.profiles import SensorRange
 from robocal_ros.hand_eye.result import (
     HandEyeSettings,
     PoseNoise,
@@ -56,7 +56,7 @@ def sphere_poses(count, cell=CELL, seed=0):
 
 
 def judged(target, poses, limit_m=LIMIT_M):
-    return check_plan(target, poses, CELL.T_flange_sensor, SENSOR, NOISE, limit_m)
+    return check_plan(target, poses, CELL.T_flange_sensor, NOISE, limit_m)
 
 
 BALL = PlannedSphere(RADIUS_M, SENSOR, tuple(CENTRE))
@@ -96,7 +96,7 @@ def test_a_sphere_of_unknown_place_is_where_the_poses_see_it(seed, strays):
     rough[:3, 3] += rng.normal(0.0, 1e-3, 3)
     poses = shots.true_T_base_flange.copy()
     poses[12 - strays :, :3, 3] += 0.3  # those look elsewhere
-    plan = check_plan(PlannedSphere(RADIUS_M, SENSOR), poses, rough, SENSOR, NOISE, LIMIT_M)
+    plan = check_plan(PlannedSphere(RADIUS_M, SENSOR), poses, rough, NOISE, LIMIT_M)
     assert sorted(plan.unseen) == list(range(12 - strays, 12))
     if not strays:  # against what is achieved, at the same points of the field
         settings = HandEyeSettings(POSE_M, POSE_RAD)
@@ -260,9 +260,9 @@ def test_a_field_counted_in_heights_about_its_middle_is_the_same_field(kind):
     heights = replace(SENSOR, near_m=half_m, far_m=-half_m)
     turned = frames.transform(frames.exp_rotation([np.pi, 0.0, 0.0]), [0.0, 0.0, middle_m])
     mount = CELL.T_flange_sensor
-    one = check_plan(target, poses, mount, SENSOR, NOISE, LIMIT_M)
+    one = check_plan(target, poses, mount, NOISE, LIMIT_M)
     same = replace(target, sensor=heights)
-    other = check_plan(same, poses, mount @ turned, heights, NOISE, LIMIT_M)
+    other = check_plan(same, poses, mount @ turned, NOISE, LIMIT_M)
     assert list(one.unseen) == list(other.unseen)
     assert one.working_error_m == pytest.approx(other.working_error_m, rel=1e-6)
     added_m = [plan.proposed_error_m or 0.0 for plan in (one, other)]

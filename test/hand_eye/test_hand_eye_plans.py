@@ -14,13 +14,13 @@ from robocal_ros.ground.samples import JointSample
 from robocal_ros.hand_eye.data import data_set_begun
 from robocal_ros.hand_eye.planning import (
     MOST_POSES,
-    SensorRange,
     judged_plan,
     planned_poses,
     pose_of,
     rough_mount,
     sphere_centre,
 )
+from robocal_ros.hand_eye.profiles import SensorRange
 from robocal_ros.hand_eye.session import HandEyeConfig
 from robocal_ros.session import events
 
