@@ -292,13 +292,9 @@ class HandEyeFiles:
 
     def _save_twin(self, request: Any, response: Any) -> Any:
         """Into the folder of the data sets, called after sensor and time (UTC)."""
-        try:
-            frame = quote(self._session().config.sensor_frame, safe="")
-            stem = f"{frame}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
-            _, words = self._write(unused(self._folder(), stem, SUFFIX))
-        except RobocalError as error:
-            response.message = trigger_text(0, error.code, str(error))
-            return response
+        frame = quote(self._session().config.sensor_frame, safe="")
+        stem = f"{frame}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+        _, words = self._write(unused(self._folder(), stem, SUFFIX))
         response.success, response.message = True, trigger_text(0, Code.ACCEPT, words)
         return response
 
@@ -319,42 +315,6 @@ class HandEyeFiles:
         if points > MOST_POINTS:
             words += f"; {points} points are too many to load (at most {MOST_POINTS})"
         return len(rows), words
-
-
-def start_arguments(
-    settings: Mapping[str, Any],
-    kind: str = "",
-    file: str = "",
-    feature: str = "",
-    method: str = "",
-    mount: str = "",
-) -> dict[str, Any]:
-    """Arguments of the command that begins a data set; what is empty comes from the settings.
-
-    The configured file counts for the target that it describes, and for no other.
-
-    Raises `InputError` when the target's file is missing, or describes another target.
-    """
-    kind = kind or settings["target"]
-    configured = settings["target_file"]
-    if file:
-        target = target_document(kind, read_target(Path(file)))
-    else:
-        target, found = {"kind": kind}, ""
-        if configured and kind in KIND_OF.values():
-            described = read_target(Path(configured))
-            found = KIND_OF[type(described)]
-            if found == kind:
-                target = target_document(kind, described)
-        if found != kind and kind not in WITHOUT_FILE:
-            words = f"'{configured}' describes a {found}" if found else "is empty"
-            raise InputError(f"target_file {words}: name the file that describes the {kind}")
-    return {
-        "target": target,
-        "feature": feature or settings["feature"],
-        "method": method or settings["method"],
-        "mount": mount or settings["mount"],
-    }
 
 
 class CameraTopic:
@@ -464,22 +424,39 @@ class HandEyeServices:
         add(VerifyHandEye, "~/verify", self._verify)
 
     async def _start(self, request: Any, response: Any) -> Any:
-        kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
-        given = kind, request.target_file, request.feature, request.method, mount
-        arguments = self._begun(*given)
+        given = {
+            "target": _named(TARGETS, request.target),
+            "feature": request.feature,
+            "method": request.method,
+            "mount": _named(MOUNTS, request.mount),
+        }
+        arguments = self._begun(given, request.target_file)
         return answer(response, await self._files.begin(Command(START, arguments)))
 
-    def _begun(self, *given: str) -> dict[str, Any]:
-        arguments = start_arguments(self._settings, *given)
-        return arguments | {"target": self._camera.given(arguments["target"])}
+    def _begun(self, given: Mapping[str, str], file: str = "") -> dict[str, Any]:
+        """Arguments of the command that begins a data set; what is empty comes from the settings.
+
+        The configured file counts for the target that it describes, and for no other.
+        """
+        names = ("target", "feature", "method", "mount")
+        told = {name: given.get(name) or self._settings[name] for name in names}
+        kind, configured = told["target"], self._settings["target_file"]
+        if file:
+            target = target_document(kind, read_target(Path(file)))
+        else:
+            target, found = {"kind": kind}, ""
+            if configured and kind in KIND_OF.values():
+                described = read_target(Path(configured))
+                found = KIND_OF[type(described)]
+                if found == kind:
+                    target = target_document(kind, described)
+            if found != kind and kind not in WITHOUT_FILE:
+                words = f"'{configured}' describes a {found}" if found else "is empty"
+                raise InputError(f"target_file {words}: name the file that describes the {kind}")
+        return told | {"target": self._camera.given(target)}
 
     async def _start_twin(self, request: Any, response: Any) -> Any:
-        try:
-            arguments = self._begun()
-        except RobocalError as error:
-            response.message = trigger_text(0, error.code, str(error))
-            return response
-        return await twin(self._files.begin, START, arguments)(request, response)
+        return await twin(self._files.begin, START, self._begun({}))(request, response)
 
     async def _capture_now(self, arguments: Mapping[str, Any]) -> Outcome:
         """A capture takes nothing that was received before its call."""
@@ -494,11 +471,7 @@ class HandEyeServices:
         return answer(response, outcome)
 
     async def _capture_twin(self, request: Any, response: Any) -> Any:
-        try:
-            outcome = await self._capture_now({})
-        except RobocalError as error:  # deactivated meanwhile
-            response.message = trigger_text(0, error.code, str(error))
-            return response
+        outcome = await self._capture_now({})
         response.success = outcome.done
         response.message = trigger_text(_handle(outcome), outcome.status, outcome.message)
         return response

@@ -575,12 +575,7 @@ def twin(ask: Ask, name: str, arguments: Mapping[str, Any]) -> Callable[..., Any
     """A Trigger that gives one command; its message is `trigger_text`."""
 
     async def trigger(request: Any, response: Any) -> Any:
-        try:
-            outcome = await ask(Command(name, {"by": TWIN, **arguments}))
-        except RobocalError as error:  # deactivated meanwhile
-            response.message = trigger_text(0, error.code, str(error))
-            return response
-        return trigger_answer(response, outcome)
+        return trigger_answer(response, await ask(Command(name, {"by": TWIN, **arguments})))
 
     return trigger
 

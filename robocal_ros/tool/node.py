@@ -341,12 +341,7 @@ class TcfServices:
 
     def _starter(self, mode: str) -> Callable[[Any, Any], Any]:
         async def start(request: Any, response: Any) -> Any:
-            try:
-                outcome = await self._node.begin(mode, "", "trigger")
-            except RobocalError as error:
-                response.message = trigger_text(0, error.code, str(error))
-                return response
-            return trigger_answer(response, outcome)
+            return trigger_answer(response, await self._node.begin(mode, "", "trigger"))
 
         return start
 
