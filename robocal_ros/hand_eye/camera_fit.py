@@ -216,9 +216,7 @@ def _closed_forms(pairs: PosePairs, weights: Array) -> list[Placement]:
 def _rotations(matrix: Array) -> Array:
     """Rotations (s, 3, 3) nearest to matrices up to a factor of either sign."""
     sign = np.sign(np.linalg.det(matrix))[:, None, None]
-    U, _, Vt = np.linalg.svd(np.where(sign == 0.0, 1.0, sign) * matrix)
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return np.asarray(U @ Vt)
+    return frames.nearest_rotation(np.where(sign == 0.0, 1.0, sign) * matrix)
 
 
 SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data solvable

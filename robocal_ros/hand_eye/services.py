@@ -100,9 +100,37 @@ class HandEyeOutputs:
 
         ``ended``: the session is over; its captures are told once more, as they ended.
         """
-        message = status_message(session, last)
-        if ended:
-            message.state = HandEyeStatus.IDLE
+        data, config = session.data, session.config
+        fixed = data is not None and data.mount == TO_HAND
+        message = HandEyeStatus(
+            header=conversions.header(
+                session.newest_joints_ns, config.base_frame if fixed else config.flange_frame
+            ),
+            child_frame_id=config.sensor_frame,
+            state=HandEyeStatus.IDLE,
+            revision=session.in_force.revision,
+        )
+        if data is not None:
+            if not ended:
+                waits = data.waiting is not None
+                message.state = HandEyeStatus.CAPTURING if waits else HandEyeStatus.COLLECTING
+            message.target, message.method = NUMBER_OF[data.kind], data.method
+            message.mount, message.candidate_id = MOUNT_NUMBER_OF[data.mount], data.candidate
+            states = {Code.NONE: HandEyeSample.WAITING, Code.ACCEPT: HandEyeSample.CAPTURED}
+            message.samples = [
+                HandEyeSample(
+                    handle=one.handle,
+                    mark=one.mark,
+                    state=states.get(one.code, HandEyeSample.FAILED),
+                    reason=one.reason,
+                    status=int(one.code),
+                    stamp=conversions.time_message(one.stamp_ns),
+                )
+                for _, one in sorted(data.captures.items())
+            ]
+        if last is not None:
+            message.last_command, message.last_message = last.command.name, last.message
+            message.last_status = int(last.status)
         self._status.publish(message)
 
     def transform(self, head: Head, stamp_ns: int) -> None:
@@ -133,41 +161,6 @@ class HandEyeOutputs:
             errors = {f"{name}_mm": value for name, value in left_out.items()}
             conversions.set_errors(message, "candidate", errors)
         self._quality.publish(message)
-
-
-def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStatus:
-    """The state of a session."""
-    data, config = session.data, session.config
-    fixed = data is not None and data.mount == TO_HAND
-    message = HandEyeStatus(
-        header=conversions.header(
-            session.newest_joints_ns, config.base_frame if fixed else config.flange_frame
-        ),
-        child_frame_id=config.sensor_frame,
-        state=HandEyeStatus.IDLE,
-        revision=session.in_force.revision,
-    )
-    if data is not None:
-        waits = data.waiting is not None
-        message.state = HandEyeStatus.CAPTURING if waits else HandEyeStatus.COLLECTING
-        message.target, message.method = NUMBER_OF[data.kind], data.method
-        message.mount, message.candidate_id = MOUNT_NUMBER_OF[data.mount], data.candidate
-        states = {Code.NONE: HandEyeSample.WAITING, Code.ACCEPT: HandEyeSample.CAPTURED}
-        message.samples = [
-            HandEyeSample(
-                handle=one.handle,
-                mark=one.mark,
-                state=states.get(one.code, HandEyeSample.FAILED),
-                reason=one.reason,
-                status=int(one.code),
-                stamp=conversions.time_message(one.stamp_ns),
-            )
-            for _, one in sorted(data.captures.items())
-        ]
-    if last is not None:
-        message.last_command, message.last_message = last.command.name, last.message
-        message.last_status = int(last.status)
-    return message
 
 
 class HandEyeFiles:

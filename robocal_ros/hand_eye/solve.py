@@ -662,21 +662,16 @@ def _together(parts: Sequence[Part], reads: Sequence[Read]) -> tuple[HandEyeData
         view = replace(read.view, sightings=s)
         named.append(Read(view, rejected, points, read.linearity, pulled))
         first += len(data.names)
+    known = [data.joints for _, data in parts if data.joints is not None]
     together = HandEyeData(
         tuple(f"{task.kind}/{name}" for task, data in parts for name in data.names),
         np.concatenate([data.T_base_flange for _, data in parts]),
         [profile for _, data in parts for profile in data.profiles],
-        joints=_same_joints([data.joints for _, data in parts]),
     )
+    if len(known) == len(parts):
+        joints = ShotJoints(known[0].arm, np.concatenate([part.q for part in known]))
+        together = replace(together, joints=joints)
     return together, named
-
-
-def _same_joints(parts: Sequence[ShotJoints | None]) -> ShotJoints | None:
-    """Those of all shots; None where some are not known."""
-    known = [part for part in parts if part is not None]
-    if len(known) < len(parts):
-        return None
-    return ShotJoints(known[0].arm, np.concatenate([part.q for part in known]))
 
 
 def _held_out(
