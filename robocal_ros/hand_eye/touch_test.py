@@ -33,7 +33,7 @@ class TouchTest:
     ``points``: names, p of them; ``place`` (p, 3): mean of each, base, m; ``count`` (p,).
     ``three_sigma_m`` (p,): along the worst axis; not a number of fewer than three scans.
     ``distance_m`` (m,): of each scan of a touched point from there; empty where none was touched.
-    ``off_m``: by name, of the mean of a touched point from there.
+    ``off_m``: by name, of the mean of a touched point from there. ``limit_m``: what is allowed.
     """
 
     points: tuple[str, ...]
@@ -42,7 +42,7 @@ class TouchTest:
     three_sigma_m: Array
     distance_m: Array
     off_m: Mapping[str, float]
-    verdict: Verdict
+    limit_m: float
 
     @property
     def accuracy(self) -> ErrorSummary | None:
@@ -54,6 +54,26 @@ class TouchTest:
         """Largest of the three sigmas; None where no point was scanned often enough."""
         known = self.three_sigma_m[np.isfinite(self.three_sigma_m)]
         return float(known.max()) if len(known) else None
+
+    @property
+    def verdict(self) -> Verdict:
+        """By what all scans are off by; where nothing was touched, by how they scatter."""
+        accuracy, stability_m = self.accuracy, self.stability_m
+        words = []
+        if accuracy is not None:
+            words.append(f"scanned points are off by {1e3 * accuracy.mean_m:.3f} mm on average")
+        if stability_m is not None:
+            words.append(f"three sigma of one point {1e3 * stability_m:.3f} mm at most")
+        if accuracy is None:
+            words.append("no point was touched, so what all scans share does not show")
+        worst_m = stability_m if accuracy is None else accuracy.rms_m
+        if worst_m is None:
+            what = f"no point was touched, and none scanned from {FEWEST_SCANS} poses or more"
+            return Verdict(Code.TOO_FEW_SAMPLES, what)
+        if worst_m > self.limit_m:
+            words.append(f"allowed are {1e3 * self.limit_m:g} mm: the mount is not this one")
+            return Verdict(Code.RESIDUAL_TOO_LARGE, "; ".join(words))
+        return Verdict(Code.ACCEPT, "; ".join(words))
 
     def document(self) -> "TouchedPointsDocument":
         """In the units people read."""
@@ -134,31 +154,7 @@ def touch_test(
     truth = np.array([touched[scanned.point[i]] for i in known]).reshape(-1, 3)
     distance = np.linalg.norm(p_base[known] - truth, axis=1)
     off = {n: float(np.linalg.norm(place[names.index(n)] - p)) for n, p in touched.items()}
-    verdict = _verdict(distance, three, limit_m)
-    return TouchTest(names, place, tuple(int(r.sum()) for r in own), three, distance, off, verdict)
-
-
-def _verdict(distance: Array, three_sigma: Array, limit_m: float) -> Verdict:
-    known = three_sigma[np.isfinite(three_sigma)]
-    words = []
-    if len(known):
-        words.append(f"three sigma of one point {1e3 * known.max():.3f} mm at most")
-    if not len(distance):
-        if not len(known):
-            return Verdict(
-                Code.TOO_FEW_SAMPLES,
-                f"no point was touched, and none scanned from {FEWEST_SCANS} poses or more",
-            )
-        words.append("no point was touched, so what all scans share does not show")
-        worst_m = float(known.max())
-    else:
-        found = summarise(distance)
-        words.insert(0, f"scanned points are off by {1e3 * found.mean_m:.3f} mm on average")
-        worst_m = found.rms_m
-    if worst_m > limit_m:
-        words.append(f"allowed are {1e3 * limit_m:g} mm: the mount is not this one")
-        return Verdict(Code.RESIDUAL_TOO_LARGE, "; ".join(words))
-    return Verdict(Code.ACCEPT, "; ".join(words))
+    return TouchTest(names, place, tuple(int(r.sum()) for r in own), three, distance, off, limit_m)
 
 
 def compared(found: Mapping[str, TouchTest]) -> Verdict:
