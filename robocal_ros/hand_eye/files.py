@@ -133,13 +133,10 @@ def read_pose_table(
     table = read_cells(path, check)
     layout = found[0]
     files = _files(table, file_column) if file_column else ()
-    q = None
-    if layout.joints:
-        q = np.column_stack([table.numbers(name) for name in layout.joints])
-        q = q * layout.joint_factors
+    T_base_flange, q = _poses(table, layout, arm)
     return PoseTable(
         names=read_samples(table, files or tuple(map(str, table.rows))),
-        T_base_flange=_poses(table, layout, arm, q),
+        T_base_flange=T_base_flange,
         files=files,
         joints=None if q is None or arm is None else ShotJoints(arm, q),
         stamp_ns=read_stamps(table) if "stamp_s" in layout.place else None,
@@ -165,11 +162,15 @@ def _files(table: Cells, column: str) -> tuple[str, ...]:
     return files
 
 
-def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | None) -> Array:
+def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None) -> tuple[Array, Array | None]:
+    """Where the flange was (m, 4, 4), m, and the joints (m, n); None where the table has none."""
+    q = None
+    if layout.joints:
+        q = np.column_stack([table.numbers(name) for name in layout.joints]) * layout.joint_factors
     if layout.orientation is None:
         if arm is None or q is None:
             raise ValueError("a layout without poses has joints")
-        return arm.fk(q)
+        return arm.fk(q), q
     columns = layout.position
     position = np.column_stack([table.numbers(name) for name in columns])
     position *= layout.position_factor
@@ -177,7 +178,7 @@ def _poses(table: Cells, layout: TableLayout, arm: SerialArm | None, q: Array | 
     if fault is not None:
         index, words = fault
         table.fail(words, index, columns[int(np.argmax(np.abs(position[index])))])
-    return frames.transform(read_rotations(table, layout.orientation), position)
+    return frames.transform(read_rotations(table, layout.orientation), position), q
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,12 +209,8 @@ def read_scanned_points(path: Path, arm: SerialArm | None = None) -> ScannedPoin
             raise InputError(f"column {', '.join(missing)} is missing", file=file, row=1)
 
     table = read_cells(path, check)
-    layout, q = found[0], None
-    if layout.joints:
-        q = np.column_stack([table.numbers(name) for name in layout.joints])
-        q = q * layout.joint_factors
     points = 1e-3 * np.column_stack([table.numbers(name) for name in SCANNED[1:]])
-    return ScannedPoints(table.words("point"), points, _poses(table, layout, arm, q))
+    return ScannedPoints(table.words("point"), points, _poses(table, found[0], arm)[0])
 
 
 def read_touched_points(path: Path) -> dict[str, Array]:
