@@ -2,6 +2,7 @@
 """The services of the hand-eye node: each call becomes a command to the session."""
 
 import os
+import re
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
@@ -224,7 +225,8 @@ class HandEyeFiles:
         from robocal_ros.bags.bags import read_data_set
 
         session, inputs = self._session(), self._history.inputs(number)
-        kept = [path for path in self._folder().glob(f"{number}*{SUFFIX}") if path.is_file()]
+        own = re.compile(rf"{number}(_\d+)?{re.escape(SUFFIX)}")  # as `unused` names them
+        kept = [path for path in self._folder().iterdir() if own.fullmatch(path.name)]
         method = self._history.get(number).method.rpartition(", ")[2]
         try:
             newest = max(kept, key=lambda path: path.stat().st_mtime)

@@ -47,6 +47,14 @@ def test_the_data_of_each_calibration_are_kept_and_calibrate_to_the_same(
     assert len(list(folder.iterdir())) == 3
 
 
+def test_a_calibration_is_solved_again_from_its_own_samples(graph: Any, sensor: LiveSensor) -> None:
+    """Not from those of another whose number begins alike, though these were kept later."""
+    first = sensor.calibrate()
+    folder = graph.state / "K7" / "hand_eye"
+    (folder / f"{first.candidate_id}0.mcap").write_bytes(b"")
+    assert sensor.node._files.solved_again_s(first.candidate_id) > 0.0
+
+
 def test_a_plc_saves_without_a_name(graph: Any, sensor: LiveSensor) -> None:
     told = [graph.call(Trigger, f"{NAME}/save_trigger") for _ in range(2)]
     assert [one.success for one in told] == [True, True]
