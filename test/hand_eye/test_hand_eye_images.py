@@ -22,7 +22,7 @@ from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession, take_han
 from robocal_ros.hand_eye.targets import read_target, target_document
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.session import events
-from robocal_ros.session.events import arguments_text, digest, outcome_text, read_command
+from robocal_ros.session.events import digest
 
 CONFIG = HandEyeConfig(sensor_frame=FRAME, limit_m=2e-3)  # as `robocal hand-eye camera`
 CORNERS = COLUMNS * ROWS
@@ -255,13 +255,6 @@ def test_a_recording_gives_the_same_again(history, tmp_path):
     seen_all(driver)
     live = driver.ask(events.CALIBRATE)
     assert live.status is Code.ACCEPT, live.message
-    commands = [
-        (
-            read_command(o.command.name, o.command.stamp_ns, arguments_text(o.command)),
-            json.loads(outcome_text(o)),
-        )
-        for o in driver.outcomes
-    ]
     messages = [
         SimpleNamespace(topic=f"/{m.kind}", message=namespace(m.fields))
         for m in driver.recorded
@@ -269,7 +262,7 @@ def test_a_recording_gives_the_same_again(history, tmp_path):
     ]
     with CalibrationHistory.open("K2", state_dir=tmp_path) as other:
         session = HandEyeSession(ARM, other, CONFIG, "test")
-        report = replay(session, messages, commands, None, take_hand_eye_message)
+        report = replay(session, messages, driver.commands, None, take_hand_eye_message)
         assert report.differs == []
         assert [o.message for o in report.outcomes] == [o.message for o in driver.outcomes]
         assert digest(report.outcomes[-1].document) == digest(live.document)

@@ -44,11 +44,8 @@ from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.joint_errors import HONEST
 from robocal_ros.session import events
 from robocal_ros.session.events import (
-    arguments_text,
     bring_into_force,
     digest,
-    outcome_text,
-    read_command,
 )
 
 KIND = hand_eye_kind(FRAME)
@@ -105,17 +102,10 @@ def test_a_recorder_may_write_the_topics_in_another_order(history, tmp_path, lat
     driver.sphere(6)
     written = [m for m in driver.recorded if isinstance(m, Recorded)]
     written.sort(key=lambda m: m.stamp_ns + 3_000_000_000 * (m.kind == later))
-    commands = [
-        (
-            read_command(o.command.name, o.command.stamp_ns, arguments_text(o.command)),
-            json.loads(outcome_text(o)),
-        )
-        for o in driver.outcomes
-    ]
     messages = [SimpleNamespace(topic=m.kind, message=namespace(m.fields)) for m in written]
     with CalibrationHistory.open("K2", state_dir=tmp_path) as other:
         session = HandEyeSession(ARM, other, driver.session.config, "test")
-        report = replay(session, messages, commands, None, take_hand_eye_message)
+        report = replay(session, messages, driver.commands, None, take_hand_eye_message)
         assert report.differs == []
         assert digest(session.data.document()) == digest(driver.session.data.document())
 

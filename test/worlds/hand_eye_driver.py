@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulated robot with a sensor before a target; all that it says are messages of ROS types."""
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -22,7 +23,13 @@ from robocal_ros.hand_eye.session import HandEyeSession, take_hand_eye_message
 from robocal_ros.hand_eye.targets import SphereTarget, target_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.events import (
+    Command,
+    Outcome,
+    arguments_text,
+    outcome_text,
+    read_command,
+)
 
 NS = 1_000_000_000
 START_NS = 1_700_000_000 * NS
@@ -184,6 +191,17 @@ class Driver:
     def outcomes(self) -> list[Outcome]:
         """What came of all commands."""
         return [one for one in self.recorded if isinstance(one, Outcome)]
+
+    @property
+    def commands(self) -> list[tuple[Command, Any]]:
+        """All of them as a recording tells them, each with what came of it."""
+        return [
+            (
+                read_command(o.command.name, o.command.stamp_ns, arguments_text(o.command)),
+                json.loads(outcome_text(o)),
+            )
+            for o in self.outcomes
+        ]
 
     def sphere(self, count: int = 14) -> None:
         """Start, and capture the sphere from each pose."""
