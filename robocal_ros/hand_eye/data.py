@@ -329,15 +329,6 @@ class PoseModel:
         return nominal if self.model is None else arm_of(self.model, nominal)
 
 
-def flange_poses(q: Array, models: Sequence[PoseModel], nominal: SerialArm) -> Array:
-    """T_base_flange (k, 4, 4), m, of joints (k, n), each by its own model."""
-    found = np.zeros((len(q), 4, 4))
-    for one in dict.fromkeys(models):
-        rows = [i for i, model in enumerate(models) if model is one]
-        found[rows] = one.arm(nominal).fk(q[rows])
-    return found
-
-
 class PoseModels:
     """The models of a session; ``began_with`` was in force at its beginning."""
 
@@ -345,24 +336,21 @@ class PoseModels:
         self._began_with = began_with.revision
         self._newest = PoseModel(began_with.revision, began_with.model)
 
-    def bound(self, command: Command, in_force: Head) -> Command:
-        """The command with the model, where another than at the beginning is in force.
+    def of(self, command: Command, in_force: Head) -> tuple[PoseModel, Command]:
+        """The model of a sample that a command takes, and the command, which says it if need be.
 
-        So a replay, which knows that of the beginning, takes the same flange poses.
+        That is where another than at the beginning is in force: so a replay, which knows that of
+        the beginning, takes the same flange poses.
         """
-        if THERMAL_MODEL in command.arguments or in_force.revision == self._began_with:
-            return command
-        told = {THERMAL_MODEL: {"revision": in_force.revision, "model": in_force.model}}
-        return replace(command, arguments={**command.arguments, **told})
-
-    def of(self, command: Command, in_force: Head) -> PoseModel:
-        """The model of a sample that the command, `bound`, takes."""
         told = command.arguments.get(THERMAL_MODEL)
         if told is None:
             told = {"revision": in_force.revision, "model": in_force.model}
+            if in_force.revision != self._began_with:
+                arguments = {**command.arguments, THERMAL_MODEL: told}
+                command = replace(command, arguments=arguments)
         if self._newest.revision != told["revision"]:
             self._newest = PoseModel(int(told["revision"]), told["model"])
-        return self._newest
+        return self._newest, command
 
 
 @dataclass(eq=False)

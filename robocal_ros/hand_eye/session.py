@@ -51,7 +51,6 @@ from robocal_ros.hand_eye.data import (
     board_of,
     data_set_begun,
     data_set_of,
-    flange_poses,
     seen_corners,
     shot_of,
 )
@@ -205,7 +204,11 @@ def laser_shots(samples: Samples, nominal: SerialArm) -> "HandEyeData":
 def sample_poses(samples: Samples, nominal: SerialArm) -> Array:
     """T_base_flange (k, 4, 4), m, each by the thermal model that was in force at its sample."""
     q = np.array([sample.q for sample in samples]).reshape(-1, nominal.n)
-    return flange_poses(q, [sample.thermal for sample in samples], nominal)
+    found = np.zeros((len(q), 4, 4))
+    for model in dict.fromkeys(sample.thermal for sample in samples):
+        rows = [i for i, sample in enumerate(samples) if sample.thermal is model]
+        found[rows] = model.arm(nominal).fk(q[rows])
+    return found
 
 
 def shot_joints(samples: Samples, nominal: SerialArm) -> ShotJoints:
@@ -473,8 +476,7 @@ class HandEyeSession(SessionBase):
         if mean is None:
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
         handle, mark = capture.handle, capture.mark
-        command = self._models.bound(command, self.current.thermal)
-        thermal = self._models.of(command, self.current.thermal)
+        thermal, command = self._models.of(command, self.current.thermal)
         try:
             values = seen_corners(data.target, shot) if data.topic == IMAGE else shot.read()
             words = data.put(HandEyeSample(handle, mark, at_ns, mean, values, thermal))
