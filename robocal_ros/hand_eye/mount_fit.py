@@ -272,12 +272,9 @@ def noise_numbers(problem: MountProblem) -> int:
 
     Where light is laid by eye, two of a pose tell how well; three unknowns look the same.
     """
-    told = min(POSE_NUMBERS * len(_poses(problem)), int(problem.sizes.sum())) - len(problem.names)
-    return min(told, 2 * len(_poses(problem)) - 3 + LEAST_AIM) if problem.aimed else told
-
-
-def _poses(problem: MountProblem) -> NDArray[np.int64]:
-    return np.unique(np.concatenate([view.sightings.pose for view in problem.views]))
+    poses = len(np.unique(np.concatenate([view.sightings.pose for view in problem.views])))
+    told = min(POSE_NUMBERS * poses, int(problem.sizes.sum())) - len(problem.names)
+    return min(told, 2 * poses - 3 + LEAST_AIM) if problem.aimed else told
 
 
 def _solved(

@@ -378,7 +378,7 @@ class HandEyeNode(SessionNode[HandEyeSession]):
             health.worsen(WARN, self._outputs.missing)
         if data is not None and "columns" in data.target and (told := self._camera.other_frame()):
             health.worsen(ERROR, told)
-        elif data is not None and (told := self._camera.doubt(data.target)):
+        elif data is not None and (told := self._camera.apart(data.target, taken=False)):
             health.worsen(WARN, told)
 
 

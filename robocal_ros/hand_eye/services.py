@@ -356,16 +356,11 @@ class CameraTopic:
             return document
         return target_document("camera", target.with_intrinsics(self._told(target)))
 
-    def require_same(self, document: Mapping[str, Any]) -> None:
-        """Raise `InputError` when the camera is not any more what the open set took it for."""
-        if fault := self._apart(document, taken=True):
-            raise InputError(f"{fault}: was it set anew? Start a new data set")
+    def apart(self, document: Mapping[str, Any], taken: bool) -> str:
+        """Say that the camera is not what a data set takes it for; empty where it is.
 
-    def doubt(self, document: Mapping[str, Any]) -> str:
-        """What is to be told of intrinsics from a file; empty: nothing."""
-        return self._apart(document, taken=False)
-
-    def _apart(self, document: Mapping[str, Any], taken: bool) -> str:
+        ``taken``: of one that has its intrinsics from the topic; else from a file.
+        """
         target = target_of(document) if "columns" in document else None
         if not isinstance(target, BoardTarget) or target.intrinsics is None:
             return ""
@@ -456,8 +451,10 @@ class HandEyeServices:
     async def _capture_now(self, arguments: Mapping[str, Any]) -> Outcome:
         """A capture takes nothing that was received before its call."""
         self._node.take_waiting()
-        if (data := self._session().data) is not None:
-            self._camera.require_same(data.target)
+        data = self._session().data
+        fault = "" if data is None else self._camera.apart(data.target, taken=True)
+        if fault:
+            raise InputError(f"{fault}: was it set anew? Start a new data set")
         return await self._ask(Command(CAPTURE, arguments))
 
     async def _capture(self, request: Any, response: Any) -> Any:
