@@ -619,8 +619,7 @@ def solve_joint(
 
 def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read], Array]:
     """Features of each target, and the pose of the sensor from the one that shows it best alone."""
-    starts, fits = [], []
-    unseen: list[RobocalError] = []
+    fits, unseen = [], list[RobocalError]()
     reads = [features(task, data) for task, data in parts]
     every = [read.linearity for read in reads if read.linearity is not None]
     known = min(every, key=lambda own: own.assumed, default=None)
@@ -631,14 +630,10 @@ def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read]
         ]
     for read, (task, data) in zip(reads, parts, strict=True):
         try:
-            starts.append((read.view, looked(task, data, read)[0]))
+            near, _ = looked(task, data, read)
+            fits.append(fit_mount((read.view,), near, settings.noise()))
         except (TooFewSamplesError, RankDeficientError) as error:
             unseen.append(error)  # others may show more
-    for view, near in starts:
-        try:
-            fits.append(fit_mount((view,), near, settings.noise()))
-        except (TooFewSamplesError, RankDeficientError) as error:
-            unseen.append(error)
     if not fits:
         raise unseen[0]
     best = min(fits, key=lambda fit: float(np.trace(fit.covariance[:3, :3])))

@@ -502,12 +502,6 @@ def solve_tracker(
     }
     states = states_without(problem, estimate, [profile.name for profile in data.profiles])
     told = estimate.covariance[SENSOR, SENSOR]
-    best = replace(
-        best,
-        covariance=told,
-        rejected={**best.rejected, **misses},
-        leave_one_out_m=_left_out(data, target, classic, states),
-    )
     z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
     working_m = float(expected_error_m(told, np.array([[0.0, 0.0, z]])))
     angle, gap_m = estimate.state.mismatch.tolist()
@@ -517,8 +511,15 @@ def solve_tracker(
         "widened_by": estimate.scale,
         "axes_off_nominal": {"angle_deg": float(np.degrees(angle)), "gap_mm": gap_m * 1e3},
     }
-    verdict = judge_tracker(estimate, working_m, limit_m)
-    best = replace(best, working_error_m=working_m, verdict=verdict, more=more)
+    best = replace(
+        best,
+        covariance=told,
+        rejected={**best.rejected, **misses},
+        leave_one_out_m=_left_out(data, target, classic, states),
+        working_error_m=working_m,
+        verdict=judge_tracker(estimate, working_m, limit_m),
+        more=more,
+    )
     erring = joint_errors(problem, estimate, joint_error_rad) if joint_error_rad else None
     best = said_of_joints(best, erring)
     return _classic(data, target, classic, best, limit_m) if method == "classic" else best

@@ -172,14 +172,11 @@ def _best_plane(cloud: Array, rng: np.random.Generator) -> Plane | None:
     miss = np.abs(judges @ normal.T - np.sum(first[whole][wide] * normal, axis=1))
     best = int(np.argmin(np.minimum(miss, 2.0 * NEAR_M).sum(axis=0)))
     chosen = judges[miss[:, best] < 2.0 * NEAR_M]
-    if len(chosen) < 3:
-        return None
-    plane = fit_plane(moment(chosen))[0]
-    for _ in range(ROUNDS):
-        chosen = judges[plane.distances(judges) < NEAR_M]
+    for _ in range(1 + ROUNDS):
         if len(chosen) < 3:
             return None
         plane = fit_plane(moment(chosen))[0]
+        chosen = judges[plane.distances(judges) < NEAR_M]
     return plane
 
 
