@@ -95,11 +95,8 @@ def solve_task(
     """
     read = features(task, data)
     near, doubt = looked(task, data, read)
-    fit = fit_mount((read.view,), near, settings.noise())
-    fit, (read,) = _with_linearity(fit, [read], settings.noise())
+    fit, (read,) = _fitted([read], near, settings.noise())
     fit = replace(fit, doubt=fit.doubt or doubt)
-    require_radius(fit, (read.view,))
-    require_seen(fit)
     if method == "classic":
         return _classic(task, read, fit, data, settings)
     return _result_of([task], fit, [read], data, settings)
@@ -194,24 +191,30 @@ def _pulled(reads: Sequence[Read], linearity: SensorLinearity) -> dict[str, Arra
     return {name: pull @ root for read in reads for name, pull in read.pulled.items()}
 
 
-def _with_linearity(
-    fit: MountFit, reads: list[Read], given: PoseNoise | None
+def _fitted(
+    reads: list[Read], start: MountState, given: PoseNoise | None
 ) -> tuple[MountFit, list[Read]]:
-    """The fit, and the features without the linearity as mount and curves together have it."""
+    """The fit, and the features without the linearity as mount and curves together have it.
+
+    Raises as `require_radius` and `require_seen`.
+    """
+    fit = fit_mount(tuple(read.view for read in reads), start, given)
     linearity = next((read.linearity for read in reads if read.linearity is not None), None)
-    if linearity is None:
-        return fit, reads
-    taken = _bent(fit, reads, linearity)[0]
-    step = linearity.root @ taken
-    own = replace(linearity, coefficients=linearity.coefficients + step)
-    without_it = []
-    for read in reads:
-        s = read.view.sightings
-        moved = np.array([read.pulled[name] @ step for name in s.names])
-        view = replace(read.view, sightings=replace(s, value=s.value - moved))
-        without_it.append(replace(read, linearity=own, view=view))
-    views, bend = tuple(read.view for read in without_it), Bend(_pulled(reads, linearity), taken)
-    return fit_mount(views, fit.state, given, bend), without_it
+    if linearity is not None:
+        taken = _bent(fit, reads, linearity)[0]
+        step, bend = linearity.root @ taken, Bend(_pulled(reads, linearity), taken)
+        own = replace(linearity, coefficients=linearity.coefficients + step)
+        without_it = []
+        for read in reads:
+            s = read.view.sightings
+            moved = np.array([read.pulled[name] @ step for name in s.names])
+            view = replace(read.view, sightings=replace(s, value=s.value - moved))
+            without_it.append(replace(read, linearity=own, view=view))
+        reads = without_it
+        fit = fit_mount(tuple(read.view for read in reads), fit.state, given, bend)
+    require_radius(fit, tuple(read.view for read in reads))
+    require_seen(fit)
+    return fit, reads
 
 
 def field_of(data: HandEyeData) -> Array:
@@ -603,12 +606,8 @@ def solve_joint(
         raise InputError(f"several targets of different kinds are needed, not: {', '.join(kinds)}")
     own, X = _alone(parts, settings)
     data, reads = _together(parts, own)
-    views = tuple(read.view for read in reads)
-    places = tuple(task.placed(view, X) for task, view in zip(tasks, views, strict=True))
-    fit = fit_mount(views, MountState(X, places), settings.noise())
-    fit, reads = _with_linearity(fit, reads, settings.noise())
-    require_radius(fit, tuple(read.view for read in reads))
-    require_seen(fit)
+    places = tuple(task.placed(read.view, X) for task, read in zip(tasks, reads, strict=True))
+    fit, reads = _fitted(reads, MountState(X, places), settings.noise())
     result = _result_of(tasks, fit, reads, data, settings)
     if not checks:
         return result
