@@ -68,7 +68,7 @@ def by_tracker(cell: TrackerCell, rng: np.random.Generator) -> Solved:
     data, target = cell.measure(rng), cell.told(rng)
     try:
         first = solve_classic(data, target, cell.sizes.noise)
-        _, best = solve_best(data, target, cell.sizes.noise, first)
+        _, best = solve_best(first)
     except RobocalError:
         return {"MCT, best": None, "MCT, classic": None}
     return {"MCT, best": best.state.T_flange_sensor, "MCT, classic": first.T_flange_sensor}

@@ -128,7 +128,7 @@ def tracker_run(arm: GearedArm, rng: np.random.Generator) -> Said:
     cell = replace(six_axis_cell(arm.nominal, q), true=arm)
     noise, data, target = cell.sizes.noise, cell.measure(rng), cell.told(rng)
     first = solve_classic(data, target, noise)
-    problem, found = tracker.solve_best(data, target, noise, first)
+    problem, found = tracker.solve_best(first)
     said = tracker.joint_errors(problem, found, SIZE_RAD)
     step = increment(found.state.T_flange_sensor, cell.T_flange_sensor, np.zeros(3))
     return Said.of(step, found.covariance[tracker.SENSOR, tracker.SENSOR], said)

@@ -74,7 +74,7 @@ def repeat(cell: TrackerCell, runs: int) -> Runs:
         rng = np.random.default_rng([54, seed])
         data, target = cell.measure(rng), cell.told(rng)
         first = solve_classic(data, target, noise)
-        _, estimate = solve_best(data, target, noise, first)
+        _, estimate = solve_best(first)
         classic.append(first.T_flange_sensor)
         best.append(estimate.state.T_flange_sensor)
         covariance.append(estimate.covariance[SENSOR, SENSOR])

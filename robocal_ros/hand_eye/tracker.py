@@ -44,7 +44,6 @@ from robocal_ros.hand_eye.tracker_scan import (
     Caps,
     Classic,
     Lines,
-    Scan,
     each_without,
     fit_caps,
     fit_lines,
@@ -394,28 +393,26 @@ LEAST_REST = 1e-6  # what the others say about a profile, where they say anythin
 
 
 def profile_distances(
-    data: TrackerData,
-    target: TrackerTarget,
-    parts: Sequence[Scan],
-    states: Sequence[TrackerUnknowns],
+    classic: Classic, states: Sequence[TrackerUnknowns]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Rms distance (m,), m, of each profile's points from the target, and which show it.
 
     ``states`` (m,): for each profile, where sensor and target are.
     """
-    P = np.array([state.sensor_poses(T) for state, T in zip(states, data.motion, strict=True)])
+    motion = zip(states, classic.data.motion, strict=True)
+    P = np.array([state.sensor_poses(T) for state, T in motion])
     normals = np.array([state.normals for state in states])
     offsets = np.array([state.offsets for state in states])
     centres = np.array([state.centre for state in states])
     total, count = np.zeros(len(P)), np.zeros(len(P))
-    for index, scan in enumerate(parts):
+    for index, scan in enumerate(classic.parts):
         own = scan.profile
         T, x, z = P[own], scan.points[:, :1], scan.points[:, 1:]
         points = T[:, :3, 0] * x + T[:, :3, 2] * z + T[:, :3, 3]
         if index < len(FACES):
             off = np.einsum("ni,ni->n", points, normals[own, index]) - offsets[own, index]
         else:
-            off = np.linalg.norm(points - centres[own], axis=1) - target.sphere_radius_m
+            off = np.linalg.norm(points - centres[own], axis=1) - classic.target.sphere_radius_m
         total += np.bincount(own, off**2, len(P))
         count += np.bincount(own, minlength=len(P))
     return np.sqrt(total / np.maximum(count, 1)), count > 0
@@ -491,8 +488,8 @@ def solve_tracker(
     ``joint_error_rad``: see `HandEyeSettings`.
     """
     classic = solve_classic(data, target, noise)
-    problem, estimate = solve_best(data, target, noise, classic)
-    best = _result(data, target, classic, estimate.state, "best")
+    problem, estimate = solve_best(classic)
+    best = _result(classic, estimate.state, "best")
     worst: dict[str, float] = {}
     for index in np.flatnonzero(estimate.rejected):
         name = problem.rows[index]
@@ -515,14 +512,14 @@ def solve_tracker(
         best,
         covariance=told,
         rejected={**best.rejected, **misses},
-        leave_one_out_m=_left_out(data, target, classic, states),
+        leave_one_out_m=_left_out(classic, states),
         working_error_m=working_m,
         verdict=judge_tracker(estimate, working_m, limit_m),
         more=more,
     )
     erring = joint_errors(problem, estimate, joint_error_rad) if joint_error_rad else None
     best = said_of_joints(best, erring)
-    return _classic(data, target, classic, best, limit_m) if method == "classic" else best
+    return _classic(classic, best, limit_m) if method == "classic" else best
 
 
 def joint_errors(
@@ -552,23 +549,21 @@ def joint_errors(
     return JointErrors.beside(size_rad, by_joints - widened, told)
 
 
-def _classic(
-    data: TrackerData, target: TrackerTarget, classic: Classic, best: HandEyeResult, limit_m: float
-) -> HandEyeResult:
+def _classic(classic: Classic, best: HandEyeResult, limit_m: float) -> HandEyeResult:
     """The closed form; its error is its distance from the best estimate, with that one's own."""
     away_m = apart(
         classic.T_flange_sensor,
         best.T_flange_sensor,
-        field_points([profile.points for profile in data.profiles]),
+        field_points([profile.points for profile in classic.data.profiles]),
     )
     error_m = float(np.hypot(away_m, best.working_error_m or 0.0))
     states = [
         None if T is None else replace(_state(classic), T_flange_sensor=T)
-        for T in each_without(classic, target, len(data.profiles))
+        for T in each_without(classic)
     ]
     return replace(
-        _result(data, target, classic, _state(classic), "classic"),
-        leave_one_out_m=_left_out(data, target, classic, states),
+        _result(classic, _state(classic), "classic"),
+        leave_one_out_m=_left_out(classic, states),
         working_error_m=error_m,
         verdict=best.verdict
         if best.verdict.code is Code.RESIDUAL_TOO_LARGE
@@ -576,12 +571,7 @@ def _classic(
     )
 
 
-def _left_out(
-    data: TrackerData,
-    target: TrackerTarget,
-    classic: Classic,
-    states: Sequence[TrackerUnknowns | None],
-) -> Array | None:
+def _left_out(classic: Classic, states: Sequence[TrackerUnknowns | None]) -> Array | None:
     """Rms distance (n,), m, of each profile's points from the target as found without it.
 
     None where a profile alone determines something.
@@ -589,7 +579,7 @@ def _left_out(
     known = [state for state in states if state is not None]
     if len(known) < len(states):
         return None
-    distance_m, seen = profile_distances(data, target, classic.parts, known)
+    distance_m, seen = profile_distances(classic, known)
     return distance_m[seen]
 
 
@@ -601,14 +591,13 @@ def _state(classic: Classic) -> TrackerUnknowns:
     )  # fmt: skip
 
 
-def solve_best(
-    data: TrackerData, target: TrackerTarget, noise: TrackerNoise, classic: Classic
-) -> tuple[TrackerProblem, Estimate[TrackerUnknowns]]:
+def solve_best(classic: Classic) -> tuple[TrackerProblem, Estimate[TrackerUnknowns]]:
     """All measurements at once, from the closed form on; the noise of the profiles is theirs.
 
     Raises `TooFewSamplesError` or `RankDeficientError` as `estimation.estimation.solve`;
     `ResidualError` when the place of the sphere does not settle.
     """
+    data, target = classic.data, classic.target
     fits = [fit_lines(scan, name) for scan, name in zip(classic.parts, FACES, strict=False)]
     scatter_m = float(np.sqrt(np.mean([scatter**2 for _, scatter in fits])))
     noise_m = max(scatter_m, SMALLEST_NOISE_M)
@@ -621,7 +610,7 @@ def solve_best(
     for _ in range(MOST_ROUNDS):
         place = sphere_in(state.sensor_poses(data.motion), state.centre)
         caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m)
-        problem = TrackerProblem(data, target, noise, state, axes, lines, caps)
+        problem = TrackerProblem(data, target, classic.noise, state, axes, lines, caps)
         estimate = solve(problem, state)
         state = estimate.state
         if np.abs(sphere_in(state.sensor_poses(data.motion), state.centre) - place).max() < NEAR_M:
@@ -632,17 +621,10 @@ def solve_best(
     )
 
 
-def _result(
-    data: TrackerData,
-    target: TrackerTarget,
-    classic: Classic,
-    state: TrackerUnknowns,
-    method: Method,
-) -> HandEyeResult:
+def _result(classic: Classic, state: TrackerUnknowns, method: Method) -> HandEyeResult:
     """What both methods report, not judged yet."""
-    states = [state] * len(data.profiles)
-    residual_m, seen = profile_distances(data, target, classic.parts, states)
-    names = np.array([profile.name for profile in data.profiles])
+    names = np.array([profile.name for profile in classic.data.profiles])
+    residual_m, seen = profile_distances(classic, [state] * len(names))
     cube = Cube(state.normals, state.offsets, state.centre)
     return HandEyeResult(
         kind="tracker",

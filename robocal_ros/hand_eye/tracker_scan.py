@@ -358,13 +358,16 @@ ALIKE_M = 2e-4
 
 @dataclass(frozen=True, eq=False)
 class Classic:
-    """Closed-form answer, and what it was made of.
+    """Closed-form answer, and what it was made of: ``data``, ``target``, ``noise``.
 
     ``T_tracker_flange`` (4, 4): at the first profile. ``tracked``: the target in the tracker frame.
     ``parts``: the scan of face 1, face 2 and the sphere. ``mismatch_m``: by how much tracker and
     sensor disagree about the target's shape.
     """
 
+    data: TrackerData
+    target: TrackerTarget
+    noise: TrackerNoise
     axes: tuple[Axis, Axis]
     T_tracker_flange: Array
     T_flange_sensor: Array
@@ -398,6 +401,9 @@ def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise)
     parts = parts_of(scan, match.T_flange_sensor, match.seen, target.sphere_radius_m)
     match = search.refined(parts, match.T_flange_sensor)
     return Classic(
+        data=data,
+        target=target,
+        noise=noise,
         axes=axes,
         T_tracker_flange=T_tracker_flange,
         T_flange_sensor=match.T_flange_sensor,
@@ -408,11 +414,11 @@ def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise)
     )
 
 
-def each_without(classic: Classic, target: TrackerTarget, profiles: int) -> list[Array | None]:
+def each_without(classic: Classic) -> list[Array | None]:
     """T_flange_sensor without each of the profiles, solved again; None where that fails."""
-    search = _CubeSearch(classic.tracked, classic.T_tracker_flange, target)
+    search = _CubeSearch(classic.tracked, classic.T_tracker_flange, classic.target)
     found: list[Array | None] = []
-    for profile in range(profiles):
+    for profile in range(len(classic.data.profiles)):
         first, second, ball = (part.part(part.profile != profile) for part in classic.parts)
         try:
             match = search.refined((first, second, ball), classic.T_flange_sensor)

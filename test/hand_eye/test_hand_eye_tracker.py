@@ -85,7 +85,7 @@ def solved():
     """Problem and estimate of `noisy`, and the closed form."""
     made = cell("prp")
     first = solve_classic(noisy(), made.sizes.target, made.sizes.noise)
-    return *solve_best(noisy(), made.sizes.target, made.sizes.noise, first), first
+    return *solve_best(first), first
 
 
 def left_out(data: TrackerData, row: int) -> TrackerData:
@@ -103,7 +103,7 @@ def test_leaving_a_profile_out_is_as_solving_without_it():
         assert state is not None
         rest = left_out(data, row)
         first = solve_classic(rest, made.sizes.target, made.sizes.noise)
-        _, again = solve_best(rest, made.sizes.target, made.sizes.noise, first)
+        _, again = solve_best(first)
         here = estimate.state.T_flange_sensor
         told, exact = (
             frames.invert(here) @ s.T_flange_sensor for s in (state, again.state)
@@ -166,7 +166,7 @@ def repeated(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rng = np.random.default_rng([5, seed])
         data, target = made.measure(rng), made.told(rng)
         first = solve_classic(data, target, made.sizes.noise)
-        _, estimate = solve_best(data, target, made.sizes.noise, first)
+        _, estimate = solve_best(first)
         best.append(error(made, estimate.state.T_flange_sensor))
         classic.append(error(made, first.T_flange_sensor))
         covariance.append(estimate.covariance[SENSOR, SENSOR])
@@ -199,7 +199,7 @@ def test_the_jacobian_is_the_derivative():
     data = made.measure(rng)
     told = replace(made.sizes.target, height_m=0.04)
     first = solve_classic(data, told, made.sizes.noise)
-    problem, estimate = solve_best(data, told, made.sizes.noise, first)
+    problem, estimate = solve_best(first)
     state = estimate.state.moved(1e-4 * rng.standard_normal(UNKNOWNS))
     residual, jacobian = problem.linearise(state)
     assert len(problem.rows) == len(residual)
