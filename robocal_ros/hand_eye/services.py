@@ -21,6 +21,7 @@ from robocal_msgs.srv import (
     HandEyeFile,
     RemoveHandEye,
     StartHandEye,
+    VerifyHandEye,
 )
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
@@ -409,8 +410,6 @@ class HandEyeServices:
         add(CalibrateHandEye, "~/calibrate", self._calibrate)
         add(Trigger, "~/calibrate_trigger", twin(files.calibrate, CALIBRATE, {}))
         add(CheckHandEyePlan, "~/check_plan", self._check_plan)
-        from robocal_msgs.srv import VerifyHandEye
-
         add(VerifyHandEye, "~/verify", self._verify)
 
     async def _start(self, request: Any, response: Any) -> Any:
