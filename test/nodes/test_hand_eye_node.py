@@ -47,6 +47,22 @@ def matrix(transform: Any) -> np.ndarray:
     return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
 
 
+def replayed(sensor: LiveSensor, live: list[Any], path: Path, result: Any) -> Any:
+    """What `robocal replay` prints of all that was sent and told: nothing that differs."""
+    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
+        now_ns = 0
+        for message in sensor.sent:
+            now_ns = max(now_ns, message.stamp_ns)
+            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
+        for event in live:
+            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
+    document = robocal_json("replay.hand_eye.json", "replay", path)
+    assert document["differs"] == []
+    found_mm = document["calibrations"][0]["T_flange_sensor"]["xyz_mm"]
+    assert found_mm == pytest.approx(1e3 * matrix(result.sensor)[:3, 3], abs=1e-12)
+    return document
+
+
 def taken(sensor: LiveSensor) -> str:
     """Why the sensor's frame cannot stand below the flange."""
     return str(sensor.node._frames.conflict("tool0", np.eye(4)))
@@ -134,18 +150,7 @@ def test_a_makes_profiles_are_calibrated_and_replayed_alike(
     away_m = np.linalg.norm((matrix(result.sensor) - truth)[:3, 3])
     assert away_m < 3e-3 * result.expected_error_mm
     graph.spin_until(lambda: len(live) > 1 + 2 * 10 + 1, "all events, and the configuration")
-    path = tmp_path / "live.mcap"
-    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
-        now_ns = 0
-        for message in sensor.sent:
-            now_ns = max(now_ns, message.stamp_ns)
-            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
-        for event in live:
-            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
-    document = robocal_json("replay.hand_eye.json", "replay", path)
-    assert document["differs"] == []
-    found_mm = document["calibrations"][0]["T_flange_sensor"]["xyz_mm"]
-    assert found_mm == pytest.approx(1e3 * matrix(result.sensor)[:3, 3], abs=1e-12)
+    replayed(sensor, live, tmp_path / "live.mcap", result)
 
 
 def test_a_moving_robot_is_not_captured_and_a_sample_is_removed(graph: Any, tmp_path: Path) -> None:
@@ -535,17 +540,6 @@ def test_live_equals_replay_bit_for_bit(graph: Any, sensor: LiveSensor, tmp_path
     assert sensor.calibrate(handles=[1, 2, 3, 4, 5, 6, 7]).samples == 7
     commands = 1 + 2 * 8 + 1 + 1 + 1
     graph.spin_until(lambda: len(live) >= commands + 2, "all events, with two configurations")
-    path = tmp_path / "live.mcap"
-    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
-        now_ns = 0
-        for message in sensor.sent:
-            now_ns = max(now_ns, message.stamp_ns)
-            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
-        for event in live:
-            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
-    document = robocal_json("replay.hand_eye.json", "replay", path)
-    assert document["differs"] == []
+    document = replayed(sensor, live, tmp_path / "live.mcap", result)
     assert len(document["commands"]) == commands
-    found_mm = document["calibrations"][0]["T_flange_sensor"]["xyz_mm"]
-    assert found_mm == pytest.approx(1e3 * matrix(result.sensor)[:3, 3], abs=1e-12)
     assert document["final_sensor"]["revision"] == 1
