@@ -317,6 +317,8 @@ def read_bag_shots(
     data = data_set_of(read_data_set(path, arm), arm)
     if data.topic != PROFILE:
         raise InputError(f"holds shots of a {data.kind}, not profiles", file=str(path))
+    if not data.samples:
+        raise TooFewSamplesError(f"{path}: the data file holds no sample")
     return ReadShots(laser_shots(data.chosen([]), arm))
 
 

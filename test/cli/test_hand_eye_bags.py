@@ -228,6 +228,17 @@ class TestSaved:
         refused = robocal(*from_bag("sphere", path), status=2)["error"]
         assert "holds shots of a camera" in refused["message"]
 
+    def test_without_a_sample(self, tmp_path):
+        path = tmp_path / "empty.mcap"
+        models = {"thermal_models": [{"revision": 0, "model": None}], "samples": []}
+        given = {"target": {"kind": "line"}, "method": "best", "mount": "in-hand"}
+        write_data_set(path, given | models | {"feature": "edge"}, "profile", "laser", UR10)
+        refused = robocal(*from_bag("line", path), status=3)["error"]
+        assert (refused["code"], "holds no sample" in refused["message"]) == (
+            "TOO_FEW_SAMPLES",
+            True,
+        )
+
     def test_of_another_robot(self, saved):
         words = ["--bag", saved("step"), "--robot", "kr150_r3100", *known("step")]
         assert robocal("step", *words, status=2)["error"]["code"] == "WRONG_ROBOT"
