@@ -119,10 +119,9 @@ class JointWire:
         self.is_finite = True
         self._layout: _Layout | None = None
         self._efforts = 0  # how many go out
-        # what goes out, and the places of its numbers
-        self._out, self._effort_at = bytearray(), 0
-        self._position = self._velocity = np.empty(0)
-        self._made_for: tuple[_Layout | None, str, bool, int] = (None, "", False, 0)
+        # of what goes out: what it was made for, and what stands before the numbers of each field
+        self._made_for: tuple[_Layout, str, bool, int] | None = None
+        self._before: list[bytes] = []
 
     def read(self, data: bytes) -> JointCommand | None:
         """The command in a message; None for one that is not regular, finite and whole."""
@@ -155,31 +154,26 @@ class JointWire:
             raise ValueError("no message was read")
         wanted = layout, command.mark, velocity is not None, efforts
         if self._made_for != wanted:
-            self._make(layout, command.mark, moves=velocity is not None)
-        out = self._out
-        out[STAMP:FRAME] = data[STAMP:FRAME]
-        self._position[:] = command.position
-        if velocity is not None:
-            self._velocity[:] = velocity
-        if efforts:
-            place, size = layout.places[2], 8 * efforts
-            out[self._effort_at : self._effort_at + size] = data[place : place + size]
-        return bytes(out)
+            k = len(layout.names)
+            counts = k, 0 if velocity is None else k, efforts
+            self._before, self._made_for = _before(layout, command.mark, counts), wanted
+        to_position, to_velocity, to_effort = self._before
+        speeds, place = b"" if velocity is None else velocity.tobytes(), layout.places[2]
+        effort = data[place : place + 8 * efforts]
+        out = data[:FRAME], to_position, command.position.tobytes(), to_velocity, speeds
+        return b"".join((*out, to_effort, effort))
 
-    def _make(self, layout: _Layout, mark: str, *, moves: bool) -> None:
-        """Lay the outgoing message out."""
-        out, places, k = bytearray(HEAD + bytes(8) + _string_bytes(mark)), [], len(layout.names)
-        out += layout.named
-        for count in (k, k if moves else 0, self._efforts):
-            out += bytes(-len(out) % 4) + struct.pack("<I", count)
-            if count:
-                out += bytes((len(HEAD) - len(out)) % 8)
-            places.append(len(out))
-            out += bytes(8 * count)
-        self._out, self._effort_at = out, places[2]
-        self._position = np.frombuffer(out, np.float64, k, places[0])
-        self._velocity = np.frombuffer(out, np.float64, k if moves else 0, places[1])
-        self._made_for = layout, mark, moves, self._efforts
+
+def _before(layout: _Layout, mark: str, counts: tuple[int, ...]) -> list[bytes]:
+    """What stands before the numbers of each field, so many, after the stamp."""
+    parts, part, at = [], _string_bytes(mark) + layout.named, FRAME
+    for count in counts:
+        part += bytes(-(at + len(part)) % 4) + struct.pack("<I", count)
+        if count:
+            part += bytes((len(HEAD) - at - len(part)) % 8)
+        parts.append(part)
+        at, part = at + len(part) + 8 * count, b""
+    return parts
 
 
 def _layout(data: bytes) -> _Layout | None:

@@ -164,8 +164,8 @@ class TargetStream:
         if self._holds(elapsed):
             return None
         q, before, desired = command.position.copy(), output.out.copy(), self._desired
-        given = elapsed, elapsed, self._active, self._speeds
-        if not 0.0 <= desired.step(q, self._velocity, *given) <= 1.0 + ROUNDING:
+        share = desired.step(q, self._velocity, elapsed, elapsed, self._active, self._speeds)
+        if not 0.0 <= share <= 1.0 + ROUNDING:
             return None
         self._unnoted = now_s, q, before, now_s - elapsed
         self._goal, self._command = q, command
