@@ -315,7 +315,6 @@ class Offset:
     ``withheld``: offset less the one that model and tool ask for: the limiter is on its way.
     """
 
-    names: tuple[str, ...]
     offset: Array  # (n,) corrected less taught, rad (prismatic: m)
     withheld: Array  # (n,)
     revision: int | None  # of the model that is corrected with; None for none

@@ -166,7 +166,7 @@ class CorrectionReport:
         message = JointOffset(
             header=header(self._now_ns(), ""),
             cause=cause,
-            joint_names=offset.names,
+            joint_names=self._joint_names,
             offset=doubles(offset.offset),
             model_revision=offset.revision or 0,
             tool_revision=offset.tool_revision or 0,

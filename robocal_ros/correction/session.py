@@ -449,7 +449,6 @@ class CorrectionSession:
             offset = measured - output.uncorrected(measured, (stage, withheld))
         tool = self._gate.tools.in_use if self._enabled else None
         return Offset(
-            names=self._reference.joint_names,
             offset=offset,
             withheld=withheld,
             revision=self._gate.revision if self._enabled and not self._gate.stale else None,

@@ -65,7 +65,8 @@ class TargetStream:
 
     def __init__(self, output: Output) -> None:
         self._output, self._robot, self._desired = output, output.robot, output.desired
-        self._arm, self._config = arm, config = output.arm, output.config
+        self._arm = arm = output.arm
+        config = output.config
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
         self._pause_s = config.stream_gap_s
         self._unlimited = ~np.isfinite(self._fastest)
@@ -118,7 +119,7 @@ class TargetStream:
             return
         self._as_usual = 0
         lengths = sorted(intervals)
-        pause = max(self._config.stream_gap_s, 2.0 * lengths[len(lengths) // 2])
+        pause = max(self._pause_s, 2.0 * lengths[len(lengths) // 2])
         while lengths[-1] > pause:
             lengths.pop()
         usual = max(len(lengths) - STALLS, 1)
@@ -129,7 +130,7 @@ class TargetStream:
     def _gap_s(self) -> float:
         """A longer silence is a pause."""
         period = self.period_s
-        return max(self._config.stream_gap_s, 2.0 * period if period > 0.0 else 0.0)
+        return max(self._pause_s, 2.0 * period if period > 0.0 else 0.0)
 
     def is_due(self, now_s: float, periods: float) -> bool:
         """Whether its last message came so long ago."""
