@@ -20,9 +20,9 @@ from robocal_ros.ground.samples import Measurements
 from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import fit_pairs
 from robocal_ros.identification import identify, row_kernels
-from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.arm import inverse
 from robocal_ros.kinematics.joint_functions import JointFunctions
+from robocal_ros.kinematics.robots import load_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,31 +33,9 @@ POSES = 30
 LINE_EVERY = 10  # kernels, where no terminal shows each
 
 
-def arm_of_six_joints() -> SerialArm:
-    """Return a small arm with a parallel pair; only its shape matters."""
-    turn = np.pi / 2
-    mdh = [
-        (0.3, 0.0, 0.0, turn, 0.0),
-        (0.0, 0.0, -0.6, 0.0, 0.0),
-        (0.1, 0.0, -0.5, turn, 0.0),
-        (0.2, 0.0, 0.0, -turn, 0.0),
-        (0.1, 0.0, 0.0, turn, 0.0),
-        (0.1, 0.0, 0.0, 0.0, 0.0),
-    ]
-    return SerialArm(
-        name="warm",
-        joint_names=tuple(f"joint_{i}" for i in range(6)),
-        mdh=np.array(mdh),
-        sign=np.ones(6),
-        prismatic=np.zeros(6, dtype=np.bool_),
-        lower=np.full(6, -np.pi),
-        upper=np.full(6, np.pi),
-    )
-
-
 def warming() -> Mapping[str, Callable[[], object]]:
     """What nodes and commands call first, by what it is for; in this order."""
-    arm = arm_of_six_joints()
+    arm = load_robot("ur10")  # only its shape matters, six joints
     rng = np.random.default_rng(0)
     q = rng.uniform(-1.5, 1.5, (POSES, 6))
     names = tuple(str(i) for i in range(POSES))
