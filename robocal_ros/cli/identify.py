@@ -98,10 +98,13 @@ def show_identification(console: "Console", document: Document) -> None:
     predicted = document["calibrated"]["predicted"]
     functions = any(row["function"] for row in document.get("joints", ()))
     of = " of its geometry alone" if functions else ""
+    bound = ""
+    if "bound_sigmas" in document:  # not of a drift
+        bound = f" 95 % of errors stay within {document['bound_sigmas']:.2f} of their sigmas."
     console.print(
         f"Uncertainty of the model itself: {predicted['model_rms_mm']:.3f} mm rms at these poses, "
         f"{predicted['workspace_rms_mm']:.3f} mm{of} throughout the joint limits. "
-        f"Noise: {document['noise_mm']:.3f} mm per coordinate." + _bound_words(document),
+        f"Noise: {document['noise_mm']:.3f} mm per coordinate.{bound}",
         soft_wrap=True,
     )
     console.print()
@@ -116,12 +119,6 @@ def show_identification(console: "Console", document: Document) -> None:
             then = f"'robocal history accept {number}', for the same serial, brings it into force"
         print_words(console, f"Kept as calibration {number} of the history: {then}.")
     print_output(console, document)
-
-
-def _bound_words(document: Document) -> str:
-    if "bound_sigmas" not in document:  # of a drift
-        return ""
-    return f" 95 % of errors stay within {document['bound_sigmas']:.2f} of their sigmas."
 
 
 _JOINT_HEADS = (

@@ -3,7 +3,7 @@
 
 import argparse
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -214,17 +214,14 @@ def _mapping(path: Path, text: str) -> Told:
     for needed, told in KINDS:
         if keys >= needed:
             return told(path, found)
-    if any(isinstance(part, Mapping) and "ros__parameters" in part for part in _values(found)):
+    parts = found.values() if keys else ()
+    if any(isinstance(part, Mapping) and "ros__parameters" in part for part in parts):
         nodes = [("nodes", ", ".join(map(str, found)))]
         return "parameter file of nodes", nodes, [
             f"ros2 launch robocal_ros cell.launch.py params:={_typed(path)}"
         ]  # fmt: skip
     words = ", ".join(map(str, found)) if keys else type(found).__name__
     return "document of no kind that is known", [("holds", words)], []
-
-
-def _values(found: Any) -> Sequence[Any]:
-    return list(found.values()) if isinstance(found, Mapping) else []
 
 
 def _robot(path: Path, _: Any) -> Told:

@@ -122,7 +122,8 @@ class Stationarity:
 
     ``autocorrelation`` (LAGS, k): at lags 1 ... LAGS. ``bound``: half width of the interval that
     holds 95 % of a white series' autocorrelations. ``outside`` (k,): how many lags lie outside it;
-    ``allowed`` of them is what chance allows. ``p_value`` (k,): of Ljung and Box's test.
+    chance exceeds ``allowed`` of them in no more than 5 % of white series. ``p_value`` (k,): of
+    Ljung and Box's test.
     """
 
     autocorrelation: Array
@@ -152,7 +153,7 @@ def stationarity(series: Array) -> Stationarity:
 
     Raises `TooFewSamplesError` with fewer than 21 times.
     """
-    from scipy.special import gammaincc
+    from scipy.special import bdtrc, gammaincc
 
     n = len(series)
     if n < FEWEST:
@@ -167,7 +168,7 @@ def stationarity(series: Array) -> Stationarity:
         autocorrelation=r,
         bound=bound,
         outside=np.sum(np.abs(r) > bound, axis=0),
-        allowed=_allowed(),
+        allowed=next(count for count in range(LAGS + 1) if bdtrc(count, LAGS, LEVEL) <= LEVEL),
         p_value=np.asarray(gammaincc(0.5 * LAGS, 0.5 * squared)),
     )
 
@@ -178,13 +179,6 @@ def autocorrelation(series: Array) -> Array:
     power = np.sum(x**2, axis=0)
     power = np.where(power > 0.0, power, 1.0)
     return np.array([np.sum(x[lag:] * x[:-lag], axis=0) / power for lag in range(1, LAGS + 1)])
-
-
-def _allowed() -> int:
-    """Most lags outside that chance exceeds in no more than 5 % of white series."""
-    from scipy.special import bdtrc
-
-    return next(count for count in range(LAGS + 1) if bdtrc(count, LAGS, LEVEL) <= LEVEL)
 
 
 Removal = Literal["best", "classic"]
