@@ -96,18 +96,6 @@ def test_the_reference_is_what_the_program_was_taught_with() -> None:
     assert np.array_equal(robot.settle(), HOME)
 
 
-def test_the_blend_moves_no_joint_faster_than_its_bound(robot: Robot) -> None:
-    robot.session.offer_model(offer(drifted(2.0)))
-    robot.session.offer_tool(bent_tool())
-    robot.session.enable(True)
-    outputs = [robot.stream()]
-    while not robot.session.status().settled:
-        outputs.append(robot.stream())
-    speed = np.abs(np.diff(outputs, axis=0)).max(axis=1) / DT
-    assert speed.max() <= REST + ROUNDING / DT
-    assert speed.max() > 0.9 * REST
-
-
 def test_a_pause_does_not_let_the_blend_jump(robot: Robot) -> None:
     robot.stream()
     robot.session.offer_model(offer(drifted(2.0)))

@@ -18,6 +18,7 @@ from correction_robot import (
     bent_tool,
     distance,
     drifted,
+    endless,
     good_here_only,
     offer,
     pose,
@@ -216,15 +217,10 @@ def test_values_that_are_not_finite(warm: Robot, bad: float) -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_values_of_a_joint_without_limits_that_are_not_finite(bad: float) -> None:
-    free = np.arange(6) == 5
-    arm = replace(
-        NOMINAL,
-        lower=np.where(free, -np.inf, NOMINAL.lower),
-        upper=np.where(free, np.inf, NOMINAL.upper),
-    )
-    session, q = CorrectionSession(arm, arm, "s1", CorrectionConfig(**LIMITS)), HOME.copy()
+    arm, q = endless(), HOME.copy()
+    session = CorrectionSession(arm, arm, "s1", CorrectionConfig(**LIMITS))
     session.reading(JointCommand(NAMES, HOME), 100.0)
-    q[free] = bad
+    q[5] = bad
     refused(Reason.NOT_FINITE, session.reading, JointCommand(NAMES, q), 100.0)
     refused(Reason.NOT_FINITE, session.target, JointCommand(NAMES, q), 100.0)
     refused(Reason.NOT_FINITE, session.taught, NAMES, q, None, 100.0)

@@ -15,8 +15,7 @@ from correction_robot import (
     REST_A,
     ROUNDING,
     Robot,
-    bent_tool,
-    drifted,
+    endless,
     good_here_only,
     large,
     offer,
@@ -34,10 +33,7 @@ PAUSES_S = 0.2, 0.5, 0.8
 
 def left_in_motion() -> tuple[Robot, np.ndarray]:
     """A stream that ended by silence while its offset moved, near a bent wrist."""
-    robot = Robot()
-    robot.session.offer_model(offer(drifted()))
-    robot.session.offer_tool(bent_tool())
-    robot.session.enable(True)
+    robot = large()
     robot.settle()
     q, speed = HOME.copy(), 0.0
     while q[4] > 0.2:
@@ -94,16 +90,11 @@ def test_a_stream_that_goes_on_begins_with_an_offset_at_rest() -> None:
 
 def test_a_turn_that_the_controller_counts_is_no_start() -> None:
     """What drives a joint without limits does not wrap: a whole turn is a whole turn."""
-    free = np.array([False] * 5 + [True])
-    arm = replace(
-        NOMINAL,
-        lower=np.where(free, -np.inf, NOMINAL.lower),
-        upper=np.where(free, np.inf, NOMINAL.upper),
-    )
+    arm = endless()
     session = CorrectionSession(arm, arm, "s1", CorrectionConfig(**LIMITS))
     session.reading(JointCommand(NAMES, HOME), 100.0)
     session.controller(NAMES, HOME, 1.0, 100.0)
-    turned = HOME + 4.0 * np.pi * free
+    turned = HOME + 4.0 * np.pi * np.eye(6)[5]
     refused(Reason.START_MISMATCH, session.target, JointCommand(NAMES, turned), 100.0)
     session.acknowledge(100.0)
     refused(Reason.START_MISMATCH, session.trajectory, still(turned), 100.0)
@@ -143,10 +134,7 @@ def test_a_goal_that_was_rejected_breaks_no_stream() -> None:
     for _ in range(100):
         q[0] += np.radians(20.0) * DT
         before = robot.stream(q)
-    goal = swing()
-    goal = replace(
-        goal, position=goal.position + (q - HOME), time_from_start_s=goal.time_from_start_s
-    )
+    goal = replace(swing(), position=swing().position + (q - HOME))
     robot.session.trajectory(goal, robot.now, may_be_rejected=True)
     path = robot.session.output.path
     assert path is not None

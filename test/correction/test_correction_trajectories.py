@@ -2,7 +2,6 @@
 """Trajectories are corrected as a whole, with a blend along their time."""
 
 import contextlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from correction_robot import (
     bent_tool,
     distance,
     drifted,
+    endless,
     large,
     offer,
     pose,
@@ -288,10 +288,7 @@ SECOND = 1_000_000_000
 @pytest.fixture
 def corrected() -> Robot:
     """At rest, corrected by some tenths of a degree."""
-    robot = Robot()
-    robot.session.offer_model(offer(drifted()))
-    robot.session.offer_tool(bent_tool())
-    robot.session.enable(True)
+    robot = large()
     robot.settle()
     robot.rest(1.0)
     return robot
@@ -322,11 +319,9 @@ def test_off_a_way_out_that_was_rejected_is_gone_again(corrected: Robot, again: 
 
 
 def test_a_refused_trajectory_is_no_beginning(corrected: Robot) -> None:
-    fresh = Robot()
+    fresh = large()
+    fresh.session.enable(False)
     fresh.at = corrected.at
-    fresh.rest()
-    fresh.session.offer_model(offer(drifted()))
-    fresh.session.offer_tool(bent_tool())
     fresh.rest()
     beyond = np.tile(HOME, (41, 1))
     beyond[-1, 0] = 4.0
@@ -501,9 +496,7 @@ def test_the_speed_between_points_is_that_of_the_spline(bends: bool) -> None:
 
 def test_a_joint_without_limits_stands_where_its_turns_meet() -> None:
     """Readings go to and fro between pi and -pi by a microradian."""
-    lower, upper = NOMINAL.lower.copy(), NOMINAL.upper.copy()
-    lower[5], upper[5] = -np.inf, np.inf
-    arm = replace(NOMINAL, lower=lower, upper=upper)
+    arm = endless()
     session = CorrectionSession(arm, arm, "s1", CorrectionConfig(**LIMITS))
     here = np.array([*HOME[:5], np.pi])
     for i in range(60):

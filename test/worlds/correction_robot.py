@@ -52,6 +52,13 @@ def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:
     return NOMINAL.with_mdh(mdh)
 
 
+def endless() -> SerialArm:
+    """The robot, whose last joint has no limits."""
+    free = np.arange(6) == 5
+    lower, upper = np.where(free, [[-np.inf], [np.inf]], [NOMINAL.lower, NOMINAL.upper])
+    return replace(NOMINAL, lower=lower, upper=upper)
+
+
 def offer(arm: SerialArm, revision: int = 1, **changes: Any) -> OfferedModel:
     model = OfferedModel(
         robot=NOMINAL.name,
