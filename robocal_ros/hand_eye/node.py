@@ -220,15 +220,13 @@ class HandEyeNode(SessionNode[HandEyeSession]):
     def configure(self) -> None:
         """Read the robot, open the history, then the topics and services."""
         super().configure()
-        settings = self.settings
-        self._config = session_config(settings)
+        self._config = session_config(self.settings)
         history = self.open_session(sole=False)
         self._kind = hand_eye_kind(self._config.sensor_frame)
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
-        ask, session = self._desk.ask, self._running
-        self._files = HandEyeFiles(self, ask, session, history)
+        self._files = HandEyeFiles(self, self._desk.ask, self._running, history)
         self._camera = CameraTopic(self, self._config.sensor_frame)
-        HandEyeServices(self, settings, ask, self._files, session, history, self._camera)
+        HandEyeServices(self, self._files, self._camera)
         DecisionServices(self.add_service, self._ask_decision, history, self._kind)
         self.add_timer(WATCH_S, self._watch, steady=True)
 

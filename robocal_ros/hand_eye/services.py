@@ -4,7 +4,7 @@
 import os
 import re
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,6 @@ from urllib.parse import quote
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
-from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import (
     CalibrateHandEye,
@@ -55,17 +54,15 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import unused
 from robocal_ros.history.history_records import Head, hand_eye_kind
 from robocal_ros.ros import conversions, endpoints
+from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.conversions import StaticTf, pose_message, transform_message
 from robocal_ros.ros.endpoints import EndpointNode, trigger_text
 from robocal_ros.ros.parameters import given_pose
-from robocal_ros.ros.session_node import SessionEvents, answer, twin
+from robocal_ros.ros.session_node import AddOutput, Ask, SessionEvents, answer, twin
 from robocal_ros.session.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.files import SensorMount
-
-AddOutput = Callable[[type, str, QoSProfile], Any]
-Ask = Callable[[Command], Awaitable[Outcome]]
 
 KEPT, SUFFIX = "hand_eye", ".mcap"
 RUNS, LONGEST_RUNS_S = 5, 3.0  # of a calibration whose time is taken
@@ -179,7 +176,7 @@ class HandEyeFiles:
         session: Callable[[], HandEyeSession],
         history: CalibrationHistory,
     ) -> None:
-        self._node, self._ask, self._session, self._history = node, ask, session, history
+        self._node, self.ask, self.session, self.history = node, ask, session, history
         self._saved: tuple[DataSet | None, frozenset[int]] = None, frozenset()
         self._fault: tuple[int, str] = 0, ""  # of the last calibration
         node.add_service(HandEyeFile, "~/load", self._load)
@@ -188,8 +185,8 @@ class HandEyeFiles:
 
     async def begin(self, command: Command) -> Outcome:
         """Give a command that opens a data set; the answer tells of what was dropped unsaved."""
-        before = self._session().data
-        outcome = await self._ask(command)
+        before = self.session().data
+        outcome = await self.ask(command)
         if not outcome.done or not (lost := self._unsaved(before)):
             return outcome
         words = f"{outcome.message}; {lost} samples were dropped that were not saved"
@@ -197,7 +194,7 @@ class HandEyeFiles:
 
     async def calibrate(self, command: Command) -> Outcome:
         """Give a command that calibrates; the answer tells when its data set could not be kept."""
-        outcome = await self._ask(command)
+        outcome = await self.ask(command)
         number, fault = self._fault
         if not fault or number != outcome.calibration_id:
             return outcome
@@ -216,7 +213,7 @@ class HandEyeFiles:
             self._node.get_logger().error(f"calibration {number}: {self._fault[1]}")
 
     def _folder(self) -> Path:
-        return made_folder_beside(self._history.path, KEPT)
+        return made_folder_beside(self.history.path, KEPT)
 
     def solved_again_s(self, number: int) -> float:
         """Processor time, s, of a calibration from its kept samples; -1 where they are not there.
@@ -225,10 +222,10 @@ class HandEyeFiles:
         """
         from robocal_ros.bags.bags import read_data_set
 
-        session, inputs = self._session(), self._history.inputs(number)
+        session, inputs = self.session(), self.history.inputs(number)
         own = re.compile(rf"{number}(_\d+)?{re.escape(SUFFIX)}")  # as `unused` names them
         kept = [path for path in self._folder().iterdir() if own.fullmatch(path.name)]
-        method = self._history.get(number).method.rpartition(", ")[2]
+        method = self.history.get(number).method.rpartition(", ")[2]
         try:
             newest = max(kept, key=lambda path: path.stat().st_mtime)
             data = data_set_of(read_data_set(newest, session.nominal), session.nominal)
@@ -261,14 +258,14 @@ class HandEyeFiles:
         return len(set(samples) - (handles if data is of else set()))
 
     def _mark_saved(self) -> None:
-        data = self._session().data
+        data = self.session().data
         self._saved = data, frozenset(() if data is None else data.samples)
 
     async def _load(self, request: Any, response: Any) -> Any:
         from robocal_ros.bags.bags import read_data_set
 
         path = self._path(request.path)
-        document = read_data_set(path, self._session().nominal)
+        document = read_data_set(path, self.session().nominal)
         outcome = await self.begin(Command(LOAD, {"path": str(path), "set": document}))
         if outcome.done:
             self._mark_saved()
@@ -288,7 +285,7 @@ class HandEyeFiles:
 
     def _save_twin(self, request: Any, response: Any) -> Any:
         """Into the folder of the data sets, called after sensor and time (UTC)."""
-        frame = quote(self._session().config.sensor_frame, safe="")
+        frame = quote(self.session().config.sensor_frame, safe="")
         stem = f"{frame}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
         _, words = self._write(unused(self._folder(), stem, SUFFIX))
         response.success, response.message = True, trigger_text(0, Code.ACCEPT, words)
@@ -298,7 +295,7 @@ class HandEyeFiles:
         """Write the open data set; how many samples it has, and what to say."""
         from robocal_ros.bags.bags import write_data_set
 
-        session = self._session()
+        session = self.session()
         document, config = session.document(), session.config
         topic = data_set_begun(document).topic
         write_data_set(
@@ -380,25 +377,12 @@ class CameraTopic:
 class HandEyeServices:
     """Data set, captures, calibration, with their Trigger twins.
 
-    ``ask``: gives a command to the session and awaits its outcome.
-    ``files``: asks where data sets begin or are calibrated.
-    ``session``: the one that runs; raises while the node is inactive.
-    ``camera``: what the camera tells of itself.
+    ``files``: asks where data sets begin or are calibrated. ``camera``: what it tells of itself.
     """
 
-    def __init__(
-        self,
-        node: EndpointNode,
-        settings: Mapping[str, Any],
-        ask: Ask,
-        files: HandEyeFiles,
-        session: Callable[[], HandEyeSession],
-        history: CalibrationHistory,
-        camera: CameraTopic,
-    ) -> None:
-        self._node, self._settings, self._ask = node, settings, ask
-        self._files, self._session, self._history = files, session, history
-        self._camera = camera
+    def __init__(self, node: HouseNode, files: HandEyeFiles, camera: CameraTopic) -> None:
+        self._node, self._settings, self._files, self._camera = node, node.settings, files, camera
+        self._ask, self._session, self._history = files.ask, files.session, files.history
         add = node.add_service
         add(StartHandEye, "~/start", self._start)
         add(Trigger, "~/start_trigger", self._start_twin)
@@ -406,7 +390,7 @@ class HandEyeServices:
         add(Trigger, "~/capture_trigger", self._capture_twin)
         add(Trigger, "~/result_trigger", self._result_twin)
         add(RemoveHandEye, "~/remove", self._remove)
-        add(Trigger, "~/remove_trigger", twin(ask, REMOVE, {"handle": 0}))
+        add(Trigger, "~/remove_trigger", twin(files.ask, REMOVE, {"handle": 0}))
         add(CalibrateHandEye, "~/calibrate", self._calibrate)
         add(Trigger, "~/calibrate_trigger", twin(files.calibrate, CALIBRATE, {}))
         add(CheckHandEyePlan, "~/check_plan", self._check_plan)
