@@ -475,15 +475,12 @@ _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several varianc
 class GivenNoise:
     """What is known of the noise, standard deviations per axis; None is estimated.
 
-    ``camera_m``, ``camera_rad``: of board poses without a covariance of their own.
     ``camera_scale``: factor of the sigmas in the covariance that board poses have: 1 to trust it.
     What is told of corners alone knows nothing of a lens or a board that are not as assumed.
     """
 
     robot_m: float | None = None
     robot_rad: float | None = None
-    camera_m: float | None = None
-    camera_rad: float | None = None
     camera_scale: float | None = None
 
     def variances(self, own_covariance: bool) -> Array:
@@ -494,11 +491,7 @@ class GivenNoise:
         if own_covariance:
             scale = unknown if self.camera_scale is None else self.camera_scale**2 - 1.0
             return np.array([robot, turn, 0.0, 0.0, 0.0, scale])
-        place, depth = unknown, unknown
-        if self.camera_m is not None:
-            place, depth = robot + self.camera_m**2, 0.0
-        camera = unknown if self.camera_rad is None else self.camera_rad**2
-        return np.array([place, turn, camera, camera, depth, 0.0])
+        return np.array([unknown, turn, unknown, unknown, unknown, 0.0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from robocal_ros.hand_eye.camera_fit import GivenNoise, correlation
 
 MOUNTS = ("in-hand", "to-hand")
 NOISE = BoardNoise(1e-4, 2e-4, (4e-4, 4e-4, 4e-4), (1e-3, 1e-3, 1e-3))
-GIVEN = GivenNoise(1e-4, 2e-4, 4e-4, 1e-3)
+GIVEN = GivenNoise(1e-4, 2e-4)
 
 
 def recorded(offset_s: float, mount: str, seed: int, noise: BoardNoise = NOISE, last_s: float = 20):
