@@ -490,7 +490,7 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
             raise ValueError("a result of one target has its place")
         X, linearity = result.T_flange_sensor, result.linearity
         seen = held_out(task, judges.data, X, result.place, linearity)
-        result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
+        result = judged(result, seen, len(judges.data.names), judges.rejected)
     read = None if args.figures is None else task.read(shots.data, result.T_flange_sensor)
     return CliResult(drawn_document(result, args, {} if read is None else read.points), show_mount)
 

@@ -33,6 +33,7 @@ TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
 
 METHODS: tuple[Method, ...] = ("best", "classic")
 MOST_REJECTED = 1.0 / 3.0
+LARGEST_RMS_M = 2e-3  # of samples from the target
 ARM_M = 3.0  # a turn of the flange counts as the shift that goes with it there
 STRIDE = 8  # of the points that tell the field of view
 OUTSIDE = 0.02  # share of points beyond it on each side: spikes
@@ -70,7 +71,6 @@ class HandEyeSettings:
     each axis; None to estimate both from the profiles. Where the first is given alone, the second
     is that shift at an arm's length of 3 m.
     ``limit_m``: largest expected error (rms) of a point in the field that the profiles cover.
-    ``residual_m``: largest distance (rms) of samples from the target.
     ``joint_error_rad``: rms by which joints turn otherwise than their encoders show, where the
     model that poses are of does not hold it; 0: nothing is said of it.
     """
@@ -78,7 +78,6 @@ class HandEyeSettings:
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
     limit_m: float = 1e-3
-    residual_m: float = 2e-3
     joint_error_rad: float = 0.0
 
     def noise(self) -> PoseNoise | None:
@@ -176,13 +175,11 @@ def judge_classic(apart_m: float, error_m: float, limit_m: float) -> Verdict:
     return Verdict(Code.ACCEPT, words)
 
 
-def judge_residuals(
-    distances_m: Array, shots: int, lost: int, settings: HandEyeSettings
-) -> Verdict | None:
+def judge_residuals(distances_m: Array, shots: int, lost: int) -> Verdict | None:
     """Refuse samples that are too far off, or too few of them; None where they will do."""
     rms = float(np.sqrt(np.mean(distances_m**2)))
-    if rms > settings.residual_m:
-        words = f"samples are off by {rms * 1e3:.2f} mm (allowed {settings.residual_m * 1e3:g} mm)"
+    if rms > LARGEST_RMS_M:
+        words = f"samples are off by {rms * 1e3:.2f} mm (allowed {LARGEST_RMS_M * 1e3:g} mm)"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
     if lost > MOST_REJECTED * shots:
         words = f"{lost} of {shots} samples do not fit the others: see the rejected ones"

@@ -240,7 +240,7 @@ def _classic(
     own_m = float(expected_error_m(best.covariance[:6, :6], field - pivot))
     apart_m = apart(state.T_flange_sensor, best.state.T_flange_sensor, field)
     error_m = float(np.hypot(apart_m, own_m))
-    refused = judge_residuals(residual, shots, shots - _shots(views), settings)
+    refused = judge_residuals(residual, shots, shots - _shots(views))
     return HandEyeResult(
         kind=task.kind,
         method="classic",
@@ -262,11 +262,7 @@ def judge(
 ) -> Verdict:
     """The verdict on a mount; ``lost`` of ``shots`` gave nothing or did not fit."""
     far_m = distances(fit.views, fit.state)
-    refused = (
-        _too_few(fit, settings)
-        or judge_residuals(far_m, shots, lost, settings)
-        or _inconsistent(fit)
-    )
+    refused = _too_few(fit, settings) or judge_residuals(far_m, shots, lost) or _inconsistent(fit)
     if refused is not None:
         return refused
     if fit.doubt:
@@ -489,7 +485,6 @@ def judged(
     result: HandEyeResult,
     seen: HeldOut,
     shots: int,
-    settings: HandEyeSettings,
     left_out: Mapping[str, str] | None = None,
 ) -> HandEyeResult:
     """A result with what ``shots`` that were not used say of it; they may refuse it.
@@ -501,7 +496,7 @@ def judged(
         "rejected": list(rejected),
         "rejected_because": rejected,
     }
-    refused = judge_residuals(seen.distance_m, shots, len(seen.rejected), settings)
+    refused = judge_residuals(seen.distance_m, shots, len(seen.rejected))
     verdict = result.verdict
     if refused is not None and verdict.accept:
         words = f"shots that were not used to solve: {refused.reason}"
@@ -613,7 +608,7 @@ def solve_joint(
         return result
     shots = sum(len(data.names) for data in checks.values())
     seen = _held_out(tasks, fit.state, checks, result.linearity)
-    return judged(result, seen, shots, settings)
+    return judged(result, seen, shots)
 
 
 def _alone(parts: Sequence[Part], settings: HandEyeSettings) -> tuple[list[Read], Array]:
