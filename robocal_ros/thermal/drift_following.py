@@ -188,9 +188,14 @@ class InForce(HistoryFollower):
 
     ``reference``, ``reference_id``, ``reference_model``: the cold reference, its calibration, and
     what is kept of it; or None. ``reference_revision``: its, counted up where it goes too.
+    ``config``: of the session.
     """
 
-    def __init__(self, history: CalibrationHistory, nominal: SerialArm) -> None:
+    def __init__(
+        self, history: CalibrationHistory, nominal: SerialArm, config: ThermalConfig
+    ) -> None:
+        self.config = config
+        self._followed: tuple[int | None, DriftFollower] | None = None
         super().__init__(history, THERMAL, nominal)
 
     def _read(self) -> None:
@@ -220,6 +225,25 @@ class InForce(HistoryFollower):
                 "the thermal model back to the one without it"
             )
         return commissioned_of(self.reference_model, self.nominal)
+
+    @property
+    def expected(self) -> LearnedProcess:
+        """What the reference in force knows of the robot's drift; the default without one."""
+        kept = (self.reference_model or {}).get(EXPECTED)
+        if kept is not None:
+            return process_of(kept)
+        return default_process(self.nominal, self.config.sigma_m)
+
+    @property
+    def follower(self) -> "DriftFollower | None":
+        """Of the drift since the reference, made anew for another one; None without a reference."""
+        if self.reference is None:
+            return None
+        if self._followed is None or self._followed[0] != self.reference_id:
+            follower = DriftFollower(self.reference, self.expected, self.config.work)
+            follower.catch_up(self.history, self.reference_id or 0)
+            self._followed = (self.reference_id, follower)
+        return self._followed[1]
 
 
 class DriftFollower:
@@ -403,31 +427,3 @@ class DriftFollower:
 def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
     """What to expect of a robot of which nothing is known; ``sigma_m`` of one visit."""
     return LearnedProcess(DriftProcess(drift_prior(nominal)), sigma_m)
-
-
-class Following:
-    """The follower of the cold reference in force, made anew where another one comes into force."""
-
-    def __init__(self, current: InForce, config: ThermalConfig) -> None:
-        self._current, self._config = current, config
-        self._followed: tuple[int | None, DriftFollower] | None = None
-
-    @property
-    def expected(self) -> LearnedProcess:
-        """What the reference in force knows of the robot's drift; the default without one."""
-        kept = (self._current.reference_model or {}).get(EXPECTED)
-        if kept is not None:
-            return process_of(kept)
-        return default_process(self._current.nominal, self._config.sigma_m)
-
-    @property
-    def follower(self) -> DriftFollower | None:
-        """None without a reference."""
-        current = self._current
-        if current.reference is None:
-            return None
-        if self._followed is None or self._followed[0] != current.reference_id:
-            follower = DriftFollower(current.reference, self.expected, self._config.work)
-            follower.catch_up(current.history, current.reference_id or 0)
-            self._followed = (current.reference_id, follower)
-        return self._followed[1]

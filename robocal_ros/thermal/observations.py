@@ -37,7 +37,7 @@ from robocal_ros.kinematics import SerialArm
 from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.session.inputs import Ignored
-from robocal_ros.thermal.drift_following import InForce, ThermalConfig
+from robocal_ros.thermal.drift_following import InForce
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
 MOST_KEPT = 20000  # observations that no command has used
@@ -380,10 +380,9 @@ class Beside:
 class Windows:
     """Which observations belong to a command, and when a cycle ends by itself."""
 
-    def __init__(
-        self, desk: ObservationDesk, cycle: OpenCycle, current: InForce, config: ThermalConfig
-    ) -> None:
-        self._desk, self._cycle, self._current, self._config = desk, cycle, current, config
+    def __init__(self, desk: ObservationDesk, cycle: OpenCycle, current: InForce) -> None:
+        self._desk, self._cycle, self._current = desk, cycle, current
+        self._config = config = current.config
         self._pause_ns = int(config.cycle_timeout_s * 1e9)
         self._span_ns = int(config.cycle_span_s * 1e9)
 

@@ -40,7 +40,6 @@ from robocal_ros.thermal.drift_following import (
     METHODS,
     DriftFollower,
     InForce,
-    ThermalConfig,
     default_process,
 )
 from robocal_ros.thermal.flange_sensor import (
@@ -85,8 +84,8 @@ class Proposer:
     ``current``: what is in force, followed by the session.
     """
 
-    def __init__(self, config: ThermalConfig, software: str, current: InForce) -> None:
-        self._config, self._software, self._current = config, software, current
+    def __init__(self, software: str, current: InForce) -> None:
+        self._software, self._current, self._config = software, current, current.config
         self._nominal, self._history = current.nominal, current.history
 
     def _propose(

@@ -52,7 +52,6 @@ from robocal_ros.thermal.drift_following import (
     FLANGE,
     DriftFollower,
     FollowerState,
-    Following,
     InForce,
     ThermalConfig,
 )
@@ -90,7 +89,7 @@ class ThermalSession(SessionBase):
         self, nominal: SerialArm, history: CalibrationHistory, config: ThermalConfig, software: str
     ) -> None:
         self.config = config
-        self.current = InForce(history, nominal)
+        self.current = InForce(history, nominal, config)
         super().__init__(self.current)
         self.desk = ObservationDesk(
             nominal.joint_names, config.standstill, config.measuring_frame or None
@@ -99,9 +98,8 @@ class ThermalSession(SessionBase):
         self.stream, self.newest_ns = self.desk.stream, self.desk.newest_ns
         self.temperatures = MotorTemperatures(nominal.joint_names)
         self.cycle = OpenCycle()
-        self.windows = Windows(self.desk, self.cycle, self.current, config)
-        self._following = Following(self.current, config)
-        self._proposer = Proposer(config, software, self.current)
+        self.windows = Windows(self.desk, self.cycle, self.current)
+        self._proposer = Proposer(software, self.current)
 
     @property
     def marks(self) -> dict[str, int]:
@@ -116,13 +114,13 @@ class ThermalSession(SessionBase):
     @property
     def follower(self) -> DriftFollower | None:
         """What follows the drift since the cold reference; None without one."""
-        return self._following.follower
+        return self.current.follower
 
     def expected_drift(self) -> Array:
         """Covariance (k, k), SI, of the drift that a shift may bring."""
         if self.follower is not None:
             return self.follower.expected_drift()
-        return self._following.expected.process.covariance
+        return self.current.expected.process.covariance
 
     def add(self, sample: JointSample | PointSample | TemperatureSample) -> None:
         """Take a sample."""
