@@ -118,6 +118,26 @@ def test_it_is_due_when_the_bound_reaches_the_tolerance(tracker):
     assert forecast.due_in_s(now, 1.0) == HORIZON_S
 
 
+def test_when_it_is_due_does_not_depend_on_what_was_asked_before(tracker):
+    """Looks one second apart, hours apart, back, and at other tolerances; each as the first one."""
+    arm, now = arms(tracker)[0], tracker.state.time_s
+    asked, step_s = AccuracyForecast(tracker, arm, Work()), HORIZON_S / 2**17
+    for after_s, left_s in (
+        (0, 900),
+        (1, 900),
+        (2, 900),
+        (600, 900),
+        (7200, 30),
+        (5, 20),
+        (9, 9e3),
+    ):
+        tolerance = asked.at(now + after_s + left_s).bound_m
+        found = asked.due_in_s(now + after_s, tolerance)
+        assert found == AccuracyForecast(tracker, arm, Work()).due_in_s(now + after_s, tolerance)
+        ends = (asked.at(now + after_s + found + more_s).bound_m for more_s in (0.0, step_s))
+        assert [bound_m > tolerance for bound_m in ends] == [False, True]
+
+
 def test_less_is_known_the_longer_ago_it_was_measured(tracker):
     forecast, now = AccuracyForecast(tracker, arms(tracker)[0], Work()), tracker.state.time_s
     bounds = [forecast.at(now + t).bound_m for t in (0.0, 300.0, 1800.0, 7200.0, 86400.0)]
