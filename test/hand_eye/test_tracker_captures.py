@@ -9,7 +9,7 @@ import pytest
 from command import beyond_rounding, robocal_json
 from hand_eye_driver import ARM, FRAME, Driver, tracker_point
 from scipy.stats import chi2
-from tracked_robot import CELL, START, captures, marks, scans_of_marks
+from tracked_robot import CELL, START, Capture, captured, captures, marks, scans_of_marks
 
 from robocal_ros.bags.bags import DATA_SET, read_bag, read_data_set, write_data_set
 from robocal_ros.estimation.edge import EdgeRule
@@ -33,27 +33,18 @@ def driver(tmp_path):
         yield Driver(HandEyeSession(ARM, history, config, "test"))
 
 
-def captured(driver: Driver, *, without: str = "", knocked: str = "") -> None:
-    """All captures but those of one mark; the second point of another was read 4 mm off."""
-    driver.robot.rest(0.1)
-    assert driver.ask(events.START, **START).done
-    seen: dict[str, int] = {}
-    for q, mark, shot in captures():
-        if mark == without:
-            continue
-        seen[mark] = seen.get(mark, 0) + 1
-        if mark == knocked and seen[mark] == 2:
-            point = shot(1).fields["point"]
-            off = np.array([point[a] for a in "xyz"]) + KNOCKED_M
-            shot = lambda stamp_ns, p=off: tracker_point(stamp_ns, p)  # noqa: E731
-        driver.robot.move(q, 0.1)
-        driver.robot.rest(0.1)
-        assert driver.ask(events.CAPTURE, mark=mark).done
-        driver.robot.rest(0.5, shot)
+def knocked(mark: str) -> list[Capture]:
+    """All captures; the second point of a mark was read 4 mm off."""
+    shots = list(captures())
+    bad = [i for i, one in enumerate(shots) if one.mark == mark][1]
+    point = shots[bad].shot(1).fields["point"]
+    off = np.array([point[a] for a in "xyz"]) + KNOCKED_M
+    shots[bad] = shots[bad]._replace(shot=lambda stamp_ns: tracker_point(stamp_ns, off))
+    return shots
 
 
 def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
-    captured(driver)
+    captured(driver, captures())
     outcome = driver.ask(events.CALIBRATE)
     assert outcome.status is Code.ACCEPT, outcome.message
     model = driver.session._history.model(outcome.calibration_id)
@@ -80,7 +71,7 @@ def test_the_sensor_is_found_as_well_as_it_says(driver, tmp_path):
 
 
 def test_a_point_that_was_misread_is_named_by_its_capture(driver):
-    captured(driver, knocked="arc_b")
+    captured(driver, knocked("arc_b"))
     outcome = driver.ask(events.CALIBRATE)
     bad = [h for h, one in driver.session.data.samples.items() if one.mark == "arc_b"][1]
     assert outcome.status is Code.ACCEPT, outcome.message
@@ -88,7 +79,7 @@ def test_a_point_that_was_misread_is_named_by_its_capture(driver):
 
 
 def test_what_is_missing_is_named(driver):
-    captured(driver, without="face_2")
+    captured(driver, [one for one in captures() if one.mark != "face_2"])
     outcome = driver.ask(events.CALIBRATE)
     assert outcome.status is Code.TOO_FEW_SAMPLES
     assert "face_2" in outcome.message

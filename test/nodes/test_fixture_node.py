@@ -12,6 +12,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from robocal_msgs.msg import CalibrationQuality
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from transforms import matrix_of
 
 from bench.measured_fixture import ARM, FRAME, PLATE, MeasuredFixture
 from robocal_ros.fixture.files import fixture_document
@@ -82,13 +83,7 @@ def test_a_fixture_is_taught_found_moved_accepted_and_rolled_back(cell):
     cell.graph.spin_until(lambda: len(cell.frame) == 2)
     told = cell.frame[-1].pose
     assert np.all(np.diag(np.reshape(told.covariance, (6, 6))) > 0.0)
-    before, after = (
-        frames.transform_from_quat(
-            np.array([p.position.x, p.position.y, p.position.z]),
-            np.array([p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w]),
-        )
-        for p in (one.pose.pose for one in cell.frame[-2:])
-    )
+    before, after = (matrix_of(one.pose.pose) for one in cell.frame[-2:])
     change = SimpleNamespace(change=after @ frames.invert(before))
     assert world.worst_m(change, "fixture_moved", 5e-4) < 1e-4
     assert cell.call("rollback")[0]

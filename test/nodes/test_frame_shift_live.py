@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
 from std_srvs.srv import Trigger
+from transforms import matrix_of
 
 from bench.robot_programs import NOMINAL, T_FLANGE_TOOL, drifted, postures
-from robocal_ros.ground import frames
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics.arm import model_document
@@ -19,11 +19,6 @@ from robocal_ros.thermal.node import ThermalNode
 
 ACTUAL, WORK = drifted(NOMINAL, 1), postures(8, 7)
 TIP = T_FLANGE_TOOL[:3, 3]
-
-
-def shift_of(message):
-    t, r = message.transform.translation, message.transform.rotation
-    return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
 
 
 @pytest.mark.parametrize("poses", [True, False])
@@ -38,7 +33,7 @@ def test_a_shift_is_found_accepted_told_and_rolled_back(graph, tmp_path, poses):
     settings = {"serial": "S1", "state_dir": str(tmp_path), "tip_mm": (1e3 * TIP).tolist()}
     graph.add(ThermalNode, settings | ({"work_poses_deg": work} if poses else {}))
     graph.spin_until(lambda: all(told[part] for part in PARTS))
-    assert all(np.array_equal(shift_of(told[part][-1]), np.eye(4)) for part in PARTS)
+    assert all(np.array_equal(matrix_of(told[part][-1].transform), np.eye(4)) for part in PARTS)
 
     def call(name):
         done = graph.call(Trigger, f"/thermal_node/{name}_trigger")
@@ -54,10 +49,10 @@ def test_a_shift_is_found_accepted_told_and_rolled_back(graph, tmp_path, poses):
     T = NOMINAL.T_flange_tool.copy()
     T[:3, 3] = TIP
     best = best_shift(CorrectionModels(NOMINAL, ACTUAL, NOMINAL), WORK, T)
-    np.testing.assert_allclose(shift_of(told["base"][-1]), best.T_base_shift, atol=1e-9)
-    np.testing.assert_allclose(shift_of(told["tool"][-1]), best.T_tool_shift, atol=1e-9)
+    np.testing.assert_allclose(matrix_of(told["base"][-1].transform), best.T_base_shift, atol=1e-9)
+    np.testing.assert_allclose(matrix_of(told["tool"][-1].transform), best.T_tool_shift, atol=1e-9)
     # with the same model a new one gains nothing over what is in force
     assert call("shift_frames") == (False, "NO_SIGNIFICANT_GAIN")
     assert call("rollback_shift")[0]
     graph.spin_until(lambda: all(len(told[part]) == 3 for part in PARTS))
-    assert np.array_equal(shift_of(told["base"][-1]), np.eye(4))
+    assert np.array_equal(matrix_of(told["base"][-1].transform), np.eye(4))

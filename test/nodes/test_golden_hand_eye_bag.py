@@ -10,9 +10,10 @@ import pytest
 from command import robocal_json
 from hand_eye_live import STREAM, TYPES
 from rclpy.serialization import deserialize_message
+from recordings import with_events
 from robocal_msgs.msg import SessionEvent
 
-from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.ground.samples import JOINTS
 from robocal_ros.hand_eye.data import PROFILE, TRACKER_POINT
 from robocal_ros.hand_eye.node import HandEyeNode
@@ -95,8 +96,7 @@ def test_live_equals_replay_bit_for_bit(graph: Any, bag: Path, tmp_path: Path) -
     assert [e.sequence for e in live] == list(range(1, len(live) + 1))
     never = {REMOVE} if bag.stem == "tracker" else set()
     assert {SAMPLE, BREAK_OFF, *CALLED} - never <= {e.command for e in live}
-    again = tmp_path / "live.mcap"
-    _write(bag, live, again)
+    again = with_events(bag, live, tmp_path / "live.mcap", EVENT_TOPIC, INPUTS)
     document = robocal_json("replay.hand_eye.json", "replay", again)
     assert document["differs"] == []
     made = robocal_json("replay.hand_eye.json", "replay", bag)
@@ -125,14 +125,3 @@ def _wait(graph: Any, node: HandEyeNode, sent: int) -> None:
     """One message at a time, so that the topics stay in order."""
     inputs = node.inputs
     graph.spin_until(lambda: sum(i.received for i in inputs.values()) >= sent, "the message")
-
-
-def _write(bag: Path, events: list[SessionEvent], path: Path) -> None:
-    """The inputs, with what the live node recorded of its session."""
-    with BagReader(bag) as reader, BagWriter(path, latched=[EVENT_TOPIC]) as writer:
-        for m in reader.messages(INPUTS):
-            kind = reader.info.topics[m.topic].msgtype
-            writer.write(m.topic, kind, m.message, m.log_time_ns)
-            last_ns = m.log_time_ns
-        for event in events:
-            writer.write(EVENT_TOPIC, "robocal_msgs/msg/SessionEvent", event, last_ns)

@@ -8,10 +8,13 @@ from typing import Any
 
 import pytest
 from command import robocal_json
-from robocal_msgs.msg import SessionEvent
+from rclpy.serialization import deserialize_message
+from recordings import with_events
+from robocal_msgs.msg import BeamEvent, SessionEvent
+from sensor_msgs.msg import JointState
 from tool_cell_live import STREAM
 
-from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.ground.errors import Code
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros.session_node import EVENTS
@@ -30,7 +33,7 @@ from robocal_ros.tool.run import ToolConfig
 
 BAGS = Path(__file__).parents[2] / "bags"
 EVENT_TOPIC = "/tcf_node/session_events"
-INPUTS = ("/joint_states", "/beam_events")
+INPUTS = {"/joint_states": JointState, "/beam_events": BeamEvent}
 CALLED = (MEASURE_TOOL, SWEEP, SOLVE_SWEEPS, ACCEPT)
 
 
@@ -70,26 +73,25 @@ def test_live_equals_replay_bit_for_bit(
 ) -> None:
     """Every sample over DDS; the calls where they were made; every outcome as it was recorded."""
     live = graph.collect(SessionEvent, EVENT_TOPIC, EVENTS)
-    kinds = {topic: sub.msg_type for topic, sub in _subscriptions(node).items()}
-    publishers = {topic: graph.publisher(kinds[topic], topic, STREAM) for topic in INPUTS}
+    publishers = {topic: graph.publisher(kind, topic, STREAM) for topic, kind in INPUTS.items()}
     sent = 0
     with BagReader(bag) as reader:
-        for m in reader.messages([*INPUTS, EVENT_TOPIC]):
-            if m.topic not in INPUTS:
-                if m.message.command in CALLED:
-                    _wait(graph, node, sent, 0)
-                    arguments = json.loads(m.message.arguments)["arguments"]
-                    graph.executor.spin_once(timeout_sec=0.0)
-                    node._desk.ask(Command(m.message.command, arguments))
+        for m in reader.messages([*INPUTS, EVENT_TOPIC], raw=True):
+            if m.topic in INPUTS:
+                publishers[m.topic].publish(deserialize_message(m.message, INPUTS[m.topic]))
+                sent += 1
+                _wait(graph, node, sent, 4)
                 continue
-            publishers[m.topic].publish(_copy(kinds[m.topic], m.message))
-            sent += 1
-            _wait(graph, node, sent, 4)
+            event = deserialize_message(m.message, SessionEvent)
+            if event.command in CALLED:
+                _wait(graph, node, sent, 0)
+                graph.executor.spin_once(timeout_sec=0.0)
+                arguments = json.loads(event.arguments)["arguments"]
+                node._desk.ask(Command(event.command, arguments))
     wanted = [_told(e) for e in recorded(bag)]
     graph.spin_until(lambda: len(live) >= len(wanted), "all events")
     assert [_told(e) for e in live] == wanted
-    again = tmp_path / "live.mcap"
-    _write(bag, live, again)
+    again = with_events(bag, live, tmp_path / "live.mcap", EVENT_TOPIC, INPUTS)
     document = robocal_json("replay.tool.json", "replay", again)
     assert document["differs"] == []
     taken = [c for c in document["commands"] if c["command"] in (TOOL_STEP, SWEEP)]
@@ -105,38 +107,10 @@ def _told(event: SessionEvent) -> Any:
     return event.command, event.stamp.sec, event.stamp.nanosec, arguments, status
 
 
-def _write(bag: Path, events: list[SessionEvent], path: Path) -> None:
-    """The samples, with what the live node recorded of its session."""
-    with BagReader(bag) as reader, BagWriter(path, latched=[EVENT_TOPIC]) as writer:
-        for m in reader.messages(INPUTS):
-            kind = reader.info.topics[m.topic].msgtype
-            writer.write(m.topic, kind, m.message, m.log_time_ns)
-            last_ns = m.log_time_ns
-        for event in events:
-            writer.write(EVENT_TOPIC, "robocal_msgs/msg/SessionEvent", event, last_ns)
-
-
-def _subscriptions(node: TcfNode) -> dict[str, Any]:
-    return {s.topic_name: s for s in node.subscriptions if s.topic_name in INPUTS}
-
-
 def _wait(graph: Any, node: TcfNode, sent: int, behind: int) -> None:
     """Topics stay in step: an edge must not overtake the readings around it by much."""
     inputs = [node.inputs[topic.lstrip("/")] for topic in INPUTS]
     graph.spin_until(lambda: sum(i.received for i in inputs) >= sent - behind, "the samples")
-
-
-def _copy(kind: Any, message: Any) -> Any:
-    """The bag's message as one of rclpy."""
-    made = kind()
-    made.header.stamp.sec = message.header.stamp.sec
-    made.header.stamp.nanosec = message.header.stamp.nanosec
-    made.header.frame_id = message.header.frame_id
-    for field in ("name", "position", "beam", "edge", "stamp_sigma_s"):
-        if hasattr(message, field):
-            value = getattr(message, field)
-            setattr(made, field, value.tolist() if hasattr(value, "tolist") else value)
-    return made
 
 
 def test_the_recording_holds_each_ending(bag: Path) -> None:

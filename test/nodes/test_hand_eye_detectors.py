@@ -14,6 +14,7 @@ from robocal_msgs.msg import HandEyeSample, HandEyeStatus, SessionEvent
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
+from transforms import off_m
 
 from robocal_ros.adapter.node import AdapterNode
 from robocal_ros.ground import frames
@@ -26,13 +27,6 @@ from robocal_ros.ros.session_node import EVENTS
 CAMERA = HandEyeStatus.CAMERA
 TAG = "tag36h11:0"
 COUNT = 8
-
-
-def off_m(result: Any, truth: np.ndarray, depth_m: float) -> float:
-    """How far a point ahead of the camera is off."""
-    t, r = result.sensor.translation, result.sensor.rotation
-    T = frames.transform_from_quat([t.x, t.y, t.z], [r.x, r.y, r.z, r.w])
-    return float(np.linalg.norm(((T - truth) @ [0.0, 0.0, depth_m, 1.0])[:3]))
 
 
 def replayed_alike(graph: Any, folder: Path, sensor: LiveSensor, live: list, result: Any) -> None:
@@ -75,7 +69,9 @@ def test_compressed_images_of_a_marked_board_before_a_camera_that_tells_its_lens
     result = sensor.calibrate()
     assert result.success, result.message
     assert result.samples == COUNT
-    assert off_m(result, shots.cell.camera.matrices()[0], 0.55) < 2e-3  # the limit of acceptance
+    assert (
+        off_m(result.sensor, shots.cell.camera.matrices()[0], 0.55) < 2e-3
+    )  # the limit of acceptance
     replayed_alike(graph, tmp_path, sensor, live, result)
     tell(camera_info(binning_x=2, binning_y=2))
     refused = sensor.ask_capture()
@@ -173,7 +169,7 @@ def test_a_camera_by_a_tag_on_tf(graph: Any, tmp_path: Path) -> None:
         assert told.state == HandEyeSample.CAPTURED, told.reason
     result = sensor.calibrate()
     assert result.success, result.message
-    assert off_m(result, truth, 0.5) < 5e-4
+    assert off_m(result.sensor, truth, 0.5) < 5e-4
     health = sensor.adapter.health()
     poses = sum(one.kind == TARGET_POSE for one in sensor.sent)
     assert (health.level, health.values["target poses"]) == (OK, poses)  # none of them twice

@@ -40,8 +40,8 @@ def test_the_data_of_each_calibration_are_kept_and_calibrate_to_the_same(
     loaded = graph.call(HandEyeFile, f"{NAME}/load", path=str(kept[0]))
     assert (loaded.success, loaded.samples) == (True, 8), loaded.message
     again = sensor.calibrate()
-    assert again.sensor == first.sensor
-    assert again.covariance == first.covariance
+    assert (again.sensor, again.covariance) == (first.sensor, first.covariance)
+    assert (again.message, again.residual_mm) == (first.message, first.residual_mm)
     # Without a candidate there is nothing to keep.
     assert sensor.calibrate(handles=[1]).candidate_id == 0
     assert len(list(folder.iterdir())) == 3
@@ -106,6 +106,9 @@ def test_a_caller_writes_below_the_folder_of_data_sets_alone(
     saved = graph.call(HandEyeFile, f"{NAME}/save", path="a.mcap")
     assert (saved.success, saved.message) == (True, f"8 samples saved in {path}")
     assert path.is_file()
+    assert not graph.call(HandEyeFile, f"{NAME}/save", path="a.mcap").success  # it is there
+    missing = graph.call(HandEyeFile, f"{NAME}/load", path="b.mcap")
+    assert (missing.success, missing.status) == (False, Code.BAD_INPUT)
     before = sorted(tmp_path.rglob("*"))
     for given in (str(tmp_path / "b.mcap"), "~/b.mcap", "../b.mcap", f"{folder}/../../b.mcap"):
         refused = graph.call(HandEyeFile, f"{NAME}/save", path=given)

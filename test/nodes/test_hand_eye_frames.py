@@ -10,7 +10,7 @@ import pytest
 from geometry_msgs.msg import Transform, TransformStamped
 from hand_eye_driver import FRAME
 from hand_eye_live import NAME, LiveSensor
-from robocal_msgs.srv import Decide
+from robocal_msgs.srv import Decide, ListCalibrations
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
@@ -103,6 +103,11 @@ def test_an_accept_waits_until_all_was_heard(
     early = graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me")
     assert (early.success, early.status) == (False, Code.BAD_INPUT)
     assert "'camera_rail'" in early.message
+    assert "'tool0'" in early.message
+    twin = graph.call(Trigger, f"{NAME}/accept_trigger")
+    assert twin.message.startswith("0 BAD_INPUT tf shows")
+    (listed,) = graph.call(ListCalibrations, f"{NAME}/list").calibrations
+    assert listed.state == "pending"
     # One that waits while the node is deactivated is answered.
     sensor.node._frames._listen_anew()
     asked = graph._clients[f"{NAME}/accept"].call_async(
@@ -113,6 +118,10 @@ def test_an_accept_waits_until_all_was_heard(
     sensor.node.trigger_deactivate()
     graph.spin_until(asked.done, "the answer")
     assert (asked.result().success, asked.result().status) == (False, Code.CONFLICT)
+    # Once the other publisher has gone, nothing stands in the way.
+    graph.probe.destroy_publisher(urdf)
+    sensor.node.trigger_activate()
+    assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
 
 
 def test_the_twin_looks_at_the_candidate_that_it_would_accept(

@@ -11,9 +11,9 @@ from command import robocal_json
 from hand_eye_live import NAME, LiveSensor, recorded
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import HandEyeFile
+from transforms import matrix_of, off_m
 
 from robocal_ros.bags.bags import read_bag
-from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros.session_node import EVENTS
 
@@ -54,10 +54,8 @@ def test_a_camera_is_calibrated_from_images_and_replayed_to_the_last_bit(
     result = camera.calibrate()
     assert result.success, result.message
     assert result.samples == COUNT
-    t, r = result.sensor.translation, result.sensor.rotation
-    T = frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
-    away = (T - board_set().cell.camera.matrices()[0]) @ [0.0, 0.0, 0.55, 1.0]
-    assert np.linalg.norm(away[:3]) < 2e-3  # at the board; the limit of what is accepted
+    # at the board; the limit of what is accepted
+    assert off_m(result.sensor, board_set().cell.camera.matrices()[0], 0.55) < 2e-3
     path = str(graph.state / "K7" / "hand_eye" / "set.mcap")
     assert graph.call(HandEyeFile, f"{NAME}/save", path=path).success
     assert [m.topic for m in read_bag(path)] == ["data_set", *["joint_states", "image"] * COUNT]
@@ -72,7 +70,9 @@ def test_a_camera_is_calibrated_from_images_and_replayed_to_the_last_bit(
     assert document["differs"] == []
     first, second = document["calibrations"]
     assert first["T_flange_sensor"] == second["T_flange_sensor"]
-    assert first["T_flange_sensor"]["xyz_mm"] == pytest.approx(1e3 * T[:3, 3], abs=1e-12)
+    assert first["T_flange_sensor"]["xyz_mm"] == pytest.approx(
+        1e3 * matrix_of(result.sensor)[:3, 3], abs=1e-12
+    )
     failures = [
         c for c in document["commands"] if c["command"] == "sample" and c["code"] != "ACCEPT"
     ]

@@ -14,6 +14,7 @@ from robocal_msgs.msg import HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import CheckHandEyePlan, Decide, HandEyeFile
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
+from transforms import off_m
 
 from bench.hand_eye_cell import TrueStairs, edge_shots, step_shots
 from bench.hand_eye_files import write_target
@@ -30,13 +31,6 @@ TRUTH = sphere_set()[0].T_flange_sensor
 STAIRS = TrueStairs(frames.transform(frames.exp_rotation([0.02, -0.03, 0.4]), [0.75, -0.1, 0.1]))
 STEPS = Staircase(5, 0.09, 0.01, 0.01)
 OFF_M = 5e-4  # at the working distance
-
-
-def off_m(transform: Any, truth: np.ndarray, depth_m: float = 0.0) -> float:
-    """How far a point at the working distance is off."""
-    t, r = transform.translation, transform.rotation
-    T = frames.transform_from_quat([t.x, t.y, t.z], [r.x, r.y, r.z, r.w])
-    return float(np.linalg.norm(((T - truth) @ [0.0, 0.0, depth_m, 1.0])[:3]))
 
 
 def captured(sensor: LiveSensor, shots: Iterator[tuple[np.ndarray, Any, str]]) -> None:

@@ -4,16 +4,20 @@
 import numpy as np
 import pytest
 from geometry_msgs.msg import Point
+from hand_eye_driver import ARM, FRAME, Driver
 from hand_eye_live import NAME, LiveSensor
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus
-from robocal_msgs.srv import Decide, VerifyHandEye
+from robocal_msgs.srv import Decide, HandEyeFile, VerifyHandEye
 from scipy.stats import chi2
-from tracked_robot import CELL, captures, marks, scans_of_marks
+from tracked_robot import CELL, captured, captures, marks, scans_of_marks
+from transforms import matrix_of
 
 from bench.hand_eye_files import write_tracker_target
-from robocal_ros.ground import frames
+from robocal_ros.bags.bags import write_data_set
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.result import increment
+from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
+from robocal_ros.history.calibrations import CalibrationHistory
 
 EACH = 3  # scans of a mark: the fewest that tell its steadiness
 
@@ -24,12 +28,6 @@ def test_targets_have_the_numbers_of_the_message():
     for number, name in TARGETS.items():
         assert getattr(HandEyeStatus, name.upper()) == number
     assert set(MOUNTS) == {HandEyeStatus.ON_FLANGE, HandEyeStatus.FIXED}
-
-
-def measured(sensor: LiveSensor, each) -> None:
-    for q, mark, shot in each:
-        sensor.robot.move(q, 0.1)
-        assert sensor.capture(shot, 0.5, mark).state == HandEyeSample.CAPTURED
 
 
 def verify(sensor: LiveSensor, **request):
@@ -47,15 +45,16 @@ def test_the_tracker_places_the_sensor_and_marked_points_judge_it(graph, tmp_pat
     assert sensor.start().success
     assert sensor.status[-1].target == HandEyeStatus.TRACKER
     assert "arc_a, arc_b" in sensor.ask_capture("elbow").message
-    measured(sensor, captures())
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        driver = Driver(HandEyeSession(ARM, history, HandEyeConfig(sensor_frame=FRAME), "test"))
+        captured(driver, captures())  # live they are in test_golden_hand_eye_bag.py
+    path, data = tmp_path / "set.mcap", driver.session.data
+    write_data_set(path, data.document(), data.topic, FRAME, ARM)
+    assert graph.call(HandEyeFile, f"{NAME}/load", path=str(path)).success
     found = sensor.calibrate()
     assert found.success, found.message
     # As well as it says: sigma is told about the sensor's origin along the flange's axes.
-    moved, turned = found.sensor.translation, found.sensor.rotation
-    T = frames.transform_from_quat(
-        np.array([moved.x, moved.y, moved.z]),
-        np.array([turned.x, turned.y, turned.z, turned.w]),
-    )
+    T = matrix_of(found.sensor)
     off = increment(T, CELL.T_flange_sensor, np.zeros(3))
     along_flange = np.concatenate([T[:3, :3] @ off[:3], T[:3, :3] @ off[3:]])
     spread = np.reshape(found.covariance, (6, 6))
@@ -66,7 +65,9 @@ def test_the_tracker_places_the_sensor_and_marked_points_judge_it(graph, tmp_pat
     assert graph.call(Decide, f"{NAME}/accept", within_s=10.0, id=1, by="Ada").success
 
     assert sensor.start(target=HandEyeStatus.POINT).success
-    measured(sensor, scans_of_marks(EACH))
+    for q, mark, shot in scans_of_marks(EACH):
+        sensor.robot.move(q, 0.1)
+        assert sensor.capture(shot, 0.5, mark).state == HandEyeSample.CAPTURED
     steady = verify(sensor)
     assert steady.success, steady.message
     assert list(steady.judged) == [1]

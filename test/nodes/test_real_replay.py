@@ -10,12 +10,12 @@ from command import robocal
 from diagnostic_msgs.msg import DiagnosticArray
 from history_content import content
 from long_form import more
+from recordings import with_events
 from robocal_msgs.msg import SessionEvent
 from robocal_msgs.srv import Decide, Identify
 from std_msgs.msg import String
 
 from robocal_ros.bags import ur10_campaigns
-from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.kinematics.robots import load_robot
@@ -75,18 +75,6 @@ def stamps_taken_out(side: dict[str, Any]) -> set[int]:
     return {entry.pop("stamp"), entry["document"].pop("stamp_ns")}
 
 
-def with_events(bag: Path, events: list[SessionEvent], path: Path) -> Path:
-    """The same recording, as if a recorder had listened to the node too."""
-    with BagReader(bag) as reader, BagWriter(path, latched=[EVENT_TOPIC]) as writer:
-        for m in reader.messages():
-            kind = reader.info.topics[m.topic].msgtype
-            writer.write(m.topic, kind, m.message, m.log_time_ns)
-            last_ns = m.log_time_ns
-        for event in events:
-            writer.write(EVENT_TOPIC, "robocal_msgs/msg/SessionEvent", event, last_ns)
-    return path
-
-
 @pytest.mark.parametrize("series", ["D", *more("B")])
 def test_live_equals_replay(graph, data_dir: Path, tmp_path: Path, series: str) -> None:
     arm, data = load_robot("ur10"), ur10_campaigns.load_campaign(series, data_dir / "ur10_tmac")
@@ -111,7 +99,7 @@ def test_live_equals_replay(graph, data_dir: Path, tmp_path: Path, series: str) 
     )
     assert accepted.revision == 1, accepted.message
     graph.spin_until(lambda: len(events) == 4, "the commands and what they changed")
-    recorded = with_events(bag, events, tmp_path / f"{series}_recorded.mcap")
+    recorded = with_events(bag, events, tmp_path / f"{series}_recorded.mcap", EVENT_TOPIC)
     document = replayed(recorded, tmp_path / "again")
     assert (document["recorded"], document["differs"]) == (True, [])
     assert kept(recorded.stem, tmp_path / "again") == kept(series, graph.state)

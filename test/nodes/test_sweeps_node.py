@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tool by two parallel beams alone, by the Triggers of tcf_node over DDS; its record replayed."""
+"""Tools without crossed beams, by the Triggers of tcf_node over DDS: swept, or touched."""
 
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,14 @@ from scipy.stats import chi2
 from std_srvs.srv import Trigger
 from tool_cell_live import LiveCell
 from tool_driver import NOISE, START_NS, TAUGHT
+from tool_driver import TRUTH as TOUCHED
+from transforms import matrix_of, off_m
 
+from bench.measured_runs import touching
 from bench.parallel_sweeps import STATION, STRAIGHT, SweepProgram, plunge_at, upright_of
 from robocal_ros.bags.bag_writer import ros_time
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.cell_sim.beams import RoundTool, TrueInput, bent
-from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.session_node import EVENTS
@@ -26,10 +28,12 @@ from robocal_ros.tool.touch_points import PLUNGE
 
 TRUTH = bent(TAUGHT, [0.0015, -0.001, 0.0006], [0.012, 0.018, 0.0])
 EVENT_TOPIC = "/tcf_node/session_events"
+TOUCHES = 6
 POLLED = TrueInput(latency_s=0.004, sample_period_s=0.002)
 
 
 def test_a_tool_is_swept_solved_accepted_and_replayed(graph: Any, tmp_path: Path) -> None:
+    """By two parallel beams alone."""
     cell = LiveCell(
         graph,
         tmp_path,
@@ -70,8 +74,7 @@ def test_a_tool_is_swept_solved_accepted_and_replayed(graph: Any, tmp_path: Path
     assert qualities[-1].candidate_id == number
     assert graph.call(Decide, "/tcf_node/accept", id=number, by="me").success
     graph.spin_until(lambda: tools[-1].revision == 1, "the tool is in force")
-    t, q = tools[-1].tool.translation, tools[-1].tool.rotation
-    T = frames.transform_from_quat([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+    T = matrix_of(tools[-1].tool)
     error = np.concatenate([TRUTH[:3, 3] - T[:3, 3], T[:3, :2].T @ TRUTH[:3, 2]])
     covariance = np.array(tools[-1].covariance).reshape(5, 5)
     assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 5)
@@ -99,3 +102,25 @@ def written(samples: list[Any], events: list[SessionEvent], path: Path) -> None:
         for event in events:
             kind = "robocal_msgs/msg/SessionEvent"
             bag.write(EVENT_TOPIC, kind, event, samples[-1].stamp_ns)
+
+
+def test_a_tip_is_touched_solved_and_accepted(graph: Any, tmp_path: Path) -> None:
+    cell = LiveCell(graph, tmp_path, TOUCHED)
+    tools = graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
+    candidates = graph.collect(ToolFrame, "/tcf_node/candidate", endpoints.LATCHED)
+    qualities = graph.collect(CalibrationQuality, "/tcf_node/quality", endpoints.LATCHED)
+    arm, near = cell.cell.arm, cell.cell.q_near
+    for q in touching(arm, TOUCHED, near, TOUCHES):
+        cell.program.q = q
+        cell.rest(0.45)
+        taken = graph.call(Trigger, "/tcf_node/touch_trigger")
+        assert taken.success, taken.message
+    solved = graph.call(Trigger, "/tcf_node/solve_touches_trigger")
+    assert solved.success, solved.message
+    graph.spin_until(lambda: candidates and qualities, "candidate and quality")
+    number = int(solved.message.split()[0])
+    assert qualities[-1].candidate_id == number
+    assert graph.call(Decide, "/tcf_node/accept", id=number, by="me").success
+    graph.spin_until(lambda: tools[-1].revision == 1, "the tool is in force")
+    # Exact touches of an exact robot: what is left is the readings' rounding.
+    assert off_m(tools[-1].tool, TOUCHED) < 1e-6

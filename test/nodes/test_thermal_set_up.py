@@ -9,6 +9,7 @@ from robocal_msgs.srv import CalibrateSensor, PlanPoses
 from sensor_msgs.msg import JointState
 from shift import BALL, T_SENSOR_BASE, Shift, built, postures
 from tf2_msgs.msg import TFMessage
+from transforms import matrix_of, off_m
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
@@ -41,19 +42,15 @@ def test_from_an_unmounted_sphere_to_planned_poses(graph):
         found = placed(graph, method)
         assert (found.success, found.status) == (True, Code.ACCEPT), found.message
         # The arm as built misses the nominal one by some tenths of a millimetre.
-        t = found.sensor_base.translation
-        assert np.linalg.norm([t.x, t.y, t.z] - T_SENSOR_BASE[:3, 3]) < 2e-3
+        assert off_m(found.sensor_base, T_SENSOR_BASE) < 2e-3
         p = found.sphere_in_flange
         assert np.linalg.norm([p.x, p.y, p.z] - BALL[:3]) < 2e-3
         assert 0.0 < found.left_out_rms_mm < 2.0
         assert found.samples == POSES
     graph.spin_until(lambda: len(sensors) == 2, "the placed sensor is published")
     assert (sensors[-1].header.frame_id, sensors[-1].child_frame_id) == ("base", "sensor")
-    inverse = frames.transform_from_quat([t.x, t.y, t.z], _quat(found.sensor_base.rotation))
-    published, q_xyzw = sensors[-1].transform, _quat(sensors[-1].transform.rotation)
-    x = published.translation
-    T = frames.transform_from_quat([x.x, x.y, x.z], q_xyzw)
-    assert np.abs(T - frames.invert(inverse)).max() < 1e-14  # to rounding
+    T = matrix_of(sensors[-1].transform)
+    assert np.abs(T - frames.invert(matrix_of(found.sensor_base))).max() < 1e-14  # to rounding
     graph.spin_until(lambda: on_tf and on_tf[-1].transforms == sensors[-1:], "it stands on tf")
 
     own = [JointState(name=list(nominal.joint_names), position=row) for row in q[:6]]
@@ -92,7 +89,3 @@ def test_a_sensor_frame_that_is_on_tf_already_is_left_to_the_other(graph):
     graph.spin_until(lambda: on_tf[-1].transforms != [theirs], "its own")
     (own,) = on_tf[-1].transforms
     assert (own.header.frame_id, own.child_frame_id) == ("base", "sensor")
-
-
-def _quat(rotation) -> list[float]:
-    return [rotation.x, rotation.y, rotation.z, rotation.w]

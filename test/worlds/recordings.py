@@ -9,7 +9,7 @@ import numpy as np
 from campaign import NOISE_M, POINTS, ROBOT, postures, true_arm
 
 from robocal_ros.bags.bag_writer import ros_time
-from robocal_ros.bags.bags import BagWriter
+from robocal_ros.bags.bags import BagReader, BagWriter
 from robocal_ros.ground import frames
 from robocal_ros.ground.samples import JointSample, PointSample
 from robocal_ros.history.calibrations import CalibrationHistory
@@ -91,6 +91,18 @@ def plain_bag(path: Path, visits: Sequence[Sequence[Sample]], **topics: str) -> 
     with BagWriter(path) as bag:
         for part in visits:
             write_samples(bag, part, **topics)
+    return path
+
+
+def with_events(
+    bag: Path, events: Iterable[Any], path: Path, topic: str, inputs: Iterable[str] | None = None
+) -> Path:
+    """A bag, or these topics of it, as if its recorder had listened to a node's session too."""
+    with BagReader(bag) as reader, BagWriter(path, latched=[topic]) as writer:
+        for m in reader.messages(inputs):
+            writer.write(m.topic, reader.info.topics[m.topic].msgtype, m.message, m.log_time_ns)
+        for event in events:
+            writer.write(topic, TYPES[EVENTS], event, m.log_time_ns)
     return path
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A UR10 that a laser tracker measures, and marked points of its target: shots as messages."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from hand_eye_driver import ARM, Q_NEAR, Recorded, profile, tracker_point
+from hand_eye_driver import ARM, Q_NEAR, Driver, Recorded, profile, tracker_point
 
 from bench.laser_tracker import CUBE_M, TrackerCell, six_axis_cell, true_flange
 from robocal_ros.ground import frames
@@ -14,6 +14,7 @@ from robocal_ros.hand_eye.data import SCAN
 from robocal_ros.hand_eye.targets import FACES, SPHERE, target_document
 from robocal_ros.hand_eye.tracker_data import TrackerData
 from robocal_ros.kinematics.arm import inverse
+from robocal_ros.session import events
 
 CELL: TrackerCell = six_axis_cell(ARM, Q_NEAR)
 START = {
@@ -57,6 +58,17 @@ def captures() -> Iterator[Capture]:
             yield Capture(still, name, _seen(point))
     for q, shown in list(zip(data.q, data.profiles, strict=True))[::3]:
         yield Capture(q, SCAN, lambda stamp_ns, p=shown.points: profile(stamp_ns, p))
+
+
+def captured(driver: Driver, shots: Iterable[Capture]) -> None:
+    """All of these by a session that begins with them."""
+    driver.robot.rest(0.1)
+    assert driver.ask(events.START, **START).done
+    for q, mark, shot in shots:
+        driver.robot.move(q, 0.1)
+        driver.robot.rest(0.1)
+        assert driver.ask(events.CAPTURE, mark=mark).done
+        driver.robot.rest(0.5, shot)
 
 
 def marks() -> dict[str, np.ndarray]:
