@@ -66,6 +66,25 @@ def test_a_replay_has_its_own_serial_after_the_parameters_of_the_cell():
     assert "apart = in_share('config', 'replay_history.yaml')" in ast.unparse(tree("replay"))
 
 
+def test_the_two_nodes_of_one_robot_have_files_of_their_own_and_are_wired():
+    calls = [n for n in ast.walk(tree("thermal")) if isinstance(n, ast.Call)]
+
+    def texts(of: str) -> list[list[str]]:
+        named = [c for c in calls if getattr(c.func, "id", "") == of]
+        given = [(*c.args, *(k.value for k in c.keywords)) for c in named]
+        return [[a.value for a in one if isinstance(a, ast.Constant)] for one in given]
+
+    declared = texts("params")
+    assert [shown[0] for shown in texts("LaunchConfiguration")] == [name for name, _ in declared]
+    started = [shown[:2] for shown in texts("Node")]  # executable and name
+    assert started == [[file.removesuffix(".yaml")] * 2 for _, file in declared]
+    usage = re.findall(r"(\w+):=", ast.get_docstring(tree("thermal")))
+    assert usage == [name for name, _ in declared]
+    pairs = [n.elts for n in ast.walk(tree("thermal")) if isinstance(n, ast.Tuple)]
+    wired = {old.value: new.value for old, new in pairs}
+    assert wired == {"kinematic_model": "/thermal_node/model", "tool": "/tcf_node/tool"}
+
+
 def test_all_nodes_of_a_cell_are_started():
     scripts = {e.name for e in metadata.distribution("robocal-ros").entry_points}
     nodes = {name for name in scripts if name.endswith("_node")}
@@ -75,12 +94,16 @@ def test_all_nodes_of_a_cell_are_started():
 
 
 def test_a_cell_of_one_robot_in_its_namespace(graph, tmp_path):
-    """Started as the launch file does: its file, then that of the cell, names and remappings."""
-    mine = tmp_path / "mine.yaml"
-    text = (ROOT / "config" / "cell.yaml").read_text()
-    mine.write_text(text.replace('serial: ""', "serial: R7"))
-    said = graph.collect(DiagnosticArray, "/diagnostics")
+    """Started as the launch file does: its file, then that of the cell, names and remappings.
+
+    That of the cell has a section for all, and one for each node.
+    """
     nodes = sorted(w for w in words(tree("cell")) if w.endswith("_node"))
+    mine = tmp_path / "mine.yaml"
+    text = (ROOT / "config" / "cell.yaml").read_text().replace('serial: ""', "")
+    own = (f"/**/{name}:\n  ros__parameters: {{serial: R7}}\n" for name in nodes)
+    mine.write_text(text + "".join(own))
+    said = graph.collect(DiagnosticArray, "/diagnostics")
     for name in nodes:
         trajectories = "joint_trajectory" if name == "cell_sim_node" else "~/joint_trajectory"
         graph.start(

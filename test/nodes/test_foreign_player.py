@@ -59,7 +59,9 @@ def recording(graph: Any, folder: Path) -> Path:
     """What the recorder makes of a message on each topic."""
     topics = COMMANDS | READINGS
     node = graph.add(RecorderNode, {"topics": list(topics), "folder": str(folder)})
-    publishers = {name: graph.publisher(kind, name) for name, kind in topics.items()}
+    publishers = {name: graph.publisher(kind, name, subscribers=0) for name, kind in topics.items()}
+    heard = lambda: all(one.get_subscription_count() for one in publishers.values())  # noqa: E731
+    graph.spin_until(heard, "the recorder hears all")
     for name, kind in topics.items():
         publishers[name].publish(kind())
     graph.spin_until(lambda: node.health().values["messages"] == len(topics), "all is recorded")

@@ -2,7 +2,6 @@
 """What the controller tells the joint correction node, and what that tells of time. Over DDS."""
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -52,10 +51,11 @@ def path_time(line: Line) -> float:
     return float(path.time(time.monotonic()))
 
 
-def scaled(line: Line, publish: Callable[[float], None]) -> None:
+def test_the_offset_waits_while_the_controller_says_that_it_is_halted(graph: Any) -> None:
     """A correction that comes in along a trajectory waits with the controller's clock."""
-    told = [1.0]
-    line.graph.probe.create_timer(0.1, lambda: publish(told[0]))
+    line, told = Line(graph, offset_deg_s=0.01), [1.0]
+    states = graph.publisher(type(controller_state(HOME, 1.0)), "controller_state")
+    graph.probe.create_timer(0.1, lambda: states.publish(controller_state(HOME, told[0])))
 
     def say(scaling: float) -> None:
         told[0], robot = scaling, line.node._session.robot
@@ -94,28 +94,16 @@ def scaled(line: Line, publish: Callable[[float], None]) -> None:
     line.graph.spin_until(lambda: np.abs(latest(1)).max() < 1e-9, "the whole offset")
 
 
-def test_the_offset_waits_while_the_controller_says_that_it_is_halted(graph: Any) -> None:
-    line = Line(graph, offset_deg_s=0.01)
-    told = graph.publisher(type(controller_state(HOME, 1.0)), "controller_state")
-    scaled(line, lambda scaling: told.publish(controller_state(HOME, scaling)))
-
-
-def test_the_offset_waits_with_the_speed_slider(graph: Any) -> None:
-    line = Line(graph, offset_deg_s=0.01)
-    told = graph.publisher(Float64, "speed_scaling")
-    scaled(line, lambda scaling: told.publish(Float64(data=100.0 * scaling)))
-
-
-def test_a_slider_that_dies_at_zero_is_forgotten(graph: Any) -> None:
+def test_a_slider_in_percent_scales_too_and_one_that_dies_at_zero_is_forgotten(graph: Any) -> None:
     """Finding: its last word was believed for ever, and the path never ended."""
     line = Line(graph)
     line.rest()
     slider = graph.publisher(Float64, "speed_scaling")
     line.to_path.publish(trajectory(np.stack([HOME, HOME]), np.array([0.1, 1.1])))
     line.wait(line.paths)
-    for percent in (100.0, 0.0):
+    for percent in (100.0, 50.0, 0.0):
         line.take(Float64(data=percent), slider, "speed_scaling")
-    assert line.node._session.robot.scaling == 0.0
+        assert line.node._session.robot.scaling == 0.01 * percent
     graph.spin_until(lambda: line.node._session.robot.scaling == 1.0, "it is forgotten", 3.0)
     path = line.node._session.output.path
     graph.spin_until(lambda: not path.live(time.monotonic()), "the path ends", 3.0)

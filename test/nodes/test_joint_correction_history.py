@@ -149,6 +149,7 @@ def test_a_damaged_history_is_not_touched_and_what_could_not_be_written_comes_la
 def test_a_damaged_history_is_told_until_a_person_acknowledges_it(
     graph: Any, monkeypatch: Any
 ) -> None:
+    """Finding: who acknowledged a mismatch ended both, and every node fell silent about it."""
     monkeypatch.setattr(correction_log, "RETRY_S", 0.1)
     graph.state.mkdir(exist_ok=True)
     (graph.state / "s1.sqlite").write_bytes(b"\xff" * 5000)
@@ -157,23 +158,6 @@ def test_a_damaged_history_is_told_until_a_person_acknowledges_it(
     graph.spin_until(lambda: line.statuses and line.statuses[-1].history, "the status says so")
     assert "was set aside as" in line.statuses[-1].history
     assert "was set aside as" in line.report(b"\x01", "set aside").message
-    answer = graph.call(Trigger, f"{NODE}/acknowledge")
-    assert answer.success
-    assert "; acknowledged: a damaged history was set aside as" in answer.message
-    graph.spin_until(lambda: not line.statuses[-1].history, "it is acknowledged")
-    assert len(list(graph.state.glob("*.damaged-*"))) == 1
-    assert graph.call(Trigger, f"{NODE}/acknowledge").message.endswith("; acknowledged: nothing")
-
-
-def test_who_acknowledges_a_mismatch_has_not_said_that_the_damage_is_known(
-    graph: Any, monkeypatch: Any
-) -> None:
-    """Finding: one call ended both, and every node fell silent about the damage."""
-    monkeypatch.setattr(correction_log, "RETRY_S", 0.1)
-    graph.state.mkdir(exist_ok=True)
-    (graph.state / "s1.sqlite").write_bytes(b"\xff" * 5000)
-    CalibrationHistory.open("s1", state_dir=graph.state).close()
-    line = Line(graph)
     line.enable()
     line.at = HOME + np.radians(2.0)
     line.rest()
@@ -186,8 +170,11 @@ def test_who_acknowledges_a_mismatch_has_not_said_that_the_damage_is_known(
     graph.spin_for(0.3)  # three looks of the log
     assert "was set aside as" in line.node._report.log.damage
     answer = graph.call(Trigger, f"{NODE}/acknowledge")
-    assert "; acknowledged: a damaged history" in answer.message
+    assert answer.success
+    assert "; acknowledged: a damaged history was set aside as" in answer.message
     graph.spin_until(lambda: not line.statuses[-1].history, "it is known now")
+    assert len(list(graph.state.glob("*.damaged-*"))) == 1
+    assert graph.call(Trigger, f"{NODE}/acknowledge").message.endswith("; acknowledged: nothing")
 
 
 def test_damage_that_came_after_what_was_told_is_not_known(graph: Any) -> None:

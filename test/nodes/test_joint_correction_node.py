@@ -36,14 +36,11 @@ from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import OK, WARN
 from robocal_ros.ros.graph import SourceGuard
 
-# What an arm's model holds: a drift, or joint functions and compliances besides.
-ACTUAL = {"drifted": drifted(), "full": with_joint_errors(drifted(), 1)}
+FULL = with_joint_errors(drifted(), 1)  # joint functions and compliances besides a drift
 
 
-@pytest.mark.parametrize("model", ACTUAL)
-def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any, model: str) -> None:
-    line = Line(graph, thermal_tcp_mm=5.0)
-    actual = ACTUAL[model]
+def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:
+    line, actual = Line(graph, thermal_tcp_mm=5.0), FULL
     line.take(model_message(actual), line.to_model, "kinematic_model")
     out = line.target(effort=array("d", np.full(6, 3.0)))
     assert list(out.position) == HOME.tolist()
@@ -64,10 +61,8 @@ def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any, mod
     assert list(line.settle().position) == HOME.tolist()
 
 
-@pytest.mark.parametrize("model", ACTUAL)
-def test_a_trajectory_keeps_its_times(graph: Any, model: str) -> None:
-    line = Line(graph, enable_on_start=True, thermal_tcp_mm=5.0)
-    actual = ACTUAL[model]
+def test_a_trajectory_keeps_its_times(graph: Any) -> None:
+    line, actual = Line(graph, enable_on_start=True, thermal_tcp_mm=5.0), FULL
     line.take(model_message(actual), line.to_model, "kinematic_model")
     line.settle()
     line.rest()  # the offset that came in stands

@@ -53,7 +53,7 @@ class Line:
 
 def test_after_a_restart_the_line_reads_that_nothing_is_corrected(graph):
     in_force(graph)
-    line = Line(graph)
+    line = Line(graph, correction_silent_s=2.0)
     line.reads(AccuracyState.DEGRADED, "joint_correction_node is silent")
     correction = graph.add(JointCorrectionNode, {"serial": "K7", "robot": "ur10"})
     told = line.reads(AccuracyState.DEGRADED, "joint_correction_node is OFF: call ~/enable")

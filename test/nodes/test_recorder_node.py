@@ -27,7 +27,7 @@ from robocal_ros.bags.bag_writer import (
 )
 from robocal_ros.bags.bags import BagReader
 from robocal_ros.bags.mcap_files import encode
-from robocal_ros.bags.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
+from robocal_ros.bags.recorder_node import LOOK_S, TOPICS, RecorderNode
 from robocal_ros.cell_sim.fixture import PLATE
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.fixture.files import fixture_document
@@ -51,9 +51,9 @@ MOTION = {  # by what moves a robot
 }
 
 
-def started(graph, **parameters):
-    defaults = {"topics": "[words, model, missing]", "folder": graph.state / "rec", "flush_s": 0.1}
-    return graph.start(NODE, defaults | parameters)
+def started(graph):
+    given = {"topics": "[words, model, missing]", "folder": graph.state / "rec", "flush_s": 0.1}
+    return graph.start(NODE, given)
 
 
 def words(folder, topic: str) -> list[str]:
@@ -113,7 +113,11 @@ def test_each_recording_opens_with_what_is_in_force(graph):
         assert not bag.info.topics.keys() - {"/model", "/words"}
 
 
-def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_in_force(graph):
+def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_in_force(
+    graph, monkeypatch
+):
+    """And how many were lost: its diagnostics are recorded too, a dispute must find the hole."""
+    monkeypatch.setattr(recorder_node, "AGAIN_S", 0.2)
     graph.state.mkdir(exist_ok=True)
     obstacle = graph.state / "rec"
     obstacle.write_text("a file where the folder should be")
@@ -123,51 +127,33 @@ def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_
     commands = ["configure", "identify"]
     for number, command in enumerate(commands, start=1):
         events.publish(SessionEvent(sequence=number, command=command))
-    recorder = started(graph, topics="[words, model, events]")
+    topics = ["words", "model", "events"]
+    node = graph.add(RecorderNode, {"topics": topics, "folder": str(obstacle), "flush_s": 0.1})
     publisher = graph.publisher(String, "/words")
     said(graph, publisher, String, "lost")
     answer = graph.call(Trigger, f"/{NODE}/keep")
     assert not answer.success
     assert "nothing is being recorded" in answer.message
-    assert recorder.process.poll() is None
-    assert "cannot be made" in recorder.output
+    assert node.health().level == ERROR
+    assert "cannot be made" in node.health().message
     obstacle.unlink()
-
-    def recorded_again() -> bool:
-        said(graph, publisher, String, "again")
-        return bool(recordings(obstacle))
-
-    graph.spin_until(recorded_again, "a recording", AGAIN_S + 10.0)
-    graph.spin_for(2 * LOOK_S)
-    assert recorder.stop() == 0
-    (recording,) = recordings(obstacle)
-    folder = recording.folder
-    assert words(folder, "/model") == ["revision 3"]
-    assert set(words(folder, "/words")) <= {"again"}
-    with BagReader(folder) as bag:
-        assert [m.message.command for m in bag.messages(["/events"])] == commands
-
-
-def test_messages_that_were_lost_are_told_also_when_it_records_again(graph, monkeypatch):
-    """Its diagnostics are recorded too: a dispute must find the hole."""
-    monkeypatch.setattr(recorder_node, "AGAIN_S", 0.2)
-    graph.state.mkdir(exist_ok=True)
-    folder = graph.state / "rec"
-    folder.write_text("a file where the folder should be")
-    node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(folder)})
-    publisher = graph.publisher(String, "/words")
-    said(graph, publisher, String, "lost")
-    graph.spin_until(lambda: node.health().level == ERROR, "it cannot record")
-    folder.unlink()
 
     def recorded_again() -> bool:
         said(graph, publisher, String, "again")
         return bool(node.health().values["messages"])
 
     graph.spin_until(recorded_again, "it records again")
+    graph.spin_for(2 * LOOK_S)
     health = node.health()
     assert health.level == WARN
     assert f"{health.values['messages not recorded']} messages since 20" in health.message
+    node.trigger_deactivate()
+    (recording,) = recordings(obstacle)
+    folder = recording.folder
+    assert words(folder, "/model") == ["revision 3"]
+    assert set(words(folder, "/words")) <= {"again"}
+    with BagReader(folder) as bag:
+        assert [m.message.command for m in bag.messages(["/events"])] == commands
 
 
 def test_a_recording_whose_folder_is_removed_is_told_and_begun_anew(graph, monkeypatch):
@@ -358,14 +344,12 @@ def test_a_disk_that_fills_up_is_relieved_and_what_others_take_is_told(
 
 
 def test_the_type_is_the_one_that_is_offered(graph):
-    started(graph)
-    publisher = graph.publisher(Bool, "/words")
-    said(graph, publisher, Bool, True)
-    graph.spin_until(lambda: recordings(graph.state / "rec"), "a recording")
-    graph.spin_for(0.5)
+    node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(graph.state / "rec")})
+    said(graph, graph.publisher(Bool, "/words"), Bool, True)
+    graph.spin_until(lambda: node.health().values["messages"], "it is recorded")
+    node.trigger_deactivate()
     (recording,) = recordings(graph.state / "rec")
-    folder = recording.folder
-    assert words(folder, "/words") == [True]
+    assert words(recording.folder, "/words") == [True]
 
 
 NODES = {

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.bags.bags import BagWriter
 from robocal_ros.bags.mcap_files import message_class, recorded_name
-from robocal_ros.bags.replay_node import chosen_topics
+from robocal_ros.bags.replay_node import ReplayNode, chosen_topics
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import JointSample
 from robocal_ros.kinematics.robots import load_robot
@@ -215,13 +215,17 @@ def test_a_thermal_node_takes_all_of_a_fast_replay(graph, tmp_path):
     assert (answer.success, answer.samples) == (True, 20)
 
 
-def test_a_bag_that_is_none_is_said(graph, tmp_path):
+def test_what_cannot_be_played_or_is_awaited_in_vain_is_said(graph, tmp_path):
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"not a bag")
-    process = graph.start("replay_node", {"bag": broken})
-    graph.spin_until(lambda: "cannot configure" in process.output, "the fault is logged")
-    assert process.process.poll() is None
-    assert "broken.mcap" in process.output
+    bag = write_bag(tmp_path / "shift.mcap", 10, 1_000_000)
+    for given, words in (
+        ({"bag": str(broken)}, "broken.mcap"),
+        ({"bag": str(bag), "wait_for_subscribers": ["/nothing"]}, "/nothing, which is not played"),
+    ):
+        node = graph.add(ReplayNode, given)
+        assert node.state == "unconfigured"
+        assert words in node._failure.message
 
 
 @pytest.mark.parametrize("settings", [{}, {"bag": "/there/is/none.mcap"}])
@@ -264,13 +268,6 @@ def test_play_waits_for_its_subscribers_and_says_for_which(graph, tmp_path):
     assert status["unheard"] == {"/joint_states": 20, "/odd": 1}
     told = "nothing was lost; nobody listened to 20 of /joint_states, 1 of /odd"
     graph.spin_until(lambda: told in process.output, "the end says so")
-
-
-def test_waiting_for_what_is_not_played_is_refused(graph, tmp_path):
-    bag = write_bag(tmp_path / "shift.mcap", 10, 1_000_000)
-    process = graph.start("replay_node", {"bag": bag, "wait_for_subscribers": "[/nothing]"})
-    graph.spin_until(lambda: "cannot configure" in process.output, "it is refused")
-    assert "/nothing, which is not played" in process.output
 
 
 def test_the_commands_of_the_page_run_as_typed(graph):

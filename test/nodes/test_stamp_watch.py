@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings against this host's clock, and robots that nothing but their file tells apart."""
+"""Readings against this host's clock; robots that nothing but their file or serial tells apart."""
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from robocal_msgs.msg import KinematicModel
 from sensor_msgs.msg import JointState
 
 from robocal_ros.ground.errors import WrongRobotError
 from robocal_ros.kinematics.robots import find_robot, load_description
-from robocal_ros.ros import endpoints, session_node
+from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.ros import session_node
 from robocal_ros.ros.conversions import time_message
 from robocal_ros.ros.session_node import open_history
 from robocal_ros.thermal.node import ThermalNode
@@ -26,7 +27,6 @@ class Reader:
 
     def __init__(self, graph: Any) -> None:
         self.graph = graph
-        self.models = graph.collect(KinematicModel, "/thermal_node/model", endpoints.LATCHED)
         self.node = graph.add(ThermalNode, {"serial": "s1"})
         self.said = graph.collect(DiagnosticArray, "/diagnostics")
         self.joints = graph.publisher(JointState, "/joint_states")
@@ -93,12 +93,6 @@ def test_velocities_and_efforts_that_are_no_numbers_are_absent_ones(graph: Any) 
     assert not reader.node._session.desk.ignored
 
 
-def test_the_model_tells_its_robot_file(graph: Any) -> None:
-    reader = Reader(graph)
-    graph.spin_until(lambda: reader.models, "the model")
-    assert reader.models[0].robot_file_hash == load_description("kr150_r3100").file_hash
-
-
 def test_two_nameless_robots_of_one_type_share_no_history(tmp_path: Path) -> None:
     """Same geometry, so the same model hash; the files differ in a speed."""
     own, other = tmp_path / "left.yaml", tmp_path / "right.yaml"
@@ -115,3 +109,24 @@ def test_two_nameless_robots_of_one_type_share_no_history(tmp_path: Path) -> Non
     with pytest.raises(WrongRobotError, match="set the serial of each robot"):
         open_history(settings, second)
     open_history(settings | {"serial": "right"}, second)[1].close()
+
+
+@pytest.mark.parametrize("kind", [ThermalNode, MaintenanceNode])
+def test_the_second_node_of_a_kind_for_a_serial_refuses_to_work(graph: Any, kind: type) -> None:
+    values = {} if kind is ThermalNode else {"home_deg": [0.0, -90.0, 90.0, 0.0, 90.0, 0.0]}
+    left = graph.add(kind, values, namespace="left")
+    assert left.is_active
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    right = graph.add(kind, values, namespace="right")
+    assert not right.is_active
+    why = f"another {kind.NAME} (process {os.getpid()}) keeps the calibrations of robot 'unset'"
+    graph.spin_until(
+        lambda: any(why in status.message for array in said for status in array.status),
+        "it says why",
+    )
+    other = graph.add(kind, values | {"serial": "K8"}, namespace="other")
+    assert other.is_active
+    left.trigger_deactivate()
+    left.trigger_cleanup()
+    right.autostart()
+    assert right.is_active
