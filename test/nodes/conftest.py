@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,6 +38,8 @@ from jumps import JumpError  # noqa: E402
 from trajectory_controllers import missing_packages  # noqa: E402
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+LEASE = "<leaseDuration><sec>2</sec></leaseDuration>"
 # The arm of most tests' worlds, where a test names none.
 ROBOTS = {
     name: {"robot": robot}
@@ -53,7 +55,7 @@ ENDS_WITHIN_S = 10.0
 DISCOVERY_S = 0.25
 GONE_WITHIN_S = 0.25  # of another one
 LEAVES_WITHIN_S = 3.0
-TRIES = 4
+TRIES = 8
 LATE_S = 0.03  # half of what stops begin ahead of now
 
 
@@ -81,9 +83,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.stem not in WHOLE_CELLS)
 
 
-def starved_s(pid: int | str) -> float:
-    """For how long a process's main thread was to run and had no core (kernel: sched-stats.rst)."""
-    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) * 1e-9
+Waits = dict[str, int]
+
+
+def waits_of(pid: int | str) -> Waits:
+    """For how long each thread of a process was to run and had no core, ns (sched-stats.rst).
+
+    Those of DDS too: a message goes through them before a node takes it.
+    """
+    found = {}
+    for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            found[file.parent.name] = int(file.read_text().split()[1])
+    return found
 
 
 class Executable:
@@ -95,7 +107,7 @@ class Executable:
     def __init__(
         self, name: str, command: list[str], environment: dict[str, str], *, forked: bool = False
     ) -> None:
-        self.name = name
+        self.name, self._waits = name, Waits()
         self._log = tempfile.NamedTemporaryFile("w+")  # noqa: SIM115 (closed by stop)
         self.process: subprocess.Popen[str] | ForkedScript
         if forked:
@@ -116,12 +128,11 @@ class Executable:
         return self._log.read()
 
     @property
-    def starved_s(self) -> float:
-        """For how long its main thread was to run and had no core, since its start.
-
-        What it did itself meanwhile, a stall of its own, does not count.
-        """
-        return starved_s(self.process.pid)
+    def waits(self) -> Waits:
+        """As `waits_of`, as far as that was seen before it ended."""
+        if self.process.poll() is None:
+            self._waits = waits_of(self.process.pid)
+        return self._waits
 
     def kill(self) -> None:
         """End it as a power cut would."""
@@ -161,6 +172,13 @@ class Probe(Node):
         return super().create_subscription(*given, **({"event_callbacks": quiet} | named))
 
 
+def destroy_actions(node: Node) -> None:
+    """What the traceback of a failed test keeps would command the next one's robot."""
+    for waitable in list(node.waitables):
+        if isinstance(waitable, (ActionClient, ActionServer)):
+            waitable.destroy()
+
+
 class Graph:
     """One ROS graph: nodes in this process, executables beside it, and a probe that talks to them.
 
@@ -181,7 +199,12 @@ class Graph:
             "ROBOCAL_STATE": str(state),
             "PYTHONUNBUFFERED": "1",
         }
+        profiles = (ROOT / "tools" / "fastdds.xml").read_text()
+        self._short_lease = state.parent / "short_lease.xml"
+        self._short_lease.write_text(profiles.replace("<leaseAnn", f"{LEASE}<leaseAnn"))
         self._nodes: list[Any] = []
+        self._others: list[Any] = []
+        self._apart = False  # whether there was another participant
         self._clients: dict[str, Any] = {}
         self._executables: list[Executable] = []
         self.at_close: list[Callable[[], None]] = []  # ends threads that use the probe
@@ -210,10 +233,12 @@ class Graph:
         parameters: dict[str, Any] | None = None,
         remap: dict[str, str] | None = None,
         *arguments: str,
+        mortal: bool = False,
     ) -> Executable:
         """Start an executable of the install tree (or a script); it is ended with the test.
 
         ``arguments``: given as they are, a parameter file with the robot among them.
+        ``mortal``: DDS misses it 2 s after it was killed, not 20 s.
         """
         self._forget_clients()
         given = ({} if arguments else ROBOTS.get(str(executable), {})) | (parameters or {})
@@ -221,22 +246,48 @@ class Graph:
         ros += [f"-r{old}:={new}" for old, new in (remap or {}).items()]
         ros_arguments = [item for pair in ros for item in (pair[:2], pair[2:])]
         script = str(EXECUTABLES / executable)
-        return self._run(str(executable), [script, *arguments, "--ros-args", *ros_arguments], True)
+        environment = self._environment | ({PROFILES: str(self._short_lease)} if mortal else {})
+        command = [script, *arguments, "--ros-args", *ros_arguments]
+        return self._started(Executable(str(executable), command, environment, forked=True))
 
     def run(self, name: str, command: list[str]) -> Executable:
         """Start any command; it is ended with the test."""
-        return self._run(name, command, False)
+        return self._started(Executable(name, command, self._environment))
 
-    def _run(self, name: str, command: list[str], forked: bool) -> Executable:
-        process = Executable(name, command, self._environment, forked=forked)
+    def _started(self, process: Executable) -> Executable:
+        self._apart = True
         self._executables.append(process)
         return process
 
+    def other(self, name: str, kind: type[Node] = Node) -> Any:
+        """A node of a DDS participant of its own, as another process has; it ends with the test."""
+        self._apart, context = True, Context()
+        rclpy.init(args=[], context=context, domain_id=self.domain)
+        self._others.append(kind(name, context=context))
+        return self._others[-1]
+
+    def end(self, other: Any) -> None:
+        """End what `other` has made, before the test ends."""
+        self._others.remove(other)
+        destroy_actions(other)
+        other.destroy_node()
+        other.context.try_shutdown()
+
     @property
-    def starved_s(self) -> float:
-        """Of all executables together, and of this process, which plays what is not there."""
-        running = [one for one in self._executables if one.process.poll() is None]
-        return starved_s("self") + sum(one.starved_s for one in running)
+    def waits(self) -> list[Waits]:
+        """Of this process, which plays what is not there, and of all executables."""
+        return [waits_of("self"), *(one.waits for one in self._executables)]
+
+    def starved_s(self, since: list[Waits]) -> float:
+        """For how long processes had no core since then: each that thread which waited longest.
+
+        What a thread did itself meanwhile, a stall of its own, does not count.
+        """
+        longest = (
+            max((ns - before.get(thread, ns) for thread, ns in now.items()), default=0)
+            for now, before in zip(self.waits, since, strict=False)
+        )
+        return 1e-9 * sum(longest)
 
     def undisturbed(self, trial: Callable[[], None]) -> None:
         """Try anew what jumped while a process waited for a core: once heard late, any plan jumps.
@@ -244,11 +295,11 @@ class Graph:
         What jumps while none did is a fault.
         """
         for _ in range(TRIES):
-            before_s = self.starved_s
+            before = self.waits
             try:
                 return trial()
             except JumpError as error:
-                waited_s = self.starved_s - before_s
+                waited_s = self.starved_s(before)
                 if waited_s < LATE_S:
                     raise
                 jumped = error
@@ -266,6 +317,11 @@ class Graph:
                 pytest.fail(f"not within {within_s} s: {what or condition}{logs}")
             self.executor.spin_once(timeout_sec=min(left, 0.05))
 
+    def awaited(self, future: Any, what: str = "", within_s: float = DEADLINE_S) -> Any:
+        """Let the graph work until a future is done; its result."""
+        self.spin_until(future.done, what, within_s)
+        return future.result()
+
     def spin_for(self, seconds: float) -> None:
         """Let the graph work for a time, to show that something does not happen."""
         deadline = time.monotonic() + seconds
@@ -276,20 +332,34 @@ class Graph:
 
     def client(self, kind: type, name: str, within_s: float = DEADLINE_S) -> Any:
         """A client of a service that is there and has discovered it."""
-        client = self._clients.get(name)
-        if client is None:
-            client = self._clients[name] = self.probe.create_client(kind, name)
-            self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
+        self.discover({name: kind}, within_s)
+        return self._clients[name]
+
+    def discover(self, kinds: Mapping[str, type], within_s: float = DEADLINE_S) -> None:
+        """Have clients of services by their names, so that calls take no time later."""
+        new = [name for name in kinds if name not in self._clients]
+        self._clients |= {name: self.probe.create_client(kinds[name], name) for name in new}
+        clients = [self._clients[name] for name in kinds]
+        ready = lambda: all(client.service_is_ready() for client in clients)  # noqa: E731
+        self.spin_until(ready, f"services {', '.join(kinds)} appear", within_s)
+        if not all(self._serves(self._clients[name].service_name) for name in new):
             # A server drops its answer to a client that it has not discovered itself yet.
             self.spin_for(DISCOVERY_S)
-        self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
-        return client
+            self.spin_until(ready, f"services {', '.join(kinds)} appear", within_s)
+
+    def _serves(self, name: str) -> bool:
+        """Whether a node of this participant does: nothing of it has to be discovered."""
+        nodes = (self.probe, *self._nodes)
+        return name in {service.service_name for node in nodes for service in node.services}
 
     def call(self, kind: type, name: str, within_s: float = DEADLINE_S, **fields: Any) -> Any:
         """Call a service, waiting for it to appear, and return its response."""
-        future = self.client(kind, name, within_s).call_async(kind.Request(**fields))
-        self.spin_until(future.done, f"service {name} answers", within_s)
-        return future.result()
+        asked = self.client(kind, name, within_s).call_async(kind.Request(**fields))
+        return self.awaited(asked, f"service {name} answers", within_s)
+
+    def meanwhile(self, client: Any, work: Any) -> Any:
+        """What a coroutine gives that a client runs in its own loop while the graph goes on."""
+        return self.awaited(client.start(work), "what a client does", 70.0)
 
     def _forget_clients(self) -> None:
         """A node that starts has to discover whom it answers."""
@@ -338,6 +408,8 @@ class Graph:
         """End everything."""
         for ended in self.at_close:
             ended()
+        for other in list(self._others):
+            self.end(other)
         # Fast DDS crashes, once in 40 times, where a participant ends soon after others that it
         # knows were killed: who can leaves by itself.
         for executable in self._executables:
@@ -351,13 +423,10 @@ class Graph:
             self.executor.remove_node(node)
             node.close()
         self.executor.shutdown()
-        for waitable in list(self.probe.waitables):
-            # what the traceback of a failed test keeps would command the next one's robot
-            if isinstance(waitable, (ActionClient, ActionServer)):
-                waitable.destroy()
+        destroy_actions(self.probe)
         # Nor just as it learns that another one has. One that was killed stays known for long.
         known, until_s = self.probe.get_node_names(), time.monotonic() + GONE_WITHIN_S
-        while len(known) > 1 and time.monotonic() < until_s:
+        while self._apart and len(known) > 1 and time.monotonic() < until_s:
             time.sleep(0.01)
             if (names := self.probe.get_node_names()) != known:
                 known, until_s = names, time.monotonic() + GONE_WITHIN_S

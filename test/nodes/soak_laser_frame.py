@@ -8,22 +8,27 @@ Not of ``make test``, as it takes minutes: a part of ``make soak``, or
 """
 
 import json
-import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Duration
 from command import robocal_json
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from maintenance_live import HOME_DEG, ROBOT, yaml_list
+from maintenance_live import (
+    HOME_DEG,
+    ROBOT,
+    BeatingPlc,
+    drive_to,
+    placed_beams,
+    yaml_list,
+)
 from rclpy.action import ActionClient
 from robocal_msgs.action import MeasureTool, RunMaintenance
-from robocal_msgs.msg import GapOpen, MaintenanceStatus, SessionEvent
+from robocal_msgs.msg import SessionEvent
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from transforms import away_of, matrix_of
 
 from bench.live.cell import set_fault
 from robocal_ros.bags.bag_writer import recordings
@@ -41,7 +46,7 @@ from robocal_ros.session.events import TOOL_STEP
 pytestmark = pytest.mark.cell
 SERIAL, SEED = "S1", 7
 GAP_S = 240.0
-BACK = Duration(sec=5)
+BACK_S = 5
 CHI2_6, ONE_IN_A_THOUSAND = 22.5, 3.3  # of six, one in a thousand; of a normal one, in sigmas
 TRIES = 3  # of a gap that a busy machine breaks off
 KNOCK_MM = 0.5
@@ -57,34 +62,24 @@ BODY = {
 DEFAULTS = {setting.name: setting.default for setting in SETTINGS}
 
 
-class StationCell:
+class StationCell(BeatingPlc):
     """Robot, beams, tcf_node and maintenance_node as processes; the probe is the PLC."""
 
     def __init__(self, graph: Any, folder: Path) -> None:
-        self.graph, self.recorded = graph, folder / "recorded"
-        latched = endpoints.LATCHED
-        self.statuses = graph.collect(MaintenanceStatus, "/maintenance_node/status", latched)
+        super().__init__(graph)
+        self.recorded, latched = folder / "recorded", endpoints.LATCHED
         self.frames = graph.collect(PoseWithCovarianceStamped, "/tcf_node/laser_frame", latched)
         self.events = graph.collect(SessionEvent, "/tcf_node/session_events", EVENTS)
         self.joints = graph.collect(JointState, "/joint_states", endpoints.STREAM)
-        self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
-        self._ended = threading.Event()
-        plc = threading.Thread(target=self._beats, daemon=True)
-        plc.start()
-        graph.at_close.append(lambda: (self._ended.set(), plc.join()))
-        csv, laser = folder / "beams.csv", folder / "laser.yaml"
+        csv = folder / "beams.csv"
         simulated = {"laser_csv": str(csv), "seed": SEED, "q_start_deg": yaml_list(HOME_DEG)}
         simulated["gears"] = "false"  # their model is not in force: no covariance holds them
         graph.start("cell_sim_node", simulated | BODY, {"joint_trajectory": ROBOT})
         self.recorder = graph.start("recorder_node", {"folder": str(self.recorded)})
         graph.spin_until(lambda: self.joints and csv.exists(), "the cell")
-        robocal_json(
-            "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
-            "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
-        )  # fmt: skip
         own = BODY | {
             "robot": "ur10",
-            "laser": str(laser),
+            "laser": str(placed_beams(folder, csv)),
             "taught_xyz_mm": "[0.0, 0.0, 150.0]",
             "serial": SERIAL,
             "gap_stale_s": 0.5,
@@ -111,39 +106,17 @@ class StationCell:
         ready = lambda: self.statuses and self.status.at_home  # noqa: E731
         graph.spin_until(lambda: ready() and self._measure.server_is_ready(), "the cell", 30.0)
 
-    def _beats(self) -> None:
-        while not self._ended.wait(0.1):
-            newest = self.statuses[-1:]
-            self.gap.publish(GapOpen(open=True, echo=newest[0].beat if newest else 0))
-
-    @property
-    def status(self) -> MaintenanceStatus:
-        return self.statuses[-1]
-
     def _result(self, client: ActionClient, goal: Any) -> Any:
         self.graph.spin_until(client.server_is_ready, "the action")
-        sent = client.send_goal_async(goal)
-        self.graph.spin_until(sent.done, "the goal is taken")
-        ended = sent.result().get_result_async()
-        self.graph.spin_until(ended.done, "the result", within_s=GAP_S)
-        return ended.result().result
+        handle = self.graph.awaited(client.send_goal_async(goal), "the goal is taken")
+        return self.graph.awaited(handle.get_result_async(), "the result", GAP_S).result
 
     def drive_home(self) -> None:
         """A person drives the robot home: a run begins beside the beams."""
         target = dict(zip(load_robot("ur10").joint_names, np.radians(HOME_DEG), strict=True))
         names = self.joints[-1].name  # by alphabet, as joint_state_broadcaster has them
-        home = JointTrajectoryPoint(time_from_start=BACK)
-        home.positions = [float(target[name]) for name in names]
-        home.velocities = home.accelerations = [0.0] * len(names)
-        message = JointTrajectory(joint_names=names, points=[home])
-        stood = self.joints[-1].position
-
-        def near(q: Any, atol: float) -> bool:
-            return np.allclose(self.joints[-1].position, q, rtol=0.0, atol=atol)
-
-        moves = lambda: near(home.positions, 1e-5) or not near(stood, 1e-3)  # noqa: E731
-        self.graph.drive(ROBOT, message, moves, subscribers=1)
-        self.graph.spin_until(lambda: near(home.positions, 1e-5), "the robot is home")
+        home = JointState(name=names, position=[float(target[name]) for name in names])
+        drive_to(self.graph, ROBOT, self.joints, home, BACK_S)
         self.graph.spin_until(lambda: self.status.at_home, "it is seen there")
 
     def commission(self) -> Any:
@@ -198,10 +171,7 @@ def cell(graph: Any, tmp_path: Path) -> StationCell:
 
 def is_true(told: PoseWithCovarianceStamped, truth: np.ndarray) -> None:
     """The frame is where the beams are (4, 4), within the covariance that is told with it."""
-    p, q = told.pose.pose.position, told.pose.pose.orientation
-    T = frames.transform_from_quat([p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
-    turn = frames.log_rotation(T[:3, :3] @ truth[:3, :3].T)
-    away = np.concatenate([T[:3, 3] - truth[:3, 3], turn])
+    away = away_of(matrix_of(told.pose.pose), truth)
     covariance = np.array(told.pose.covariance).reshape(6, 6)
     assert away @ np.linalg.solve(covariance, away) < CHI2_6, (away, covariance)
 

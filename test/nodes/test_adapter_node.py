@@ -13,7 +13,6 @@ from robocal_msgs.msg import BeamEvent, CalibrationQuality, HandEyeSample
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan, PointCloud2
 from std_msgs.msg import Bool
-from test_correction_graph import Process
 from tool_cell_live import LiveCell
 from tool_driver import TRUTH
 
@@ -168,9 +167,7 @@ def test_a_scan_becomes_a_profile_of_its_middle(graph: Any) -> None:
 def test_a_driver_that_falls_silent_and_one_of_another_type_are_errors(graph: Any) -> None:
     node = graph.add(AdapterNode, {"input": "bool", "period_ms": 10.0})
     beam = graph.publisher(Bool, "/beam_x", endpoints.RELIABLE)
-    other = Process(graph.domain, "other")
-    graph.at_close.append(other.end)
-    other.node.create_publisher(JointState, "/beam_y", endpoints.RELIABLE)
+    graph.other("other").create_publisher(JointState, "/beam_y", endpoints.RELIABLE)
     beam.publish(Bool(data=True))
     graph.spin_until(lambda: node.health().values["beam x"] == "interrupted", "its level")
     graph.spin_until(lambda: "beam x: its driver is silent for" in node.health().message, "silence")

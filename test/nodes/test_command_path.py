@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who else commands the robot that a node of the cell moves: told by the graph, over DDS."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -11,7 +10,6 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from std_srvs.srv import SetBool
-from test_correction_graph import Process
 from tool_cell_live import LiveCell
 from tool_driver import TRUTH
 from trajectory_msgs.msg import JointTrajectory
@@ -29,15 +27,10 @@ class Watched:
 
     def __init__(self, graph: Any) -> None:
         self.graph = graph
-        self.processes: list[Process] = []
-        self.own = self.process("tcf_node").node
+        self.own = graph.other("tcf_node")
         self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
-        self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
+        graph.at_close.append(ActionClient(self.own, FollowJointTrajectory, ACTION).destroy)
         self.watch = CommandPath(self.own, PATH, (ACCURACY, CORRECTION))
-
-    def process(self, name: str, kind: type[Node] = Node) -> Process:
-        self.processes.append(Process(self.graph.domain, name, kind))
-        return self.processes[-1]
 
     def becomes(self, words: str) -> None:
         """Wait until it says so; empty: until nothing is wrong."""
@@ -48,12 +41,8 @@ class Watched:
 
 
 @pytest.fixture
-def watched(graph: Any) -> Iterator[Watched]:
-    made = Watched(graph)
-    yield made
-    made.client.destroy()
-    for process in made.processes:
-        process.end()
+def watched(graph: Any) -> Watched:
+    return Watched(graph)
 
 
 @pytest.mark.parametrize(
@@ -64,8 +53,8 @@ def test_a_node_of_the_cell_may_command_the_robot_and_no_other_of_its_process(
 ) -> None:
     """A process is composed of many nodes: the program's too."""
     watched.becomes("")
-    process = watched.process("another_name", LifecycleNode)
-    own, planner = process.node, Node("planner", context=process.context)
+    own = watched.graph.other("another_name", LifecycleNode)
+    planner = Node("planner", context=own.context)
     own.create_publisher(kind, topic, endpoints.LATCHED)
     watched.graph.spin_until(lambda: watched.own.count_publishers(topic), "it is of the cell")
     own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
@@ -89,16 +78,8 @@ def test_the_topic_beside_the_controllers_action_is_looked_at(watched: Watched) 
     """Motions go by the action, so that the topic of this node was left as it is."""
     watched.watch = CommandPath(watched.own, "/tcf_node/joint_trajectory", ())
     watched.becomes("")
-    watched.process("planner").node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    watched.graph.other("planner").create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(f"/planner publishes {PATH}")
-
-
-def test_a_second_node_of_the_same_name_is_told(watched: Watched) -> None:
-    second = watched.process("tcf_node").node
-    publisher = second.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
-    watched.becomes(f"a second /tcf_node publishes {PATH}")
-    second.destroy_publisher(publisher)
-    watched.becomes("")
 
 
 def test_two_tool_nodes_of_two_hosts_arm_nothing_until_one_is_gone(

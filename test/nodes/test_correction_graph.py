@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who else commands the robot: told by the graph, over DDS."""
 
-import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionClient
-from rclpy.context import Context
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from robocal_msgs.msg import MotionLease
@@ -30,39 +26,22 @@ STATED = "/arm_controller/controller_state"
 NAMES = [f"joint_a{i}" for i in range(1, 7)]
 
 
-class Process:
-    """A DDS participant of its own, as another process has."""
-
-    def __init__(self, domain: int, name: str, kind: type[Node] = Node) -> None:
-        self.context = Context()
-        rclpy.init(args=[], context=self.context, domain_id=domain)
-        self.node = kind(name, context=self.context)
-
-    def end(self) -> None:
-        self.node.destroy_node()
-        self.context.try_shutdown()
-
-
 class Watched:
     """A correction node's endpoints before a controller, and a watch on who else is there."""
 
     def __init__(self, graph: Any) -> None:
-        self.graph = graph
-        self.others: list[Process] = []
-        self.own = self.process("joint_correction_node").node
+        self.graph, self.process = graph, graph.other
+        self.own = graph.other("joint_correction_node")
         self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
-        self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
+        client = ActionClient(self.own, FollowJointTrajectory, ACTION)
         self.leases = Leases("kr150", "s1")
         self.sources = JointSources(self.own, "/joint_states", NAMES)
         self.watch = GraphWatch(
             self.own, {PATH: 1}, {ACTION: 1}, self.sources, self.leases, "/motion_lease", STATED
         )
+        graph.at_close += [self.sources.close, client.destroy]
 
-    def process(self, name: str, kind: type[Node] = Node) -> Process:
-        self.others.append(Process(self.graph.domain, name, kind))
-        return self.others[-1]
-
-    def becomes(self, reason: Reason | None, words: str = "", within_s: float = 10.0) -> None:
+    def becomes(self, reason: Reason | None, words: str = "") -> None:
         """Wait until the watch says so."""
         found: list[Any] = []
 
@@ -72,28 +51,18 @@ class Watched:
                 return found[0] is reason
             return found[0].reason is reason and words in found[0].detail
 
-        self.graph.spin_until(look, f"{reason} {words}, not {found}", within_s)
-
-    def end(self) -> None:
-        self.sources.close()
-        self.client.destroy()
-        for other in self.others:
-            other.end()
+        self.graph.spin_until(look, f"{reason} {words}, not {found}", 10.0)
 
 
 @pytest.fixture
-def watched(graph: Any) -> Iterator[Watched]:
-    watched = Watched(graph)
-    yield watched
-    watched.end()
+def watched(graph: Any) -> Watched:
+    return Watched(graph)
 
 
 def test_endpoints_of_a_process_share_a_participant(watched: Watched) -> None:
     same = Node("another", context=watched.own.context)
     assert own_endpoint(watched.own).participant == own_endpoint(same).participant
-    assert (
-        own_endpoint(watched.process("another").node).participant != own_endpoint(same).participant
-    )
+    assert own_endpoint(watched.process("another")).participant != own_endpoint(same).participant
     same.destroy_node()
 
 
@@ -103,12 +72,12 @@ def test_a_second_correction_node_under_the_same_or_another_name(
 ) -> None:
     watched.becomes(None)
     other = watched.process(name)
-    publisher = other.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    publisher = other.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     second = "a second /joint_correction_node" if name == "joint_correction_node" else f"/{name}"
     watched.becomes(Reason.OTHER_COMMANDER, f"{second} publishes {PATH}")
-    other.node.destroy_publisher(publisher)
+    other.destroy_publisher(publisher)
     watched.becomes(None)
-    client = ActionClient(other.node, FollowJointTrajectory, ACTION)
+    client = ActionClient(other, FollowJointTrajectory, ACTION)
     watched.becomes(Reason.OTHER_COMMANDER, f"{second} is a client of {ACTION}")
     client.destroy()
     watched.becomes(None)
@@ -118,8 +87,8 @@ def test_a_second_correction_node_under_the_same_or_another_name(
 
 def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None:
     own = watched.process("some_name", LifecycleNode)
-    own.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
-    own.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    own.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     inbox = watched.graph.collect(MotionLease, "/motion_lease", endpoints.LATCHED)
     watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
     watched.becomes(None)
@@ -135,26 +104,11 @@ def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None
     assert not inbox
 
 
-def test_another_node_of_a_holders_process_is_a_stranger(watched: Watched) -> None:
-    """Finding: whatever a process with a publisher of leases did, it was the cell's own."""
-    own = watched.process("some_name", LifecycleNode)
-    own.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
-    own.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
-    watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
-    watched.becomes(None)
-    planner = Node("planner", context=own.context)
-    publisher = planner.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
-    watched.becomes(Reason.OTHER_COMMANDER, f"/planner publishes {PATH}")
-    planner.destroy_publisher(publisher)
-    watched.becomes(None)
-    planner.destroy_node()
-
-
 def test_a_player_of_a_bag_is_a_stranger_also_where_it_plays_leases(watched: Watched) -> None:
     """Finding: who published leases, as a recording of everything does, commanded unseen."""
     player = watched.process("rosbag2_player")
-    player.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
-    player.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    player.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    player.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     watched.becomes(Reason.OTHER_COMMANDER, f"/rosbag2_player publishes {PATH}")
 
 
@@ -162,10 +116,10 @@ def test_a_client_of_the_action_beside_the_topic_is_a_stranger(watched: Watched)
     """Finding: who moves by topic did not see a planner that moves by the controller's action."""
     mover, planner = watched.process("tcf_node"), watched.process("planner")
     topic, action = "/robot/joint_trajectory", "/robot/follow_joint_trajectory"
-    mover.node.create_publisher(JointTrajectory, topic, endpoints.RELIABLE)
-    path = CommandPath(mover.node, topic, ())
+    mover.create_publisher(JointTrajectory, topic, endpoints.RELIABLE)
+    path = CommandPath(mover, topic, ())
     assert not path.look("")
-    client = ActionClient(planner.node, FollowJointTrajectory, action)
+    client = ActionClient(planner, FollowJointTrajectory, action)
     words = f"/planner is a client of {action}"
     watched.graph.spin_until(lambda: words in path.look(""), words)
     client.destroy()
@@ -173,10 +127,10 @@ def test_a_client_of_the_action_beside_the_topic_is_a_stranger(watched: Watched)
 
 def test_the_robots_controller_alone_says_where_it_is(watched: Watched) -> None:
     one, other = watched.process("controller_manager"), watched.process("next_robot")
-    one.node.create_publisher(JointTrajectoryControllerState, STATED, endpoints.RELIABLE)
+    one.create_publisher(JointTrajectoryControllerState, STATED, endpoints.RELIABLE)
     watched.graph.spin_until(lambda: watched.own.count_publishers(STATED) == 1, "the controller")
     watched.becomes(None)
-    other.node.create_publisher(JointTrajectoryControllerState, STATED, endpoints.RELIABLE)
+    other.create_publisher(JointTrajectoryControllerState, STATED, endpoints.RELIABLE)
     words = f"{STATED} has several publishers: /controller_manager, /next_robot"
     watched.becomes(Reason.OTHER_COMMANDER, words)
 
@@ -203,8 +157,8 @@ def test_a_lease_that_ends_by_silence_lasts_until_the_robot_stands() -> None:
 
 def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:
     other = watched.process("next_cell", LifecycleNode)
-    other.node.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
-    other.node.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    other.create_publisher(MotionLease, "/motion_lease", endpoints.LATCHED)
+    other.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
     lease = MotionLease(robot="kr150", serial="s2", holder="/next_cell", held=True)
     watched.leases.hear(lease, time.monotonic())
     watched.becomes(Reason.OTHER_COMMANDER, f"/next_cell publishes {PATH}")
@@ -213,8 +167,8 @@ def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:
 
 def test_two_publishers_of_the_arms_joints_and_one_of_a_gripper(watched: Watched) -> None:
     driver, gripper = watched.process("driver"), watched.process("gripper")
-    arm = driver.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
-    hand = gripper.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
+    arm = driver.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
+    hand = gripper.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
     message = JointState(name=NAMES, position=[0.0] * 6, velocity=[float("nan")] * 6)
 
     def publish(*which: tuple[Any, list[str]]) -> None:
@@ -244,15 +198,15 @@ def test_two_publishers_of_the_arms_joints_and_one_of_a_gripper(watched: Watched
         read.append(watched.watch.look(time.monotonic()))
     assert read[-1].reason is Reason.OTHER_COMMANDER
     assert "joint_a4, joint_a5, joint_a6 by two of /driver, /gripper" in read[-1].detail
-    gripper.node.destroy_publisher(hand)
+    gripper.destroy_publisher(hand)
     watched.becomes(None)
 
 
 def test_a_driver_that_was_restarted_is_one_driver(watched: Watched) -> None:
     """Its predecessor was killed and is still on the graph: its numbers begin anew once."""
     old, new = watched.process("driver"), watched.process("driver")
-    before = old.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
-    after = new.node.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
+    before = old.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
+    after = new.create_publisher(JointState, "/joint_states", endpoints.RELIABLE)
     message = JointState(name=NAMES, position=[0.0] * 6)
     watched.graph.spin_until(lambda: watched.own.count_publishers("/joint_states") == 2, "both")
     watched.watch.look(time.monotonic())
@@ -275,15 +229,11 @@ def test_a_killed_predecessor_is_told_until_it_is_gone(graph: Any, tmp_path: Pat
         "node = rclpy.create_node('joint_correction_node')\n"
         f"node.create_publisher(JointTrajectory, '{PATH}', 10)\nrclpy.spin(node)\n"
     )
-    process = graph.start(script)
+    process = graph.start(script, mortal=True)
     watched = Watched(graph)
-    try:
-        watched.becomes(Reason.OTHER_COMMANDER, "a second /joint_correction_node")
-        process.process.send_signal(signal.SIGKILL)
-        process.process.wait()
-        violation = watched.watch.look(time.monotonic())
-        assert violation is not None
-        assert "one that was killed counts until DDS gives it up" in violation.detail
-        watched.becomes(None, within_s=30.0)
-    finally:
-        watched.end()
+    watched.becomes(Reason.OTHER_COMMANDER, "a second /joint_correction_node")
+    process.kill()
+    violation = watched.watch.look(time.monotonic())
+    assert violation is not None
+    assert "one that was killed counts until DDS gives it up" in violation.detail
+    watched.becomes(None)

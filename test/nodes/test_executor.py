@@ -258,9 +258,7 @@ def test_an_action_server_that_its_own_goal_takes_down_answers_it(graph: Any) ->
     client = ActionClient(probe, MeasureTool, "/measure")
     graph.spin_until(client.server_is_ready)
     graph.spin_for(DISCOVERY_S)
-    asked = client.send_goal_async(MeasureTool.Goal())
-    graph.spin_until(asked.done)
-    assert not asked.result().accepted
+    assert not graph.awaited(client.send_goal_async(MeasureTool.Goal())).accepted
     graph.spin_until(lambda: not client.server_is_ready())
 
 

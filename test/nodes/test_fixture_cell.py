@@ -4,7 +4,6 @@ decided by maintenance_node. All is simulated.
 """
 
 import json
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,10 +13,12 @@ import pytest
 from fixture_driver import mounted
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from long_form import amount
+from maintenance_live import BeatingPlc, yaml_list
 from panel_faults import wrongly_told
-from robocal_msgs.msg import AccuracyState, CalibrationQuality, GapOpen, MaintenanceStatus
+from robocal_msgs.msg import AccuracyState, CalibrationQuality
 from robocal_msgs.srv import Decide, RunMaintenanceCycle
 from std_srvs.srv import Trigger
+from transforms import matrix_of
 
 from bench.live.cell import set_fault
 from bench.measured_fixture import ARM, FRAME, LIMITS, PLATE, MeasuredFixture, fixture_poses
@@ -37,15 +38,11 @@ TRIES = 3  # of a gap that a busy machine breaks off
 SHOWN_MM, RIGHT_M = 1.0, 1e-4
 
 
-def degrees_of(q: np.ndarray) -> str:
-    return str([float(x) for x in np.degrees(q).ravel()])
-
-
-class FixtureCell:
+class FixtureCell(BeatingPlc):
     """Robot, sensor, fixture_node and maintenance_node as processes; the probe is the PLC."""
 
     def __init__(self, graph: Any, folder: Path) -> None:
-        self.graph = graph
+        super().__init__(graph)
         with CalibrationHistory.open(
             SERIAL, model_hash=ARM.model_hash, state_dir=graph.state
         ) as history:
@@ -53,15 +50,9 @@ class FixtureCell:
         file = folder / "plate.yaml"
         file.write_text(json.dumps(fixture_document(PLATE)))
         latched = endpoints.LATCHED
-        self.statuses = graph.collect(MaintenanceStatus, "/maintenance_node/status", latched)
         self.states = graph.collect(AccuracyState, "/accuracy_state", latched)
         self.verdicts = graph.collect(CalibrationQuality, "/fixture_node/quality", latched)
         self.frames = graph.collect(PoseWithCovarianceStamped, "/fixture_node/frame", latched)
-        self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
-        self._ended = threading.Event()
-        plc = threading.Thread(target=self._beats, daemon=True)
-        plc.start()
-        graph.at_close.append(lambda: (self._ended.set(), plc.join()))
         simulated = {"cell": "kr150", "fixture": True, "seed": SEED, "cloud_points": 0}
         graph.start("cell_sim_node", simulated, {"joint_trajectory": ROBOT})
         own = {"robot": "kr150_r3100", "serial": SERIAL}
@@ -69,8 +60,8 @@ class FixtureCell:
         measured = {"fixture_file": str(file), "sensor_frame": FRAME}
         graph.start("fixture_node", own | measured | sigma)
         self.settings = own | {
-            "home_deg": degrees_of(poses("home")[0]),
-            "fixture_poses_deg": degrees_of(fixture_poses()),
+            "home_deg": yaml_list(np.degrees(poses("home")[0])),
+            "fixture_poses_deg": yaml_list(np.degrees(fixture_poses()).ravel()),
             "fixture_visits": 2,
             "travel_speed_mm_s": 1500.0,
             "joint_velocity_deg_s": "[105.0]",
@@ -83,15 +74,6 @@ class FixtureCell:
         }
         graph.start("maintenance_node", self.settings, {"~/joint_trajectory": ROBOT})
         graph.spin_until(lambda: self.states and self.statuses and self.status.at_home, "the cell")
-
-    def _beats(self) -> None:
-        while not self._ended.wait(0.1):
-            newest = self.statuses[-1:]
-            self.gap.publish(GapOpen(open=True, echo=newest[0].beat if newest else 0))
-
-    @property
-    def status(self) -> MaintenanceStatus:
-        return self.statuses[-1]
 
     def ran(self, name: str, pause_s: float = 0.0) -> Any:
         """The result of a gap that nothing has broken off; the robot's first motion pauses."""
@@ -159,13 +141,7 @@ def test_a_fixture_that_moved_is_told_in_one_gap_and_corrected(cell: FixtureCell
     assert decided.success, decided.message
     cell.graph.spin_until(lambda: len(cell.frames) == 2, "the new frame")
     assert "ACCEPT/fixture" not in [task.key for task in cell.page(number).tasks(0.0)]
-    before, after = (
-        frames.transform_from_quat(
-            np.array([p.position.x, p.position.y, p.position.z]),
-            np.array([p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w]),
-        )
-        for p in (one.pose.pose for one in cell.frames)
-    )
+    before, after = (matrix_of(one.pose.pose) for one in cell.frames)
     change = SimpleNamespace(change=after @ frames.invert(before))
     world = MeasuredFixture(SEED)
     assert world.worst_m(change, "fixture_moved", 1e-3 * SHOWN_MM) < RIGHT_M

@@ -212,13 +212,12 @@ class Attacked(Line):
         self.stand()
         self.sent.add(str(trajectory))
         self.controller.accepts = accepts
-        sent = self.client.send_goal_async(FollowJointTrajectory.Goal(trajectory=trajectory))
-        self.graph.spin_until(sent.done, "the goal is taken")
-        ended = sent.result().get_result_async()
-        self.graph.spin_until(ended.done, "the goal ends")
+        goal = FollowJointTrajectory.Goal(trajectory=trajectory)
+        handle = self.graph.awaited(self.client.send_goal_async(goal), "the goal is taken")
+        ended = self.graph.awaited(handle.get_result_async(), "the goal ends")
         goals = list(self.controller.goals)
         self.controller.goals.clear()
-        succeeded = ended.result().status == GoalStatus.STATUS_SUCCEEDED
+        succeeded = ended.status == GoalStatus.STATUS_SUCCEEDED
         assert succeeded == bool(goals and accepts)
         for out in goals:
             if self.shadow:

@@ -27,16 +27,6 @@ PERIOD_S, AHEAD_S = 0.1, 0.3  # of the stream; of its point, from when it is sen
 SPEED = np.array([0.3, 0.1, -0.1, 0.2, -0.1, 0.1])  # rad/s
 FASTEST = 3.0  # of that: messages that a busy machine holds up come together
 DRIFT = 1e-4, 5e-5  # m, rad: of what goes out it changes some hundredths of a degree
-SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
-<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
-<participant profile_name="short_lease" is_default_profile="true"><rtps><builtin>
-<discovery_config>
-<leaseDuration><sec>2</sec></leaseDuration>
-<leaseAnnouncement><sec>0</sec><nanosec>100000000</nanosec></leaseAnnouncement>
-</discovery_config>
-</builtin></rtps></participant>
-</profiles></dds>
-"""
 
 
 class Stream:
@@ -45,8 +35,8 @@ class Stream:
     OUTPUT = f"{NODE}/joint_trajectory"
     PARAMETERS: ClassVar[dict[str, Any]] = {}  # of the node, besides
 
-    def __init__(self, graph: Any, controller: Controlled, profiles: Path) -> None:
-        self.graph, self.controller, self._profiles = graph, controller, profiles
+    def __init__(self, graph: Any, controller: Controlled) -> None:
+        self.graph, self.controller = graph, controller
         probe = graph.probe
         probe.destroy_publisher(controller.topic)  # the node alone commands the controller
         controller.action.destroy()
@@ -85,20 +75,15 @@ class Stream:
             self.taught = self.taught + PERIOD_S * SPEED
             self._planner.publish(trajectory([(AHEAD_S, self.taught)]))
 
-    def start(self, monkeypatch: pytest.MonkeyPatch) -> Any:
-        """Start the node; that it was killed is noticed after 2 s."""
+    def start(self) -> Any:
+        """Start the node."""
         self.status.clear()
-        with monkeypatch.context() as patch:
-            environment = self.graph._environment
-            patch.setitem(environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(self._profiles))
-            node = self.graph.start(
-                "joint_correction_node",
-                {"robot": "ur10", "serial": "s1", "joint_state_age_s": 0.5} | self.PARAMETERS,
-                {
-                    "~/joint_trajectory": self.OUTPUT,
-                    "controller_state": f"{NODE}/controller_state",
-                },
-            )
+        given = {"robot": "ur10", "serial": "s1", "joint_state_age_s": 0.5} | self.PARAMETERS
+        wired = {
+            "~/joint_trajectory": self.OUTPUT,
+            "controller_state": f"{NODE}/controller_state",
+        }
+        node = self.graph.start("joint_correction_node", given, wired, mortal=True)
         self.wait(CorrectionStatus.OFF)
         return node
 
@@ -134,13 +119,12 @@ class Stream:
 
 @pytest.mark.parametrize("kind", CONTROLLERS)
 def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
-    graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+    graph: Any, tmp_path: Path, kind: str
 ) -> None:
     controller = CONTROLLERS[kind](graph, tmp_path, True)
     controller.wait()
-    (profiles := tmp_path / "lease.xml").write_text(SHORT_LEASE)
-    stream = Stream(graph, controller, profiles)
-    node = stream.start(monkeypatch)
+    stream = Stream(graph, controller)
+    node = stream.start()
     stream.is_heard()
     graph.call(SetBool, f"{CORRECTION}/enable", data=True)
     began_s = controller.now_s
@@ -160,7 +144,7 @@ def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
     no_jump(stream.fastest(began_s) < FASTEST, "no faster than the stream")
 
     count, again_s = len(stream.sent), controller.now_s
-    stream.start(monkeypatch)
+    stream.start()
     graph.spin_for(0.5)
     assert len(stream.sent) == count  # off, and nothing goes out by itself
     assert controller.stands() == pytest.approx(stands, abs=1e-6)

@@ -40,7 +40,6 @@ pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
 SPEED = np.array([0.6, 0.2, -0.1, 0.3, -0.2, 0.1])  # rad/s
 # The joint that needs longest slows down as it may, the others with it.
 SLOWS_S = float(np.max(np.abs(SPEED) / load_description("ur10").max_acceleration))
-PROFILES = Path(__file__).parents[2] / "tools" / "fastdds.xml"
 
 
 def motion(start: np.ndarray, speed: np.ndarray) -> list[Any]:
@@ -52,12 +51,9 @@ def motion(start: np.ndarray, speed: np.ndarray) -> list[Any]:
 class Program(Stream):
     """A program before the node."""
 
-    def __init__(self, graph: Any, controller: Controlled) -> None:
-        super().__init__(graph, controller, PROFILES)
-
-    def corrects(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def corrects(self) -> None:
         """Start the node, and enable it."""
-        self.start(monkeypatch)
+        self.start()
         self.is_heard()
         self.graph.call(SetBool, f"{CORRECTION}/enable", data=True)
         self.graph.spin_for(0.3)  # what was passed on before that is there
@@ -123,13 +119,13 @@ class ByAction(Program):
 
 
 @pytest.fixture
-def program(request: Any, graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
+def program(request: Any, graph: Any, tmp_path: Path) -> Program:
     """On a controller of a kind, whose hardware has velocities or has none."""
     kind, velocities, line = request.param
     controller = CONTROLLERS[kind](graph, tmp_path, velocities)
     controller.wait()
     program = line(graph, controller)
-    program.corrects(monkeypatch)
+    program.corrects()
     return program
 
 
@@ -173,13 +169,13 @@ def test_a_stop_that_is_lost_is_sent_again_in_time(program):
     def stops(lost: int) -> None:
         speed, _ = program.drives()
         program.lost, began_s = lost, controller.now_s
-        starved_s = graph.starved_s
+        waits = graph.waits
         planned = program.says()
         planned_s = seconds(planned.points[-1].time_from_start)
         if stamp_s := seconds(planned.header.stamp):
             planned_s += stamp_s - began_s
         controller.stands()
-        starved_s = graph.starved_s - starved_s
+        starved_s = graph.starved_s(waits)
         assert program.lost == 0
         at_s, found = controller.speeds(began_s - 0.05)
         found = found * np.sign(speed)

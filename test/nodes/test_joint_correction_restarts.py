@@ -96,7 +96,7 @@ class Cell:
         }[name]
         remap = {"kinematic_model": "/thermal_node/model", "tool": "/tcf_node/tool"}
         mine = remap if name == "joint_correction_node" else None
-        self.nodes[name] = self.graph.start(name, parameters, mine)
+        self.nodes[name] = self.graph.start(name, parameters, mine, mortal=True)
         if mine is not None:
             self.status.clear()  # a killed node still seems to be there for a while
             self.graph.spin_until(lambda: self.status, "the status of a new node", 30.0)

@@ -90,15 +90,15 @@ def test_two_streams_at_once_are_refused(graph: Any) -> None:
 
 
 def test_planners_that_wait_do_not_hold_up_another(graph: Any) -> None:
-    line = Line(graph)
+    line = Line(graph, stream_gap_s=0.5)  # what is at once, on a machine with other work
     idle = graph.probe.create_publisher(JointTrajectory, "joint_trajectory", endpoints.RELIABLE)
     two_on(line, "joint_trajectory")
     path = trajectory(np.stack([HOME, HOME]), np.array([0.5, 1.0]))
     line.rest()
     line.to_path.publish(path)
-    line.wait(line.paths)
     # at once with it: refused, whoever sent it
     line.refused(idle, path, "joint_trajectory")
+    line.wait(line.paths)
     graph.spin_until(lambda: not line.node._rivals(), "a while later")
     line.rest()
     idle.publish(path)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
+import itertools
 import math
 import os
 import signal
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from history_workers import proposal
 from rclpy.action import ActionClient, CancelResponse
 from robocal_msgs.action import RunMaintenance
 from robocal_msgs.msg import AccuracyState, GapOpen, MaintenanceStatus, SessionEvent
@@ -24,7 +26,6 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import Proposal
 from robocal_ros.kinematics.arm import model_document
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode
@@ -92,9 +93,9 @@ class Plc:
         return str(answer.message)
 
 
-def process(graph: Any) -> Any:
+def process(graph: Any, *, mortal: bool = False) -> Any:
     """The node as its own process."""
-    node = graph.start("maintenance_node", SETTINGS)
+    node = graph.start("maintenance_node", SETTINGS, mortal=mortal)
     graph.spin_until(lambda: graph.probe.count_subscribers("gap_open"), "the node", 30.0)
     return node
 
@@ -152,11 +153,9 @@ def test_the_action_does_the_same(plc, graph):
     results = []
     for gap_s in (30.0, 30.0, -1.0):
         name = "a" if gap_s > 0.0 else "b"
-        sent = client.send_goal_async(RunMaintenance.Goal(cycle_id=name, gap_s=gap_s))
-        graph.spin_until(sent.done, "the goal is taken")
-        ended = sent.result().get_result_async()
-        graph.spin_until(ended.done, "the result")
-        results.append(ended.result().result)
+        goal = RunMaintenance.Goal(cycle_id=name, gap_s=gap_s)
+        handle = graph.awaited(client.send_goal_async(goal), "the goal is taken")
+        results.append(graph.awaited(handle.get_result_async(), "the result").result)
     assert results[0].success, results[0].message
     assert results[0] == results[1]
     assert (results[2].success, results[2].status) == (False, Code.BAD_INPUT)
@@ -212,13 +211,8 @@ def test_twins_of_a_plc_without_arguments(plc, graph):
 def proposed(history: CalibrationHistory, based_on: int) -> int:
     """A thermal candidate that another node proposes."""
     arm = load_robot("ur10")
-    return history.propose(
-        Proposal(
-            model_hash=arm.model_hash, based_on=based_on, cycle_id="", stamp_ns=1, created_ns=1,
-            software="test", method="map", code=Code.ACCEPT, reason="better", document={},
-            model=model_document(arm),
-        )
-    )  # fmt: skip
+    told = {"model_hash": arm.model_hash, "based_on": based_on, "cycle_id": ""}
+    return history.propose(proposal(**told, model=model_document(arm)))
 
 
 def candidates(graph: Any, count: int, based_on: int = 0) -> list[int]:
@@ -282,16 +276,15 @@ def test_a_history_that_cannot_be_read_leaves_nobody_waiting(plc, graph):
     graph.spin_until(client.server_is_ready, "the action")
     with closing(sqlite3.connect(plc.node._history.path)) as other:
         other.executescript("ALTER TABLE calibrations RENAME TO gone")
-        sent = client.send_goal_async(RunMaintenance.Goal(cycle_id="a", gap_s=30.0))
-        graph.spin_until(sent.done, "the goal is taken")
-        ended = sent.result().get_result_async()
-        graph.spin_until(ended.done, "the result")
-        assert ended.result().result.status == Code.STORAGE_FAILED
+        goal = RunMaintenance.Goal(cycle_id="a", gap_s=30.0)
+        handle = graph.awaited(client.send_goal_async(goal), "the goal is taken")
+        ended = graph.awaited(handle.get_result_async(), "the result").result
+        assert ended.status == Code.STORAGE_FAILED
         graph.spin_for(1.2)  # diagnostics and accuracy_state come meanwhile
         known = plc.call(GetMaintenance, "status", cycle_id="a")
         assert (known.success, known.status) == (False, Code.STORAGE_FAILED)
         assert known.state.state == MaintenanceStatus.IDLE
-        assert known.result == ended.result().result.result
+        assert known.result == ended.result
         assert plc.statuses[-1].last == known.result
         assert plc.trigger("status").startswith("0 STORAGE_FAILED")
         other.executescript("ALTER TABLE gone RENAME TO calibrations")
@@ -314,10 +307,8 @@ def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
     assert calls._cancel(goal) is CancelResponse.REJECT
     graph.spin_until(lambda: session.running is None, "b has ended")
     assert session.result("b").code is Code.ACCEPT
-    graph.spin_until(sent.done, "a was taken")
-    told = sent.result().get_result_async()
-    graph.spin_until(told.done, "a's caller is told")
-    assert told.result().result.status == session.result("a").code
+    told = graph.awaited(sent, "a was taken").get_result_async()
+    assert graph.awaited(told, "a's caller is told").result.status == session.result("a").code
 
 
 def test_a_node_that_is_deactivated_says_so(plc, graph):
@@ -343,31 +334,32 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
 MINE = {"robot": "UR10", "serial": "unset"}
 
 
-@pytest.mark.parametrize("other", [{"serial": "K8"}, {"robot": "bx200l"}, {}], ids=str)
-def test_the_accuracy_of_another_robot_does_not_count(graph, other):
+def test_the_accuracy_of_another_robot_does_not_count(graph):
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
     drift = graph.publisher(AccuracyState, ACCURACY, endpoints.LATCHED)
-    told = AccuracyState(state=AccuracyState.OK, **((MINE | other) if other else {}))
-    drift.publish(told)
-    graph.spin_until(lambda: node.inputs[ACCURACY].invalid == 1, "it is refused")
+    for count, others in enumerate((MINE | {"serial": "K8"}, MINE | {"robot": "bx200l"}, {}), 1):
+        drift.publish(AccuracyState(state=AccuracyState.OK, **others))
+        graph.spin_until(lambda n=count: node.inputs[ACCURACY].invalid == n, f"{others} is refused")
     drift.publish(AccuracyState(state=AccuracyState.OK, **MINE))
-    graph.spin_until(lambda: node.inputs[ACCURACY].received == 2, "the right one comes")
-    assert node.inputs[ACCURACY].invalid == 1
+    graph.spin_until(lambda: node.inputs[ACCURACY].received == 4, "the right one comes")
+    assert node.inputs[ACCURACY].invalid == 3
 
 
-@pytest.mark.parametrize("name", ["predicted_error_mm", "bound_mm", "due_in_s"])
-def test_a_figure_that_cannot_be_is_no_drift(graph, name):
+def test_a_figure_that_cannot_be_is_no_drift(graph):
     poses = [angle + 10.0 for angle in HOME_DEG]
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})
     states = graph.collect(AccuracyState, "accuracy_state", endpoints.LATCHED)
     drift = graph.publisher(AccuracyState, ACCURACY, endpoints.LATCHED)
-    known = MINE | {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
-    for count, value in enumerate((np.nan, np.inf, -np.inf, 1e300), 1):
+    figures = {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
+    known, heard = MINE | figures, node.inputs[ACCURACY]
+    for name, value in itertools.product(figures, (np.nan, np.inf, -np.inf, 1e300)):
+        count = heard.received + 1
         drift.publish(AccuracyState(state=AccuracyState.OK, **(known | {name: value})))
-        graph.spin_until(lambda n=count: node.inputs[ACCURACY].invalid == n, f"{value} is refused")
-        states.clear()
-        graph.spin_until(lambda: states, "the line is told")
-        assert states[-1].reason == "drift: the thermal node is silent"
+        graph.spin_until(lambda n=count: heard.received == n, "it has come")
+        assert heard.invalid == count, (name, value)
+    states.clear()
+    graph.spin_until(lambda: states, "the line is told")
+    assert states[-1].reason == "drift: the thermal node is silent"
     drift.publish(AccuracyState(state=AccuracyState.OK, **known))
     graph.spin_until(lambda: states[-1].state == AccuracyState.OK, "the next one counts")
     assert (states[-1].predicted_error_mm, states[-1].bound_mm) == pytest.approx((0.1, 0.2))

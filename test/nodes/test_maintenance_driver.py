@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the maintenance session asks is carried out in the right order."""
+"""What the maintenance session asks is carried out in the right order, by a clock that is right."""
 
 import time
 from typing import Any
 
 import numpy as np
+import pytest
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionServer, GoalResponse
 from std_msgs.msg import Float64
-from test_correction_graph import Process
 from trajectory_controllers import HOME as Q_UR10
 from trajectory_controllers import accepted_goals
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -18,7 +18,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceDriver
 from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import COPY_S, MotionDriver
+from robocal_ros.motion.driver import COPY_S, MotionDriver, SteadyClock
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
@@ -27,6 +27,7 @@ from robocal_ros.ros.graph import actions_beside
 ARM = load_robot("kr150_r3100")
 ACTION = "/controller/follow_joint_trajectory"
 DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=MotionLimits())
+PREEMPTED_S = 0.01  # between the reads of its two clocks, at most in one of a thousand
 
 
 def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
@@ -88,19 +89,17 @@ def test_each_motion_goes_by_the_action_that_is_there_when_it_begins(graph: Any)
     assert sent(stop=False) == "action"
     assert motion.way == f"the action {ACTION}"
     assert sent(stop=True) == "action"
-    others = [Process(graph.domain, name) for name in ("one", "two")]
-    try:
-        for other in others:
-            other.node.create_subscription(JointTrajectory, path, inbox.append, 1)
-        graph.spin_until(lambda: motion.topic.get_subscription_count() == 4, "they listen")
-        assert sent(stop=False) == "action"  # a recorder serves nothing
-        for other in others:
-            ActionServer(other.node, FollowJointTrajectory, "~/follow", inbox.append)
-        graph.spin_until(lambda: len(actions_beside(node, path)) == 3, "they serve")
-        assert sent(stop=False) == "topic"
-    finally:
-        for other in others:
-            other.end()
+    others = [graph.other(name) for name in ("one", "two")]
+    for other in others:
+        other.create_subscription(JointTrajectory, path, inbox.append, 1)
+    graph.spin_until(lambda: motion.topic.get_subscription_count() == 4, "they listen")
+    assert sent(stop=False) == "action"  # a recorder serves nothing
+    for other in others:
+        ActionServer(other, FollowJointTrajectory, "~/follow", inbox.append)
+    graph.spin_until(lambda: len(actions_beside(node, path)) == 3, "they serve")
+    assert sent(stop=False) == "topic"
+    for other in others:
+        graph.end(other)
     assert controller.stop() == 0
     graph.spin_until(lambda: not actions_beside(node, path), "the controller is gone")
     assert sent(stop=False) == "topic"
@@ -191,3 +190,24 @@ def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> 
     becomes(0.0, 0.0, 50.0)
     motion.close()
     node.destroy_node()
+
+
+def test_a_suspend_is_told_once_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host's, to the clock of whoever moves the robot."""
+    told: list[float] = []
+    clock = SteadyClock(told.append)
+    before_s = [clock.now_s() for _ in range(1000)][-1]
+    assert sum(told) < PREEMPTED_S
+    told.clear()
+    read = time.clock_gettime
+
+    def woken(which: int) -> float:
+        return read(which) + 3600.0 * (which == time.CLOCK_BOOTTIME)
+
+    monkeypatch.setattr(time, "clock_gettime", woken)
+    assert clock.now_s() - before_s >= 3600.0
+    assert len(told) == 1
+    assert abs(told[0] - 3600.0) < PREEMPTED_S
+    for _ in range(1000):
+        clock.now_s()
+    assert abs(sum(told) - 3600.0) < PREEMPTED_S

@@ -23,8 +23,7 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once_and_so_does_the_end_of_th
     graph.spin_until(lambda: len(cell.goals) >= 3, "the stop", within_s=1.0)
     graph.spin_until(lambda: cell.stands(1.0), "it stands", within_s=4.0)
     stopped = len(cell.goals)
-    graph.spin_until(ended.done, "the result")
-    assert not ended.result().result.success
+    assert not graph.awaited(ended, "the result").result.success
     status = graph.call(GetMaintenance, "/maintenance_node/status")
     assert status.state.state == MaintenanceStatus.FAULT
     assert status.state.disarmed
@@ -37,6 +36,7 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once_and_so_does_the_end_of_th
     cell.node.kill()
     cell.start_maintenance()  # a fault outlives its node
     assert cell.statuses[-1].state == MaintenanceStatus.FAULT
+    graph.spin_until(lambda: cell.statuses[-1].disarmed, "the tool node confirms it")
     answer = graph.call(Acknowledge, "/maintenance_node/acknowledge", by="me")
     assert (answer.success, answer.status) == (False, Code.LIMIT_EXCEEDED), answer.message
     assert "robot is not at home: " in answer.message

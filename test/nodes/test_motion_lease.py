@@ -12,7 +12,6 @@ from maintenance_live import HOME_DEG, ROBOT, SERIAL, LiveCell
 from robocal_msgs.msg import CorrectionStatus, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import SetBool, Trigger
-from test_correction_graph import Process
 from test_maintenance_calls import HOME_DEG as STANDING_DEG
 from test_maintenance_calls import Plc, process
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -36,9 +35,7 @@ def test_two_maintenance_nodes_of_two_hosts_refuse_until_one_is_gone(
     words = "accuracy_state has 2 publishers"
     for node in ("another_name", "maintenance_node"):
         graph.spin_until(
-            lambda n=node: any(
-                n in status.name and words in status.message for a in said for status in a.status
-            ),
+            lambda n=node: any(n in s.name and words in s.message for a in said for s in a.status),
             f"{node} says so",
             30.0,
         )
@@ -91,8 +88,8 @@ def test_the_program_waits_while_the_cell_measures_and_calls_do_not(
     becomes(CorrectionStatus.OFF, 30.0)
     to_program = graph.publisher(JointTrajectory, PROGRAM)
     kinds = {name: kind for name, (kind, _, _) in CALLS.items()} | dict.fromkeys(TRIGGERS, Trigger)
-    for name, kind in (kinds | {"status": GetMaintenance, "cancel_trigger": Trigger}).items():
-        graph.client(kind, f"/maintenance_node/{name}")  # so that calls take no time later
+    kinds |= {"status": GetMaintenance, "cancel_trigger": Trigger}
+    graph.discover({f"/maintenance_node/{name}": kind for name, kind in kinds.items()})
     cell.begin("c1", GAP_S)
     becomes(CorrectionStatus.LEASED)
     graph.spin_until(lambda: "/maintenance_node: cycle 'c1'" in said[-1].lease, "who holds it")
@@ -150,40 +147,35 @@ def stopped_by_planner(cell: LiveCell, ended: Any, said: list[DiagnosticArray]) 
     """A planner that can command the robot ends the motion; it is gone at the end."""
     graph, before = cell.graph, len(cell.goals)
     said.clear()
-    planner = Process(graph.domain, "planner")
-    try:
-        planner.node.create_publisher(JointTrajectory, ROBOT, 10)
-        graph.spin_until(lambda: len(cell.goals) > before, "the stop", within_s=2.0)
-        graph.spin_until(ended.done, "the result")
-        result = ended.result().result
-        assert not result.success
-        assert f"publishes {ROBOT}" in result.message  # its name may be discovered later
-        graph.spin_until(lambda: cell.stands(0.2), "it has stopped")
-        assert cell.stands(1.0)
-        assert not cell.at_home()
-        assert cell.statuses[-1].state == MaintenanceStatus.FAULT
-        for node in ("tcf_node", "maintenance_node"):
-            graph.spin_until(lambda n=node: error(said, n, STRANGER), f"{node} says so")
-        answer = graph.call(SetBool, "/tcf_node/arm", data=True)
-        assert not answer.success
-        assert STRANGER in answer.message
-    finally:
-        planner.end()
+    planner = graph.other("planner")
+    planner.create_publisher(JointTrajectory, ROBOT, 10)
+    graph.spin_until(lambda: len(cell.goals) > before, "the stop", within_s=2.0)
+    result = graph.awaited(ended, "the result").result
+    assert not result.success
+    assert f"publishes {ROBOT}" in result.message  # its name may be discovered later
+    graph.spin_until(lambda: cell.stands(0.2), "it has stopped")
+    assert cell.stands(1.0)
+    assert not cell.at_home()
+    assert cell.statuses[-1].state == MaintenanceStatus.FAULT
+    for node in ("tcf_node", "maintenance_node"):
+        graph.spin_until(lambda n=node: error(said, n, STRANGER), f"{node} says so")
+    answer = graph.call(SetBool, "/tcf_node/arm", data=True)
+    assert not answer.success
+    assert STRANGER in answer.message
+    graph.end(planner)
 
 
 def test_no_cycle_begins_while_somebody_else_commands_the_robot(graph: Any) -> None:
     plc = Plc(graph, lambda: process(graph))
     said = graph.collect(DiagnosticArray, "/diagnostics")
     path = "/maintenance_node/joint_trajectory"
-    planner = Process(graph.domain, "planner")
-    try:
-        planner.node.create_publisher(JointTrajectory, path, 10)
-        words = f"/planner publishes {path}"
-        graph.spin_until(lambda: error(said, "maintenance_node", words), "it says so")
-        answer = plc.run("c1")
-        assert (answer.success, answer.status) == (False, Code.CONFLICT)
-        assert words in answer.message
-        assert words in plc.trigger("run")
-    finally:
-        planner.end()
+    planner = graph.other("planner")
+    planner.create_publisher(JointTrajectory, path, 10)
+    words = f"/planner publishes {path}"
+    graph.spin_until(lambda: error(said, "maintenance_node", words), "it says so")
+    answer = plc.run("c1")
+    assert (answer.success, answer.status) == (False, Code.CONFLICT)
+    assert words in answer.message
+    assert words in plc.trigger("run")
+    graph.end(planner)
     graph.spin_until(lambda: plc.run("c2").success, "it works again")

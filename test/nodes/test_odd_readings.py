@@ -64,14 +64,11 @@ class Corrected:
         """Send a goal of a second; its handle."""
         goal = FollowJointTrajectory.Goal(trajectory=trajectory([(1.0, to, REST)]))
         sent = self.action.send_goal_async(goal, feedback_callback=self.feedback.append)
-        self.graph.spin_until(sent.done, "the goal is answered")
-        return sent.result()
+        return self.graph.awaited(sent, "the goal is answered")
 
     def ends(self, handle: Any) -> int:
         """Wait for the end of a goal; its status."""
-        ended = handle.get_result_async()
-        self.graph.spin_until(ended.done, "the goal ends")
-        return int(ended.result().status)
+        return int(self.graph.awaited(handle.get_result_async(), "the goal ends").status)
 
 
 @pytest.mark.parametrize("missing", [1.0, *more(-2.0)])
@@ -146,8 +143,7 @@ def test_a_clock_that_begins_anew_ends_a_measurement_of_the_tool(
     ended = cell.begin(MeasureTool.Goal.FULL).get_result_async()
     graph.spin_until(lambda: cell.steps[-1].number == 2, "the second circle", 30.0)
     set_fault(graph.call, "clock_reset")
-    graph.spin_until(ended.done, "the result", 30.0)
-    result = ended.result().result
+    result = graph.awaited(ended, "the result").result
     assert (result.success, result.status) == (False, Code.CLOCK_WRONG), result.message
     assert "the clock jumped back" in result.message
     assert cell.tcf.process.poll() is None

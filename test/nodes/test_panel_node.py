@@ -23,8 +23,6 @@ from robocal_ros.panel.server import ANSWER_S, TOKEN
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import trigger_text
 
-DISAPPEARS_S = 25.0  # DDS misses a process that was killed after up to 20 s
-
 
 class Page:
     """A node, and a browser's requests to it while the graph goes on."""
@@ -46,10 +44,8 @@ class Page:
     async def _open(self) -> aiohttp.ClientSession:
         return aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True))
 
-    def do(self, work: Coroutine[Any, Any, Any], within_s: float = 30.0) -> Any:
-        done = self.loop.start(work)
-        self.graph.spin_until(done.done, "the page answers", within_s)
-        return done.result()
+    def do(self, work: Coroutine[Any, Any, Any]) -> Any:
+        return self.graph.meanwhile(self.loop, work)
 
     async def ask(self, path: str, body: Any) -> tuple[int, Any]:
         headers = {"Origin": self.url, TOKEN: self.token}
@@ -76,7 +72,7 @@ class Page:
         return number, answer
 
     def until(self, wanted: Callable[[Any], bool], name: str = "state") -> Any:
-        return self.do(self.event(wanted, name), DISAPPEARS_S + 10.0)
+        return self.do(self.event(wanted, name))
 
     def login(self, user: tuple[str, str]) -> None:
         assert self.post("/login", name=user[0], password=user[1])[0] == 200
@@ -103,7 +99,7 @@ def loop() -> Iterator[Any]:
 
 def test_a_shift_at_the_page(graph, loop, tmp_path):
     """Reading, a gap, a decision that the history knows, a fault, maintenance_node killed."""
-    plc = Plc(graph, lambda: process(graph))
+    plc = Plc(graph, lambda: process(graph, mortal=True))
     page = Page(graph, security_folder(tmp_path), loop)
     first = page.until(lambda told: told["headline"] != "SILENT")
     said = plc.states[-1]

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from asyncua import ua
+from conftest import DEADLINE_S
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from other_stack import gap_by_another_stack
@@ -44,19 +45,19 @@ from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import trigger_text
 
 BRIDGE = "/plc_bridge_node"
-DISAPPEARS_S = 25.0  # DDS misses a process that was killed after up to 20 s
 
 
 class Line:
     """One cell with its bridge, and the PLCs that a test connects."""
 
     def __init__(self, graph: Any, folder: Path) -> None:
-        self.graph, self.folder, self.port = graph, security_folder(folder), free_port()
+        self.graph, self.do = graph, graph.meanwhile
+        self.folder, self.port = security_folder(folder), free_port()
         self.modbus_port = free_port()
         self.clients: list[PlcClient] = []
         self.gaps: list[GapOpen] = graph.collect(GapOpen, "gap_open")
         self.edges: list[BeamEvent] = graph.collect(BeamEvent, "beam_events")
-        self.maintenance = Plc(graph, lambda: process(graph), bridge=False)
+        self.maintenance = Plc(graph, lambda: process(graph, mortal=True), bridge=False)
         # tcf_node says it once, at its start: before this server is up
         self.tool = graph.probe.create_publisher(ToolFrame, "tcf_node/tool", endpoints.LATCHED)
         frame = ToolFrame(child_frame_id="tcp", revision=3, state=ToolFrame.ACCEPTED)
@@ -79,19 +80,13 @@ class Line:
             "modbus_clients": "['127.0.0.1']",
             "modbus_port": self.modbus_port,
         }
-        return self.graph.start("plc_bridge_node", settings)
+        return self.graph.start("plc_bridge_node", settings, mortal=True)
 
     def connected(self, user: str = "plc", name: str = "line") -> PlcClient:
         client = PlcClient(self.folder, self.port, user, name)
         self.clients.append(client)
         self.do(client, client.connect_once_there())
         return client
-
-    def do(self, client: PlcClient, work: Coroutine[Any, Any, Any], within_s: float = 70.0) -> Any:
-        """Let a PLC do something while the graph goes on."""
-        done = client.start(work)
-        self.graph.spin_until(done.done, "the PLC's request", within_s)
-        return done.result()
 
     def read(self, path: str) -> Any:
         return self.do(self.plc, self.plc.read(path))
@@ -107,7 +102,7 @@ class Line:
 
     def open(self) -> None:
         self.plc.is_open = self.plc.beating = True
-        self.graph.spin_until(lambda: not self.doing, "the gap is open", DISAPPEARS_S)
+        self.graph.spin_until(lambda: not self.doing, "the gap is open")
 
     def quiet(self) -> None:
         """The program writes nothing more, and what it wrote has come."""
@@ -327,7 +322,7 @@ def test_a_gap_by_the_register_map_of_modbus(line):
         return found
 
     def until(holds: Callable[[dict[str, float]], bool]) -> dict[str, float]:
-        until_s = time.monotonic() + DISAPPEARS_S
+        until_s = time.monotonic() + DEADLINE_S
         while not holds(found := cycle()):
             assert time.monotonic() < until_s, (found, line.doing)
         return found
@@ -358,7 +353,7 @@ def by_the_page(
     cycles: list[str] = []
 
     def until(holds: Callable[[], object]) -> None:
-        until_s = time.monotonic() + DISAPPEARS_S
+        until_s = time.monotonic() + DEADLINE_S
         while not holds():
             assert time.monotonic() < until_s, (program._values, line.doing)
             line.graph.spin_for(0.05)
@@ -443,15 +438,9 @@ def test_a_gap_by_another_stack(line, tmp_path):
 
 def test_nobody_gets_in_without_certificate_user_and_password(line):
     def connect(change: Callable[[PlcClient], Any]) -> str:
-        stranger = PlcClient(line.folder, line.port)
-        try:
-            client = stranger.made()
-            line.do(stranger, stranger.secured(client))
-            change_made = change(stranger) if callable(change) else None
-            client = change_made or client
+        with contextlib.closing(PlcClient(line.folder, line.port)) as stranger:
+            client = change(stranger)
             return refused(lambda: line.do(stranger, client.connect()))
-        finally:
-            stranger.close()
 
     def wrong_password(stranger: PlcClient) -> Any:
         return line.do(stranger, stranger.secured(stranger.made("plc", "not it at all")))
@@ -464,13 +453,10 @@ def test_nobody_gets_in_without_certificate_user_and_password(line):
         client._username = client._password = None
         return client
 
-    def unencrypted(stranger: PlcClient) -> Any:
-        return stranger.made()
-
     assert connect(wrong_password) == "BadUserAccessDenied"
     assert connect(unknown_user) == "BadUserAccessDenied"
     assert connect(anonymous) in {"BadIdentityTokenRejected", "BadIdentityTokenInvalid"}
-    assert connect(unencrypted) == "BadCertificateUntrusted"
+    assert connect(PlcClient.made) == "BadCertificateUntrusted"
 
 
 def test_an_untrusted_certificate_is_turned_away_and_kept_for_a_person(line, tmp_path):
@@ -639,9 +625,7 @@ def test_a_stalled_executor_holds_up_no_heartbeat_and_carries_out_no_old_call(gr
     client = PlcClient(tmp_path, port)
 
     def do(work: Coroutine[Any, Any, Any]) -> Any:
-        done = client.start(work)
-        graph.spin_until(done.done, "the PLC's request", 70.0)
-        return done.result()
+        return graph.meanwhile(client, work)
 
     try:
         do(client.connect_once_there())

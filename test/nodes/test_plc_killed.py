@@ -15,15 +15,14 @@ from asyncua import ua
 from long_form import more
 from maintenance_live import HOME_DEG, SERIAL, LiveCell
 from other_stack import gap_by_another_stack
-from robocal_msgs.msg import MaintenanceStatus, ToolFrame
+from robocal_msgs.msg import MaintenanceStatus
 from test_maintenance_calls import proposed
-from test_plc_bridge import DISAPPEARS_S, refused
+from test_plc_bridge import refused
 
 from bench.live.opc_ua import PlcClient, free_port, security_folder
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.plc.cell import CONTEST_S
-from robocal_ros.ros import endpoints
 
 pytestmark = pytest.mark.cell
 GAP_S = 150.0
@@ -52,7 +51,7 @@ class KilledBridge:
     """The cell, its bridge, a PLC and an engineer's panel."""
 
     def __init__(self, graph: Any, folder: Path) -> None:
-        self.graph, self.cell = graph, LiveCell(graph, folder)
+        self.graph, self.do, self.cell = graph, graph.meanwhile, LiveCell(graph, folder)
         self.cell._stop_beats()
         graph.probe.destroy_publisher(self.cell.gap)  # the bridge's PLC alone gives the gap
         certificates, port = security_folder(folder / "plc"), free_port()
@@ -65,11 +64,11 @@ class KilledBridge:
 
     @property
     def status(self) -> MaintenanceStatus:
-        return self.cell.statuses[-1]
+        return self.cell.status
 
     def start(self) -> None:
         """Start the bridge; its clients come back, as PLCs do."""
-        self.bridge = self.graph.start("plc_bridge_node", self.settings)
+        self.bridge = self.graph.start("plc_bridge_node", self.settings, mortal=True)
         self.comes_back()
 
     def comes_back(self) -> None:
@@ -77,18 +76,13 @@ class KilledBridge:
         for client in (self.plc, self.ada):
             self.do(client, client.connect_once_there())
 
-    def do(self, client: PlcClient, work: Any, within_s: float = 70.0) -> Any:
-        done = client.start(work)
-        self.graph.spin_until(done.done, "the PLC's request", within_s)
-        return done.result()
-
     def call(self, method: str, *arguments: Any, client: PlcClient | None = None) -> list[Any]:
         plc = client or self.plc
         return list(self.do(plc, plc.call(method, *arguments)))
 
     def opens(self) -> None:
         self.plc.beating = self.plc.is_open = True
-        self.graph.spin_until(lambda: not self.status.doing, "the gap is open", DISAPPEARS_S)
+        self.graph.spin_until(lambda: not self.status.doing, "the gap is open")
 
     def ended(self, cycle: str) -> bool:
         return self.status.last.cycle_id == cycle and self.status.last.code != Code.NONE
@@ -169,19 +163,6 @@ def line(cell: KilledBridge) -> KilledBridge:
         cell.start()
     cell.made_good()
     return cell
-
-
-def test_a_whole_gap_by_opc_ua_alone(line: KilledBridge) -> None:
-    cycle = line.begins("whole", MEASURES)
-    line.graph.spin_until(lambda: line.ended(cycle), "it ends", within_s=GAP_S)
-    success, code, words, state, result, *_ = line.call("Status", cycle)
-    assert (success, code, result) == (True, Code.ACCEPT, Code.ACCEPT), words
-    assert state == MaintenanceStatus.IDLE
-    assert line.cell.at_home()
-    line.says_the_truth()
-    tools = line.graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
-    line.graph.spin_until(lambda: tools, "the tool in force")
-    assert line.do(line.plc, line.plc.read("Tool.Name")) == tools[-1].child_frame_id != ""
 
 
 def test_a_whole_gap_by_another_stack(line: KilledBridge, tmp_path: Path) -> None:

@@ -69,9 +69,7 @@ class SharedCell:
         return bool(self.statuses and self.statuses[-1].at_home)
 
     def do(self, work: Coroutine[Any, Any, Any]) -> Any:
-        done = self.plc.start(work)
-        self.graph.spin_until(done.done, f"the PLC of {self.name}", UP_S + 10.0)
-        return done.result()
+        return self.graph.meanwhile(self.plc, work)
 
     def call(self, method: str, *arguments: Any) -> list[Any]:
         return self.do(self.plc.call(method, *arguments))

@@ -15,18 +15,13 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
 from tool_driver import TAUGHT, TRUTH
+from transforms import matrix_of
 
 from robocal_ros.cell_sim.beams import RoundTool, bent
-from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import conversions, endpoints
 
-FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
-
-
-def matrix(transform: Any) -> np.ndarray:
-    t, r = transform.translation, transform.rotation
-    return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
+QUICK = MeasureTool.Goal.QUICK
 
 
 @pytest.fixture
@@ -42,12 +37,12 @@ def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCe
     assert result.success, result.message
     assert result.status == CalibrationQuality.ACCEPT
     covariance = np.array(result.tool.covariance).reshape(5, 5)
-    away = matrix(result.tool.tool)[:3, 3] - TRUTH[:3, 3]
+    away = matrix_of(result.tool.tool)[:3, 3] - TRUTH[:3, 3]
     assert away @ np.linalg.solve(covariance[:3, :3], away) < 16.3  # chi-square, 1e-3
     names = [f.feedback.step.name for f in cell.feedback]
     assert names == ["low", "high", "upright", "plunge_1", "plunge_2", ""]
     # Nothing is in force before somebody accepts it.
-    assert matrix(frame[-1].transform) == pytest.approx(TAUGHT, abs=1e-12)
+    assert matrix_of(frame[-1].transform) == pytest.approx(TAUGHT, abs=1e-12)
     done = graph.call(Decide, "/tcf_node/accept", id=result.candidate_id, by="me")
     assert done.success, done.message
     graph.spin_until(lambda: tools[-1].revision == 1, "the tool is in force")
@@ -155,12 +150,11 @@ def test_a_run_is_cancelled(graph: Any, cell: LiveCell) -> None:
     handle = cell.begin()
     ended = handle.get_result_async()
     cell.graph.spin_until(lambda: cell.steps[-1].name == "low", "the first step")
-    cancelled = handle.cancel_goal_async()
-    graph.spin_until(cancelled.done, "the cancel is answered")
-    assert len(cancelled.result().goals_canceling) == 1
-    graph.spin_until(ended.done, "the result")
-    assert ended.result().status == 5  # STATUS_CANCELED
-    assert not ended.result().result.success
+    cancelled = graph.awaited(handle.cancel_goal_async(), "the cancel is answered")
+    assert len(cancelled.goals_canceling) == 1
+    answer = graph.awaited(ended, "the result")
+    assert answer.status == 5  # STATUS_CANCELED
+    assert not answer.result.success
     assert cell.steps[-1].kind == 0
     assert cell.measure().success
 
@@ -169,13 +163,11 @@ def test_a_second_goal_takes_nothing_from_the_first(graph: Any, cell: LiveCell) 
     first = cell.begin()
     ended = first.get_result_async()
     graph.spin_until(lambda: cell.steps[-1].name == "low", "the first step")
-    second = cell.begin().get_result_async()
-    graph.spin_until(second.done, "the second is refused")
-    assert second.result().result.status == Code.CONFLICT
-    assert "run 1 is open" in second.result().result.message
-    cancelled = first.cancel_goal_async()
-    graph.spin_until(cancelled.done, "the cancel is answered")
-    assert len(cancelled.result().goals_canceling) == 1
+    second = graph.awaited(cell.begin().get_result_async(), "the second is refused").result
+    assert second.status == Code.CONFLICT
+    assert "run 1 is open" in second.message
+    cancelled = graph.awaited(first.cancel_goal_async(), "the cancel is answered")
+    assert len(cancelled.goals_canceling) == 1
     graph.spin_until(ended.done, "the first one's result")
 
 
@@ -191,18 +183,9 @@ def test_nothing_of_an_old_run_is_told_while_a_new_one_is_open(graph: Any, tmp_p
     assert (told.success, told.message) == (False, "0 NONE run 2 is open")
 
 
-def test_the_answer_of_a_cycle_is_given_again(graph: Any, cell: LiveCell) -> None:
-    first = cell.measure(FULL, "gap-1")
-    again = cell.measure(FULL, "gap-1")
-    assert (first.candidate_id, first.message) == (again.candidate_id, again.message)
-    assert again.success
-
-
 def test_joint_states_that_stop_end_the_run(graph: Any, cell: LiveCell) -> None:
-    handle = cell.begin()
-    ended = handle.get_result_async()
-    graph.spin_until(ended.done, "the run is broken off", within_s=5.0)
-    result = ended.result().result
+    ended = cell.begin().get_result_async()
+    result = graph.awaited(ended, "the run is broken off", 5.0).result
     assert result.status == Code.TOO_FEW_SAMPLES
     assert "joint states are silent" in result.message
 

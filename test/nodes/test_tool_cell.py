@@ -7,19 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Duration
-from command import robocal_json
 from geometry_msgs.msg import TransformStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from long_form import more
+from maintenance_live import drive_to, placed_beams
 from rclpy.action import ActionClient
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import ToolStep
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_controllers import accepted_goals
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.live.cell import set_fault
 from robocal_ros.cell_sim.trajectory_controller import LAG_S
@@ -30,7 +28,8 @@ from robocal_ros.ros import endpoints
 pytestmark = pytest.mark.cell
 
 RUN_S = 60.0
-BACK = Duration(sec=2)
+BACK_S = 2
+RESTS = 75  # readings: 0.6 s
 CHANGE_STATE = "/tcf_node/change_state"
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 BUSY = {"motion_silence_s": 0.5}  # the machine of the tests has other work: readings come late
@@ -61,12 +60,8 @@ class Cell:
         self.steps = graph.collect(ToolStep, "/tcf_node/next_step", endpoints.LATCHED)
         graph.start("cell_sim_node", simulated, remap)
         graph.spin_until(lambda: self.truth and csv.exists(), "the cell")
-        laser = folder / "laser.yaml"
-        robocal_json(
-            "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
-            "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
-        )  # fmt: skip
-        settings = {"laser": str(laser), "taught_xyz_mm": "[0.0, 0.0, 150.0]", "motion": motion}
+        laser = str(placed_beams(folder, csv))
+        settings = {"laser": laser, "taught_xyz_mm": "[0.0, 0.0, 150.0]", "motion": motion}
         settings["gap_stale_s"] = 0.0  # a station of its own, without a PLC
         settings |= BUSY
         self.tcf = graph.start("tcf_node", settings)
@@ -76,14 +71,11 @@ class Cell:
         graph.spin_for(0.3)
 
     def begin(self, mode: int) -> Any:
-        sent = self.client.send_goal_async(MeasureTool.Goal(mode=mode))
-        self.graph.spin_until(sent.done, "the goal is taken")
-        return sent.result()
+        return self.graph.awaited(self.client.send_goal_async(MeasureTool.Goal(mode=mode)))
 
     def measure(self, mode: int = MeasureTool.Goal.FULL) -> Any:
         ended = self.begin(mode).get_result_async()
-        self.graph.spin_until(ended.done, "the result", within_s=RUN_S)
-        return ended.result().result
+        return self.graph.awaited(ended, "the result", RUN_S).result
 
     def arm(self) -> None:
         """Arm, once the last motion is over."""
@@ -95,24 +87,20 @@ class Cell:
             self.graph.spin_for(0.2)
         raise AssertionError(answer.message)
 
+    def rests(self) -> None:
+        """Until the robot's program has driven its motion to the end."""
+
+        def still() -> bool:
+            lately = [message.position for message in self.joints[-RESTS:]]
+            return float(np.ptp(lately, axis=0).max()) < 1e-9
+
+        self.graph.spin_for(0.2)
+        self.graph.spin_until(still, "the robot rests")
+
     def drive_back(self) -> None:
         """A person drives the robot to where it stood at first."""
-        back = JointTrajectoryPoint(positions=self.joints[0].position, time_from_start=BACK)
-        back.velocities = back.accelerations = [0.0] * len(back.positions)
-        message = JointTrajectory(joint_names=self.joints[0].name, points=[back])
-
-        def near(atol: float) -> bool:
-            at = self.joints[-1].position
-            return np.allclose(at, back.positions, rtol=0.0, atol=atol)
-
-        stood = self.joints[-1].position
-        self.graph.drive(
-            "/tcf_node/joint_trajectory",
-            message,
-            lambda: near(1e-6) or not np.allclose(self.joints[-1].position, stood, atol=1e-3),
-            subscribers=1,
-        )
-        self.graph.spin_until(lambda: near(1e-6), "the robot is back")
+        topic, joints = "/tcf_node/joint_trajectory", self.joints
+        drive_to(self.graph, topic, joints, joints[0], BACK_S)
         self.graph.spin_for(0.5)
 
 
@@ -181,7 +169,7 @@ def stops(cell: Cell, how: str) -> None:
         set_fault(graph.call, "joints_silent")
     graph.spin_until(lambda: len(cell.goals) == sent + 2, "the first circle", within_s=RUN_S)
     graph.spin_for(0.6 if how != "silent" else 0.0)  # in the middle of it
-    before = len(cell.joints)
+    before, waits = len(cell.joints), graph.waits
     if how == "cancel":
         handle.cancel_goal_async()
     elif how == "disarm":
@@ -200,12 +188,10 @@ def stops(cell: Cell, how: str) -> None:
     limits = MotionLimits()
     hardest = np.max(np.asarray(limits.joint_velocity) / limits.stop_deceleration)
     longest_s = max(float(hardest), SHORTEST_STOP_S)
-    starved_s = graph.starved_s
     graph.spin_for(1.0)
-    starved_s = graph.starved_s - starved_s
+    starved_s = graph.starved_s(waits)
     if how != "kill":
-        graph.spin_until(ended.done, "the result")
-        assert not ended.result().result.success
+        assert not graph.awaited(ended, "the result").result.success
     if how != "silent":
         # From the stop's arrival, a tick of the cell and the stop's own time later it stands.
         late_s = 0.1 + 2.0 * LAG_S  # until it is sent, and until the drives are where it ends
@@ -222,19 +208,19 @@ def test_the_robots_program_drives_what_is_announced_and_a_fault_is_refused_in_i
     found(cell, cell.measure())
     names = [s.name for s in cell.steps if s.kind]
     assert names == ["low", "high", "upright", "plunge_1", "plunge_2"]
-    graph.spin_for(2.5)  # the program drives its motion to the end
+    cell.rests()
     set_fault(graph.call, "lost_edge")
     result = cell.measure()
     assert not result.success
     assert "an edge between was lost" in result.message
     graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
-    graph.spin_for(2.5)  # the program drives its motion to the end
+    cell.rests()
     set_fault(graph.call, "none")
     graph.spin_for(1.0)
     ended = cell.begin(MeasureTool.Goal.FULL).get_result_async()
     graph.spin_until(lambda: cell.steps[-1].name == "high", "a circle", within_s=RUN_S)
     set_fault(graph.call, "moved_by_hand")
-    graph.spin_until(ended.done, "the result", within_s=RUN_S)
-    assert ended.result().result.status == Code.RESIDUAL_TOO_LARGE
-    assert "apart from the other steps" in ended.result().result.message
+    result = graph.awaited(ended, "the result", RUN_S).result
+    assert result.status == Code.RESIDUAL_TOO_LARGE
+    assert "apart from the other steps" in result.message
     assert cell.goals == []

@@ -231,49 +231,33 @@ def test_a_rejected_goal_leaves_what_runs(cell: Any) -> None:
     assert np.abs(cell.taught() - MOVED).max() < 1e-6
 
 
-def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
+def test_a_goal_that_is_refused_or_rejected_disturbs_nothing(cell: Any) -> None:
+    """One without points is no stop, as before joint_trajectory_controller."""
     cell.begin()
-    sent = cell.send(HOME, MOVED, lasts_s=0.8).moves()
+    sent = cell.send(HOME, MOVED, lasts_s=3.0).moves()
     count = len(cell.robot.goals)
-    unknown, missing = goal_of(HOME, MOVED), goal_of(HOME, MOVED * np.nan)
+    unknown, again = goal_of(HOME, MOVED), goal_of(HOME, MOVED)
     unknown.trajectory.joint_names = [*NAMES[:5], "elbow"]
-    result = Sent(cell, unknown).ends(GoalStatus.STATUS_ABORTED)
-    assert result.error_code == Result.INVALID_JOINTS
-    assert "elbow" in result.error_string
-    result = Sent(cell, missing).ends(GoalStatus.STATUS_ABORTED)
-    assert result.error_code == Result.INVALID_GOAL
-    assert "not finite" in result.error_string
-    again = goal_of(HOME, MOVED)
     again.trajectory.header.frame_id = CORRECTED
-    result = Sent(cell, again).ends(GoalStatus.STATUS_ABORTED)
-    assert "comes from a joint correction already" in result.error_string
-    cell.node._proxy._correct = lambda message: 1 / 0
+    for goal, code, words in (
+        (unknown, Result.INVALID_JOINTS, "elbow"),
+        (goal_of(HOME, MOVED * np.nan), Result.INVALID_GOAL, "not finite"),
+        (again, Result.INVALID_GOAL, "comes from a joint correction already"),
+    ):
+        result = Sent(cell, goal).ends(GoalStatus.STATUS_ABORTED)
+        assert result.error_code == code
+        assert words in result.error_string
+    for points in (0, MOST_GOAL_POINTS_IN_MOTION + 1, MOST_POINTS + 1):
+        rejected = Sent(cell, goal_of(*np.linspace(HOME, MOVED, points), lasts_s=100.0))
+        cell.graph.spin_until(lambda sent=rejected: sent.handle, "the answer")
+        assert not rejected.handle.accepted
+    correct, cell.node._proxy._correct = cell.node._proxy._correct, lambda message: 1 / 0
     result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
     assert "a defect of this software" in result.error_string
+    cell.node._proxy._correct = correct
+    assert not sent.answer
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
     assert len(cell.robot.goals) == count
-
-
-def test_a_goal_without_points_is_rejected_and_disturbs_nothing(cell: Any) -> None:
-    """As joint_trajectory_controller does: it is no stop."""
-    cell.begin()
-    sent = cell.send(HOME, MOVED, lasts_s=2.0).moves()
-    empty = Sent(cell, goal_of())
-    cell.graph.spin_until(lambda: empty.handle, "the answer")
-    assert not empty.handle.accepted
-    assert cell.robot.goals[-1].trajectory.points
-    sent.ends(GoalStatus.STATUS_SUCCEEDED)
-
-
-def test_a_goal_of_too_many_points_is_rejected_and_disturbs_nothing(cell: Any) -> None:
-    cell.begin()
-    sent = cell.send(HOME, MOVED, lasts_s=2.0).moves()
-    for most in (MOST_GOAL_POINTS_IN_MOTION, MOST_POINTS):
-        many = Sent(cell, goal_of(*np.linspace(HOME, MOVED, most + 1), lasts_s=100.0))
-        cell.graph.spin_until(lambda m=many: m.handle, "the answer")
-        assert not many.handle.accepted
-    sent.ends(GoalStatus.STATUS_SUCCEEDED)
-    assert len(cell.robot.goals[-1].trajectory.points) == 2
     cell.taught()
     back = cell.send(
         *np.linspace(MOVED, HOME, MOST_GOAL_POINTS_IN_MOTION + 1), lasts_s=1.0
@@ -492,95 +476,71 @@ class InParts(Node):
         self._states.publish(JointState(name=NAMES, position=self.q.tolist()))
 
 
-@pytest.mark.parametrize("deaf", [False, True])
-def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, deaf: bool) -> None:
-    """Finding: its goal was failed, but never cancelled, and the robot was believed to stand."""
+@pytest.fixture
+def parts(graph: Any, request: Any) -> Iterator[Any]:
+    """In the middle of a goal, with a hard stop that was ``called``; a parameter: deaf."""
     cell = Cell(graph)
-    robot = InParts(deaf, context=graph.context)
+    robot = cell.robot = InParts(request.param, context=graph.context)
     graph.executor.add_node(robot)
-    called: list[Any] = []
+    cell.called = []
     robot.create_service(
-        Trigger, "/hard_stop", lambda request, response: called.append(request) or response
+        Trigger, "/hard_stop", lambda request, response: cell.called.append(request) or response
     )
-    node = graph.add(JointCorrectionNode, SETTINGS | {"hard_stop_service": "/hard_stop"})
+    cell.node = graph.add(JointCorrectionNode, SETTINGS | {"hard_stop_service": "/hard_stop"})
     cell.begin(settled=False)
-    sent = cell.send(HOME, MOVED, lasts_s=20.0)
+    cell.sent = cell.send(HOME, MOVED, lasts_s=20.0)
     graph.spin_until(lambda: robot.q[0] > HOME[0] + 0.01, "the robot moves")
+    yield cell
+    cell.client.destroy()
+    robot.without_answers.destroy_node()
+    robot.destroy_node()
+
+
+@pytest.mark.parametrize("parts", [False, True], indirect=True)
+def test_a_controller_that_only_drops_out_of_discovery_is_stopped(parts: Any) -> None:
+    """Finding: its goal was failed, but never cancelled, and the robot was believed to stand."""
+    graph, robot, node = parts.graph, parts.robot, parts.node
     path = node._session.output.path
     robot.destroy_publisher(robot.status)
-    assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 5.0).error_string
+    assert "vanished" in parts.sent.ends(GoalStatus.STATUS_ABORTED, 5.0).error_string
     assert path.live(time.monotonic())  # it is not known to stand
     graph.spin_until(lambda: len(robot.goals) > 1 and robot.cancels, "stop and cancel")
     assert slows_down(robot.goals[1].trajectory.points)
-    if deaf:
+    if robot.deaf:
         fault = "the robot does not stop: it still moves"
         graph.spin_until(lambda: fault in node._stop_fault, fault, 10.0)
-        graph.spin_until(lambda: called, "the hard stop")
+        graph.spin_until(lambda: parts.called, "the hard stop")
         assert path.live(time.monotonic())
     else:
         graph.spin_until(lambda: not path.live(time.monotonic()), "it is known to stand", 5.0)
         assert time.monotonic() > robot._ends_s
-        assert not called
-    cell.client.destroy()
-    robot.without_answers.destroy_node()
-    robot.destroy_node()
+        assert not parts.called
 
 
-def test_a_stop_of_before_a_deactivation_ends_with_it(graph: Any) -> None:
+@pytest.mark.parametrize("parts", [True], indirect=True)
+def test_a_stop_of_before_a_deactivation_ends_with_it(parts: Any) -> None:
     """Finding: activated again, at whatever time, the node called the hard stop at once."""
-    cell = Cell(graph)
-    robot = InParts(deaf=True, context=graph.context)
-    graph.executor.add_node(robot)
-    called: list[Any] = []
-    robot.create_service(
-        Trigger, "/hard_stop", lambda request, response: called.append(request) or response
-    )
-    node = graph.add(JointCorrectionNode, SETTINGS | {"hard_stop_service": "/hard_stop"})
-    cell.begin(settled=False)
-    cell.send(HOME, MOVED, lasts_s=20.0)
-    graph.spin_until(lambda: robot.q[0] > HOME[0] + 0.01, "the robot moves")
-    cell.change(Transition.TRANSITION_DEACTIVATE)
-    graph.spin_until(lambda: len(robot.goals) > 1, "the stop")
-    graph.spin_for(1.5)  # somebody else drives it
-    cell.change(Transition.TRANSITION_ACTIVATE)
-    graph.spin_for(0.5)
-    assert node.is_active
-    assert not called
-    assert not node._stop_fault
-    cell.client.destroy()
-    robot.without_answers.destroy_node()
-    robot.destroy_node()
+    parts.change(Transition.TRANSITION_DEACTIVATE)
+    parts.graph.spin_until(lambda: len(parts.robot.goals) > 1, "the stop")
+    parts.graph.spin_for(1.5)  # somebody else drives it
+    parts.change(Transition.TRANSITION_ACTIVATE)
+    parts.graph.spin_for(0.5)
+    assert parts.node.is_active
+    assert not parts.called
+    assert not parts.node._stop_fault
 
 
 # ---- node and controller as processes: the node in its own executor -----------------------------
 
-SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
-<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
-<participant profile_name="short_lease" is_default_profile="true"><rtps><builtin>
-<discovery_config>
-<leaseDuration><sec>2</sec></leaseDuration>
-<leaseAnnouncement><sec>0</sec><nanosec>100000000</nanosec></leaseAnnouncement>
-</discovery_config>
-</builtin></rtps></participant>
-</profiles></dds>
-"""
-LEASE_S = 2.0
+CONTROLLER = Path(__file__).parents[1] / "worlds" / "follower.py"
+LEASE_S = 2.0  # of a mortal one
 
 
 @pytest.fixture
-def apart(graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The controller is a process whose death is noticed after 2 s."""
+def apart(graph: Any) -> Iterator[Any]:
+    """The controller is a process."""
     cell = Cell(graph)
-    profiles = tmp_path / "lease.xml"
-    profiles.write_text(SHORT_LEASE)
-
-    def start() -> Any:
-        with monkeypatch.context() as patch:
-            patch.setitem(graph._environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(profiles))
-            return graph.start(Path(__file__).parents[1] / "worlds" / "follower.py")
-
-    cell.start = start
-    cell.controller = start()
+    cell.controller = graph.start(CONTROLLER, mortal=True)
     yield cell
     cell.client.destroy()
 
@@ -620,7 +580,9 @@ def test_a_controller_that_is_killed_ends_the_goal(apart: Any) -> None:
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
     cell.controller.kill()
-    again = cell.start()  # at once: the old one is still believed alive
+    again = cell.graph.start(
+        CONTROLLER, mortal=True
+    )  # at once: the old one is still believed alive
     result = sent.ends(GoalStatus.STATUS_ABORTED, LEASE_S + 3.0)
     assert "vanished" in result.error_string
     assert again.process.poll() is None
@@ -653,7 +615,7 @@ def test_a_goal_accepted_too_late_is_cancelled(apart: Any, monkeypatch: Any) -> 
 def test_hostile_feedback_does_not_end_the_process(graph: Any) -> None:
     """Finding: fewer velocities than positions ended the process in mid-goal."""
     cell = Cell(graph)
-    graph.start(Path(__file__).parents[1] / "worlds" / "follower.py", None, None, "hostile")
+    graph.start(CONTROLLER, None, None, "hostile")
     process = graph.start("joint_correction_node", SETTINGS)
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=2.0)

@@ -97,11 +97,11 @@ class Cell:
     def start(self) -> None:
         """Start the node and wait until it is all there."""
         self.models.clear()
-        self.sent = 0
+        self.sent = dict.fromkeys(TOPICS, 0)
         if self.apart:
             self.process = self.graph.start("thermal_node", self.parameters)
         else:
-            self.graph.add(ThermalNode, self.parameters)
+            self.node = self.graph.add(ThermalNode, self.parameters)
         publishers = (self.joints, self.points, self.poses, self.fixed)
         self.graph.spin_until(
             lambda: (
@@ -114,23 +114,23 @@ class Cell:
 
     def call(self, name: str, **fields: Any) -> Any:
         client = self.clients[name]
-        future = client.call_async(client.srv_type.Request(**fields))
-        self.graph.spin_until(future.done, f"{name} answers")
-        return future.result()
+        asked = client.call_async(client.srv_type.Request(**fields))
+        return self.graph.awaited(asked, f"{name} answers")
 
     def play(self, samples: Iterable[Any]) -> None:
         """Publish as fast as it goes; nothing is lost, the node keeps all."""
+        by_topic = dict(zip(TOPICS, (self.joints, self.points, self.fixed), strict=True))
         for sample in samples:
-            self._publisher(sample).publish(message_of(sample))
-            self.sent += isinstance(sample, JointSample)
-        self.graph.spin_until(
-            lambda: self.value("joint_states received") == str(self.sent), "all joints taken"
-        )
+            topic = "joint_states" if isinstance(sample, JointSample) else sample.topic
+            by_topic[topic].publish(message_of(sample))
+            self.sent[topic] += 1
+        self.graph.spin_until(lambda: self._received() == self.sent, "all is taken")
 
-    def _publisher(self, sample: JointSample | PointSample) -> Any:
-        if isinstance(sample, JointSample):
-            return self.joints
-        return self.fixed if sample.topic == REFERENCE_SPHERE else self.points
+    def _received(self) -> dict[str, int]:
+        """How many messages the node has taken; a process tells it once a second."""
+        if self.apart:
+            return {topic: int(self.value(f"{topic} received") or 0) for topic in TOPICS}
+        return {topic: self.node.inputs[topic].received for topic in TOPICS}
 
     def status(self) -> Any:
         """The node's last diagnostic status, None before the first."""

@@ -12,6 +12,7 @@ from functools import cache
 from multiprocessing import forkserver, get_context
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 PR_SET_PDEATHSIG = 1
@@ -46,7 +47,14 @@ def _as_script(words: list[str], environment: Mapping[str, str], folder: Path, l
     become(environment, folder, [log, log])
     sys.stdout.reconfigure(line_buffering=True)
     sys.argv = words
-    runpy.run_path(words[0], run_name="__main__")
+    status: Any = 0
+    try:
+        runpy.run_path(words[0], run_name="__main__")
+    except SystemExit as ended:
+        status = ended.code or 0
+    sys.stdout.flush()
+    # With C's part of an exit, which a fork omits, a DDS participant tells others that it leaves.
+    ctypes.CDLL(None).exit(status)
 
 
 class ForkedScript:

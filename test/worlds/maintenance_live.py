@@ -4,10 +4,12 @@ and sphere sensor. Everything is simulated."""
 
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Duration
 from command import robocal_json
 from geometry_msgs.msg import PointStamped
 from rclpy.action import ActionClient
@@ -17,7 +19,7 @@ from robocal_msgs.srv import Acknowledge, CaptureReference
 from sensor_msgs.msg import JointState
 from shift import BALL, NOISE_M, T_SENSOR_BASE
 from trajectory_controllers import accepted_goals
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.kinematics.arm import inverse
 from robocal_ros.kinematics.robots import load_robot
@@ -60,11 +62,69 @@ BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6}
 BUSY_TIMES = {"answer_s": 3.0, "rest_s": 2.0, "check_s": 30.0, "full_s": 60.0}
 
 
-def yaml_list(numbers: list[float]) -> str:
+def yaml_list(numbers: Iterable[float]) -> str:
     return str([float(x) for x in numbers])
 
 
-class LiveCell:
+def placed_beams(folder: Path, csv: Path) -> Path:
+    """The laser file of beams that a cell's own robot has placed."""
+    laser = folder / "laser.yaml"
+    robocal_json(
+        "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
+        "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
+    )  # fmt: skip
+    return laser
+
+
+def drive_to(graph: Any, topic: str, joints: list[JointState], goal: JointState, sec: int) -> None:
+    """A person drives a robot, of which ``joints`` grows, to rest at other joints."""
+    point = JointTrajectoryPoint(positions=goal.position, time_from_start=Duration(sec=sec))
+    point.velocities = point.accelerations = [0.0] * len(goal.position)
+    stood = joints[-1].position
+
+    def near(q: Any, atol: float) -> bool:
+        return np.allclose(joints[-1].position, q, rtol=0.0, atol=atol)
+
+    message = JointTrajectory(joint_names=goal.name, points=[point])
+    moves = lambda: near(goal.position, 1e-5) or not near(stood, 1e-3)  # noqa: E731
+    graph.drive(topic, message, moves, subscribers=1)
+    graph.spin_until(lambda: near(goal.position, 1e-5), "the robot is there")
+
+
+class BeatingPlc:
+    """A PLC that gives the gap: its heartbeat comes from a thread, whatever else goes on here."""
+
+    def __init__(self, graph: Any, beat_s: float = BEAT_S) -> None:
+        self.graph, self.beat_s = graph, beat_s
+        self.is_open = self.beating = True
+        self.statuses = graph.collect(
+            MaintenanceStatus, "/maintenance_node/status", endpoints.LATCHED
+        )
+        self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
+        self._ended = threading.Event()
+        self._plc = threading.Thread(target=self._beats, daemon=True)
+        self._plc.start()
+        graph.at_close.append(self._stop_beats)
+
+    @property
+    def status(self) -> MaintenanceStatus:
+        """The newest."""
+        return self.statuses[-1]
+
+    def _beats(self) -> None:
+        while not self._ended.wait(self.beat_s):
+            if self.beating:
+                newest = self.statuses[-1:]  # which the test may clear meanwhile
+                beat = newest[0].beat if newest else 0
+                self.gap.publish(GapOpen(open=self.is_open, echo=beat))
+
+    def _stop_beats(self) -> None:
+        """Who publishes with a node that is being destroyed ends the process."""
+        self._ended.set()
+        self._plc.join()
+
+
+class LiveCell(BeatingPlc):
     """All nodes as processes; time is real.
 
     ``busy``: with limits for a machine that has other work too; else all as it is set.
@@ -74,37 +134,25 @@ class LiveCell:
     def __init__(
         self, graph: Any, folder: Path, *, busy: bool = True, listens: bool = True, **faults: Any
     ) -> None:
-        self.graph = graph
-        self.beat_s, self.times = (BEAT_S, BUSY_TIMES) if busy else (PLC_BEAT_S, {})
+        super().__init__(graph, BEAT_S if busy else PLC_BEAT_S)
+        self.times = BUSY_TIMES if busy else {}
         self.arm = load_robot("ur10")
         self.rng = np.random.default_rng(2)
-        self.is_open = self.beating = self.sensing = True
+        self.sensing = True
         self.joints: list[JointState] = []
         self.goals = accepted_goals(graph, "/cell_sim_node/follow_joint_trajectory")
         self.on_topic = graph.collect(JointTrajectory, ROBOT)
-        self.statuses = graph.collect(
-            MaintenanceStatus, "/maintenance_node/status", endpoints.LATCHED
-        )
         self.states = graph.collect(AccuracyState, "/accuracy_state", endpoints.LATCHED)
         self.events = graph.collect(SessionEvent, "/maintenance_node/session_events", EVENTS)
         graph.probe.create_subscription(JointState, "joint_states", self._joints, endpoints.STREAM)
         self.sphere = graph.probe.create_publisher(PointStamped, "sphere_center", 10)
-        self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
-        self._ended = threading.Event()
-        self._plc = threading.Thread(target=self._beats, daemon=True)
-        self._plc.start()
-        graph.at_close.append(self._stop_beats)
         graph.probe.create_timer(SENSE_S, self._sense)
-        csv, laser = folder / "beams.csv", folder / "laser.yaml"
+        csv = folder / "beams.csv"
         simulated = {"laser_csv": str(csv), "seed": 7, "q_start_deg": yaml_list(HOME_DEG)} | faults
         graph.start("cell_sim_node", simulated, {"joint_trajectory": ROBOT})
         graph.spin_until(lambda: self.joints and csv.exists(), "the cell")
-        robocal_json(
-            "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
-            "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
-        )  # fmt: skip
         self.tool = {
-            "laser": str(laser),
+            "laser": str(placed_beams(folder, csv)),
             "taught_xyz_mm": "[0.0, 0.0, 150.0]",
             "serial": SERIAL,
             "gap_stale_s": 0.5,
@@ -118,7 +166,7 @@ class LiveCell:
         self.start_maintenance()
         self.client = ActionClient(graph.probe, RunMaintenance, "/maintenance_node/run_maintenance")
 
-    def start_maintenance(self, **changes: Any) -> None:
+    def start_maintenance(self) -> None:
         self.statuses.clear()
         self.states.clear()
         settings = (
@@ -131,28 +179,15 @@ class LiveCell:
             }
         )
         out = {"~/joint_trajectory": ROBOT}
-        self.node = self.graph.start("maintenance_node", settings | changes, out)
+        self.node = self.graph.start("maintenance_node", settings, out, mortal=True)
         self.graph.spin_until(lambda: self.statuses and self.states, "the maintenance node", 30.0)
         self.graph.spin_for(1.0)
 
-    # ---- sensor and PLC -------------------------------------------------------------------------
+    # ---- sensor ---------------------------------------------------------------------------------
 
     def _joints(self, message: JointState) -> None:
         self.joints.append(message)
         del self.joints[:-500]
-
-    def _beats(self) -> None:
-        """As a PLC does it: whatever else goes on here."""
-        while not self._ended.wait(self.beat_s):
-            if self.beating:
-                newest = self.statuses[-1:]  # which the test may clear meanwhile
-                beat = newest[0].beat if newest else 0
-                self.gap.publish(GapOpen(open=self.is_open, echo=beat))
-
-    def _stop_beats(self) -> None:
-        """Who publishes with a node that is being destroyed ends the process."""
-        self._ended.set()
-        self._plc.join()
 
     def _sense(self) -> None:
         recent = self.joints[-round(RESTS_S * 125) :]
@@ -237,8 +272,7 @@ class LiveCell:
         goal = RunMaintenance.Goal(cycle_id=cycle_id, gap_s=gap_s)
         self.feedback: list[Any] = []
         sent = self.client.send_goal_async(goal, feedback_callback=self.feedback.append)
-        self.graph.spin_until(sent.done, "the goal is taken")
-        return sent.result()
+        return self.graph.awaited(sent, "the goal is taken")
 
     def measures(self, cycle_id: str, gap_s: float) -> Any:
         """Begin a cycle and let it come to the tool's first circle; its result, to wait for.
@@ -259,8 +293,7 @@ class LiveCell:
     def run(self, cycle_id: str, gap_s: float) -> Any:
         """A whole cycle by the action; its result."""
         ended = self.begin(cycle_id, gap_s).get_result_async()
-        self.graph.spin_until(ended.done, "the result", within_s=gap_s + 5.0)
-        return ended.result().result
+        return self.graph.awaited(ended, "the result", gap_s + 5.0).result
 
     def timed(self, kind: type, name: str, **fields: Any) -> tuple[Any, float]:
         """The answer of a service that is discovered already, and how long it took."""

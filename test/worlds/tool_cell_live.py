@@ -89,18 +89,15 @@ class LiveCell(Driver):
         self.rest(0.1)
         goal = MeasureTool.Goal(mode=mode, cycle_id=cycle_id)
         sent = self.client.send_goal_async(goal, feedback_callback=self.feedback.append)
-        self.graph.spin_until(sent.done, "the goal is accepted")
-        handle = sent.result()
+        handle = self.graph.awaited(sent, "the goal is accepted")
         assert handle.accepted
         return handle
 
     def measure(self, mode: int = MeasureTool.Goal.FULL, cycle_id: str = "") -> Any:
         """A whole run by the action; its result."""
-        handle = self.begin(mode, cycle_id)
-        ended = handle.get_result_async()
+        ended = self.begin(mode, cycle_id).get_result_async()
         self.follow(ended.done)
-        self.graph.spin_until(ended.done, "the result arrives")
-        return ended.result().result
+        return self.graph.awaited(ended, "the result arrives").result
 
     def follow(self, ended: Any) -> None:
         """Drive what is announced until the run has ended."""

@@ -143,17 +143,13 @@ class Controlled:
 
     def goal(self, message: JointTrajectory, **fields: Any) -> Any:
         """Send a goal; its handle once it is accepted or rejected."""
-        future = self.action.send_goal_async(
-            FollowJointTrajectory.Goal(trajectory=message, **fields)
-        )
-        self.graph.spin_until(future.done, "the goal is answered")
-        return future.result()
+        goal = FollowJointTrajectory.Goal(trajectory=message, **fields)
+        return self.graph.awaited(self.action.send_goal_async(goal), "the goal is answered")
 
     def end(self, handle: Any, within_s: float = 10.0) -> tuple[int, int]:
         """Status and error code of a goal."""
-        future = handle.get_result_async()
-        self.graph.spin_until(future.done, "the goal ends", within_s)
-        return future.result().status, future.result().result.error_code
+        ended = self.graph.awaited(handle.get_result_async(), "the goal ends", within_s)
+        return ended.status, ended.result.error_code
 
     def scale(self, factor: float) -> None:
         """Set its speed, and wait until it says so."""
@@ -258,9 +254,8 @@ def _ask(graph: Any, service: str, kind: Any, request: Any) -> None:
     """Call a service of the controller manager."""
     client = graph.probe.create_client(kind, f"controller_manager/{service}")
     graph.spin_until(client.service_is_ready, f"{service} appears", 30.0)
-    future = client.call_async(request)
-    graph.spin_until(future.done, f"{service} answers", 30.0)
-    assert future.result().ok, f"{service}: {request}"
+    answer = graph.awaited(client.call_async(request), f"{service} answers")
+    assert answer.ok, f"{service}: {request}"
     graph.probe.destroy_client(client)
 
 
