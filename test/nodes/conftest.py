@@ -207,7 +207,7 @@ class Graph:
         self._apart = False  # whether there was another participant
         self._clients: dict[str, Any] = {}
         self._executables: list[Executable] = []
-        self.at_close: list[Callable[[], None]] = []  # ends threads that use the probe
+        self.at_close: list[Callable[[], None]] = []  # before all else
 
     def add(
         self, node_class: type, parameters: dict[str, Any] | None = None, **options: Any

@@ -11,7 +11,7 @@ from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionClient
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
-from robocal_msgs.msg import MotionLease
+from robocal_msgs.msg import AccuracyState, CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -22,24 +22,31 @@ from robocal_ros.ros.graph import CommandPath, own_endpoint
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"
+ACCURACY, CORRECTION = "/accuracy_state", "/joint_correction_node/status"
 STATED = "/arm_controller/controller_state"
 NAMES = [f"joint_a{i}" for i in range(1, 7)]
 
 
-class Watched:
-    """A correction node's endpoints before a controller, and a watch on who else is there."""
+class Commander:
+    """A node's endpoints before a controller."""
+
+    def __init__(self, graph: Any, name: str) -> None:
+        self.graph, self.process, self.own = graph, graph.other, graph.other(name)
+        self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+        graph.at_close.append(ActionClient(self.own, FollowJointTrajectory, ACTION).destroy)
+
+
+class Watched(Commander):
+    """The correction node, and its watch on who else is there."""
 
     def __init__(self, graph: Any) -> None:
-        self.graph, self.process = graph, graph.other
-        self.own = graph.other("joint_correction_node")
-        self.own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
-        client = ActionClient(self.own, FollowJointTrajectory, ACTION)
+        super().__init__(graph, "joint_correction_node")
         self.leases = Leases("kr150", "s1")
         self.sources = JointSources(self.own, "/joint_states", NAMES)
         self.watch = GraphWatch(
             self.own, {PATH: 1}, {ACTION: 1}, self.sources, self.leases, "/motion_lease", STATED
         )
-        graph.at_close += [self.sources.close, client.destroy]
+        graph.at_close.append(self.sources.close)
 
     def becomes(self, reason: Reason | None, words: str = "") -> None:
         """Wait until the watch says so."""
@@ -54,9 +61,29 @@ class Watched:
         self.graph.spin_until(look, f"{reason} {words}, not {found}", 10.0)
 
 
+class Mover(Commander):
+    """A node that moves the robot for the cell, and its watch."""
+
+    def __init__(self, graph: Any) -> None:
+        super().__init__(graph, "tcf_node")
+        self.watch = CommandPath(self.own, PATH, (ACCURACY, CORRECTION))
+
+    def becomes(self, words: str) -> None:
+        """Wait until it says so; empty: until nothing is wrong."""
+        self.graph.spin_until(
+            lambda: words in self.watch.look(ACTION) and bool(words) == bool(self.watch.violation),
+            f"'{words}', not '{self.watch.violation}'",
+        )
+
+
 @pytest.fixture
 def watched(graph: Any) -> Watched:
     return Watched(graph)
+
+
+@pytest.fixture
+def mover(graph: Any) -> Mover:
+    return Mover(graph)
 
 
 def test_endpoints_of_a_process_share_a_participant(watched: Watched) -> None:
@@ -114,10 +141,10 @@ def test_a_player_of_a_bag_is_a_stranger_also_where_it_plays_leases(watched: Wat
 
 def test_a_client_of_the_action_beside_the_topic_is_a_stranger(watched: Watched) -> None:
     """Finding: who moves by topic did not see a planner that moves by the controller's action."""
-    mover, planner = watched.process("tcf_node"), watched.process("planner")
+    other, planner = watched.process("tcf_node"), watched.process("planner")
     topic, action = "/robot/joint_trajectory", "/robot/follow_joint_trajectory"
-    mover.create_publisher(JointTrajectory, topic, endpoints.RELIABLE)
-    path = CommandPath(mover, topic, ())
+    other.create_publisher(JointTrajectory, topic, endpoints.RELIABLE)
+    path = CommandPath(other, topic, ())
     assert not path.look("")
     client = ActionClient(planner, FollowJointTrajectory, action)
     words = f"/planner is a client of {action}"
@@ -237,3 +264,40 @@ def test_a_killed_predecessor_is_told_until_it_is_gone(graph: Any, tmp_path: Pat
     assert violation is not None
     assert "one that was killed counts until DDS gives it up" in violation.detail
     watched.becomes(None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "topic"), [(AccuracyState, ACCURACY), (CorrectionStatus, CORRECTION)]
+)
+def test_a_node_of_the_cell_may_command_the_robot_and_no_other_of_its_process(
+    mover: Mover, kind: Any, topic: str
+) -> None:
+    """A process is composed of many nodes: the program's too."""
+    mover.becomes("")
+    own = mover.graph.other("another_name", LifecycleNode)
+    planner = Node("planner", context=own.context)
+    own.create_publisher(kind, topic, endpoints.LATCHED)
+    mover.graph.spin_until(lambda: mover.own.count_publishers(topic), "it is of the cell")
+    own.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    of_cell = ActionClient(own, FollowJointTrajectory, ACTION)
+    mover.graph.spin_until(lambda: mover.own.count_publishers(PATH) == 2, "it is there")
+    mover.graph.spin_for(0.3)
+    mover.becomes("")
+    publisher = planner.create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    mover.becomes(f"/planner publishes {PATH}")
+    planner.destroy_publisher(publisher)
+    mover.becomes("")
+    client = ActionClient(planner, FollowJointTrajectory, ACTION)
+    mover.becomes(f"/planner is a client of {ACTION}")
+    client.destroy()
+    mover.becomes("")
+    of_cell.destroy()
+    planner.destroy_node()
+
+
+def test_the_topic_beside_the_controllers_action_is_looked_at(mover: Mover) -> None:
+    """Motions go by the action, so that the topic of this node was left as it is."""
+    mover.watch = CommandPath(mover.own, "/tcf_node/joint_trajectory", ())
+    mover.becomes("")
+    mover.graph.other("planner").create_publisher(JointTrajectory, PATH, endpoints.RELIABLE)
+    mover.becomes(f"/planner publishes {PATH}")

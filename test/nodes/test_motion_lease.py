@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may move the robot, over DDS: one maintenance node, and no program while it measures."""
+"""Who may move the robot, over DDS: one node of a kind, and no program while it measures."""
 
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenance
 from std_srvs.srv import SetBool, Trigger
 from test_maintenance_calls import HOME_DEG as STANDING_DEG
 from test_maintenance_calls import Plc, process
+from tool_cell_live import LiveCell as ToolCell
+from tool_driver import TRUTH
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.ground.errors import Code
@@ -45,6 +47,36 @@ def test_two_maintenance_nodes_of_two_hosts_refuse_until_one_is_gone(
     assert (answer.success, answer.status) == (False, Code.CONFLICT), answer.message
     assert second.stop() == 0
     graph.spin_until(lambda: plc.run("c2").success, "the one that is left works")
+
+
+def test_two_tool_nodes_of_two_hosts_arm_nothing_until_one_is_gone(
+    graph: Any, tmp_path: Path
+) -> None:
+    """Each has a history of its own, so that no file tells of the other."""
+    own = {"motion": "trajectory", "gap_stale_s": 0.0}
+    cell = ToolCell(graph, tmp_path, TRUTH, **own)
+    why = ""
+
+    def armed() -> bool:
+        nonlocal why
+        cell.rest(0.1)
+        answer = graph.call(SetBool, "/tcf_node/arm", data=True)
+        why = answer.message
+        return bool(answer.success)
+
+    graph.spin_until(armed, "it is armed")
+    laser = str(tmp_path / "laser.yaml")
+    files = {"laser": laser, "serial": "K7", "state_dir": str(tmp_path / "other")}
+    wired = {"__node": "another_name", "~/joint_trajectory": "/tcf_node/joint_trajectory"}
+    second = graph.start("tcf_node", own | files, wired)
+    graph.spin_until(lambda: "another_name" in cell.node.health().message, "it says so", 30.0)
+    health = cell.node.health()
+    assert health.level == b"\x02"
+    assert health.values["motion"].startswith("disarmed")
+    assert not armed()
+    assert "another_name" in why
+    assert second.stop() == 0
+    graph.spin_until(armed, "the one that is left works")
 
 
 CALLS = {
