@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import CalibrationQuality, GapOpen, MaintenanceStatus, ToolFrame
 from robocal_msgs.srv import Decide
@@ -15,13 +15,18 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
 from tool_driver import TAUGHT, TRUTH
-from transforms import matrix_of
+from transforms import away_of, matrix_of
 
+from bench.measured_runs import laser_of
 from robocal_ros.cell_sim.beams import RoundTool, bent
+from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.ros import conversions, endpoints
 
 QUICK = MeasureTool.Goal.QUICK
+MANDREL = bent(TAUGHT, [-0.02, 0.01, -0.01], [0.0, 0.0, 0.0])
+RADIUS_MM = 2.5
+CHI2_6 = 22.5  # of six, one in a thousand
 
 
 @pytest.fixture
@@ -198,3 +203,31 @@ def test_a_laser_of_another_robot_is_refused(graph: Any, tmp_path: Any) -> None:
         namespace="other",
     )
     assert other.state == "unconfigured"
+
+
+def test_the_laser_frame_is_measured_and_told(graph: Any, tmp_path: Any) -> None:
+    """Its own beams, with a mandrel."""
+    settings = {
+        "mandrel_xyz_mm": (1e3 * MANDREL[:3, 3]).tolist(),
+        "mandrel_quat_xyzw": frames.quat_xyzw(MANDREL).tolist(),
+        "mandrel_radius_mm": RADIUS_MM,
+    }
+    cell = LiveCell(graph, tmp_path, TAUGHT, **settings)
+    cell.program.tool = RoundTool.cylinder(MANDREL, 1e-3 * RADIUS_MM)
+    told = graph.collect(PoseWithCovarianceStamped, "/tcf_node/laser_frame", endpoints.LATCHED)
+    result = cell.measure(MeasureTool.Goal.LASER_FRAME, "commissioning")
+    assert result.success, result.message
+    assert (result.status, result.answer) == (Code.ACCEPT, MeasureTool.Result.PASS)
+    graph.spin_until(lambda: told, "the frame")
+    covariance = np.array(told[-1].pose.covariance).reshape(6, 6)
+    away = away_of(matrix_of(told[-1].pose.pose), laser_of(cell.cell.station).T_base_laser)
+    assert away @ np.linalg.solve(covariance, away) < CHI2_6
+    assert told[-1].header.frame_id == "base"
+    names = [f.feedback.step.name for f in cell.feedback]
+    assert names[:4] == [f"circle_{i}" for i in range(1, 5)]
+    assert len(names) == 13  # twelve steps, and the end
+    again = cell.measure(MeasureTool.Goal.LASER_FRAME, "commissioning")  # nothing is driven twice
+    assert (again.success, again.message) == (True, result.message)
+    assert again.candidate_id == result.candidate_id
+    with_trigger = graph.call(Trigger, "/tcf_node/laser_frame_trigger")
+    assert with_trigger.success, with_trigger.message
