@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What goals of our own motions allow the controller's robot, and what is told where it is not."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionServer
+from test_maintenance_driver import driving
 
 from robocal_ros.cell_sim.messages import tolerances_of
 from robocal_ros.cell_sim.trajectory_controller import (
@@ -22,10 +22,9 @@ from robocal_ros.cell_sim.trajectory_controller import (
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import MotionDriver, goal_tolerances
+from robocal_ros.motion.driver import goal_tolerances
 from robocal_ros.motion.plan import JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport
-from robocal_ros.ros.endpoints import EndpointNode
 
 ARM = load_robot("ur10")
 Q_START = np.radians([2.3, -124.4, -70.9, 107.7, -91.1, 91.8])
@@ -88,23 +87,10 @@ def test_a_violation_is_told_with_the_controllers_words(graph: Any, code: str) -
         handle.abort()
         return RESULT(error_code=getattr(RESULT, code), error_string="joint 3 is held")
 
-    server = ActionServer(graph.probe, FollowJointTrajectory, "/controller/follow", execute)
-    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
-    graph.executor.add_node(node)
+    ActionServer(graph.probe, FollowJointTrajectory, "/controller/follow", execute)
     reports: list[MotionReport] = []
-    names = ARM.joint_names
-    motion = MotionDriver(
-        node,
-        names,
-        "/controller/follow",
-        "",
-        goal_tolerances(ARM, DRIVING),
-        reports.append,
-        lambda: None,
-        time.monotonic,
-    )
-    node.trigger_configure()
-    node.trigger_activate()
+    names, tolerances = ARM.joint_names, goal_tolerances(ARM, DRIVING)
+    _, motion = driving(graph, names, "/controller/follow", tolerances, reports.append)
     graph.spin_until(lambda: motion._client.server_is_ready(), "the action")
     rest = np.zeros((2, ARM.n))
     plan = JointPlan(np.array([0.0, 1.0]), rest, rest, rest)
@@ -117,7 +103,3 @@ def test_a_violation_is_told_with_the_controllers_words(graph: Any, code: str) -
     graph.spin_until(lambda: len(goals) == 2, "the stop")
     assert not goals[1].path_tolerance  # nothing of ours ends a stop
     assert not goals[1].goal_tolerance
-    motion.close()
-    server.destroy()
-    graph.executor.remove_node(node)
-    node.destroy_node()

@@ -2,6 +2,7 @@
 """What the maintenance session asks is carried out in the right order, by a clock that is right."""
 
 import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPY_S, MotionDriver, SteadyClock
 from robocal_ros.motion.plan import JointPlan, MotionLimits
-from robocal_ros.motion.robot_watch import RobotWatch
+from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.graph import actions_beside
 
@@ -28,6 +29,25 @@ ARM = load_robot("kr150_r3100")
 ACTION = "/controller/follow_joint_trajectory"
 DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=MotionLimits())
 PREEMPTED_S = 0.01  # between the reads of its two clocks, at most in one of a thousand
+
+
+def driving(
+    graph: Any,
+    names: Sequence[str],
+    action: str = "",
+    tolerances: Mapping[str, Any] | None = None,
+    reported: Callable[[MotionReport], Any] = id,
+    robot: RobotWatch | None = None,
+    now: Callable[[], float] = time.monotonic,
+) -> tuple[EndpointNode, MotionDriver]:
+    """An active node and its driver, which end with the test."""
+    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
+    graph.executor.add_node(node)
+    motion = MotionDriver(node, names, action, "", tolerances or {}, reported, lambda: robot, now)
+    node.trigger_configure()
+    node.trigger_activate()
+    graph.at_close += [motion.close, lambda: graph.executor.remove_node(node), node.destroy_node]
+    return node, motion
 
 
 def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
@@ -57,14 +77,8 @@ def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
 
 def test_each_motion_goes_by_the_action_that_is_there_when_it_begins(graph: Any) -> None:
     """And its stop as it went, whatever has come since."""
-    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
-    graph.executor.add_node(node)
-    names, path = load_robot("ur10").joint_names, "/driver/joint_trajectory"
-    motion = MotionDriver(
-        node, names, "", "", {}, lambda report: None, lambda: None, time.monotonic
-    )
-    node.trigger_configure()
-    node.trigger_activate()
+    path = "/driver/joint_trajectory"
+    node, motion = driving(graph, load_robot("ur10").joint_names)
     inbox, goals = graph.collect(JointTrajectory, path), accepted_goals(graph, ACTION)
     graph.spin_until(lambda: motion.topic.get_subscription_count() > 0, "the probe listens")
     rest = np.zeros((2, 6))
@@ -103,9 +117,6 @@ def test_each_motion_goes_by_the_action_that_is_there_when_it_begins(graph: Any)
     assert controller.stop() == 0
     graph.spin_until(lambda: not actions_beside(node, path), "the controller is gone")
     assert sent(stop=False) == "topic"
-    motion.close()
-    graph.executor.remove_node(node)
-    node.destroy_node()
 
 
 def test_a_stop_is_not_sent_again_too_late_and_a_copy_that_is_rejected_is_no_fault(
@@ -113,14 +124,9 @@ def test_a_stop_is_not_sent_again_too_late_and_a_copy_that_is_rejected_is_no_fau
 ) -> None:
     """Finding: 0.2 s late it began at time 0 at its end; one that was lost stepped back there."""
     held_up_s, asked, reports = [0.0], [], []
-    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
-    graph.executor.add_node(node)
-    motion = MotionDriver(
-        node, load_robot("ur10").joint_names, ACTION, "", {}, reports.append, lambda: None,
-        lambda: time.monotonic() + held_up_s[0],
-    )  # fmt: skip
-    node.trigger_configure()
-    node.trigger_activate()
+    now = lambda: time.monotonic() + held_up_s[0]  # noqa: E731
+    names = load_robot("ur10").joint_names
+    _, motion = driving(graph, names, ACTION, reported=reports.append, now=now)
 
     def taken(goal: Any) -> GoalResponse:
         asked.append(goal.trajectory)
@@ -130,7 +136,7 @@ def test_a_stop_is_not_sent_again_too_late_and_a_copy_that_is_rejected_is_no_fau
         goal.succeed()
         return FollowJointTrajectory.Result()
 
-    controller = ActionServer(graph.probe, FollowJointTrajectory, ACTION, ends, goal_callback=taken)
+    ActionServer(graph.probe, FollowJointTrajectory, ACTION, ends, goal_callback=taken)
     rest = np.zeros((2, 6))
     plan = JointPlan(np.array([0.0, 0.12]), rest + Q_UR10, rest, rest)
     graph.spin_until(lambda: motion._client.server_is_ready(), "the controller")
@@ -146,23 +152,12 @@ def test_a_stop_is_not_sent_again_too_late_and_a_copy_that_is_rejected_is_no_fau
     graph.spin_until(lambda: len(asked) > 1, "the stop and its copy")
     graph.spin_for(0.1)
     assert not any(report.failed for report in reports)
-    controller.destroy()
-    motion.close()
-    graph.executor.remove_node(node)
-    node.destroy_node()
 
 
 def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> None:
     """Finding: its 0 was believed, and the motion waited for ever; so was a 5."""
-    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
-    graph.executor.add_node(node)
-    robot = RobotWatch(ARM, DRIVING)
-    names = ARM.joint_names
-    motion = MotionDriver(
-        node, names, "", "", {}, lambda report: None, lambda: robot, time.monotonic
-    )
-    node.trigger_configure()
-    node.trigger_activate()
+    robot, names = RobotWatch(ARM, DRIVING), ARM.joint_names
+    driving(graph, names, robot=robot)
     told = graph.publisher(JointTrajectoryControllerState, "controller_state")
     slider = graph.publisher(Float64, "speed_scaling")
     rest = JointTrajectoryPoint(positions=[0.0] * 6, velocities=[0.0] * 6)
@@ -188,8 +183,6 @@ def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> 
     becomes(0.5, 0.0, 50.0)
     becomes(1.0, 5.0, 50.0)
     becomes(0.0, 0.0, 50.0)
-    motion.close()
-    node.destroy_node()
 
 
 def test_a_suspend_is_told_once_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
