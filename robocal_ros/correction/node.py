@@ -10,7 +10,6 @@ from typing import Any, NoReturn
 import numpy as np
 from control_msgs.msg import JointTrajectoryControllerState as ControllerState
 from rclpy.serialization import serialize_message
-from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
@@ -138,10 +137,7 @@ class JointCorrectionNode(RobotNode):
         self._astray: SentPath | None = None  # a path that the robot is being stopped beside
         self._open_topics()
         self._open_action()
-        self._report = CorrectionReport(
-            self._session, self.settings, self.robot, reference, self._offsets, self._statuses,
-            self.now_ns,
-        )  # fmt: skip
+        self._report = CorrectionReport(self, self._session, reference)
         self._release.append(self._report.log.close)
 
     def _open_topics(self) -> None:
@@ -149,8 +145,6 @@ class JointCorrectionNode(RobotNode):
             topic: self.add_output(kind, f"~/{topic}", endpoints.RELIABLE)
             for topic, kind in KINDS.items()
         }
-        self._offsets = self.add_output(JointOffset, "~/correction", endpoints.RELIABLE)
-        self._statuses = self.add_output(StatusMessage, "~/status", endpoints.LATCHED)
         self.add_input(KinematicModel, MODEL, self._on_model, endpoints.LATCHED)
         self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED)
         self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED)

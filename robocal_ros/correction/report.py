@@ -5,13 +5,12 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.publisher import Publisher
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset
 
@@ -25,9 +24,11 @@ from robocal_ros.ground.errors import RobocalError
 from robocal_ros.history.history_records import CALIBRATED, NOMINAL, CorrectionRecord
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.kinematics.robots import RobotDescription
+from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import NO_SERIAL
 from robocal_ros.ros.conversions import header, transform_message
 from robocal_ros.ros.endpoints import ERROR, WARN, Health
+from robocal_ros.ros.robot import RobotNode
 from robocal_ros.ros.session_node import acknowledge_history, history_notice, open_history
 
 TELL_S = 1.0  # the status goes out at least so often
@@ -108,23 +109,16 @@ class CorrectionLog:
 
 
 class CorrectionReport:
-    """Tells what a session does, until its ``log`` is closed.
+    """Tells what a node's session does, until its ``log`` is closed.
 
-    ``reference`` has the taught tool; ``now_ns`` is the clock of what is published.
+    ``reference`` has the taught tool.
     """
 
-    def __init__(
-        self,
-        session: CorrectionSession,
-        settings: Mapping[str, Any],
-        robot: RobotDescription,
-        reference: SerialArm,
-        offsets: Publisher,
-        statuses: Publisher,
-        now_ns: Callable[[], int],
-    ) -> None:
-        self._session, self._now_ns, nominal = session, now_ns, robot.arm
-        self._offsets, self._statuses = offsets, statuses
+    def __init__(self, node: RobotNode, session: CorrectionSession, reference: SerialArm) -> None:
+        settings, robot, nominal = node.settings, node.robot, node.robot.arm
+        self._session, self._now_ns = session, node.now_ns
+        self._offsets = node.add_output(JointOffset, "~/correction", endpoints.RELIABLE)
+        self._statuses = node.add_output(StatusMessage, "~/status", endpoints.LATCHED)
         serial, chosen = settings["serial"] or NO_SERIAL, settings["reference"]
         self._joint_names, self._chosen = list(nominal.joint_names), chosen
         self._own = {

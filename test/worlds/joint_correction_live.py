@@ -95,7 +95,8 @@ class Line:
         self.rested = False
         self.node = graph.add(JointCorrectionNode, {"serial": "s1"} | PATIENT | parameters)
         self._connect(graph)
-        outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
+        report = self.node._report
+        outputs = (*self.node._outputs.values(), report._offsets, report._statuses)
         graph.spin_until(
             lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
         )
