@@ -75,32 +75,29 @@ NAMES = tuple(
 class TrackerUnknowns:
     """All unknowns, SI.
 
-    ``T_tracker_flange`` (4, 4): at the first profile. ``reflector`` (3,): in the flange. ``centre``
-    (3,) of the sphere, ``normals`` (2, 3), outward, and ``offsets`` (2,) of the faces: tracker
-    frame. ``mismatch`` (2,): of the axes' angle and gap, real minus nominal.
+    ``T_tracker_flange`` (4, 4): at the first profile. ``reflector`` (3,): in the flange. ``cube``:
+    in the tracker frame. ``mismatch`` (2,): of the axes' angle and gap, real minus nominal.
     """
 
     T_tracker_flange: Array
     T_flange_sensor: Array
     reflector: Array
-    centre: Array
-    normals: Array
-    offsets: Array
+    cube: Cube
     mismatch: Array
 
     def moved(self, step: Array) -> "TrackerUnknowns":
         """The state after an increment (26,)."""
+        cube = self.cube
         tilts = np.array(
-            [tangents(n) @ step[part] for n, part in zip(self.normals, NORMALS, strict=True)]
+            [tangents(n) @ step[part] for n, part in zip(cube.normals, NORMALS, strict=True)]
         )
-        normals = self.normals + tilts
+        normals = cube.normals + tilts
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
         return TrackerUnknowns(
             T_tracker_flange=moved(self.T_tracker_flange, step[FLANGE]),
             T_flange_sensor=moved(self.T_flange_sensor, step[SENSOR]),
             reflector=self.reflector + step[REFLECTOR],
-            centre=self.centre + step[CENTRE],
-            normals=normals / np.linalg.norm(normals, axis=1)[:, None],
-            offsets=self.offsets + step[OFFSETS],
+            cube=Cube(normals, cube.offsets + step[OFFSETS], cube.centre + step[CENTRE]),
             mismatch=self.mismatch + step[MISMATCH],
         )
 
@@ -251,13 +248,13 @@ class TrackerProblem:
         sigma, axis = self.noise.tracker_m, self.axes.height_axis
         J = np.zeros((len(self.data.sphere), 3, UNKNOWNS))
         J[..., CENTRE] = np.eye(3) / sigma
-        yield ((state.centre - self.data.sphere) / sigma).ravel(), J.reshape(-1, UNKNOWNS)
+        yield ((state.cube.centre - self.data.sphere) / sigma).ravel(), J.reshape(-1, UNKNOWNS)
         for face, points in enumerate(self.data.faces):
-            normal = state.normals[face]
+            normal = state.cube.normals[face]
             J = np.zeros((len(points), UNKNOWNS))
             J[:, NORMALS[face]] = points @ tangents(normal) / sigma
             J[:, OFFSETS.start + face] = -1.0 / sigma
-            off = points @ normal - state.offsets[face] - self.target.reflector_radius_m
+            off = points @ normal - state.cube.offsets[face] - self.target.reflector_radius_m
             yield off / sigma, J
         J = np.zeros((2, UNKNOWNS))
         J[:, MISMATCH] = np.diag(1.0 / self.axes.sigma)
@@ -273,7 +270,7 @@ class TrackerProblem:
         share = self.axes.share_of(self.data.q)
         motion = self.axes.carried(self.data.motion, state.mismatch, share)
         P = state.sensor_poses(motion)
-        root, s = self.caps.root, sphere_in(P, state.centre)
+        root, s = self.caps.root, sphere_in(P, state.cube.centre)
         shift = np.einsum("mij,mj->mi", root, s - self.caps.place) + self.caps.offset
         by_place = np.zeros((len(P), 3, UNKNOWNS))
         by_place[..., CENTRE] = root @ np.swapaxes(P[:, :3, :3], 1, 2)
@@ -290,8 +287,8 @@ class TrackerProblem:
     def _line(self, state: TrackerUnknowns, P: Array, face: int) -> tuple[Array, Array, Array]:
         lines, m = self.lines[face], len(P)
         R, t = P[:, :3, :3], P[:, :3, 3]
-        n = state.normals[face] @ R
-        d = state.offsets[face] - t @ state.normals[face]
+        n = state.cube.normals[face] @ R
+        d = state.cube.offsets[face] - t @ state.cube.normals[face]
         slope, z = -n[:, 0] / n[:, 2], (d - n[:, 0] * lines.middle) / n[:, 2]
         sigma = np.column_stack([lines.z_sigma, lines.slope_sigma])
         residual = np.column_stack([z - lines.z_m, slope - lines.slope]) / sigma
@@ -302,7 +299,7 @@ class TrackerProblem:
         by_d[:, 0, 0] = 1.0 / n[:, 2]
         twist = np.concatenate([by_d * -n[:, None], by_n @ frames.skew(n)], axis=2)
         J = np.zeros((m, 2, UNKNOWNS))
-        B = tangents(state.normals[face])
+        B = tangents(state.cube.normals[face])
         J[..., NORMALS[face]] = (by_n @ np.swapaxes(R, 1, 2) - by_d * t[:, None]) @ B
         J[..., OFFSETS.start + face] = by_d[..., 0]
         return residual, twist / sigma[..., None], J / sigma[..., None]
@@ -401,9 +398,9 @@ def profile_distances(
     """
     motion = zip(states, classic.data.motion, strict=True)
     P = np.array([state.sensor_poses(T) for state, T in motion])
-    normals = np.array([state.normals for state in states])
-    offsets = np.array([state.offsets for state in states])
-    centres = np.array([state.centre for state in states])
+    normals = np.array([state.cube.normals for state in states])
+    offsets = np.array([state.cube.offsets for state in states])
+    centres = np.array([state.cube.centre for state in states])
     total, count = np.zeros(len(P)), np.zeros(len(P))
     for index, scan in enumerate(classic.parts):
         own = scan.profile
@@ -584,11 +581,8 @@ def _left_out(classic: Classic, states: Sequence[TrackerUnknowns | None]) -> Arr
 
 
 def _state(classic: Classic) -> TrackerUnknowns:
-    cube = classic.tracked
-    return TrackerUnknowns(
-        classic.T_tracker_flange, classic.T_flange_sensor, classic.reflector,
-        cube.centre, cube.normals, cube.offsets, np.zeros(2),
-    )  # fmt: skip
+    poses = classic.T_tracker_flange, classic.T_flange_sensor
+    return TrackerUnknowns(*poses, classic.reflector, classic.tracked, np.zeros(2))
 
 
 def solve_best(classic: Classic) -> tuple[TrackerProblem, Estimate[TrackerUnknowns]]:
@@ -607,13 +601,14 @@ def solve_best(classic: Classic) -> tuple[TrackerProblem, Estimate[TrackerUnknow
     ]
     state = _state(classic)
     axes = AxisPair.of(data, classic.axes)
+    place = sphere_in(state.sensor_poses(data.motion), state.cube.centre)
     for _ in range(MOST_ROUNDS):
-        place = sphere_in(state.sensor_poses(data.motion), state.centre)
         caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m)
         problem = TrackerProblem(data, target, classic.noise, state, axes, lines, caps)
         estimate = solve(problem, state)
-        state = estimate.state
-        if np.abs(sphere_in(state.sensor_poses(data.motion), state.centre) - place).max() < NEAR_M:
+        state, before = estimate.state, place
+        place = sphere_in(state.sensor_poses(data.motion), state.cube.centre)
+        if np.abs(place - before).max() < NEAR_M:
             return problem, estimate
     raise ResidualError(
         f"the place of the sphere in the profiles did not settle in {MOST_ROUNDS} rounds: scan "
@@ -625,7 +620,6 @@ def _result(classic: Classic, state: TrackerUnknowns, method: Method) -> HandEye
     """What both methods report, not judged yet."""
     names = np.array([profile.name for profile in classic.data.profiles])
     residual_m, seen = profile_distances(classic, [state] * len(names))
-    cube = Cube(state.normals, state.offsets, state.centre)
     return HandEyeResult(
         kind="tracker",
         method=method,
@@ -636,9 +630,9 @@ def _result(classic: Classic, state: TrackerUnknowns, method: Method) -> HandEye
         verdict=Verdict(Code.NONE, ""),
         rejected=dict.fromkeys(names[~seen].tolist(), "shows neither the faces nor the sphere"),
         target={
-            "center_tracker_mm": (state.centre * 1e3).tolist(),
-            "face_angle_deg": float(np.degrees(cube.angle)),
-            "sphere_height_mm": (cube.heights * 1e3).tolist(),
+            "center_tracker_mm": (state.cube.centre * 1e3).tolist(),
+            "face_angle_deg": float(np.degrees(state.cube.angle)),
+            "sphere_height_mm": (state.cube.heights * 1e3).tolist(),
         },
         more={
             "reflector_flange_mm": (state.reflector * 1e3).tolist(),
