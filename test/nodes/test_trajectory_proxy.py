@@ -222,9 +222,9 @@ def test_a_cancel_stops_the_robot_and_the_next_goal_goes_on_from_there(cell: Any
 
 def test_a_rejected_goal_leaves_what_runs(cell: Any) -> None:
     cell.begin(settled=False)
-    first = cell.send(HOME, MOVED, lasts_s=4.0).moves()
+    first = cell.send(HOME, MOVED, lasts_s=2.0).moves()
     cell.robot.rejects = True
-    result = cell.send(MOVED, HOME, lasts_s=4.0).ends(GoalStatus.STATUS_ABORTED, AT_ONCE_S)
+    result = cell.send(MOVED, HOME, lasts_s=2.0).ends(GoalStatus.STATUS_ABORTED, AT_ONCE_S)
     assert result.error_code == Result.INVALID_GOAL
     first.ends(GoalStatus.STATUS_SUCCEEDED)
     assert np.abs(tcp(ACTUAL, cell.robot.q) - tcp(NOMINAL, MOVED)).max() < 1e-5
