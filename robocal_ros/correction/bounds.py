@@ -368,25 +368,6 @@ class DesiredOffset:
         self.figures[REMAINING] = result.remaining_m.max()
         return offset, result
 
-    def step(
-        self,
-        q: Array,
-        velocity: Array,
-        elapsed: float,
-        longest: float,
-        active: Array,
-        speeds: Array,
-    ) -> float:
-        """As `put_out`, in one piece; `NOT_WITHIN`, and nothing has changed, where it is more."""
-        limiter, given = self.limiter, self._whole_step
-        if given is None:
-            return NOT_WITHIN
-        share = step_out(
-            q, velocity, elapsed, longest, limiter.memory, limiter.limits, active, speeds, *given
-        )
-        self.made = share != NOT_WITHIN
-        return share
-
     def put_out(
         self,
         q: Array,
@@ -395,15 +376,23 @@ class DesiredOffset:
         longest: float,
         active: Array,
         speeds: Array,
+        *,
+        usual: bool = False,
     ) -> float:
         """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
 
-        Raises `RefusedError` as `at`.
+        In one piece where nothing is out of the ordinary. Else raises `RefusedError` as `at`; where
+        a ``usual`` target is asked for it is `NOT_WITHIN` then, and nothing has changed.
         """
-        share = self.step(q, velocity, elapsed, longest, active, speeds)
-        if share != NOT_WITHIN:
-            return share
-        memory, limits = self.limiter.memory, self.limiter.limits
+        limiter, given = self.limiter, self._whole_step
+        memory, limits = limiter.memory, limiter.limits
+        if given is not None:
+            share = step_out(q, velocity, elapsed, longest, memory, limits, active, speeds, *given)
+            if share != NOT_WITHIN:
+                self.made = True
+                return share
+        if usual:
+            return NOT_WITHIN
         stage, span = self.stage, self._span
         if stage is None:
             self.made, desired = False, self._nothing
@@ -411,7 +400,7 @@ class DesiredOffset:
         else:
             desired = self.at(q[None])[0][0]
         share = put_out(memory, q, desired, elapsed, longest, limits, active, speeds[0], span)
-        if isinstance(stage, ClampedCorrection) and self.made and not self.limiter.withheld.any():
+        if isinstance(stage, ClampedCorrection) and self.made and not limiter.withheld.any():
             memory[VELOCITY] = stage.velocity_one(memory[TAUGHT], velocity, memory[OUT])
         else:
             memory[VELOCITY] = velocity + memory[OFFSET_RATE]

@@ -165,7 +165,9 @@ class TargetStream:
         if self._holds(elapsed):
             return None
         q, before, desired = command.position.copy(), output.out.copy(), self._desired
-        share = desired.step(q, self._velocity, elapsed, elapsed, self._active, self._speeds)
+        share = desired.put_out(
+            q, self._velocity, elapsed, elapsed, self._active, self._speeds, usual=True
+        )
         if not 0.0 <= share <= 1.0 + ROUNDING:
             return None
         self._unnoted = now_s, q, before, now_s - elapsed
