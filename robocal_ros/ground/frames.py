@@ -95,6 +95,12 @@ def log_rotation(rotation: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
 
 
+def apart(T: Array, other: Array) -> tuple[float, float]:
+    """Distance, m, and angle, rad, between two poses (4, 4)."""
+    turn = log_rotation(T[:3, :3].T @ other[:3, :3])
+    return float(np.linalg.norm(T[:3, 3] - other[:3, 3])), float(np.linalg.norm(turn))
+
+
 def rotation_from_rpy(rpy: ArrayLike) -> Array:
     """Rotation (3, 3) of roll, pitch, yaw (3,), rad: about x, then y, then z of the fixed frame."""
     roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)

@@ -16,10 +16,12 @@ import numpy as np
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import (
     Array,
+    apart,
     exp_rotation,
     invert,
     rotation_from_rpy,
     rpy,
+    skew,
     transform,
 )
 from robocal_ros.kinematics.arm import NEARLY_PARALLEL, SerialArm
@@ -289,7 +291,6 @@ def arm_of(links: Chain, name: str = "") -> RobotDescription:
     points = np.array([T[:3, 3] for T in frames])
     T_base_tip = at_zero[-1]
     root, mdh = _hayati(axes, points, T_base_tip, links)
-    at = np.array([T for T in _frames(root, mdh)])
     arm = SerialArm(
         name=name or links.urdf.name,
         joint_names=tuple(joint.name for joint in moving),
@@ -299,7 +300,7 @@ def arm_of(links: Chain, name: str = "") -> RobotDescription:
         lower=np.array([joint.lower for joint in moving]),
         upper=np.array([joint.upper for joint in moving]),
         T_base_root=root,
-        load=_load(links, at),
+        load=_load(links, _frames(root, mdh)),
     )
     velocity = np.array([joint.velocity for joint in moving])
     return RobotDescription(
@@ -409,7 +410,7 @@ def _flange(T: Array) -> Array:
     return np.array([T[2, 3], theta, a if a > SAME_LINE_M else 0.0, alpha, beta])
 
 
-def _load(links: Chain, frames: Array) -> ArmLoad | None:
+def _load(links: Chain, frames: list[Array]) -> ArmLoad | None:
     """What gravity pulls at: masses of all that each joint carries up to the next, in its frame."""
     masses, centres = np.zeros(len(frames)), np.zeros((len(frames), 3))
     at_zero = {joint.child: T for joint, T in zip(links.joints, links.at_zero, strict=True)}
@@ -473,12 +474,12 @@ def model_difference(
     drawn = np.random.default_rng(0).uniform(low, high, (_COMPARED, arm.n))
     poses = [*([] if present is None else [present]), *drawn]
     pairs = [(links.frames(q), _moved(arm, q)) for q in poses]
-    apart = np.array([_apart(ours[-1], theirs[-1]) for ours, theirs in pairs])
-    if (apart <= [SAME_ARM_M, SAME_ARM_RAD]).all():
+    off = np.array([apart(ours[-1], theirs[-1]) for ours, theirs in pairs])
+    if (off <= [SAME_ARM_M, SAME_ARM_RAD]).all():
         return None
-    worst = int(np.argmax((apart / [SAME_ARM_M, SAME_ARM_RAD]).max(axis=1)))
-    flange = {} if present is None else {AT_PRESENT: _apart(pairs[0][0][-1], pairs[0][1][-1])}
-    flange |= {AT_MOST: (float(apart[:, 0].max()), float(apart[:, 1].max()))}
+    worst = int(np.argmax((off / [SAME_ARM_M, SAME_ARM_RAD]).max(axis=1)))
+    flange = {} if present is None else {AT_PRESENT: apart(pairs[0][0][-1], pairs[0][1][-1])}
+    flange |= {AT_MOST: (float(off[:, 0].max()), float(off[:, 1].max()))}
     return ModelDifference(flange, _begins(links, arm, *pairs[worst]))
 
 
@@ -487,13 +488,6 @@ def _moved(arm: SerialArm, q: Array) -> list[Array]:
     rows = arm.mdh.copy()
     rows[np.arange(arm.n), np.where(arm.prismatic, 0, 1)] += arm.sign * q
     return [arm.T_base_root, *_frames(arm.T_base_root, rows)]
-
-
-def _apart(T: Array, other: Array) -> tuple[float, float]:
-    R = T[:3, :3].T @ other[:3, :3]
-    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    turn = np.arctan2(sine, np.trace(R) - 1.0)
-    return float(np.linalg.norm(T[:3, 3] - other[:3, 3])), float(turn)
 
 
 def _begins(links: Chain, arm: SerialArm, described: list[Array], filed: list[Array]) -> str:
@@ -627,10 +621,7 @@ def origins_of(links: Chain, arm: SerialArm) -> dict[str, Array]:
 def _with_axis(T: Array, axis: Array, wanted: Array, point: Array) -> Array:
     """The pose next to ``T`` (4, 4) whose ``axis`` lies on the line along ``wanted`` (3,)."""
     before = T[:3, :3] @ axis
-    normal, cosine = np.cross(before, wanted), float(before @ wanted)
-    K = np.array(
-        [[0.0, -normal[2], normal[1]], [normal[2], 0.0, -normal[0]], [-normal[1], normal[0], 0.0]]
-    )
+    K, cosine = skew(np.cross(before, wanted)), float(before @ wanted)
     if cosine < 0.0:
         raise InputError("a joint counts the other way than in the description: turn its sign")
     R = (np.eye(3) + K + K @ K / (1.0 + cosine)) @ T[:3, :3]

@@ -170,9 +170,9 @@ class ProgramCorrection:
         wanted = self._models.reference.fk(q)
         corrected = self._solved(q, wanted)
         if isinstance(corrected, str):
-            left_m, left_rad = _apart(self._models.actual.fk(q) @ tool, wanted @ tool)
+            left_m, left_rad = frames.apart(self._models.actual.fk(q) @ tool, wanted @ tool)
             return replace(result, reason=corrected, left_m=left_m, left_rad=left_rad)
-        shift_m, shift_rad = _apart(nominal.fk(corrected), nominal.fk(q))
+        shift_m, shift_rad = frames.apart(nominal.fk(corrected), nominal.fk(q))
         if shift_m < LEAST_M and shift_rad < LEAST_RAD:
             return replace(result, q_corrected=q, left_m=shift_m, left_rad=shift_rad)
         changes = self._changes(point, q, corrected, ends)
@@ -181,9 +181,9 @@ class ProgramCorrection:
         if point.marks:
             marks = self._dialect.marks(point, stance_of(nominal, reached))
             changes += [(point.marks[name], text) for name, text in marks.items()]
-        left_m, left_rad = _apart(self._models.actual.fk(reached) @ tool, wanted @ tool)
+        left_m, left_rad = frames.apart(self._models.actual.fk(reached) @ tool, wanted @ tool)
         T_tool = [nominal.fk(one) @ tool for one in (q, corrected)]
-        shift_m, shift_rad = _apart(T_tool[1], T_tool[0])
+        shift_m, shift_rad = frames.apart(T_tool[1], T_tool[0])
         return replace(
             result,
             q_corrected=corrected,
@@ -220,7 +220,7 @@ class ProgramCorrection:
                 f"{np.degrees(change[joint]):.3f} deg, at most "
                 f"{np.degrees(models.largest_rad):g} are allowed"
             )
-        shift_m, _ = _apart(models.nominal.fk(found[0]), models.nominal.fk(q))
+        shift_m, _ = frames.apart(models.nominal.fk(found[0]), models.nominal.fk(q))
         if shift_m > models.largest_m:
             return (
                 f"it would move by {1e3 * shift_m:.3f} mm, at most {1e3 * models.largest_m:g} are"
@@ -260,12 +260,6 @@ class ProgramCorrection:
             return self._dialect.to_arm(np.array(numbers) * point.joint_unit)
         T = ends[0] @ pose_of(self._dialect.maker, numbers) @ frames.invert(ends[1])
         return np.asarray(reach(self._models.nominal, T[None], near[None])[0][0])
-
-
-def _apart(T: Array, other: Array) -> tuple[float, float]:
-    """Distance, m, and angle, rad, between poses (4, 4)."""
-    turn = frames.log_rotation(T[:3, :3] @ other[:3, :3].T)
-    return float(np.linalg.norm(T[:3, 3] - other[:3, 3])), float(np.linalg.norm(turn))
 
 
 def report(done: CorrectedProgram) -> "ProgramReportDocument":

@@ -445,5 +445,4 @@ def _apart(T: Array, transform: Any) -> tuple[float, float]:
     place = np.array([t.x, t.y, t.z])
     if not (norm > 0.5 and np.all(np.isfinite(place))):
         return np.inf, np.inf
-    turn = frames.transform_from_quat(place, quat / norm)[:3, :3].T @ T[:3, :3]
-    return float(np.linalg.norm(place - T[:3, 3])), float(np.linalg.norm(frames.log_rotation(turn)))
+    return frames.apart(frames.transform_from_quat(place, quat / norm), T)
