@@ -131,6 +131,18 @@ def test_no_file_needs_itself():
         walk(path, ())
 
 
+def test_our_modules_keep_their_names():
+    renamed = [
+        f"{path}: {alias.name} as {alias.asname}"
+        for path in MODULES
+        for node in written(path)[1]
+        for alias in node.names
+        if alias.asname
+        and PACKAGE.parent.joinpath(*node.module.split("."), f"{alias.name}.py").exists()
+    ]
+    assert not renamed, "\n".join(renamed)
+
+
 def test_files_and_functions_stay_small():
     large = []
     for path in MODULES:

@@ -30,7 +30,7 @@ from robocal_ros.ground.samples import (
     stamp_ns,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.maintenance import robot_interface as asked
+from robocal_ros.maintenance import robot_interface
 from robocal_ros.maintenance.robot_interface import DriverAnswer, DriverRequest, Move
 from robocal_ros.maintenance.services import (
     SETTINGS,
@@ -97,32 +97,32 @@ class MaintenanceDriver:
         self._measure.destroy()
         self._motion.close()
 
-    def carry_out(self, request: asked.DriverRequest) -> None:
+    def carry_out(self, request: DriverRequest) -> None:
         """Do it; the answer comes later."""
         number = request.number
         match request:
-            case asked.Move(plan=plan):
+            case Move(plan=plan):
                 self._moves()
                 self._motion.send(plan, stop=False)
-            case asked.Stop(plan=plan):
+            case robot_interface.Stop(plan=plan):
                 self._motion.send(plan, stop=True)
-            case asked.HardStop(why=why):
+            case robot_interface.HardStop(why=why):
                 self._motion.hard_stop(why)
-            case asked.BeginCycle(cycle_id=name):
+            case robot_interface.BeginCycle(cycle_id=name):
                 self._call(self._begin, BeginCycle.Request(cycle_id=name), number, _status)
-            case asked.EndCycle(cycle_id=name):
+            case robot_interface.EndCycle(cycle_id=name):
                 self._call(self._end, EndCycle.Request(cycle_id=name), number, _cycle)
-            case asked.BeginFixture():
+            case robot_interface.BeginFixture():
                 self._call(self._start, Trigger.Request(), number, _triggered)
-            case asked.MeasureFixture():
+            case robot_interface.MeasureFixture():
                 self._call(self._judge, Trigger.Request(), number, _triggered)
-            case asked.Arm():
+            case robot_interface.Arm():
                 self._call(self._arm, SetBool.Request(data=True), number, _done)
-            case asked.Disarm():
+            case robot_interface.Disarm():
                 self._call(self._arm, SetBool.Request(data=False), number, _done)
-            case asked.Measure(mode=mode, cycle_id=name):
+            case robot_interface.Measure(mode=mode, cycle_id=name):
                 self._begin_measure(number, mode, name)
-            case asked.CancelMeasure():
+            case robot_interface.CancelMeasure():
                 for measure, handle in self._goals.items():
                     self._cancelled.add(measure)
                     if handle is not None:
