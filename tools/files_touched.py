@@ -19,6 +19,7 @@ from types import FrameType
 
 import numpy as np
 
+import robocal_ros
 from robocal_ros.cli.main import main
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.interface import JointCommand, OfferedModel, TrajectoryCommand
@@ -26,7 +27,7 @@ from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.kinematics.robots import load_description
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "robocal_ros"
+PACKAGE = Path(robocal_ros.__file__).parent  # the one that runs
 
 
 def touched(work: Callable[[], object]) -> dict[Path, set[str]]:
