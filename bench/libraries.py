@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What other libraries would take in the place of our own code, for docs/libraries.md.
+"""What other libraries would take in the place of our own code, for docs/sources.md.
 
 Processor time, the least of five runs; a library that is not installed is left out:
 
