@@ -36,7 +36,7 @@ def generate_launch_description():
             "shared",
             default_value="false",
             description="Both measure in one place: each PLC publishes gap_wanted, sharing_node "
-            "the gap_open of one at a time (docs/sharing.md); plc_bridge_node does so",
+            "the gap_open of one at a time (docs/cell_launch.md); plc_bridge_node does so",
         ),
         Node(
             package="robocal_ros",

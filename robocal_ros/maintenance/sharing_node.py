@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gives the gap to one of several robots that share a sensor or a station (docs/sharing.md)."""
+"""Gives the gap to one of several robots that share a sensor or a station (docs/cell_launch.md)."""
 
 import time
 from functools import partial
