@@ -382,7 +382,7 @@ class DesiredOffset:
         """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
 
         In one piece where nothing is out of the ordinary. Else raises `RefusedError` as `at`; where
-        a ``usual`` target is asked for it is `NOT_WITHIN` then, and nothing has changed.
+        a ``usual`` target is asked for it is `NOT_WITHIN` then, and nothing has gone out.
         """
         limiter, given = self.limiter, self._whole_step
         memory, limits = limiter.memory, limiter.limits

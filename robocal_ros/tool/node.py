@@ -425,6 +425,7 @@ class TcfNode(SessionNode[ToolSession]):
         super().deactivate()
         if not self.run_end.done():
             self.run_end.set_exception(NotActiveError("deactivated: the run is broken off"))
+            self.run_end.exception()  # else rclpy prints it where no caller waits for it
 
     def cleanup(self) -> None:
         """Take the action down and close the history."""

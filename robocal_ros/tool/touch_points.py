@@ -243,6 +243,8 @@ def _require(edges: Edges, names: Sequence[str]) -> None:
                 raise TooFewSamplesError(
                     f"sweep {name} has no edges of beam {beam}: sweep the tool through both beams"
                 )
+            if not np.all(np.isfinite(edges[name, beam])):
+                raise InputError(f"sweep {name}, beam {beam}: a flange pose is not finite")
             if len(edges[name, beam]) % 2:
                 raise InputError(
                     f"sweep {name}, beam {beam}: {len(edges[name, beam])} edges; each pass of the "

@@ -162,6 +162,10 @@ def test_parallel_beams_refuse_what_they_cannot_tell():
     lacking["straight", "down"] = lacking["straight", "down"][:1]
     with pytest.raises(InputError, match="beam down: 1 edges; each pass of the tool has a break"):
         fit_parallel(BEAMS, lacking)
+    unknown = swept(R_TURNED)
+    unknown["turned", "up"][0, 2, 3] = np.nan
+    with pytest.raises(InputError, match="sweep turned, beam up: a flange pose is not finite"):
+        fit_parallel(BEAMS, unknown)
     with pytest.raises(ResidualError, match=r"leans by 1\.000 mm"):
         fit_parallel(BEAMS, swept(R_TURNED, 1e-3))
     with pytest.raises(RankDeficientError, match="turn the flange by 90 deg"):
