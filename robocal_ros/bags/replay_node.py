@@ -308,6 +308,7 @@ class ReplayNode(HouseNode):
         self._first_ns = self._position_ns = 0 if self._next is None else self._next.log_time_ns
         self._begin = time.monotonic() + self.settings["start_delay_s"]
         self._unsettled_since: float | None = None
+        self._fault = ""
         self._set_state(PAUSED if self.settings["start_paused"] else WAITING)
 
     def deactivate(self) -> None:
@@ -339,7 +340,7 @@ class ReplayNode(HouseNode):
             self._send(topics, now)
         except RobocalError as error:
             self._fault = str(error)
-            self._end(FAILED)
+            self._end(topics, FAILED)
 
     def _send(self, topics: ReplayTopics, now: float) -> None:
         rate, sent = self.settings["rate"], 0
@@ -356,7 +357,7 @@ class ReplayNode(HouseNode):
             self._clock_out.publish(Clock(clock=time_message(self._position_ns)))
         self._unsettled_since = now if sent else self._unsettled_since
         if self._next is None and self._settled(topics, time.monotonic()):
-            self._end(DONE)
+            self._end(topics, DONE)
 
     def _due_ns(self, now: float, rate: float) -> int:
         return self._from_ns + int((now - self._since) * rate * 1e9)
@@ -384,18 +385,25 @@ class ReplayNode(HouseNode):
         if missing:
             self.get_logger().info(f"waiting for subscribers of {', '.join(missing)}")
 
-    def _end(self, state: str) -> None:
+    def _end(self, topics: ReplayTopics, state: str) -> None:
         self._set_state(state)
-        doubt = self._topics.doubt() if self._topics is not None else ""
-        if doubt:
-            self.get_logger().error(f"{state}: loss cannot be excluded: {doubt}")
+        lost = [self._fault] if self._fault else []
+        if self._damaged():
+            lost.append(self._damaged())
+        if doubt := topics.doubt():
+            lost.append(f"loss cannot be excluded: {doubt}")
+        if lost:
+            self.get_logger().error(f"{state}: {'; '.join(lost)}")
         else:
-            alone = self._topics.alone() if self._topics is not None else ""
-            self.get_logger().info(f"{state}: nothing was lost{alone}")
+            self.get_logger().info(f"{state}: nothing was lost{topics.alone()}")
         if self.settings["exit_at_end"]:
-            lost = state == FAILED or bool(doubt)
             self._status.wait_for_all_acked(Duration(seconds=1))
             raise SystemExit(EXIT_LOSS if lost else 0)
+
+    def _damaged(self) -> str:
+        """What of the bag could not be read so far; empty: nothing."""
+        chunks = 0 if self._reader is None else len(self._reader.info.lost)
+        return f"damaged chunks of the bag, not played: {chunks}" if chunks else ""
 
     # ---- services and status --------------------------------------------------------------------
 
@@ -445,6 +453,8 @@ class ReplayNode(HouseNode):
         report = topics.report()
         if self._fault:
             health.worsen(ERROR, self._fault)
+        if damaged := self._damaged():
+            health.worsen(ERROR, damaged)
         if topics.unacknowledged:
             health.worsen(ERROR, f"{topics.unacknowledged} messages were not acknowledged")
         for topic, nodes in report["best_effort"].items():

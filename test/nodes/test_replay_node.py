@@ -281,3 +281,17 @@ def test_the_commands_of_the_page_run_as_typed(graph):
     for words in typed:
         done = subprocess.run(words, cwd=ROOT, env=environment, timeout=60, check=False)
         assert done.returncode == 0, words
+
+
+def test_what_is_damaged_in_the_bag_counts_as_lost(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 20_000, 1_000_000)
+    content = bytearray(bag.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 100] = bytes(100)
+    bag.write_bytes(content)
+    listener = Listener(graph)
+    process = graph.start("replay_node", {"bag": bag, "rate": 0.0, "exit_at_end": True} | WAIT)
+    listener.until("done")
+    assert process.process.wait(10) == 3
+    assert len(listener.joints) < 20_000
+    assert "damaged" in " ".join(listener.status["notes"])
