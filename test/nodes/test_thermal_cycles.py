@@ -163,7 +163,8 @@ def test_a_clock_that_jumps(cell, robot):
     found = end(cell, "c1")
     assert (found.success, found.visited) == (True, POSES), found.message
     cell.graph.spin_until(
-        lambda: any("the clock jumped back" in v.key for v in cell.status().values), "it is said"
+        lambda: any("clock jumped back" in v.key for v in getattr(cell.status(), "values", [])),
+        "it is said",
     )
     robot.shift.now_ns += 24 * 3600 * NS
     cell.play(robot.visit(WARM_K))
