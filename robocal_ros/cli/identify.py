@@ -48,9 +48,8 @@ from robocal_ros.identification.judged import (
     repeated,
     require_match,
 )
-from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of
+from robocal_ros.kinematics.arm import arm_of, random_postures
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.tables import (
     beyond_limits,

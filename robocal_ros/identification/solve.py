@@ -27,6 +27,7 @@ from robocal_ros.identification.cell_model import (
     make_layout,
 )
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import random_postures
 
 # ---- how far parameters may lie from the nominal ones -------------------------------------------
 
@@ -325,15 +326,6 @@ def _lever(residual: Array, lever: float, most: float) -> float:
     position = np.median(np.linalg.norm(residual[:, :3], axis=1))
     turn = np.median(np.linalg.norm(residual[:, 3:], axis=1)) / lever
     return float(min(most, max(position, 1e-9) / max(turn, 1e-9)))
-
-
-def random_postures(arm: SerialArm, count: int = 60) -> Array:
-    """The same postures (count, n) at every call, throughout the joint limits."""
-    rng = np.random.default_rng(0)
-    span = np.where(arm.prismatic, 0.5, np.pi)
-    lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
-    upper = np.where(np.isfinite(arm.upper), arm.upper, span)
-    return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
 
 
 def _redundant(

@@ -426,6 +426,15 @@ def layer_of(model: Mapping[str, Any]) -> tuple[JointFunctions | None, ArmLoad |
 _POSES = 2000  # over the joints' range, among which the largest shift is sought
 
 
+def random_postures(arm: SerialArm, count: int = 60) -> Array:
+    """The same postures (count, n) at every call, throughout the joint limits."""
+    rng = np.random.default_rng(0)
+    span = np.where(arm.prismatic, 0.5, np.pi)
+    lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
+    upper = np.where(np.isfinite(arm.upper), arm.upper, span)
+    return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
+
+
 def payload_note(arm: SerialArm, identified: ArmLoad | None, present: ArmLoad | None) -> str:
     """What it may cost that an arm carries, or hangs, otherwise than when it was identified.
 
@@ -445,9 +454,7 @@ def payload_note(arm: SerialArm, identified: ArmLoad | None, present: ArmLoad | 
         )
     if arm.functions is None or not np.any(arm.functions.compliance):
         return f"{note}: how far that bends the arm is not in the model"
-    far = np.pi  # where a joint has no limits
-    lower, upper = np.maximum(arm.lower, -far), np.minimum(arm.upper, far)
-    q = np.random.default_rng(0).uniform(lower, upper, (_POSES, arm.n))
+    q = random_postures(arm, _POSES)
     before = replace(arm, load=identified)
     shift = np.max(np.linalg.norm((arm.fk(q) - before.fk(q))[:, :3, 3], axis=1))
     return (

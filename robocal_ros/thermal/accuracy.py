@@ -19,8 +19,8 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL, CalibrationState, Entry
-from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.robots import Fields, read_made, write_made
 from robocal_ros.thermal.identification import drift_prior, identify_cycle, learned_prior
 from robocal_ros.thermal.reference import ColdSpots, reference_of

@@ -34,8 +34,8 @@ from robocal_ros.ground.frames import Array, transform_document
 from robocal_ros.ground.samples import JOINTS, JointStream, joint_sample
 from robocal_ros.history.history_records import REFERENCE
 from robocal_ros.identification.cell_model import CellModel
-from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.robots import read_fields, read_pose
 from robocal_ros.kinematics.tables import read_measurements, stamp_texts, texts, write_cells
 from robocal_ros.report.figures import draw_rounds

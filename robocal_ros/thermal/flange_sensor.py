@@ -37,9 +37,9 @@ from robocal_ros.ground.errors import (
 from robocal_ros.ground.frames import Array, Document, transform_document
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.cell_model import CellModel
-from robocal_ros.identification.solve import default_prior, fitted_prior, random_postures
+from robocal_ros.identification.solve import default_prior, fitted_prior
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import model_document, parameters_document
+from robocal_ros.kinematics.arm import model_document, parameters_document, random_postures
 from robocal_ros.thermal.reference import ColdReference, SpheresInCell
 
 _HAND_EYE = (

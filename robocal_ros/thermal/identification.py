@@ -23,9 +23,8 @@ from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamp
 from robocal_ros.ground.frames import Array, Document, Index
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.identification.judged import cell_document
-from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import parameters_document
+from robocal_ros.kinematics.arm import parameters_document, random_postures
 from robocal_ros.thermal.reference import SETUP_SIGMA_M, ColdSpots, visit_variance
 
 EXPANSION_PER_K = 12e-6  # steel and cast iron; aluminium links drift up to twice as much

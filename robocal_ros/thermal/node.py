@@ -36,9 +36,8 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import THERMAL
-from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.arm import model_document, random_postures
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.base import run
 from robocal_ros.ros.conversions import MM, NO_POSES, joint_poses, transform_message

@@ -13,7 +13,7 @@ from joint_errors import LENGTH, SIZE, with_joint_errors
 
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
-from robocal_ros.identification.solve import random_postures
+from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.joint_functions import IdentifiedFrom
 from robocal_ros.kinematics.robots import load_robot, save_robot
 from robocal_ros.kinematics.tables import write_cells

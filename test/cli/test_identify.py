@@ -16,8 +16,7 @@ from robocal_ros.ground.errors import ConflictError, StaleError
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import REFERENCE, THERMAL
 from robocal_ros.identification import identify_and_judge
-from robocal_ros.identification.solve import random_postures
-from robocal_ros.kinematics.arm import arm_of, model_document
+from robocal_ros.kinematics.arm import arm_of, model_document, random_postures
 from robocal_ros.kinematics.robots import load_description, load_robot
 from robocal_ros.session.events import bring_into_force
 from robocal_ros.thermal.proposing import head_without_reference, keep_identified

@@ -8,8 +8,8 @@ import pytest
 from drift_cell import SIGMA, cell_of, postures, visit
 
 from robocal_ros.cell_sim import kr150
-from robocal_ros.identification.solve import random_postures
 from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.arm import random_postures
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.thermal.accuracy import (
     HORIZON_S,
