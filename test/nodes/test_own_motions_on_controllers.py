@@ -284,7 +284,10 @@ def test_what_strangers_and_the_network_do_to_a_motion_ends_in_a_stop_and_says_w
     ("ahead_s", "scaling", "stamped"), [(0.0, 1.0, True), (10.0, 1.0, False), (0.0, 0.5, False)]
 )
 def test_a_stamp_is_trusted_of_a_steady_clock_at_full_speed(graph, ahead_s, scaling, stamped):
-    """A controller that says what it likes: every second state is stamped ``ahead_s`` of now."""
+    """A controller that says what it likes: no two states are stamped alike beside now.
+
+    Not those two either between which others were lost: by multiples of ``ahead_s``.
+    """
     controller = Controlled(graph)
     controller.states.append(JointTrajectoryControllerState())
     own = Own(controller, {"~/joint_trajectory": "own_motions/joint_trajectory"})
@@ -297,7 +300,9 @@ def test_a_stamp_is_trusted_of_a_steady_clock_at_full_speed(graph, ahead_s, scal
         nonlocal number
         number += 1
         now_s = time.time()
-        message = trajectory([(0.0, HOME, 0.3 * STEP)], stamp_s=now_s + ahead_s * (number % 2))
+        message = trajectory(
+            [(0.0, HOME, 0.3 * STEP)], stamp_s=now_s + ahead_s * number * (-1) ** number
+        )
         said.publish(
             JointTrajectoryControllerState(
                 header=message.header,
