@@ -382,7 +382,7 @@ def round_trip_table() -> Table:
                 error = _round_trip(case, free)
                 beyond, allowed = int(np.sum(error > 1e-12)), len(error) // 200 if free else 0
                 goal = None if free and shift_m > 10e-3 else Goal(beyond, allowed)
-                median = float(np.median(error))
+                median = float(np.median(error)) if len(error) else None
                 table.add(
                     name, tool, 5 if free else 6, len(error), median, beyond, goal
                 )  # fmt: skip
