@@ -26,6 +26,7 @@ PREFIX = next((p for p in SOURCED if (p / "lib" / "robocal_ros").is_dir()), MADE
 EXECUTABLES = PREFIX / "lib" / "robocal_ros"
 SIX = "[0.0, -90.0, 90.0, 0.0, 90.0, 0.0]"
 ROBOT = ("-p", "robot:=ur10")
+LASER = ROOT / "config" / "cells" / "kr150_laser.yaml"
 NODES: dict[str, tuple[str, ...]] = {  # with the parameters that they do not start without
     "thermal_node": ROBOT,
     "hand_eye_node": ROBOT,
@@ -34,6 +35,10 @@ NODES: dict[str, tuple[str, ...]] = {  # with the parameters that they do not st
     "recorder_node": (),
     "replay_node": ("-p", "bag:={bag}"),
     "cell_sim_node": (),
+    "tcf_node": ("-p", "robot:=kr150_r3100", "-p", f"laser:={LASER}"),
+    "adapter_node": ("-p", "target_frame:=robocal_sphere"),
+    "panel_node": (),
+    "sharing_node": (),
 }
 PROMISED_MEDIAN_S = 1.2
 ROUNDS = 7
