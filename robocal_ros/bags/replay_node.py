@@ -388,8 +388,8 @@ class ReplayNode(HouseNode):
     def _end(self, topics: ReplayTopics, state: str) -> None:
         self._set_state(state)
         lost = [self._fault] if self._fault else []
-        if self._damaged():
-            lost.append(self._damaged())
+        if damaged := self._damaged():
+            lost.append(damaged)
         if doubt := topics.doubt():
             lost.append(f"loss cannot be excluded: {doubt}")
         if lost:

@@ -180,18 +180,18 @@ class Moving(Line):
     def _slows_down(self, times: np.ndarray, q: np.ndarray, starved_s: float) -> None:
         """What went out of a stream without its planner: evenly, as the joints may, to rest."""
         when, where, fast = np.array(self.slowed).T
-        elapsed = np.diff(when)
+        elapsed, passed = np.diff(when), when[1:-1] - when[0]
         assert len(when) > 3
         assert fast[-1] == 0.0
         no_jump(np.diff(fast) >= -SLOWING * (elapsed + BUSY_S), "slows down as the joints may")
-        slower = -SLOWING * (elapsed[:-1] - BUSY_S - starved_s)
-        assert np.all(np.diff(fast)[:-1] <= slower)
+        # all together: of one step the time without a core may be more than there is
+        assert np.all(fast[0] - fast[1:-1] >= SLOWING * (passed - BUSY_S - starved_s))
         evenly = 0.5 * (fast[:-1] ** 2 - fast[1:] ** 2) / SLOWING
         # the last step is shorter than the time that has passed
         no_jump(np.abs(np.diff(where) - evenly) <= 1e-9, "slows down evenly")
         first = int(np.flatnonzero(times == when[0])[0])
-        passed = when[0] - times[first - 1] + BUSY_S
-        no_jump(where[0] - q[first - 1] <= FASTEST * passed, "the first step of a slow-down")
+        before = when[0] - times[first - 1] + BUSY_S
+        no_jump(where[0] - q[first - 1] <= FASTEST * before, "the first step of a slow-down")
         assert self.at[0] == where[-1]
 
     def held(self, words: str, state: int) -> None:
