@@ -131,10 +131,12 @@ def measure(seconds: float) -> dict[str, Any]:
         rows = [row for rate in RATES_HZ for row in _stream(probe, streams, rate, seconds)]
         paths = _paths(probe, streams)
     load.append(os.getloadavg()[0])
-    return {"load": load, "streams": rows, "paths": paths, "own": _own()}
+    with tempfile.TemporaryDirectory() as folder:
+        own = _own(folder)
+    return {"load": load, "streams": rows, "paths": paths, "own": own}
 
 
-def _own() -> dict[str, tuple[float, ...]]:
+def _own(state_dir: str) -> dict[str, tuple[float, ...]]:
     """Of each topic: messages, those refused, processor time of a callback and of publishing."""
     import rclpy
     from robocal_msgs.msg import KinematicModel
@@ -142,7 +144,8 @@ def _own() -> dict[str, tuple[float, ...]]:
     from bench.stream_probe import LEAD_S, SERIAL, STATES, TARGETS, Buffer, drifted, offered, path
     from robocal_ros.correction.node import JointCorrectionNode
 
-    given = {"robot": "kr150_r3100", "serial": SERIAL, "enable_on_start": "true"}
+    given = {"robot": "kr150_r3100", "serial": SERIAL, "state_dir": state_dir}
+    given["enable_on_start"] = "true"
     words = (word for name, value in given.items() for word in ("-p", f"{name}:={value}"))
     rclpy.init(args=["--ros-args", *words])
     node = JointCorrectionNode()
