@@ -306,7 +306,7 @@ class DesiredOffset:
     ``limiter``: brings it in. ``stage``: the correction in use, None while nothing is to be
     corrected; ``known``: the same as if it were on, a robot may show it that was corrected before.
     ``clamped``, ``passed``: how many messages were corrected in part, or not at all, for what
-    bound.
+    bound. ``whole_step``: the last arguments of `step_out`, None where it does not serve.
     """
 
     def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
@@ -325,7 +325,7 @@ class DesiredOffset:
         self._bounds = np.array(bounds, dtype=np.float64)
         self._nothing = np.zeros(reference.n)
         self._tcp = np.array([config.thermal.tcp_m, config.thermal.tcp_rad])
-        self._whole_step: tuple[Any, ...] | None = None  # the last arguments of `step_out`
+        self.whole_step: tuple[Any, ...] | None = None
 
     def want(self, actual: SerialArm, on: bool) -> None:
         """Correct for an arm with its tool from the next command on, or for nothing."""
@@ -336,11 +336,11 @@ class DesiredOffset:
             self.known = None
             if not same:
                 self.known = correction_between(self._reference, packed, self._arm, self._config)
-        self.stage, self._whole_step = self.known if on else None, None
+        self.stage, self.whole_step = self.known if on else None, None
         if self.stage is not None and self._config.policy is Policy.REFUSE:
             stage = self.stage
             given = stage.largest, stage.free_axis, stage.works, stage.reports, self.figures
-            self._whole_step = self._span, self._bounds, self._tcp, *given
+            self.whole_step = self._span, self._bounds, self._tcp, *given
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
@@ -376,23 +376,18 @@ class DesiredOffset:
         longest: float,
         active: Array,
         speeds: Array,
-        *,
-        usual: bool = False,
     ) -> float:
         """Put one target (n,) with its velocities out by the limiter; see `limiter.step_out`.
 
-        In one piece where nothing is out of the ordinary. Else raises `RefusedError` as `at`; where
-        a ``usual`` target is asked for it is `NOT_WITHIN` then, and nothing has gone out.
+        In one piece where nothing is out of the ordinary. Else raises `RefusedError` as `at`.
         """
-        limiter, given = self.limiter, self._whole_step
+        limiter, given = self.limiter, self.whole_step
         memory, limits = limiter.memory, limiter.limits
         if given is not None:
             share = step_out(q, velocity, elapsed, longest, memory, limits, active, speeds, *given)
             if share != NOT_WITHIN:
                 self.made = True
                 return share
-        if usual:
-            return NOT_WITHIN
         stage, span = self.stage, self._span
         if stage is None:
             self.made, desired = False, self._nothing

@@ -17,7 +17,7 @@ import math
 import struct
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any
 
@@ -37,26 +37,29 @@ from robocal_ros.correction.interface import (
     joint_command,
     require_few,
 )
+from robocal_ros.correction.serialized_target import FRAME, STAMP, STAMPS, SerializedTarget
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
+from robocal_ros.ground.samples import CORRECTED
 from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.ros.conversions import NS, header
 
 HEAD = b"\0\1\0\0"  # plain, little endian
-STAMP, FRAME = len(HEAD), len(HEAD) + 8  # where they begin
-STAMPS = struct.Struct("<iI")
 LEAST_POINT = 4 * FIELDS + 8  # bytes of a point without numbers
 POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
 EFFORTS = FIELDS - 1  # of a point's fields the last
 
 
-def _string(data: bytes, at: int) -> tuple[str, int]:
-    """Text and where the next number begins."""
+def _string(data: bytes, at: int) -> tuple[str, slice, int]:
+    """Text, where it stands with its length, and where the next number begins.
+
+    What stands between the two may be anything.
+    """
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     if not length > 0 or end > len(data):
         raise struct.error("a string is longer than the message")
-    return data[at + 4 : end - 1].decode(), end + -end % 4
+    return data[at + 4 : end - 1].decode(), slice(at, end), end + -end % 4
 
 
 def _string_bytes(text: str) -> bytes:
@@ -68,16 +71,17 @@ def _string_size(text: str) -> int:
     return 4 + -(-(len(text.encode()) + 1) // 4) * 4
 
 
-def _names(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
-    """Names and where the next number begins."""
+def _names(data: bytes, at: int) -> tuple[tuple[str, ...], list[slice], int]:
+    """Names, where they stand with their lengths and number, and where the next number begins."""
     (count,) = struct.unpack_from("<I", data, at)
     if count > len(data):
         raise struct.error("more names than the message is long")
-    names, at = [], at + 4
+    names, parts, at = [], [slice(at, at + 4)], at + 4
     for _ in range(count):
-        name, at = _string(data, at)
+        name, part, at = _string(data, at)
         names.append(name)
-    return tuple(names), at
+        parts.append(part)
+    return tuple(names), parts, at
 
 
 def joint_names(data: bytes) -> tuple[str, ...]:
@@ -85,7 +89,7 @@ def joint_names(data: bytes) -> tuple[str, ...]:
     if data[: len(HEAD)] != HEAD:
         return ()
     try:
-        return _names(data, _string(data, FRAME)[1])[0]
+        return _names(data, _string(data, FRAME)[2])[0]
     except (struct.error, UnicodeDecodeError):
         return ()
 
@@ -99,7 +103,8 @@ class _Layout:
     named: bytes  # the names as they stand there
     counts: tuple[int, ...]  # of positions, velocities, efforts
     places: tuple[int, ...]
-    parts: Callable[[bytes], tuple[bytes, ...]]  # that are the same in all messages laid out so
+    compared: tuple[slice, ...]  # that are the same in all messages laid out so
+    compare: Callable[[bytes], tuple[bytes, ...]]
     same: tuple[bytes, ...]
     numbers: struct.Struct  # all of them, after the stamp's two
     doubles: int  # from the first position to the end of the last number, counts among them
@@ -122,11 +127,12 @@ class JointWire:
         # of what goes out: what it was made for, and what stands before the numbers of each field
         self._made_for: tuple[_Layout, str, bool, int] | None = None
         self._before: list[bytes] = []
+        self._target: tuple[_Layout, SerializedTarget] | None = None
 
     def read(self, data: bytes) -> JointCommand | None:
         """The command in a message; None for one that is not regular, finite and whole."""
         layout = self._layout
-        if layout is None or len(data) != layout.size or layout.parts(data) != layout.same:
+        if layout is None or len(data) != layout.size or layout.compare(data) != layout.same:
             layout = self._layout = _layout(data)
             if layout is None:
                 return None
@@ -163,6 +169,23 @@ class JointWire:
         out = data[:FRAME], to_position, command.position.tobytes(), to_velocity, speeds
         return b"".join((*out, to_effort, effort))
 
+    def target(self, data: bytes, command: JointCommand) -> SerializedTarget | None:
+        """What is known of targets laid out as the message read last; None with efforts."""
+        layout = self._layout
+        if layout is None or layout.counts[2]:
+            return None
+        if self._target is None or self._target[0] is not layout:
+            out = self.written(data, replace(command, mark=CORRECTED))
+            written = _layout(out)
+            assert written is not None
+            at, out_at = (
+                (each.places[0], each.places[1] if each.velocity else 0)
+                for each in (layout, written)
+            )
+            like = SerializedTarget(command, data, layout.compared, at, out, out_at)
+            self._target = layout, like
+        return self._target[1]
+
 
 def _before(layout: _Layout, mark: str, counts: tuple[int, ...]) -> list[bytes]:
     """What stands before the numbers of each field, so many, after the stamp."""
@@ -181,9 +204,9 @@ def _layout(data: bytes) -> _Layout | None:
     if data[: len(HEAD)] != HEAD:
         return None
     try:
-        frame_id, at = _string(data, FRAME)
+        frame_id, part, at = _string(data, FRAME)
         names_begin = at
-        names, at = _names(data, at)
+        names, parts, at = _names(data, at)
         counts, places, begins = [], [], []
         for _ in range(3):
             (count,) = struct.unpack_from("<I", data, at)
@@ -197,8 +220,9 @@ def _layout(data: bytes) -> _Layout | None:
     k = len(names)
     if at > len(data) or not counts[0] == k > 0 or counts[1] not in (0, k):
         return None
-    counted = [slice(begin, begin + 4) for begin in begins[1:]]
-    parts = itemgetter(slice(0, len(HEAD)), slice(FRAME, begins[0] + 4), *counted)
+    counted = [slice(begin, begin + 4) for begin in begins]
+    compared = slice(0, len(HEAD)), part, *parts, *counted
+    compare = itemgetter(*compared)
     fields = [f"{c}d" for c in counts if c]  # each begins a number after the end of that before
     numbers, before = "8x".join(fields), places[0] - FRAME
     return _Layout(
@@ -207,8 +231,9 @@ def _layout(data: bytes) -> _Layout | None:
         named=data[names_begin : begins[0]],
         counts=tuple(counts),
         places=tuple(places),
-        parts=parts,
-        same=parts(data),
+        compared=compared,
+        compare=compare,
+        same=compare(data),
         numbers=struct.Struct(f"<iI{before}x{numbers}"),
         doubles=struct.calcsize(f"<{numbers}") // 8,
         velocity=slice(k + 1, 2 * k + 1) if counts[1] else None,
@@ -271,6 +296,10 @@ class JointMessage:
             return self._command
         build = joint_command if self._wire.is_reading else finite_command
         return build(self._message)
+
+    def target(self) -> SerializedTarget | None:
+        """What is known of targets that are laid out like it; None where it is not regular."""
+        return self._wire.target(self._data, self._command) if self._command else None
 
     def unchanged(self) -> Any:
         """What came, to publish; of a reading without what its driver does not know."""
@@ -366,8 +395,8 @@ class PathMessage:
         if size < FRAME - STAMP or data[:2] != HEAD[:2]:
             return
         sec, nanosec = STAMPS.unpack_from(data, STAMP)
-        frame_id, at = _string(data, FRAME)
-        names, at = _names(data, at)
+        frame_id, _, at = _string(data, FRAME)
+        names, _, at = _names(data, at)
         (count,) = struct.unpack_from("<I", data, at)
         if not 0 < count <= size // LEAST_POINT:
             return

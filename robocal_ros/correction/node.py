@@ -153,7 +153,9 @@ class JointCorrectionNode(RobotNode):
         states = partial(JointMessage, JointWire(is_reading=True))
         targets, act = partial(JointMessage, JointWire()), self._on_target
         self._listen(STATES, states, self._on_states, endpoints.SENSOR)
-        self._listen(TARGETS, targets, partial(act, TARGETS), endpoints.HEARTBEAT)
+        self._listen(
+            TARGETS, targets, partial(act, TARGETS), endpoints.HEARTBEAT, self._on_usual_target
+        )
         commands = partial(ArrayMessage, self._names)
         self._listen(COMMANDS, commands, partial(act, COMMANDS), endpoints.HEARTBEAT)
         counted = self._session.counted
@@ -295,21 +297,28 @@ class JointCorrectionNode(RobotNode):
         read: Callable[[Any], Any],
         act: Callable[[Any, float], None],
         profile: Any,
+        usual: Callable[[bytes, float], bool] = lambda came, now: False,
     ) -> None:
         """Act on an input; refuse what a correction node publishes itself, and several sources.
 
         In shadow mode a message goes out as it came before anything else is done with it.
-        ``act`` is given the message, and when it was taken.
+        ``act`` is given the message, and when it was taken; ``usual`` says whether it was acted on
+        already as it came.
         """
         guard, senders = self._sources[topic], self._senders.get(topic)
 
         def receive(came: Any) -> None:
-            message, now = read(came), time.monotonic()
-            if guard.fault:
-                self._refuse_message(topic, Reason.OWN_OUTPUT, guard.fault, now)
+            now, fault, rivals = time.monotonic(), guard.fault, ""
+            if senders and not fault:
+                rivals = senders.hear(topic, now)
+            if not (fault or rivals) and usual(came, now):
+                return
+            message = read(came)
+            if fault:
+                self._refuse_message(topic, Reason.OWN_OUTPUT, fault, now)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
-            if senders and (rivals := senders.hear(topic, now)):
+            if rivals:
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message, now)
 
@@ -333,9 +342,25 @@ class JointCorrectionNode(RobotNode):
         try:
             self._put_out(topic, message, command, self._session.target(command, now))
         finally:
+            self._arm_tail()
+        stream = self._session.stream
+        if stream.is_usual and isinstance(message, JointMessage):
+            stream.like = message.target() or stream.like
+        self._tell_offset(STREAM, now)
+
+    def _on_usual_target(self, came: bytes, now: float) -> bool:
+        """Correct a target of a stream that runs as usual; whether it was one."""
+        self._stream = TARGETS
+        try:
+            out = self._session.serialized_target(came, now)
+            if out is None:
+                return False
+            self._outputs[TARGETS].publish(out)
+        finally:
             self._session.stream.settle()
             self._arm_tail()
         self._tell_offset(STREAM, now)
+        return True
 
     def _on_states(self, message: JointMessage, now: float) -> None:
         session = self._session

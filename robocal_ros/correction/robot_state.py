@@ -60,7 +60,8 @@ class RobotState:
     """The arm's joints: where they were read, and where the controller is, by a steady clock.
 
     ``age_limit_s``: readings that are older, by stamp or by arrival, tell nothing. ``near`` (n,): a
-    robot that moved by less within `RESPONSE_S` stands, rad (prismatic: m).
+    robot that moved by less within `RESPONSE_S` stands, rad (prismatic: m). ``doubtful`` (n,): a
+    position beyond it may not be one.
     ``fastest`` (n,): no joint is faster, rad/s (m/s).
     ``measured``, ``velocity`` (n,): last readings, NaN before the first, and where there is none.
     ``scaling``: how fast the controller's clock runs, 0 to 1; 1 where nobody says. ``held_s``: when
@@ -82,7 +83,7 @@ class RobotState:
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
         # finite, so that infinity is beyond it for a joint without limits too
-        self._doubtful = np.minimum(np.minimum(self._turns, self._tenfold), sys.float_info.max)
+        self.doubtful = np.minimum(np.minimum(self._turns, self._tenfold), sys.float_info.max)
         self._continuous = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
         changes = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
         self._turned = 0.5 * VELOCITY_S * changes + near / LEAST_TRACK_S
@@ -119,7 +120,7 @@ class RobotState:
             raise RefusedError(Reason.WRONG_SIZE, detail)
         require_finite(names, position)
         size = np.abs(position)
-        if not (size > self._doubtful[index]).any():
+        if not (size > self.doubtful[index]).any():
             return
         if np.any(size > self._turns[index]):
             point, column = np.argwhere(size > self._turns[index])[0]
@@ -131,7 +132,7 @@ class RobotState:
     def require_target(self, command: JointCommand, index: Index) -> None:
         """As `require_positions`, and velocities that are not finite, or of another number."""
         names, position, velocity = command.names, command.position, command.velocity
-        usual = len(position) == len(names) and ordinary(plain(position), self._doubtful, index)
+        usual = len(position) == len(names) and ordinary(plain(position), self.doubtful, index)
         if not usual:
             self.require_positions(names, index, position[None])
         if velocity is None:
@@ -184,7 +185,7 @@ class RobotState:
             self._columns[state.names] = known
         names, index, joints, column = known
         position = state.position[column]
-        if not ordinary(plain(position), self._doubtful, index):
+        if not ordinary(plain(position), self.doubtful, index):
             self.require_positions(names, index, position[None])
         return joints, column
 

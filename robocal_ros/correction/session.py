@@ -39,6 +39,7 @@ from robocal_ros.correction.limiter import (
 )
 from robocal_ros.correction.robot_state import EVERY, Joints, Output
 from robocal_ros.correction.sent_path import WITHHELD, SentPath
+from robocal_ros.correction.serialized_target import FRAME, SerializedTarget
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array
@@ -213,13 +214,11 @@ class CorrectionSession:
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream of joint targets; itself where nothing is added.
 
-        A `RefusedError` ends a stream that runs: its `tail` slows the robot down. What was seen of
-        it can be noted by the stream's `settle`, when it is out.
+        A `RefusedError` ends a stream that runs: its `tail` slows the robot down.
         """
+        stream = self.stream
+        stream.settle()
         try:
-            followed = self._follow(command, now_s)
-            if followed is not None:
-                return followed
             self._require_order(TARGET[0], command, TARGET[1], now_s)
             for reason, detail in self._held.items():
                 raise RefusedError(reason, detail)
@@ -230,26 +229,36 @@ class CorrectionSession:
                 self._shadow(q[None])
                 corrected = command
             else:
-                corrected = self.stream.take(command, index, q, now_s)
+                corrected = stream.take(command, index, q, now_s)
         except RefusedError as error:
-            if error.reason not in DROPPED or self.stream.is_due(now_s, INSTEAD):
-                self.stream.end(error, now_s)
+            if error.reason not in DROPPED or stream.is_due(now_s, INSTEAD):
+                stream.end(error, now_s)
             raise self._count(error) from None
         self._goal[:] = q
         return corrected
 
-    def _follow(self, command: JointCommand, now_s: float) -> JointCommand | None:
-        """The next target of a stream as usual; None where it is for `target`, or refused there."""
-        self.stream.settle()
-        stamp, (last, came_s) = command.stamp_ns, self._stamps.get(TARGET, NEVER)
+    def serialized_target(self, came: bytes, now_s: float) -> bytes | None:
+        """As `target`, for a serialized message of a stream that runs as usual; None: it is none.
+
+        What was seen of it can be noted by the stream's `settle`, when it is out.
+        """
+        stream, like = self.stream, self.stream.like
+        stream.settle()
+        if like is None or len(came) != like.size or self._held or self._config.shadow:
+            return None
+        stamp, (last, came_s) = like.stamp_ns(came), self._stamps.get(TARGET, NEVER)
         in_order = not stamp or (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9)
-        if not in_order or self._held or self._config.shadow:
+        if not (in_order and stream.follow(came, now_s)):
             return None
         if stamp:
             self._stamps[TARGET] = stamp, now_s
-        if (corrected := self.stream.follow(command, now_s)) is not None:
-            self._goal[:] = command.position
-        return corrected
+        try:
+            out = stream.followed(came)
+        except RefusedError as error:
+            stream.end(error, now_s)
+            raise self._count(error) from None
+        self._goal[:] = like.q
+        return out
 
     def trajectory(
         self,
@@ -577,7 +586,13 @@ def load_kernels(arm: SerialArm) -> None:
     stage.rates(q, q, q, stage.correct(q))
     stage.taught_velocity_one(zeros, zeros, stage.uncorrect_one(zeros))
     output.limiter.follow(q, np.arange(2.0), np.zeros(2), ones)
-    output.robot.require_target(JointCommand(arm.joint_names, q[0]), np.arange(n))
+    target = JointCommand(arm.joint_names, zeros)
+    output.robot.require_target(target, np.arange(n))
+    message = bytes(FRAME + 8 * n)
+    like = SerializedTarget(target, message, (), (FRAME, 0), message, (FRAME, 0))
+    step = output.robot.doubtful, desired.limiter.memory, desired.limiter.limits, ones, given[-1]
+    assert desired.whole_step is not None
+    like.follow(message, 0.004, *step, *desired.whole_step)
     doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
     point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
     gather_rows(doubles, places[:, 0], np.empty((1, 1)))

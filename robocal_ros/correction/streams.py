@@ -21,6 +21,7 @@ from robocal_ros.correction.limiter import (
     VELOCITY,
 )
 from robocal_ros.correction.robot_state import Output, hold_speeds
+from robocal_ros.correction.serialized_target import SerializedTarget
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
 
@@ -80,9 +81,14 @@ class TargetStream:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self.period_s, self._as_usual = np.nan, 0  # and so many intervals since it was found
         self._step_period_s = LONGEST_STEP_S  # it, or what stands for it before two messages came
-        # its last message, and the same where it is of all joints and went out as it was wanted
+        # its last message, or one like it; whether it was of all joints and went out as wanted
         self._command: JointCommand | None = None
-        self._usual: JointCommand | None = None
+        self.is_usual = False
+        self.like: SerializedTarget | None = None  # how the targets of all joints are serialized
+        limiter = output.limiter
+        self._step = (
+            output.robot.doubtful, limiter.memory, limiter.limits, self._active, self._speeds
+        )  # fmt: skip
         self._index, self._whole = np.zeros(0, dtype=np.int64), False  # of all joints, in order
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used
@@ -91,8 +97,8 @@ class TargetStream:
         self._sent: deque[tuple[float, Array]] = deque(maxlen=MOST_KEPT)
         self._step_s = 0.0  # time that the last output used
         self._before = np.full(arm.n, np.nan)  # what was put out before it
-        # of the last message, while it is not noted: when, what came, what was put out before
-        self._unnoted: tuple[float, Array, Array, float] | None = None
+        # of a serialized target, while it is not noted: when it came, and what was out before it
+        self._unnoted: tuple[float, float] | None = None
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
         self._lasts_s, self._slowed_s = 0.0, 0.0
@@ -103,29 +109,32 @@ class TargetStream:
             return True
         return self.phase is StreamPhase.RUNNING and now_s - self._came_s <= self._gap_s()
 
-    def _note_interval(self, now_s: float) -> None:
-        """The period: half of the time is in intervals that are so long or longer.
+    def _period_at(self, now_s: float) -> tuple[float, int] | None:
+        """The period when a message comes now, and since how many intervals; None in a burst.
 
-        So it is the time from burst to burst, messages that are lost do not make it longer, and of
-        a stream that slows down a few long intervals count at once.
+        Half of the time is in intervals that are so long or longer. So it is the time from burst to
+        burst, messages that are lost do not make it longer, and of a stream that slows down a few
+        long intervals count at once.
         """
-        interval, intervals, period = now_s - self._beat_s, self._intervals, self.period_s
+        interval, period = now_s - self._beat_s, self.period_s
         if interval <= 0.0 or interval < BURST * period:
-            return
-        self._beat_s = now_s
-        intervals.append(interval)
-        self._as_usual += 1
-        if self._as_usual < SAME_PERIOD and abs(interval - period) < 0.2 * period:
-            return
-        self._as_usual = 0
-        lengths = sorted(intervals)
+            return None
+        if self._as_usual + 1 < SAME_PERIOD and abs(interval - period) < 0.2 * period:
+            return period, self._as_usual + 1
+        lengths = sorted([*self._intervals, interval][-INTERVALS:])
         pause = max(self._pause_s, 2.0 * lengths[len(lengths) // 2])
         while lengths[-1] > pause:
             lengths.pop()
         usual = max(len(lengths) - STALLS, 1)
         lengths[usual:] = [lengths[usual - 1]] * (len(lengths) - usual)
         sums = list(accumulate(lengths))
-        self.period_s = self._step_period_s = lengths[bisect_right(sums, 0.5 * sums[-1])]
+        return lengths[bisect_right(sums, 0.5 * sums[-1])], 0
+
+    def _note_period(self, period: tuple[float, int] | None, now_s: float) -> None:
+        if period is not None:
+            self._intervals.append(now_s - self._beat_s)
+            self._beat_s, (self.period_s, self._as_usual) = now_s, period
+            self._step_period_s = self.period_s
 
     def _gap_s(self) -> float:
         """A longer silence is a pause."""
@@ -140,49 +149,52 @@ class TargetStream:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
         return elapsed_s > HELD_PERIODS * self._step_period_s
 
-    def follow(self, command: JointCommand, now_s: float) -> JointCommand | None:
-        """As `take`, for the next message of a stream of all joints that runs as usual.
+    def follow(self, came: bytes, now_s: float) -> bool:
+        """As `take`, for a serialized target of a stream of all joints that runs as usual.
 
-        None, and nothing went out, where it is anything else. Where it led is noted by `settle`,
-        which can wait until it is out; the one before it has been. Raises `RefusedError` when it
-        is no whole target, or its velocities are too high.
+        False, and nothing has changed, where it is anything else. What goes out is `followed`;
+        where it led is noted by `settle`, which can wait until it is out.
         """
-        usual, output, velocity = self._usual, self._output, command.velocity
-        elapsed = now_s - output.out_s
+        like, output, desired = self.like, self._output, self._desired
+        given, elapsed = desired.whole_step, now_s - output.out_s
         if (
-            usual is None
-            or command.names != usual.names
-            or command.mark != usual.mark
+            like is None
+            or given is None
+            or not self.is_usual
             or self.phase is not RUNNING
             or not 0.0 < elapsed <= self._pause_s
             or output.path is not None
             or output.mismatch
         ):
-            return None
-        self._robot.require_target(command, self._index)
-        self._velocity[:] = 0.0 if velocity is None else velocity
-        self._note_interval(now_s)
-        if self._holds(elapsed):
-            return None
-        q, before, desired = command.position.copy(), output.out.copy(), self._desired
-        share = desired.put_out(
-            q, self._velocity, elapsed, elapsed, self._active, self._speeds, usual=True
-        )
-        if not 0.0 <= share <= 1.0 + ROUNDING:
-            return None
-        self._unnoted = now_s, q, before, now_s - elapsed
-        self._goal, self._command = q, command
+            return False
+        period = self._period_at(now_s)
+        if elapsed > HELD_PERIODS * (self._step_period_s if period is None else period[0]):
+            return False
+        if not 0.0 <= like.follow(came, elapsed, *self._step, *given) <= 1.0 + ROUNDING:
+            return False
+        self._note_period(period, now_s)
+        self._unnoted, self._command = (now_s, now_s - elapsed), like.command
         self._came_s = output.out_s = now_s
-        output.stage = desired.stage
-        return self._message(command)
+        output.stage, desired.made = desired.stage, True
+        return True
+
+    def followed(self, came: bytes) -> bytes:
+        """What goes out for the last serialized target; itself where nothing is added.
+
+        Raises `RefusedError` when its velocities are too high.
+        """
+        assert self.like is not None
+        if self.like.command.velocity is not None and self._desired.figures[TOO_FAST]:
+            self._velocity_out()
+        return self.like.written() if self._desired.figures[ADDS] else came
 
     def settle(self) -> None:
-        """Note the last message."""
-        if self._unnoted is not None:
-            now_s, q, before, before_s = self._unnoted
-            self._unnoted = None
-            self._note(self._way, q, now_s)
-            self._note(self._sent, before, before_s)
+        """Note the last serialized target."""
+        if self._unnoted is not None and self.like is not None:
+            now_s, before_s = self._unnoted
+            self._unnoted, self._goal = None, self.like.q.copy()
+            self._note(self._way, self._goal, now_s)
+            self._note(self._sent, self.like.before.copy(), before_s)
 
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
@@ -204,7 +216,7 @@ class TargetStream:
             self._way.clear()
             self._sent.clear()
             self.period_s, self._step_period_s, self._beat_s = np.nan, LONGEST_STEP_S, now_s
-        self._note_interval(now_s)
+        self._note_period(self._period_at(now_s), now_s)
         if begins or index is not self._index:
             new = index[self._active[index] == 0.0]
             if len(new):
@@ -219,10 +231,9 @@ class TargetStream:
             self._velocity[index] = velocity
         output.path = None
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
-        self._usual = None
+        self.is_usual = False
         self._advance(now_s)
-        usual = self._whole and self.lag_s == 0.0 and not self._held_up
-        self._usual = command if usual else None
+        self.is_usual = self._whole and self.lag_s == 0.0 and not self._held_up
         return self._message(command)
 
     def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
@@ -439,8 +450,9 @@ class TargetStream:
         if self._command is None:
             return None
         if self.phase is StreamPhase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
-            command = replace(self._command, position=self._goal[self._index], velocity=None)
-            self._usual = None
+            goal = self._goal[self._index]
+            command = replace(self._command, position=goal, velocity=None, stamp_ns=0)
+            self.is_usual = False
             self._note(self._way, self._goal, now_s)
             try:
                 self._advance(now_s)
@@ -468,7 +480,7 @@ class TargetStream:
             velocity = self._end_speed * (1.0 - t / self._lasts_s)
         if t >= self._lasts_s:
             self.phase = StreamPhase.IDLE
-        return replace(command, position=place, velocity=velocity, mark=CORRECTED)
+        return replace(command, position=place, velocity=velocity, mark=CORRECTED, stamp_ns=0)
 
 
 def _lately(way: deque[tuple[float, Array]], window_s: float) -> deque[tuple[float, Array]]:

@@ -29,6 +29,8 @@ from joint_correction_live import (
 )
 from long_form import amount, more
 from rclpy.action import ActionClient, ActionServer, GoalResponse
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -54,9 +56,11 @@ class Stream:
 
     def __init__(self, session: Any) -> None:
         self._session, self._target, self._tail = session, session.target, session.stream.tail
+        self._serialized = session.serialized_target
         self.outs: list[list[float]] = []
         self.at_s, self.out, self.offset = np.full((3, 6), np.nan)
         session.target, session.stream.tail = self.target, self.tail
+        session.serialized_target = self.serialized
 
     def target(self, command: Any, now_s: float) -> Any:
         out = self._target(command, now_s)
@@ -64,6 +68,15 @@ class Stream:
         lags = self._session.status().lag_s > 0.0
         self.check(index, out.position, None if lags else command.position, now_s)
         return out
+
+    def serialized(self, came: bytes, now_s: float) -> bytes | None:
+        out = self._serialized(came, now_s)
+        if out is not None:
+            taught, corrected = (deserialize_message(data, JointState) for data in (came, out))
+            assert taught.name == corrected.name == list(NAMES)
+            now, was = np.array(corrected.position), np.array(taught.position)
+            self.check(list(range(len(NAMES))), now, was, now_s)
+        return bytes(out) if out is not None else None
 
     def tail(self, now_s: float) -> Any:
         out = self._tail(now_s)
