@@ -17,8 +17,11 @@ from robocal_ros.correction.damping import (
     TCP_SHIFT,
     Six,
     Three,
+    along,
+    cross,
     dot,
     more,
+    product,
 )
 from robocal_ros.correction.six_axis import (
     ACTUAL,
@@ -87,21 +90,6 @@ def splines(layer: Array, rows: Array, at: int, lanes: int) -> None:
 
 
 @lean
-def _cross(a: Three, b: Three) -> Three:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@lean
-def _along(a: Three, s: float, b: Three) -> Three:
-    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
-
-
-@lean
-def _product(a: Three, b: Three) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@lean
 def _with_link(moment: Three, c: Array, each: int, f: Frame) -> Three:
     """Add the moment of a link, in the frame behind its joint."""
     m, x, y, z = c[each], c[each + 1], c[each + 2], c[each + 3]
@@ -116,7 +104,7 @@ def _with_link(moment: Three, c: Array, each: int, f: Frame) -> Three:
 def _swept(moment: Three, mass: float, sign: float, f: Frame) -> tuple[Three, Three]:
     """A joint's axis, and how the moment of all that it carries moves with it."""
     axis = sign * f[6], sign * f[7], sign * f[8]
-    return axis, _cross(axis, _along(moment, -mass, (f[9], f[10], f[11])))
+    return axis, cross(axis, along(moment, -mass, (f[9], f[10], f[11])))
 
 
 @lean
@@ -154,8 +142,8 @@ def _wound(c: Array, load: int, w: Vectors) -> Six:
     """How far gravity winds each joint."""
     g = c[load], c[load + 1], c[load + 2]
     torque = (
-        _product(g, w[0]), _product(g, w[1]), _product(g, w[2]),
-        _product(g, w[3]), _product(g, w[4]), _product(g, w[5]),
+        product(g, w[0]), product(g, w[1]), product(g, w[2]),
+        product(g, w[3]), product(g, w[4]), product(g, w[5]),
     )  # fmt: skip
     return _yields(c, load, torque)
 
@@ -164,24 +152,24 @@ def _wound(c: Array, load: int, w: Vectors) -> Six:
 def _wound_by(c: Array, load: int, a: Vectors, w: Vectors, x: Six) -> Six:
     """How that changes with a small shift of the joints: what a joint carries turns with all."""
     g = c[load], c[load + 1], c[load + 2]
-    b0 = _along((0.0, 0.0, 0.0), x[0], a[0])
-    b1 = _along(b0, x[1], a[1])
-    b2 = _along(b1, x[2], a[2])
-    b3 = _along(b2, x[3], a[3])
-    b4 = _along(b3, x[4], a[4])
-    b5 = _along(b4, x[5], a[5])
-    v4 = _along((0.0, 0.0, 0.0), x[5], w[5])
-    v3 = _along(v4, x[4], w[4])
-    v2 = _along(v3, x[3], w[3])
-    v1 = _along(v2, x[2], w[2])
-    v0 = _along(v1, x[1], w[1])
+    b0 = along((0.0, 0.0, 0.0), x[0], a[0])
+    b1 = along(b0, x[1], a[1])
+    b2 = along(b1, x[2], a[2])
+    b3 = along(b2, x[3], a[3])
+    b4 = along(b3, x[4], a[4])
+    b5 = along(b4, x[5], a[5])
+    v4 = along((0.0, 0.0, 0.0), x[5], w[5])
+    v3 = along(v4, x[4], w[4])
+    v2 = along(v3, x[3], w[3])
+    v1 = along(v2, x[2], w[2])
+    v0 = along(v1, x[1], w[1])
     torque = (
-        _product(g, _cross(b0, w[0])) + _product(g, _cross(a[0], v0)),
-        _product(g, _cross(b1, w[1])) + _product(g, _cross(a[1], v1)),
-        _product(g, _cross(b2, w[2])) + _product(g, _cross(a[2], v2)),
-        _product(g, _cross(b3, w[3])) + _product(g, _cross(a[3], v3)),
-        _product(g, _cross(b4, w[4])) + _product(g, _cross(a[4], v4)),
-        _product(g, _cross(b5, w[5])),
+        product(g, cross(b0, w[0])) + product(g, cross(a[0], v0)),
+        product(g, cross(b1, w[1])) + product(g, cross(a[1], v1)),
+        product(g, cross(b2, w[2])) + product(g, cross(a[2], v2)),
+        product(g, cross(b3, w[3])) + product(g, cross(a[3], v3)),
+        product(g, cross(b4, w[4])) + product(g, cross(a[4], v4)),
+        product(g, cross(b5, w[5])),
     )
     return _yields(c, load, torque)
 
