@@ -117,6 +117,8 @@ class PanelServer:
         self._logging_in = 0
         self._seen: tuple[Any, ...] = ()
         self._silent: dict[Any, float] = {}
+        self._handing = threading.Lock()  # holds `trouble` and what waits for its end together
+        self._waiting: dict[str, tuple[Values, int, float, float]] = {}  # by source
         self._stopped = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._changed = self._ending = asyncio.Event()
@@ -129,11 +131,13 @@ class PanelServer:
     # ---- the node's thread ----------------------------------------------------------------------
 
     def show(self, name: str, values: Values, stamp_ns: int) -> None:
-        """Show what a source said; nothing while the server is not up."""
-        if self._loop is not None and not self.trouble:
-            times = time.monotonic(), time.time()
-            with contextlib.suppress(RuntimeError):  # it has ended meanwhile
-                self._loop.call_soon_threadsafe(self._show, name, values, stamp_ns, *times)
+        """Show what a source said; once the server is up, the last: a latched one is said once."""
+        said = values, stamp_ns, time.monotonic(), time.time()
+        with self._handing:
+            if self._loop is None or self.trouble:
+                self._waiting[name] = said
+            else:
+                self._loop.call_soon_threadsafe(self._show, name, *said)
 
     def stop(self) -> None:
         """End it."""
@@ -207,7 +211,10 @@ class PanelServer:
                 ssl=settings.encryption,
                 ssl_handshake_timeout=None if settings.encryption is None else REQUEST_S,
             )
-            self.trouble = ""
+            with self._handing:
+                self.trouble, waiting, self._waiting = "", self._waiting, {}
+                for name, said in waiting.items():
+                    self._loop.call_soon(self._show, name, *said)
             while not self._stopped:
                 await self._look_at_history()
                 if self._sessions is not None:
@@ -219,7 +226,8 @@ class PanelServer:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._ending.wait(), LOOK_S)
         finally:
-            self.trouble = self.trouble or "ends"
+            with self._handing:
+                self.trouble = self.trouble or "ends"
             if listening is not None:
                 listening.close()
             self._wake()

@@ -18,11 +18,12 @@ from history_workers import proposal
 from panel_page import Cell, Loop, accuracy, ended, status
 
 from bench.live.opc_ua import ENGINEER, OPERATOR, free_port, security_folder
+from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.panel import server as served
 from robocal_ros.panel.server import COOKIE, HEADERS, TOKEN
 from robocal_ros.panel.sessions import ENGINEER_S, SESSION_S, PanelSessions
-from robocal_ros.panel.state import ACCURACY, STATUS
+from robocal_ros.panel.state import ACCURACY, FIXTURE, STATUS
 from robocal_ros.plc.access import LOCKED_AFTER, Role, Users
 
 Answer = tuple[int, Any]
@@ -456,6 +457,31 @@ def test_a_port_that_is_taken_is_told_and_tried_again():
     while late.trouble and time.monotonic() < deadline:
         time.sleep(0.05)
     assert late.trouble == ""
+    late.stop()
+
+
+def test_what_is_said_once_while_it_cannot_listen_yet_is_shown(tmp_path):
+    """As a latched message is, which comes as soon as the node is there."""
+    port, told = free_port(), list[str]()
+    settings = served.PanelSettings(
+        "127.0.0.1", port, None, True, tmp_path, "", None, frozenset({"localhost"})
+    )
+    deadline = time.monotonic() + 20.0
+    verdict = {"code": int(Code.ACCEPT), "candidate_id": 7, "reason": "it moved"}
+    with socket.create_server(("127.0.0.1", port)):
+        late = served.PanelServer(settings, lambda call: None, told.append)
+        late.show(FIXTURE, verdict | {"candidate_id": 6}, 1)
+        late.show(FIXTURE, verdict, 2)
+        late.show(ACCURACY, accuracy(), 3)
+        while not told and time.monotonic() < deadline:
+            time.sleep(0.05)
+    while late.trouble and time.monotonic() < deadline:
+        time.sleep(0.05)
+    late.show(STATUS, status(), 4)
+    while not late.panel.sources[STATUS].values and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert late.panel.sources[FIXTURE].values == verdict
+    assert late.panel.sources[ACCURACY].age_s(time.monotonic()) is None  # who said it may be gone
     late.stop()
 
 
