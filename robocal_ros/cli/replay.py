@@ -46,8 +46,9 @@ from robocal_ros.hand_eye.session import (
     take_hand_eye_message,
 )
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL, Action
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.arm import arm_of, layer_of, model_document, payload_note
 from robocal_ros.maintenance.session import RUN as MAINTAIN
 from robocal_ros.session import events
 from robocal_ros.session.events import Command, Outcome, SessionBase, session_kind
@@ -239,7 +240,9 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
                     f"the bag is of a {kind.replace('_', '-')} node: --auto, --cold and --warm are "
                     "for thermal ones"
                 )
-            return _replayed(recording, arm, history, watch("replaying", recording))
+            document = _replayed(recording, arm, history, watch("replaying", recording))
+            document["warnings"] += payload_notes(history, arm)
+            return document
         kept = _GOES_ON.format(history.path) if history.list(1) else ""
         streams = None
         if recording.configured is None:  # no node of ours, which takes each sample as it comes
@@ -262,8 +265,26 @@ def replay_bag(request: ReplayRequest, watch: Watch) -> Document:
         if streams is not None:
             document["streams"] = {topic: asdict(one) for topic, one in streams.timing.items()}
             document["warnings"] += [one.words(topic) for topic, one in streams.timing.items()]
+        document["warnings"] += payload_notes(history, arm)
         document["warnings"] += [kept] if kept else []
         return document
+
+
+def payload_notes(history: CalibrationHistory, nominal: SerialArm) -> list[str]:
+    """What it may cost that models which were in force were identified with other loads.
+
+    Than the robot file says; the newest model of each load tells.
+    """
+    notes: dict[str, str] = {}
+    for decision in reversed(history.decisions()):
+        chosen = decision.calibration_id
+        if decision.kind == THERMAL and decision.action is not Action.REJECT and chosen is not None:
+            model = history.model(chosen)
+            load = str(model.get("load"))
+            if load not in notes:
+                found = layer_of(model)[1]
+                notes[load] = payload_note(arm_of(model, nominal), found, nominal.load)
+    return [note for note in notes.values() if note]
 
 
 _NO_COMMANDS = "the bag holds no commands (session_events)"

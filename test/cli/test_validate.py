@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -42,7 +43,18 @@ from robocal_ros.cli.main import main
 from robocal_ros.cli.validate import validated
 from robocal_ros.cli.validating import Job, require_finite
 from robocal_ros.ground.errors import Code, InputError
-from robocal_ros.session.events import Command, Outcome, arguments_text, outcome_text
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import THERMAL
+from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.joint_functions import ArmLoad
+from robocal_ros.kinematics.robots import load_robot, save_robot
+from robocal_ros.session.events import (
+    Command,
+    Outcome,
+    arguments_text,
+    bring_into_force,
+    outcome_text,
+)
 
 TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
 EXCERPT = ROOT / "bags/golden_excerpt.mcap"
@@ -145,6 +157,30 @@ class TestRecordedSession:
         without, in_force = (second["measured"][k]["rms_mm"] for k in ("without", "in_force"))
         assert in_force < 0.6 * without  # 20 of 30 K are known
         assert second["forecast"]["bound_mm"] > second["forecast"]["rms_mm"] > 0.0
+
+    def test_another_payload_than_the_models_is_told_once(self, validate, tmp_path) -> None:
+        """As of the robot file: the hash of a model does not hold what the arm carries."""
+        load = ArmLoad(np.ones(6), np.zeros((6, 3)), 10.0, np.array([0.0, 0.0, 0.1]))
+        arms, files, state = {}, {}, tmp_path / "state"
+        for kg in (10, 90):
+            files[kg] = tmp_path / f"carries_{kg}.yaml"
+            arms[kg] = replace(load_robot(ROBOT), load=replace(load, payload_mass=float(kg)))
+            save_robot(arms[kg], files[kg])
+        bag, nominal = tmp_path / "loaded.mcap", arms[10]
+        with CalibrationHistory.open(
+            "s1", model_hash=nominal.model_hash, state_dir=state
+        ) as history:
+            identified = model_document(nominal)
+            bring_into_force(history, THERMAL, nominal, identified, "test")
+        recorded_bag(bag, state, shift(), robot=str(files[90]))
+        for kg, told in ((10, 0), (90, 1)):
+            status, _, _, report = validate(bag, "--robot", files[kg])
+            assert status == 0
+            (session,) = report["bags"][0]["sessions"]
+            words = [one for one in session["warnings"] if "identified with a payload" in one]
+            assert len(words) == told, session["warnings"]
+        assert "payload of 10 kg at (0, 0, 100) mm" in words[0]
+        assert "the robot file says 90 kg" in words[0]
 
     def test_a_recording_that_begins_late(self, bags, validate, tmp_path) -> None:
         """In mid-shift: latched topics send anew what is older, a command first, of all nodes.

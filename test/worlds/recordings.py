@@ -107,10 +107,15 @@ def with_events(
 
 
 def recorded_bag(
-    path: Path, state: Path, visits: Sequence[Sequence[Sample]], *, configure: bool = True
+    path: Path,
+    state: Path,
+    visits: Sequence[Sequence[Sample]],
+    *,
+    configure: bool = True,
+    robot: str = ROBOT,
 ) -> list[dict[str, Any]]:
     """A bag of a live session: captured, identified twice, once accepted; its documents."""
-    nominal = load_robot(ROBOT)
+    nominal = load_robot(robot)
     documents = []
     with (
         CalibrationHistory.open("s1", model_hash=nominal.model_hash, state_dir=state) as history,
