@@ -242,7 +242,10 @@ class ReadShots:
 
 
 def given_shots(
-    args: argparse.Namespace, arm: SerialArm | None, judges: Path | None = None
+    args: argparse.Namespace,
+    arm: SerialArm | None,
+    sensor: SensorDescription,
+    judges: Path | None = None,
 ) -> ReadShots:
     """Read the shots that are given, or those like them in the file of ``judges``.
 
@@ -253,13 +256,13 @@ def given_shots(
         if args.poses is None:
             raise InputError("give the shots: --poses, or --bag")
         folder = args.profiles or args.poses.parent
-        return read_shots(judges or args.poses, folder, arm, described(args))
+        return read_shots(judges or args.poses, folder, arm, sensor)
 
     if args.poses is not None or args.profiles is not None:
         raise InputError("the shots are given twice: --bag, and --poses or --profiles; keep one")
     if arm is None:
         raise InputError("a bag holds joints, not poses: name its robot with --robot")
-    return read_bag_shots(judges or args.bag, arm, dict(args.topic), described(args))
+    return read_bag_shots(judges or args.bag, arm, dict(args.topic), sensor)
 
 
 def read_shots(
@@ -473,11 +476,11 @@ def run_target(kind: str, args: argparse.Namespace) -> CliResult:
     """Do ``sphere``, ``step`` or ``line``. Raises `RobocalError` for what a user can mend."""
     arm = arm_of(args)
     target = given_target(kind, args.target, getattr(args, "radius_mm", None))
-    classic, towards = args.method == "classic", described(args).towards
-    task = task_of(target, getattr(args, "line_kind", None), classic, towards)
-    shots = given_shots(args, arm)
+    classic, sensor = args.method == "classic", described(args)
+    task = task_of(target, getattr(args, "line_kind", None), classic, sensor.towards)
+    shots = given_shots(args, arm, sensor)
     settings = settings_of(args, shots.data.joints is not None)
-    judges = None if args.check is None else given_shots(args, arm, args.check)
+    judges = None if args.check is None else given_shots(args, arm, sensor, args.check)
     if judges is not None:
         if judges.table is not None and shots.table is not None:
             require_unused(judges.table, shots.table)
@@ -563,16 +566,16 @@ def run_joint(args: argparse.Namespace) -> CliResult:
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}
     if len(folders) < 2:
         raise InputError("give the folders of at least two of --sphere, --step, --line")
-    parts, checks = [], {}
+    parts, checks, sensor = [], {}, described(args)
     for kind, folder in folders.items():
         file, profiles = folder / "target.yaml", folder / "profiles"
         known = kind != "line" or file.exists()
         target = given_target(kind, file if known else None, None)
-        task = task_of(target, args.line_kind, towards=described(args).towards)
-        shots = read_shots(folder / "poses.csv", profiles, arm, described(args))
+        task = task_of(target, args.line_kind, towards=sensor.towards)
+        shots = read_shots(folder / "poses.csv", profiles, arm, sensor)
         parts.append((task, shots.data))
         if args.check is not None and (folder / args.check).exists():
-            judges = read_shots(folder / args.check, profiles, arm, described(args))
+            judges = read_shots(folder / args.check, profiles, arm, sensor)
             if judges.table is not None and shots.table is not None:
                 require_unused(judges.table, shots.table)
             checks[task.kind] = judges.data
@@ -616,8 +619,9 @@ def run_verify(args: argparse.Namespace) -> CliResult:
     mount = read_flange_mount(args.result[0])
     T_flange_sensor = mount.T_parent_sensor
     target = given_target(args.target_kind, args.target, args.radius_mm)
-    task = task_of(target, args.line_kind, towards=described(args).towards)
-    shots = given_shots(args, arm_of(args))
+    sensor = described(args)
+    task = task_of(target, args.line_kind, towards=sensor.towards)
+    shots = given_shots(args, arm_of(args), sensor)
     found = verify(task, shots.data, T_flange_sensor, settings, mount.linearity)
     errors = errors_document(summarise(found.distance_m))
     rejected = {**shots.rejected, **by_shot(found.rejected, found.samples)}

@@ -38,6 +38,7 @@ from robocal_ros.cell_sim.cell import rigid_robot
 from robocal_ros.cell_sim.sensors import ball_on_table
 from robocal_ros.cli.main import main
 from robocal_ros.ground import frames
+from robocal_ros.hand_eye import profiles
 from robocal_ros.hand_eye.files import read_flange_mount, read_pose_table, write_pose_table
 from robocal_ros.hand_eye.targets import LineTarget
 from robocal_ros.kinematics.robots import load_robot, save_robot
@@ -162,6 +163,22 @@ class TestRecovered:
         for name, said in (("poses.csv", "other shots must judge"), ("none.csv", "none of the")):
             failed = robocal("joint", *HEIGHTS, *words, "--check", name, status=2)
             assert said in failed["error"]["message"]
+
+    def test_what_tells_the_sensor_is_read_once(self, made, tmp_path, monkeypatch):
+        file, read = tmp_path / "sensor.yaml", []
+        file.write_text("z_grows: towards\n")
+        reads = profiles.read_fields
+
+        def counted(path: Path, what: str) -> Any:
+            read.append(path)
+            return reads(path, what)
+
+        monkeypatch.setattr(profiles, "read_fields", counted)
+        words = ["--sensor", file, *several(made), "--check", "check.csv"]
+        assert robocal("joint", *words)["verdict"]["accept"]
+        one = ["--poses", made / "line" / "poses.csv", "--profiles", made / "line" / "profiles"]
+        robocal("line", "--sensor", file, *one, "--check", made / "line" / "check.csv")
+        assert read == [file, file]
 
     def test_a_line_without_a_target_file_is_unknown_in_joint(self, made, tmp_path):
         shutil.copytree(made / "groove", tmp_path / "groove")
