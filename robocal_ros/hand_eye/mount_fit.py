@@ -121,7 +121,7 @@ class MountFit:
     ``covariance`` (k, k) of the problem's unknowns; ``scale``: how far the misfit widened it.
     ``noise``: of reported poses, given or found. ``rejected``: names of sightings not used, with
     the reason. ``doubt``: why this is no solution, or not the only one, in words; empty where it
-    is.
+    is. ``bend``: of the sensor, where it was found.
     """
 
     views: tuple[TargetView, ...]
@@ -131,6 +131,7 @@ class MountFit:
     noise: PoseNoise
     rejected: Mapping[str, str]
     doubt: str
+    bend: Bend | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -183,6 +184,7 @@ def fit_mount(
         found,
         rejected,
         estimate.creeping or ("" if settled else UNSETTLED),
+        bend,
     )
 
 

@@ -18,6 +18,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Document
+from robocal_ros.hand_eye.agreement import disagreement
 from robocal_ros.hand_eye.linearity import SensorLinearity
 from robocal_ros.hand_eye.mount_fit import (
     LARGEST_POSE_M,
@@ -117,6 +118,8 @@ def _result_of(
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
     rejected |= dict(fit.rejected)
     every = summarise(distances(tuple(read.view for read in reads), fit.state))
+    other = disagreement(fit, settings.noise(), field)
+    error_m = float(np.hypot(error_m, other.beyond_m if other else 0.0))  # who is right?
     more: Document = {
         "spread": errors_document(every),
         "robot_sigma_mm": fit.noise.sigma_m * 1e3,
@@ -136,6 +139,8 @@ def _result_of(
         more |= task.more(replace(fit, views=(view,), state=state), read)
     alone = len(tasks) == 1
     verdict = judge(fit, shots, shots - _shots(fit.views), error_m, settings)
+    if other is not None:
+        verdict = other.judged(verdict, [t.kind for t in tasks], error_m > settings.limit_m)
     uncertain = verdict.code is Code.POSES_NOT_INFORMATIVE and error_m > settings.limit_m
     found_one = HandEyeResult(
         kind=tasks[0].kind if alone else "joint",
