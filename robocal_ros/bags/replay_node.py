@@ -47,6 +47,14 @@ class Played:
     untracked: dict[tuple[int, ...], str] = field(default_factory=dict)  # name by endpoint
 
 
+@dataclass(frozen=True)
+class BagLoss:
+    """What of the bag did not come to who listens, or perhaps not; ``level`` in diagnostics."""
+
+    level: bytes
+    words: str
+
+
 class ReplayTopics:
     """One reliable publisher for each topic.
 
@@ -135,18 +143,21 @@ class ReplayTopics:
         }
         return [name for name in names if self._node.resolve_topic_name(name) not in heard]
 
-    def doubt(self) -> str:
-        """Why messages may have been lost: not acknowledged, or sent to best-effort inputs."""
-        words = []
+    def losses(self) -> list[BagLoss]:
+        """What may have been lost on its way: not acknowledged, or sent to best-effort inputs."""
+        found = []
         if self.unacknowledged:
-            words.append(f"{self.unacknowledged} messages were not acknowledged")
-        words += [
-            f"{played.topic} went to best-effort subscribers ({', '.join(sorted(names))}): make "
-            "them reliable"
+            words = f"perhaps lost: {self.unacknowledged} messages that were not acknowledged"
+            found.append(BagLoss(ERROR, words))
+        return found + [
+            BagLoss(
+                WARN,
+                f"perhaps lost: messages of {played.topic} to best-effort subscribers "
+                f"({', '.join(sorted(names))}): make them reliable",
+            )
             for played in self.played.values()
             if (names := set(played.untracked.values()))
         ]
-        return "; ".join(words)
 
     def alone(self) -> str:
         """Tell what nobody heard, to go on from a sentence; empty when all had a subscriber."""
@@ -242,7 +253,7 @@ SETTINGS = (
     Setting(
         "exit_at_end",
         False,
-        "End the process: status 0, 3 when anything was lost, 2 when it cannot play",
+        "End the process: status 0, 3 when anything was lost or perhaps, 2 when it cannot play",
     ),
 )
 
@@ -370,7 +381,7 @@ class ReplayNode(HouseNode):
             if now - self._unsettled_since < self.settings["acknowledge_timeout_s"]:
                 return False
             topics.give_up()
-            self.get_logger().error(f"{topics.unacknowledged} messages were not acknowledged")
+            self.get_logger().error(topics.losses()[0].words)
         self._unsettled_since = None
         return True
 
@@ -387,23 +398,23 @@ class ReplayNode(HouseNode):
 
     def _end(self, topics: ReplayTopics, state: str) -> None:
         self._set_state(state)
-        lost = [self._fault] if self._fault else []
-        if damaged := self._damaged():
-            lost.append(damaged)
-        if doubt := topics.doubt():
-            lost.append(f"loss cannot be excluded: {doubt}")
+        lost = "; ".join(loss.words for loss in self._losses(topics))
         if lost:
-            self.get_logger().error(f"{state}: {'; '.join(lost)}")
+            self.get_logger().error(f"{state}: {lost}")
         else:
             self.get_logger().info(f"{state}: nothing was lost{topics.alone()}")
         if self.settings["exit_at_end"]:
             self._status.wait_for_all_acked(Duration(seconds=1))
             raise SystemExit(EXIT_LOSS if lost else 0)
 
-    def _damaged(self) -> str:
-        """What of the bag could not be read so far; empty: nothing."""
-        chunks = 0 if self._reader is None else len(self._reader.info.lost)
-        return f"damaged chunks of the bag, not played: {chunks}" if chunks else ""
+    def _losses(self, topics: ReplayTopics) -> list[BagLoss]:
+        """What was lost so far, or perhaps: by it go log, status, diagnostics and exit status."""
+        found = []
+        if self._fault:
+            found.append(BagLoss(ERROR, f"lost: the rest of the bag: {self._fault}"))
+        if chunks := 0 if self._reader is None else len(self._reader.info.lost):
+            found.append(BagLoss(ERROR, f"lost: damaged chunks of the bag: {chunks}"))
+        return found + topics.losses()
 
     # ---- services and status --------------------------------------------------------------------
 
@@ -441,6 +452,7 @@ class ReplayNode(HouseNode):
             "position_s": (self._position_ns - self._first_ns) * 1e-9,
             "notes": list(self._reader.info.notes),
             "fault": self._fault,
+            "lost": [loss.words for loss in self._losses(self._topics)],
             **self._topics.report(),
         }
         self._status.publish(String(data=json.dumps(status, sort_keys=True)))
@@ -450,16 +462,10 @@ class ReplayNode(HouseNode):
         health, topics = Health(message=self._play_state), self._topics
         if topics is None:
             return health
-        report = topics.report()
-        if self._fault:
-            health.worsen(ERROR, self._fault)
-        if damaged := self._damaged():
-            health.worsen(ERROR, damaged)
-        if topics.unacknowledged:
-            health.worsen(ERROR, f"{topics.unacknowledged} messages were not acknowledged")
-        for topic, nodes in report["best_effort"].items():
-            health.worsen(WARN, f"{topic}: {', '.join(nodes)} is best-effort, loss is not seen")
-        health.values = {f"{topic} sent": count for topic, count in report["sent"].items()}
+        for loss in self._losses(topics):
+            health.worsen(loss.level, loss.words)
+        sent = topics.report()["sent"]
+        health.values = {f"{topic} sent": count for topic, count in sent.items()}
         return health
 
 

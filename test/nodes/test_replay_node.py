@@ -5,7 +5,9 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +45,17 @@ HELD_BACK = {
     "/tcf_node/next_step": ("robocal_msgs/msg/ToolStep", "move a robot"),
     "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", "makes its own"),
 }
+DEAF = """
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("deaf")
+node.create_subscription(String, "/note", lambda note: None, 10)
+while not node.count_publishers("/note"):
+    rclpy.spin_once(node, timeout_sec=0.05)
+print("found", flush=True)
+rclpy.spin(node)
+"""
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -99,7 +112,7 @@ def test_everything_arrives_as_fast_as_it_is_acknowledged(graph, tmp_path):
     status = listener.status
     assert status["sent"]["/joint_states"] == count
     assert status["unacknowledged"] == 0
-    assert status["best_effort"] == {}
+    assert (status["best_effort"], status["lost"]) == ({}, [])
     assert "/n/session_events" in status["skipped"]
     assert listener.events == []
 
@@ -144,11 +157,15 @@ def test_recorded_time_goes_at_its_rate_and_is_the_clock(graph, tmp_path):
 def test_a_best_effort_subscriber_is_named(graph, tmp_path):
     bag = write_bag(tmp_path / "shift.mcap", 100, 1_000_000)
     listener = Listener(graph, BEST_EFFORT)
-    graph.start("replay_node", {"bag": bag, "rate": 0.0} | WAIT)
+    process = graph.start("replay_node", {"bag": bag, "rate": 0.0} | WAIT)
     listener.until("done")
     named = {"/joint_states": ["/probe"]}  # a name may come after its endpoint
     graph.spin_until(lambda: listener.status["best_effort"] == named, "the subscriber's name")
     assert "/odd" in listener.status["unheard"]
+    words = "messages of /joint_states to best-effort subscribers (/probe)"
+    (told,) = listener.status["lost"]
+    assert told == f"perhaps lost: {words}: make them reliable"
+    assert process.stop() == 0
 
 
 def test_topics_are_chosen_and_renamed(graph, tmp_path):
@@ -295,3 +312,26 @@ def test_what_is_damaged_in_the_bag_counts_as_lost(graph, tmp_path):
     assert process.process.wait(10) == 3
     assert len(listener.joints) < 20_000
     assert "damaged" in " ".join(listener.status["notes"])
+    (told,) = listener.status["lost"]
+    assert re.fullmatch(r"lost: damaged chunks of the bag: \d+", told)
+    assert f"done: {told}" in process.output
+
+
+def test_what_may_be_lost_is_said_in_the_same_way_and_ends_alike(graph, tmp_path):
+    """A reader that confirms nothing, and one that is stopped before it can."""
+    bag = write_bag(tmp_path / "shift.mcap", 100, 1_000_000)
+    listener = Listener(graph, BEST_EFFORT)
+    deaf = graph.run("deaf", [sys.executable, "-c", DEAF])
+    graph.spin_until(lambda: graph.probe.count_subscribers("/note") == 2, "it listens")
+    settings = {"bag": bag, "rate": 0.0, "start_paused": True, "acknowledge_timeout_s": 0.5}
+    process = graph.start("replay_node", settings | {"exit_at_end": True})
+    listener.until("paused")
+    graph.spin_until(lambda: "found" in deaf.output, "they have found each other")
+    deaf.process.send_signal(signal.SIGSTOP)
+    graph.call(Trigger, "/replay_node/play")
+    listener.until("done")
+    assert process.process.wait(10) == 3
+    late, unconfirmed = listener.status["lost"]
+    assert re.fullmatch(r"perhaps lost: \d+ messages that were not acknowledged", late)
+    assert unconfirmed.startswith("perhaps lost: messages of /joint_states to best-effort ")
+    assert f"done: {late}; {unconfirmed}" in process.output
