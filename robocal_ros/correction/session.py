@@ -39,7 +39,18 @@ from robocal_ros.correction.limiter import (
 )
 from robocal_ros.correction.robot_state import EVERY, Joints, Output
 from robocal_ros.correction.sent_path import WITHHELD, SentPath
-from robocal_ros.correction.serialized_target import FRAME, SerializedTarget
+from robocal_ros.correction.serialized_target import (
+    FAST_ONE,
+    FRAME,
+    GIVEN,
+    NS,
+    STAMP,
+    STAMPS,
+    UNCHANGED_ONE,
+    UNUSUAL,
+    SerializedTarget,
+    follow_serialized,
+)
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array
@@ -246,19 +257,23 @@ class CorrectionSession:
         stream.settle()
         if like is None or len(came) != like.size or self._held or self._config.shadow:
             return None
-        stamp, (last, came_s) = like.stamp_ns(came), self._stamps.get(TARGET, NEVER)
-        in_order = not stamp or (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9)
-        if not (in_order and stream.follow(came, now_s)):
+        sec, nanosec = STAMPS.unpack_from(came, STAMP)
+        stamp, (last, came_s) = sec * NS + nanosec, self._stamps.get(TARGET, NEVER)
+        if stamp and not (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9):
+            return None
+        became = stream.follow(came, now_s)
+        if became == UNUSUAL:
             return None
         if stamp:
             self._stamps[TARGET] = stamp, now_s
-        try:
-            out = stream.followed(came)
-        except RefusedError as error:
-            stream.end(error, now_s)
-            raise self._count(error) from None
-        self._goal[:] = like.q
-        return out
+        if became == FAST_ONE:
+            try:
+                stream.velocity_out()
+            except RefusedError as error:
+                stream.end(error, now_s)
+                raise self._count(error) from None
+        self._goal[:] = like.room[GIVEN]
+        return came if became == UNCHANGED_ONE else like.out.tobytes()
 
     def trajectory(
         self,
@@ -590,9 +605,9 @@ def load_kernels(arm: SerialArm) -> None:
     output.robot.require_target(target, np.arange(n))
     message = bytes(FRAME + 8 * n)
     like = SerializedTarget(target, message, (), (FRAME, 0), message, (FRAME, 0))
-    step = output.robot.doubtful, desired.limiter.memory, desired.limiter.limits, ones, given[-1]
+    stream = TargetStream(output)
     assert desired.whole_step is not None
-    like.follow(message, 0.004, *step, *desired.whole_step)
+    follow_serialized(0.004, *like.given, *stream.step, *desired.whole_step)
     doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
     point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
     gather_rows(doubles, places[:, 0], np.empty((1, 1)))

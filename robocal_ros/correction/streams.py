@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import replace
 from enum import Enum
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,17 @@ from robocal_ros.correction.limiter import (
     VELOCITY,
 )
 from robocal_ros.correction.robot_state import Output, hold_speeds
-from robocal_ros.correction.serialized_target import SerializedTarget
+from robocal_ros.correction.serialized_target import (
+    ACTIVE,
+    BEFORE,
+    FASTEST,
+    GIVEN,
+    MOST_BELIEVED,
+    PACE,
+    UNUSUAL,
+    SerializedTarget,
+    follow_serialized,
+)
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
 
@@ -61,7 +72,9 @@ class TargetStream:
     """Targets of a stream, each corrected and put out at once.
 
     ``period_s`` of its messages is NaN before two have come; ``lag_s`` is how long the fastest
-    joint needs from what was put out to what came in.
+    joint needs from what was put out to what came in. ``like``: how the last target of all joints
+    was serialized; ``is_usual``: whether the last one was of all joints and went out as it was
+    wanted; ``step``: the arguments of `follow_serialized` that are the stream's.
     """
 
     def __init__(self, output: Output) -> None:
@@ -71,11 +84,15 @@ class TargetStream:
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
         self._pause_s = config.stream_gap_s
         self._unlimited = ~np.isfinite(self._fastest)
-        self._speeds = np.tile(config.velocity_limits, (2, 1))  # of the joints, in a step and ever
+        self._joints = np.zeros((4, arm.n))  # as `follow_serialized` takes them
+        self._joints[PACE : FASTEST + 1] = config.velocity_limits
+        self._joints[MOST_BELIEVED] = output.robot.doubtful
+        self._active = self._joints[ACTIVE]  # 1 where a joint is commanded
+        self._speeds = self._joints[PACE : FASTEST + 1]  # in a step and ever
+        self.step: tuple[Any, ...] = self._joints, output.limiter.memory, output.limiter.limits
         self._velocity = np.zeros(arm.n)  # of the newest message
         self.phase, self.lag_s = StreamPhase.IDLE, 0.0
         self._why: RefusedError | None = None
-        self._active = np.zeros(arm.n)  # 1 where a joint is commanded
         self._goal = np.full(arm.n, np.nan)  # of the newest message
         self._came_s = self._beat_s = -np.inf  # it, and the first of its burst
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
@@ -85,10 +102,6 @@ class TargetStream:
         self._command: JointCommand | None = None
         self.is_usual = False
         self.like: SerializedTarget | None = None  # how the targets of all joints are serialized
-        limiter = output.limiter
-        self._step = (
-            output.robot.doubtful, limiter.memory, limiter.limits, self._active, self._speeds
-        )  # fmt: skip
         self._index, self._whole = np.zeros(0, dtype=np.int64), False  # of all joints, in order
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used
@@ -97,8 +110,9 @@ class TargetStream:
         self._sent: deque[tuple[float, Array]] = deque(maxlen=MOST_KEPT)
         self._step_s = 0.0  # time that the last output used
         self._before = np.full(arm.n, np.nan)  # what was put out before it
-        # of a serialized target, while it is not noted: when it came, and what was out before it
-        self._unnoted: tuple[float, float] | None = None
+        # of a serialized target, while it is not noted: when it came, the period then, and how
+        # long the output before it has been out
+        self._unnoted: tuple[float, tuple[float, int] | None, float] | None = None
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
         self._lasts_s, self._slowed_s = 0.0, 0.0
@@ -149,11 +163,11 @@ class TargetStream:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
         return elapsed_s > HELD_PERIODS * self._step_period_s
 
-    def follow(self, came: bytes, now_s: float) -> bool:
+    def follow(self, came: bytes, now_s: float) -> int:
         """As `take`, for a serialized target of a stream of all joints that runs as usual.
 
-        False, and nothing has changed, where it is anything else. What goes out is `followed`;
-        where it led is noted by `settle`, which can wait until it is out.
+        What became of it; `UNUSUAL`: nothing, and nothing has changed. Where it led is noted by
+        `settle`, which can wait until it is out.
         """
         like, output, desired = self.like, self._output, self._desired
         given, elapsed = desired.whole_step, now_s - output.out_s
@@ -166,35 +180,27 @@ class TargetStream:
             or output.path is not None
             or output.mismatch
         ):
-            return False
+            return UNUSUAL
         period = self._period_at(now_s)
         if elapsed > HELD_PERIODS * (self._step_period_s if period is None else period[0]):
-            return False
-        if not 0.0 <= like.follow(came, elapsed, *self._step, *given) <= 1.0 + ROUNDING:
-            return False
-        self._note_period(period, now_s)
-        self._unnoted, self._command = (now_s, now_s - elapsed), like.command
-        self._came_s = output.out_s = now_s
-        output.stage, desired.made = desired.stage, True
-        return True
-
-    def followed(self, came: bytes) -> bytes:
-        """What goes out for the last serialized target; itself where nothing is added.
-
-        Raises `RefusedError` when its velocities are too high.
-        """
-        assert self.like is not None
-        if self.like.command.velocity is not None and self._desired.figures[TOO_FAST]:
-            self._velocity_out()
-        return self.like.written() if self._desired.figures[ADDS] else came
+            return UNUSUAL
+        like.came[:] = came
+        became = follow_serialized(elapsed, *like.given, *self.step, *given)
+        if became != UNUSUAL:
+            self._unnoted = now_s, period, elapsed
+            self._came_s = output.out_s = now_s
+        return became
 
     def settle(self) -> None:
         """Note the last serialized target."""
         if self._unnoted is not None and self.like is not None:
-            now_s, before_s = self._unnoted
-            self._unnoted, self._goal = None, self.like.q.copy()
+            now_s, period, elapsed = self._unnoted
+            self._unnoted, room = None, self.like.room
+            self._note_period(period, now_s)
+            self._goal, self._command = room[GIVEN].copy(), self.like.command
+            self._output.stage, self._desired.made = self._desired.stage, True
             self._note(self._way, self._goal, now_s)
-            self._note(self._sent, self.like.before.copy(), before_s)
+            self._note(self._sent, room[BEFORE].copy(), now_s - elapsed)
 
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
@@ -388,15 +394,15 @@ class TargetStream:
         """What goes out for a command; itself where nothing is added."""
         index, velocity = self._index, command.velocity
         if velocity is not None:
-            velocity = self._velocity_out()
+            velocity = self.velocity_out()
         if self.lag_s == 0.0 and not self._desired.figures[ADDS]:
             return command
         out = self._output.out
         position = out.copy() if self._whole else out[index]
         return JointCommand(command.names, position, velocity, command.stamp_ns, CORRECTED)
 
-    def _velocity_out(self) -> Array:
-        """Velocities (k,) that go out for those of the last target.
+    def velocity_out(self) -> Array:
+        """Velocities (k,) that go out for those of the last target; `RefusedError` for a high one.
 
         Those of the correction where the offset is the desired one, else by what went out, or the
         limiter's rates.
