@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The usual target of a stream goes from bytes to bytes: nothing else comes of it by that."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -188,3 +189,18 @@ def test_of_an_even_stream_all_targets_but_the_first_two_are_usual() -> None:
         line.robot.read(line.robot.at)
         line.sends(_message(JointCommand(NAMES, HOME + 1e-4 * k, np.full(6, 1e-4 / DT))))
     assert line.followed[2:] == 498 * [True]
+
+
+def test_what_fills_up_after_a_name_may_be_anything() -> None:
+    line = Line(usual=True)
+    line.session.offer_model(offer(drifted(1.0)))
+    line.session.enable(True)
+    for k in range(50):
+        line.robot.now += DT
+        line.robot.read(line.robot.at)
+        came = _message(JointCommand(NAMES, HOME + 1e-4 * k, np.full(6, 1e-4 / DT)))
+        fill = rb"\g<1>" + 3 * bytes([k])
+        filled, count = re.subn(rb"(joint_a\d\0)...", fill, came, flags=re.DOTALL)
+        assert count == len(NAMES)
+        line.sends(filled)
+    assert line.followed[2:] == 48 * [True]
