@@ -4,6 +4,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye import agreement
 from robocal_ros.hand_eye.result import HandEyeSettings
 from robocal_ros.hand_eye.solve import Part, solve_joint
+from robocal_ros.hand_eye.tasks import HandEyeData
 
 SETTINGS = HandEyeSettings()
 GIVEN = HandEyeSettings(CELL.robot.position_m, CELL.robot.rotation_rad)
@@ -90,21 +92,43 @@ def test_of_three_the_one_that_has_moved_is_named_and_its_doubt_counts():
     assert strict.verdict.code is Code.RESIDUAL_TOO_LARGE
 
 
+@pytest.mark.parametrize("size_m", [1e-3, *more(5e-4, 2e-3)])
+def test_a_sphere_that_was_pushed_amid_its_shots_is_said_with_the_shot(size_m):
+    rng = np.random.default_rng(5)
+    before = data_of(sphere_shots(CELL, CENTRE, RADIUS_M, 8, rng))
+    pushed = CENTRE + np.array([size_m, 0.0, 0.0])
+    after = data_of(sphere_shots(CELL, pushed, RADIUS_M, 7, rng))
+    both = HandEyeData(
+        tuple(f"p{number + 1}" for number in range(15)),
+        np.concatenate([before.T_base_flange, after.T_base_flange]),
+        [*before.profiles, *after.profiles],
+    )
+    found = solve_joint([(sphere_task(), both), line(rng)], SETTINGS)
+    words = r"from sphere/p9 on the sphere is ([\d.]+) mm \(sigma ([\d.]+)\) from where it was"
+    told = re.search(words, found.verdict.reason)
+    assert told is not None, found.verdict.reason
+    apart_mm, sigma_mm = (float(one) for one in told.groups())
+    assert abs(apart_mm - 1e3 * size_m) < 3.0 * sigma_mm
+    assert "contradicts" not in found.verdict.reason
+
+
 @pytest.mark.parametrize("settings", [SETTINGS, *more(GIVEN)])
 def test_targets_that_agree_are_not_doubted(settings, monkeypatch):
     """As seldom as is said: chances below 5 % come in 5 % of the sets."""
     chances: list[float] = []
-    asked = agreement.fdtrc
+    asked = agreement._apart
 
-    def noted(*given: float) -> float:
-        chances.append(float(asked(*given)))
-        return chances[-1]
+    def noted(*given: Any) -> agreement.Disagreement:
+        found = asked(*given)
+        chances.append(found.chance)
+        return found
 
-    monkeypatch.setattr(agreement, "fdtrc", noted)
+    monkeypatch.setattr(agreement, "_apart", noted)
     count = amount(15, 400)
     for seed in range(count):
         rng = np.random.default_rng([77, seed])
         found = solve_joint([sphere(rng), step(rng)], settings)
-        assert "contradict" not in found.verdict.reason
+        assert "contradicts" not in found.verdict.reason
+        assert "from where it was" not in found.verdict.reason
     assert len(chances) == count
     assert np.sum(np.array(chances) < CHANCE) <= binom.ppf(0.999, count, CHANCE)
