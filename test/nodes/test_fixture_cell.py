@@ -27,6 +27,7 @@ from robocal_ros.fixture.files import fixture_document
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_description
 from robocal_ros.panel.node import SOURCES
 from robocal_ros.panel.state import ACCURACY, FIXTURE, STATUS, PanelState, plain
 from robocal_ros.ros import endpoints
@@ -35,6 +36,9 @@ pytestmark = pytest.mark.cell
 ROBOT, SERIAL, SEED = "/robot/joint_trajectory", "F1", 3
 GAP_S = 300.0
 TRIES = 3  # of a gap that a busy machine breaks off
+DRIVES = load_description("kr150_r3100")
+SPEED = 0.95  # of what the drives reach
+BRISK_DEG_S2 = [700.0] * 3 + [1500.0] * 3  # a sensor is no load for this robot
 SHOWN_MM, RIGHT_M = 1.0, 1e-4
 
 
@@ -63,8 +67,10 @@ class FixtureCell(BeatingPlc):
             "home_deg": yaml_list(np.degrees(poses("home")[0])),
             "fixture_poses_deg": yaml_list(np.degrees(fixture_poses()).ravel()),
             "fixture_visits": 2,
-            "travel_speed_mm_s": 1500.0,
-            "joint_velocity_deg_s": "[105.0]",
+            "travel_speed_mm_s": 2500.0,
+            "joint_velocity_deg_s": yaml_list(SPEED * np.degrees(DRIVES.max_velocity)),
+            "joint_acceleration_deg_s2": yaml_list(BRISK_DEG_S2),
+            "stop_deceleration_deg_s2": yaml_list(BRISK_DEG_S2),
             "motion_silence_s": 0.5,
             "motion_late_s": 0.6,
             "deviation_mm": 5.0,
