@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 
@@ -25,7 +26,7 @@ from robocal_ros.cell_sim.cell import SimulatedCell, kr150_cell
 from robocal_ros.cell_sim.faults import Fault
 from robocal_ros.ground.files import share_folders
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.robots import load_robot, save_robot
+from robocal_ros.kinematics.robots import load_description, load_robot, save_robot
 from robocal_ros.tool.laser_frame import LaserFile, write_laser
 
 ROBOT, SERIAL = "kr150_r3100", setting.SERIAL
@@ -36,6 +37,8 @@ PROGRAM, CONTROLLER = "/program/joint_trajectory", "/robot/joint_trajectory"
 RECORDED = "joint_trajectory_controller/joint_trajectory"  # by default
 TRUTH = "/cell_sim_node/truth/state"
 TOLERANCE_MM = 0.5  # the bound of a measured tool, with the default prior, is some 0.3 mm
+SHARE = 0.95  # of what the drives reach
+BRISK_DEG_S2 = [500.0] * 3 + [1000.0] * 3  # with a light tool
 LATE_S = 0.6  # joint states may come so late: this machine may have other work too
 
 
@@ -86,7 +89,13 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
 
     motion: dict[str, object] = {"motion_silence_s": 0.5, "motion_late_s": LATE_S}
     motion |= {"deviation_mm": 5.0}  # at 1.5 m/s, where the usual 2 mm go with 0.25 m/s
-    motion |= {"laser": str(made.laser), "joint_velocity_deg_s": [105.0]}
+    drives = load_description(ROBOT)
+    motion |= {
+        "laser": str(made.laser),
+        "joint_velocity_deg_s": (SHARE * np.degrees(drives.max_velocity)).tolist(),
+        "joint_acceleration_deg_s2": BRISK_DEG_S2,
+        "stop_deceleration_deg_s2": BRISK_DEG_S2,
+    }
     nodes: dict[str, dict[str, object]] = {
         "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": ""},
         "recorder_node": {"folder": str(recordings), "topics": [*TOPICS, TRUTH]},

@@ -33,7 +33,7 @@ GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
 START_S = 120.0  # of all nodes, on a machine with much else to do
 ASK_S = 0.2  # between two looks at the cell
 GIVE_UP_S, WAIT_S = 600.0, 3.0  # a gap that broke off is given again, each time after longer
-LEAD = 4  # rests at home, a second each: after a gap the offset grows there, by 2 deg/s
+LEAD = 2  # rests at home, a second each: after a gap the offset grows there, by 2 deg/s
 EACH = 9  # of the cell's working poses one in so many is visited
 SPEED_RAD_S, REST_S = 1.8, 0.1  # as fast as the slowest drive goes: the demo is short
 BY_HAND_RAD_S, STANDS_RAD = 0.5, 1e-4
@@ -74,7 +74,8 @@ class Plc:
         controller.listen(JointState, taught, self._joints, endpoints.RELIABLE)
         self._names = list(load_robot(ROBOT).joint_names)
         self._home = poses("home")[0]
-        self._way = [*[self._home] * LEAD, *poses("work")[::EACH], self._home]
+        self._way = [*poses("work")[::EACH], self._home]
+        self._gaps = 0  # that were given
 
     # ---- before the shift -----------------------------------------------------------------------
 
@@ -106,7 +107,8 @@ class Plc:
 
     def produce(self, halfway: Callable[[], None] | None = None) -> None:
         """A pass of the programme as taught; what corrects it stands on its way to the robot."""
-        self._drive(self._home, self._way, SPEED_RAD_S, halfway)
+        lead = [self._home] * LEAD if self._gaps else []
+        self._drive(self._home, [*lead, *self._way], SPEED_RAD_S, halfway)
 
     def _drive(
         self,
@@ -156,6 +158,7 @@ class Plc:
             `GIVE_UP_S`.
         """
         begin_s, results = time.monotonic(), []
+        self._gaps += 1
         while True:
             again = len(results)
             result, fault = self._cycle(name + "+" * again, length_s)
