@@ -38,7 +38,7 @@ RECORDED = "joint_trajectory_controller/joint_trajectory"  # by default
 TRUTH = "/cell_sim_node/truth/state"
 TOLERANCE_MM = 0.5  # the bound of a measured tool, with the default prior, is some 0.3 mm
 SHARE = 0.95  # of what the drives reach
-BRISK_DEG_S2 = [500.0] * 3 + [1000.0] * 3  # with a light tool
+BRISK_DEG_S2 = [573.0] * 3 + [1000.0] * 3  # with a light tool, stops too
 LATE_S = 0.6  # joint states may come so late: this machine may have other work too
 
 

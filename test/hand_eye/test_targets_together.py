@@ -124,7 +124,7 @@ def test_targets_that_agree_are_not_doubted(settings, monkeypatch):
         return found
 
     monkeypatch.setattr(agreement, "_apart", noted)
-    count = amount(15, 400)
+    count = amount(10, 400)
     for seed in range(count):
         rng = np.random.default_rng([77, seed])
         found = solve_joint([sphere(rng), step(rng)], settings)
