@@ -113,8 +113,7 @@ class CorrectionSession:
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
         self._held: dict[Reason, str] = {}
-        # what the last path interrupted
-        self._interrupted: tuple[SentPath | None, StreamPhase] = None, StreamPhase.IDLE
+        self._interrupts: SentPath | None = None  # the last path that took a stream's place
         # of each kind and source: the last stamp, ns, and when it came
         self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
         self._lateness: dict[tuple[str, ...], Lateness] = {}
@@ -315,8 +314,8 @@ class CorrectionSession:
         path.replaced = self.output.path if may_be_rejected else None
         path.scale(self.robot.scaling, now_s)
         self.output.path = path
-        self._interrupted = path, self.stream.phase
-        self.stream.phase = StreamPhase.IDLE
+        self._interrupts = path
+        self.stream.interrupt()
         self._goal[:] = q[-1]
         withheld, memory = path.known[WITHHELD], self.output.limiter.memory
         size = np.abs(withheld)
@@ -330,9 +329,8 @@ class CorrectionSession:
     def reject(self, path: SentPath) -> None:
         """The controller did not take a trajectory: what it took the place of goes on there."""
         self.output.reject(path)
-        rejected, phase = self._interrupted
-        if path is rejected and self.output.path is None and self.stream.phase is StreamPhase.IDLE:
-            self.stream.phase = phase
+        if path is self._interrupts and self.output.path is None:
+            self.stream.go_on()
 
     def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:
         """A trajectory that stops what was put out last, as a controller takes it; None: it stands.

@@ -92,6 +92,7 @@ class TargetStream:
         self.step: tuple[Any, ...] = self._joints, output.limiter.memory, output.limiter.limits
         self._velocity = np.zeros(arm.n)  # of the newest message
         self.phase, self.lag_s = StreamPhase.IDLE, 0.0
+        self._interrupted = StreamPhase.IDLE  # what it goes on with, if the path is rejected
         self._why: RefusedError | None = None
         self._goal = np.full(arm.n, np.nan)  # of the newest message
         self._came_s = self._beat_s = -np.inf  # it, and the first of its burst
@@ -122,6 +123,15 @@ class TargetStream:
         if self.phase is StreamPhase.ENDING:
             return True
         return self.phase is StreamPhase.RUNNING and now_s - self._came_s <= self._gap_s()
+
+    def interrupt(self) -> None:
+        """A path takes its place."""
+        self._interrupted, self.phase = self.phase, StreamPhase.IDLE
+
+    def go_on(self) -> None:
+        """That path was rejected: it goes on, unless it began anew or was ended meanwhile."""
+        if self.phase is StreamPhase.IDLE:
+            self.phase = self._interrupted
 
     def _period_at(self, now_s: float) -> tuple[float, int] | None:
         """The period when a message comes now, and since how many intervals; None in a burst.
@@ -217,6 +227,7 @@ class TargetStream:
         if self.phase is StreamPhase.RUNNING and pause > self._gap_s():
             self._look_after_pause(q, pause, now_s)
         if begins := self.phase is StreamPhase.IDLE:
+            self._interrupted = StreamPhase.IDLE
             self._active[:] = 0.0
             self._intervals.clear()
             self._way.clear()
@@ -426,6 +437,7 @@ class TargetStream:
         nothing more goes out, which would set it in motion again.
         """
         self.settle()
+        self._interrupted = StreamPhase.IDLE
         if self.phase is not StreamPhase.RUNNING:
             return
         output, index, self._why = self._output, self._index, why

@@ -144,6 +144,36 @@ def test_a_goal_that_was_rejected_breaks_no_stream() -> None:
     assert step[0] == pytest.approx(np.radians(20.0) * DT, rel=0.01)
 
 
+def test_a_stream_that_is_refused_before_a_goal_was_rejected_does_not_go_on() -> None:
+    robot = large()
+    robot.settle()
+    session, q = robot.session, HOME.copy()
+
+    def send() -> JointCommand:
+        q[0] += np.radians(20.0) * DT
+        robot.now += DT
+        return session.target(JointCommand(NAMES, q.copy()), robot.now)
+
+    for _ in range(48):  # unread, but not for too long
+        robot.go(send())
+    goal = replace(swing(first_s=0.5), position=swing().position + (q - HOME))
+    session.trajectory(goal, robot.now, may_be_rejected=True)
+    path = session.output.path
+    assert path is not None
+    robot.now += 3 * DT
+    refused(Reason.STALE_JOINTS, send)
+    session.reject(path)
+    refused(Reason.STALE_JOINTS, send)
+    robot.rest()
+    q[:] = session.reading(JointCommand(NAMES, robot.at), robot.now).position
+    q[0] -= np.radians(20.0) * DT
+    robot.go(send())
+    before = robot.at
+    for _ in range(50):
+        robot.go(send())
+    assert robot.at[0] - before[0] == pytest.approx(50 * np.radians(20.0) * DT, rel=0.01)
+
+
 # ---- what a person acknowledges while something moves --------------------------------------------
 
 
