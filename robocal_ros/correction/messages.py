@@ -57,8 +57,8 @@ def _string(data: bytes, at: int) -> tuple[str, slice, int]:
     """
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
-    if not length > 0 or end > len(data):
-        raise struct.error("a string is longer than the message")
+    if not length > 0 or end > len(data) or data[end - 1]:
+        raise struct.error("a string does not end within the message")
     return data[at + 4 : end - 1].decode(), slice(at, end), end + -end % 4
 
 

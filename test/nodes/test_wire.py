@@ -80,6 +80,15 @@ def test_what_is_not_regular_is_left_to_the_message(message):
     assert JointWire().read(serialize_message(message)) is None
 
 
+@pytest.mark.parametrize("text", [b"map\0", b"joint_a1\0"])
+def test_a_text_that_does_not_end_is_left_to_the_message(text):
+    """ROS reads such a name with its last byte: what goes out would be of another joint."""
+    state = JointState(name=["joint_a1"], position=[0.5])
+    state.header.frame_id = "map"
+    whole = serialize_message(state)
+    assert JointWire().read(whole.replace(text, text[:-1] + b"x")) is None
+
+
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_damaged_bytes_do_no_harm(data):
