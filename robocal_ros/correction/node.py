@@ -334,13 +334,14 @@ class JointCorrectionNode(RobotNode):
         self._session.refuse(reason, detail)
 
     def _on_target(self, topic: str, message: JointMessage | ArrayMessage, now: float) -> None:
-        self._stream = topic
         try:
             command = message.command()
         except RefusedError as error:
             self._refuse_message(topic, error.reason, error.detail, now)
         try:
-            self._put_out(topic, message, command, self._session.target(command, now))
+            corrected = self._session.target(command, now)
+            self._stream = topic  # one that is refused leaves the tail of another where it goes out
+            self._put_out(topic, message, command, corrected)
         finally:
             self._arm_tail()
         stream = self._session.stream
@@ -350,11 +351,11 @@ class JointCorrectionNode(RobotNode):
 
     def _on_usual_target(self, came: bytes, now: float) -> bool:
         """Correct a target of a stream that runs as usual; whether it was one."""
-        self._stream = TARGETS
         try:
             out = self._session.serialized_target(came, now)
             if out is None:
                 return False
+            self._stream = TARGETS
             self._outputs[TARGETS].publish(out)
         finally:
             self._session.stream.settle()

@@ -2,6 +2,7 @@
 """Who commands: several publishers at once, and publishers that vanish, over DDS."""
 
 import time
+from array import array
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.correction.interface import Reason
+from robocal_ros.correction.node import ONE_SOURCE_S
 from robocal_ros.correction.trajectories import AHEAD_S
 from robocal_ros.ros import conversions, endpoints
 from robocal_ros.ros.endpoints import WARN
@@ -158,3 +161,24 @@ def test_a_stranger_and_then_a_lease_are_both_told(graph: Any) -> None:
         MotionLease(robot=NOMINAL.name, serial="s1", holder="/h", held=True, purpose="tool")
     )
     line.told(state=CorrectionStatus.LEASED)
+
+
+def test_a_stream_that_is_being_ended_ends_on_its_own_topic(graph: Any) -> None:
+    line = Line(graph)
+    line.rest()
+    line.node._session.stream._slowdown[:] = 0.01  # as of a heavy robot: it takes its time
+    q, taken = HOME.copy(), line.node.inputs["joint_commands"]
+    for k in range(60):
+        q[0] += 2e-5 * k
+        line.take(Float64MultiArray(data=array("d", q)), line.to_array, "joint_commands")
+        line.wait(line.arrays, taken.received)
+        line.at = line.arrays[-1].data
+        line.stand()
+        graph.spin_for(0.02)
+    line.refused(line.to_array, Float64MultiArray(data=array("d", 6 * [np.nan])), "joint_commands")
+    graph.spin_for(ONE_SOURCE_S + 0.1)
+    line.arrays.clear()
+    line.refused(line.to_target, joints(q), "joint_targets")
+    graph.spin_for(0.3)
+    assert len(line.arrays) > 1
+    assert not line.targets
