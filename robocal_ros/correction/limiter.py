@@ -318,7 +318,7 @@ def step_out(
                 reports[1], out,
             )  # fmt: skip
     for j in range(n):
-        if active[j] != 0.0 and abs(out[j]) > speeds[1, j] * (1.0 + ROUNDING):
+        if active[j] != 0.0 and not abs(out[j]) <= speeds[1, j] * (1.0 + ROUNDING):
             figures[TOO_FAST] = 1.0
     return share
 

@@ -589,7 +589,7 @@ def hold_speeds(
 ) -> None:
     """Refuse speeds (m, k) beyond those of the joints (k,)."""
     speed = np.abs(speed)
-    over = speed > fastest * (1.0 + ROUNDING)
+    over = ~(speed <= fastest * (1.0 + ROUNDING))
     if over.any():
         point, j = np.argwhere(over)[0]
         raise RefusedError(

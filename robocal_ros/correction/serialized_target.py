@@ -21,9 +21,8 @@ from robocal_ros.ground.compiled import bare
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-NS = 1_000_000_000
-HEAD = 4  # bytes of a message before those by which its numbers are aligned
-STAMP, FRAME = HEAD, HEAD + 8  # where these begin
+ENCAPSULATION = 4  # bytes of a message before those by which its numbers are aligned
+STAMP, FRAME = ENCAPSULATION, ENCAPSULATION + 8  # where these begin
 STAMPS = struct.Struct("<iI")
 # what becomes of a target: nothing went out, as it is laid out otherwise or is for the long way; it
 # went out, corrected or as it came; and it did, but its velocities are too high
@@ -46,8 +45,8 @@ def follow_serialized(
     Parameters
     ----------
     came, out : the message and what goes out, with all that is not the stamp or a number, behind
-        `HEAD` bytes. Positions begin at ``at`` and ``out_at``, velocities at ``rates_at`` and
-        ``out_rates_at``, in numbers; 0 where there are none.
+        `ENCAPSULATION` bytes. Positions begin at ``at`` and ``out_at``, velocities at ``rates_at``
+        and ``out_rates_at``, in numbers; 0 where there are none.
     like : (2, b) a message that is laid out as this must be, and 255 for each byte that must be
         the same.
     room : (3, n) for what is read, and what was put out before.
@@ -61,7 +60,7 @@ def follow_serialized(
     n, unlike = room.shape[1], np.uint8(0)
     data, written, q, velocity = came.view(np.uint8), out.view(np.uint8), room[GIVEN], room[RATE]
     for i in range(like.shape[1]):
-        unlike |= (data[HEAD + i] ^ like[0, i]) & like[1, i]
+        unlike |= (data[ENCAPSULATION + i] ^ like[0, i]) & like[1, i]
     fine = unlike == 0
     for j in range(n):
         q[j], velocity[j], room[BEFORE, j] = came[at + j], 0.0, memory[OUT, j]
@@ -76,7 +75,7 @@ def follow_serialized(
     )  # fmt: skip
     if not 0.0 <= share <= 1.0 + ROUNDING:
         return UNUSUAL
-    for i in range(HEAD + STAMP, HEAD + FRAME):
+    for i in range(ENCAPSULATION + STAMP, ENCAPSULATION + FRAME):
         written[i] = data[i]
     for j in range(n):
         out[out_at + j] = memory[OUT, j]
@@ -119,7 +118,8 @@ class SerializedTarget:
         self.came, came = _aligned(like)
         self.out, written = _aligned(out)
         places, out_places = (
-            [(HEAD + place) // 8 if place else 0 for place in each] for each in (at, out_at)
+            [(ENCAPSULATION + place) // 8 if place else 0 for place in each]
+            for each in (at, out_at)
         )
         self.given: tuple[Any, ...] = (
             came, compared, *places, written, *out_places, self.room
@@ -128,7 +128,7 @@ class SerializedTarget:
 
 def _aligned(message: bytes) -> tuple[memoryview, Array]:
     """Bytes of a message so that its numbers are aligned, and these with what stands before."""
-    numbers = np.zeros(-(-(HEAD + len(message)) // 8))
-    data = numbers.view(np.uint8)[HEAD : HEAD + len(message)].data
+    numbers = np.zeros(-(-(ENCAPSULATION + len(message)) // 8))
+    data = numbers.view(np.uint8)[ENCAPSULATION : ENCAPSULATION + len(message)].data
     data[:] = message
     return data, numbers

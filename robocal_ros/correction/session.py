@@ -43,7 +43,6 @@ from robocal_ros.correction.serialized_target import (
     FAST_ONE,
     FRAME,
     GIVEN,
-    NS,
     STAMP,
     STAMPS,
     UNCHANGED_ONE,
@@ -55,7 +54,13 @@ from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
-from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
+from robocal_ros.ground.serialized_joints import (
+    FIELDS,
+    SECOND_NS,
+    gather_rows,
+    point_places,
+    scatter_rows,
+)
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.robot_watch import Lateness
 
@@ -257,7 +262,7 @@ class CorrectionSession:
         if like is None or len(came) != like.size or self._held or self._config.shadow:
             return None
         sec, nanosec = STAMPS.unpack_from(came, STAMP)
-        stamp, (last, came_s) = sec * NS + nanosec, self._stamps.get(TARGET, NEVER)
+        stamp, (last, came_s) = sec * SECOND_NS + nanosec, self._stamps.get(TARGET, NEVER)
         if stamp and not (last and last <= stamp <= last + (now_s - came_s + AHEAD_S) * 1e9):
             return None
         became = stream.follow(came, now_s)

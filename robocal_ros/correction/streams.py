@@ -176,7 +176,7 @@ class TargetStream:
     def follow(self, came: bytes, now_s: float) -> int:
         """As `take`, for a serialized target of a stream of all joints that runs as usual.
 
-        What became of it; `UNUSUAL`: nothing, and nothing has changed. Where it led is noted by
+        What became of it; `UNUSUAL`: nothing, it is for `take`. Where it led is noted by
         `settle`, which can wait until it is out.
         """
         like, output, desired = self.like, self._output, self._desired
