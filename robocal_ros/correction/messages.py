@@ -37,7 +37,8 @@ from robocal_ros.correction.interface import (
     joint_command,
     require_few,
 )
-from robocal_ros.correction.serialized_target import FRAME, STAMP, STAMPS, SerializedTarget
+from robocal_ros.correction.limiter import FRAME, STAMP
+from robocal_ros.correction.serialized_target import STAMPS, SerializedTarget
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import CORRECTED

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A target of a stream from the bytes that came to those that go out, in one compiled piece.
+"""What is known of the targets of a stream as they are serialized: see `limiter.follow_serialized`.
 
 The messages of a stream are laid out alike. Of one that was corrected the long way it is known
 which bytes are the same in all of them, and where the numbers are; the next one is compared,
@@ -15,75 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.correction.interface import JointCommand
-from robocal_ros.correction.limiter import ADDS, OUT, ROUNDING, TOO_FAST, VELOCITY, step_out
-from robocal_ros.ground.compiled import bare
+from robocal_ros.correction.limiter import ENCAPSULATION
 
 Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
-ENCAPSULATION = 4  # bytes of a message before those by which its numbers are aligned
-STAMP, FRAME = ENCAPSULATION, ENCAPSULATION + 8  # where these begin
 STAMPS = struct.Struct("<iI")
-# what becomes of a target: nothing went out, as it is laid out otherwise or is for the long way; it
-# went out, corrected or as it came; and it did, but its velocities are too high
-UNUSUAL, CORRECTED_ONE, UNCHANGED_ONE, FAST_ONE = range(4)
-GIVEN, RATE, BEFORE = range(3)  # rows of a target's room: what is read, and what was out before
-ACTIVE, PACE, FASTEST, MOST_BELIEVED = range(4)  # rows of a stream's joints
-
-
-@bare
-def follow_serialized(
-    elapsed: float, came: Array, like: Bytes, at: int, rates_at: int, out: Array, out_at: int,
-    out_rates_at: int, room: Array, joints: Array, memory: Array, limits: Array, span: Array,
-    bounds: Array, tcp: Array, largest: Array, free: bool, works: Array, reports: Array,
-    figures: Array,
-) -> int:  # fmt: skip
-    """Correct a serialized target of all n joints and put it out: see `limiter.step_out`.
-
-    Each array costs a call some 0.1 us where it left the processor's caches: so these are few.
-
-    Parameters
-    ----------
-    came, out : the message and what goes out, with all that is not the stamp or a number, behind
-        `ENCAPSULATION` bytes. Positions begin at ``at`` and ``out_at``, velocities at ``rates_at``
-        and ``out_rates_at``, in numbers; 0 where there are none.
-    like : (2, b) a message that is laid out as this must be, and 255 for each byte that must be
-        the same.
-    room : (3, n) for what is read, and what was put out before.
-    joints : (4, n) 1 where active, speeds in this step and ever, largest position believed.
-
-    Returns
-    -------
-    int
-        What became of it.
-    """
-    n, unlike = room.shape[1], np.uint8(0)
-    data, written, q, velocity = came.view(np.uint8), out.view(np.uint8), room[GIVEN], room[RATE]
-    for i in range(like.shape[1]):
-        unlike |= (data[ENCAPSULATION + i] ^ like[0, i]) & like[1, i]
-    fine = unlike == 0
-    for j in range(n):
-        q[j], velocity[j], room[BEFORE, j] = came[at + j], 0.0, memory[OUT, j]
-        if rates_at > 0:
-            velocity[j] = came[rates_at + j]
-        fine = fine and abs(q[j]) <= joints[MOST_BELIEVED, j] and np.isfinite(velocity[j])
-    if not fine:
-        return UNUSUAL
-    share = step_out(
-        q, velocity, elapsed, elapsed, memory, limits, joints[ACTIVE], joints[PACE : FASTEST + 1],
-        span, bounds, tcp, largest, free, works, reports, figures,
-    )  # fmt: skip
-    if not 0.0 <= share <= 1.0 + ROUNDING:
-        return UNUSUAL
-    for i in range(ENCAPSULATION + STAMP, ENCAPSULATION + FRAME):
-        written[i] = data[i]
-    for j in range(n):
-        out[out_at + j] = memory[OUT, j]
-        if out_rates_at > 0:
-            out[out_rates_at + j] = memory[VELOCITY, j]
-    if rates_at > 0 and figures[TOO_FAST] != 0.0:
-        return FAST_ONE
-    return CORRECTED_ONE if figures[ADDS] != 0.0 else UNCHANGED_ONE
 
 
 class SerializedTarget:

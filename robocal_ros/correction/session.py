@@ -29,27 +29,24 @@ from robocal_ros.correction.interface import (
     TrajectoryCommand,
 )
 from robocal_ros.correction.limiter import (
+    FAST_ONE,
+    FRAME,
+    GIVEN,
     LARGEST,
     MOST,
     REDUCED,
     REMAINING,
     SHIFT,
+    STAMP,
+    UNCHANGED_ONE,
+    UNUSUAL,
     WORST,
     WORST_OUT,
+    follow_serialized,
 )
 from robocal_ros.correction.robot_state import EVERY, Joints, Output
 from robocal_ros.correction.sent_path import WITHHELD, SentPath
-from robocal_ros.correction.serialized_target import (
-    FAST_ONE,
-    FRAME,
-    GIVEN,
-    STAMP,
-    STAMPS,
-    UNCHANGED_ONE,
-    UNUSUAL,
-    SerializedTarget,
-    follow_serialized,
-)
+from robocal_ros.correction.serialized_target import STAMPS, SerializedTarget
 from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array

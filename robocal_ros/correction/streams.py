@@ -13,26 +13,24 @@ import numpy as np
 from robocal_ros.correction.bounds import require_limits
 from robocal_ros.correction.interface import JointCommand, Reason, RefusedError
 from robocal_ros.correction.limiter import (
-    ADDS,
-    LONGEST_STEP_S,
-    OFFSET,
-    OFFSET_RATE,
-    ROUNDING,
-    TOO_FAST,
-    VELOCITY,
-)
-from robocal_ros.correction.robot_state import Output, hold_speeds
-from robocal_ros.correction.serialized_target import (
     ACTIVE,
+    ADDS,
     BEFORE,
     FASTEST,
     GIVEN,
+    LONGEST_STEP_S,
     MOST_BELIEVED,
+    OFFSET,
+    OFFSET_RATE,
     PACE,
+    ROUNDING,
+    TOO_FAST,
     UNUSUAL,
-    SerializedTarget,
+    VELOCITY,
     follow_serialized,
 )
+from robocal_ros.correction.robot_state import Output, hold_speeds
+from robocal_ros.correction.serialized_target import SerializedTarget
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.ground.samples import CORRECTED
 
