@@ -358,7 +358,7 @@ class JointCorrectionNode(RobotNode):
             self._stream = TARGETS
             self._outputs[TARGETS].publish(out)
         finally:
-            self._session.stream.settle()
+            self._session.settle()
             self._arm_tail()
         self._tell_offset(STREAM, now)
         return True

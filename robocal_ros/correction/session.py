@@ -114,6 +114,8 @@ class CorrectionSession:
         self._enabled, self._robot_fault = False, ""
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
+        # of a serialized target that is not noted yet: its stamp, ns, and when it came
+        self._unsettled: tuple[int, float] | None = None
         self._held: dict[Reason, str] = {}
         self._interrupts: SentPath | None = None  # the last path that took a stream's place
         # of each kind and source: the last stamp, ns, and when it came
@@ -229,7 +231,6 @@ class CorrectionSession:
         A `RefusedError` ends a stream that runs: its `tail` slows the robot down.
         """
         stream = self.stream
-        stream.settle()
         try:
             self._require_order(TARGET[0], command, TARGET[1], now_s)
             for reason, detail in self._held.items():
@@ -252,10 +253,9 @@ class CorrectionSession:
     def serialized_target(self, came: bytes, now_s: float) -> bytes | None:
         """As `target`, for a serialized message of a stream that runs as usual; None: it is none.
 
-        What was seen of it can be noted by the stream's `settle`, when it is out.
+        What is returned goes out first; then it is noted by `settle`, before anything else.
         """
         stream, like = self.stream, self.stream.like
-        stream.settle()
         if like is None or len(came) != like.size or self._held or self._config.shadow:
             return None
         sec, nanosec = STAMPS.unpack_from(came, STAMP)
@@ -265,16 +265,26 @@ class CorrectionSession:
         became = stream.follow(came, now_s)
         if became == UNUSUAL:
             return None
-        if stamp:
-            self._stamps[TARGET] = stamp, now_s
         if became == FAST_ONE:
+            if stamp:
+                self._stamps[TARGET] = stamp, now_s
             try:
                 stream.velocity_out()
             except RefusedError as error:
                 stream.end(error, now_s)
                 raise self._count(error) from None
-        self._goal[:] = like.room[GIVEN]
+        self._unsettled = stamp, now_s
         return came if became == UNCHANGED_ONE else like.out.tobytes()
+
+    def settle(self) -> None:
+        """Note the last serialized target."""
+        if self._unsettled is not None and self.stream.like is not None:
+            stamp, now_s = self._unsettled
+            self._unsettled = None
+            if stamp:
+                self._stamps[TARGET] = stamp, now_s
+            self._goal[:] = self.stream.like.room[GIVEN]
+            self.stream.settle()
 
     def trajectory(
         self,

@@ -43,7 +43,7 @@ class Line:
         """What goes out for a target."""
         session, now = self.session, self.robot.now
         out = session.serialized_target(came, now) if self.usual else None
-        session.stream.settle()
+        session.settle()
         self.followed.append(out is not None)
         if out is None:
             message = JointMessage(self.wire, came)
