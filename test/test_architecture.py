@@ -2,6 +2,7 @@
 """The house rules that a reader relies on: who may import whom, and how large a file may be."""
 
 import ast
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -162,3 +163,29 @@ def test_a_class_name_occurs_once():
                 twice.append(f"{name}: {seen[name]} and {path}")
             seen[name] = path
     assert not twice, "\n".join(twice)
+
+
+def bound(path: Path) -> list[str]:
+    """Names that a file binds at its top, each as often as it does."""
+    names: list[str] = []
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            names.append(node.name)
+        elif isinstance(node, (ast.Import, ast.ImportFrom)):
+            names += [alias.asname or alias.name for alias in node.names]
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names += [
+                each.id
+                for target in targets
+                for each in ast.walk(target)
+                if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)
+            ]
+    return names
+
+
+def test_no_constant_takes_the_name_of_another():
+    twice = {
+        (path.stem, name) for path in MODULES for name, n in Counter(bound(path)).items() if n > 1
+    }
+    assert not twice

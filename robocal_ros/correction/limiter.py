@@ -72,7 +72,9 @@ STAMP, FRAME = ENCAPSULATION, ENCAPSULATION + 8  # where these begin
 # what becomes of a target: nothing went out, as it is laid out otherwise or is for the long way; it
 # went out, corrected or as it came; and it did, but its velocities are too high
 UNUSUAL, CORRECTED_ONE, UNCHANGED_ONE, FAST_ONE = range(4)
-GIVEN, RATE, BEFORE = range(3)  # rows of a target's room: what is read, and what was out before
+GIVEN, GIVEN_RATE, BEFORE = range(
+    3
+)  # rows of a target's room: what is read, and what was out before
 ACTIVE, PACE, FASTEST, MOST_BELIEVED = range(4)  # rows of a stream's joints
 
 
@@ -359,7 +361,12 @@ def follow_serialized(
         What became of it.
     """
     n, unlike = room.shape[1], np.uint8(0)
-    data, written, q, velocity = came.view(np.uint8), out.view(np.uint8), room[GIVEN], room[RATE]
+    data, written, q, velocity = (
+        came.view(np.uint8),
+        out.view(np.uint8),
+        room[GIVEN],
+        room[GIVEN_RATE],
+    )
     for i in range(like.shape[1]):
         unlike |= (data[ENCAPSULATION + i] ^ like[0, i]) & like[1, i]
     fine = unlike == 0
