@@ -72,9 +72,8 @@ STAMP, FRAME = ENCAPSULATION, ENCAPSULATION + 8  # where these begin
 # what becomes of a target: nothing went out, as it is laid out otherwise or is for the long way; it
 # went out, corrected or as it came; and it did, but its velocities are too high
 UNUSUAL, CORRECTED_ONE, UNCHANGED_ONE, FAST_ONE = range(4)
-GIVEN, GIVEN_RATE, BEFORE = range(
-    3
-)  # rows of a target's room: what is read, and what was out before
+# rows of a target's room: what is read, and what was out before
+GIVEN, GIVEN_RATE, BEFORE = range(3)
 ACTIVE, PACE, FASTEST, MOST_BELIEVED = range(4)  # rows of a stream's joints
 
 
@@ -341,9 +340,7 @@ def follow_serialized(
     bounds: Array, tcp: Array, largest: Array, free: bool, works: Array, reports: Array,
     figures: Array,
 ) -> int:  # fmt: skip
-    """Correct a serialized target of all n joints and put it out: see `limiter.step_out`.
-
-    Each array costs a call some 0.1 us where it left the processor's caches: so these are few.
+    """Correct a serialized target of all n joints and put it out: see `step_out`.
 
     Parameters
     ----------
@@ -360,13 +357,8 @@ def follow_serialized(
     int
         What became of it.
     """
-    n, unlike = room.shape[1], np.uint8(0)
-    data, written, q, velocity = (
-        came.view(np.uint8),
-        out.view(np.uint8),
-        room[GIVEN],
-        room[GIVEN_RATE],
-    )
+    n, unlike, q, velocity = room.shape[1], np.uint8(0), room[GIVEN], room[GIVEN_RATE]
+    data, written = came.view(np.uint8), out.view(np.uint8)
     for i in range(like.shape[1]):
         unlike |= (data[ENCAPSULATION + i] ^ like[0, i]) & like[1, i]
     fine = unlike == 0

@@ -97,10 +97,9 @@ class TargetStream:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self.period_s, self._as_usual = np.nan, 0  # and so many intervals since it was found
         self._step_period_s = LONGEST_STEP_S  # it, or what stands for it before two messages came
-        # its last message, or one like it; whether it was of all joints and went out as wanted
-        self._command: JointCommand | None = None
+        self._command: JointCommand | None = None  # its last message, or one like it
         self.is_usual = False
-        self.like: SerializedTarget | None = None  # how the targets of all joints are serialized
+        self.like: SerializedTarget | None = None
         self._index, self._whole = np.zeros(0, dtype=np.int64), False  # of all joints, in order
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used

@@ -180,27 +180,31 @@ def test_a_usual_target_comes_to_what_the_long_way_comes_to(
             q, speed = twin.lines[0].robot.at.copy(), np.zeros(6)
 
 
-def test_of_an_even_stream_all_targets_but_the_first_two_are_usual() -> None:
+def _follows(fill: Callable[[bytes, int], bytes]) -> list[bool]:
+    """Which of an even stream's targets are usual, each filled up by its number."""
     line = Line(usual=True)
     line.session.offer_model(offer(drifted(1.0)))
     line.session.enable(True)
-    for k in range(500):
-        line.robot.now += DT
-        line.robot.read(line.robot.at)
-        line.sends(_message(JointCommand(NAMES, HOME + 1e-4 * k, np.full(6, 1e-4 / DT))))
-    assert line.followed[2:] == 498 * [True]
-
-
-def test_what_fills_up_after_a_name_may_be_anything() -> None:
-    line = Line(usual=True)
-    line.session.offer_model(offer(drifted(1.0)))
-    line.session.enable(True)
-    for k in range(50):
+    for k in range(200):
         line.robot.now += DT
         line.robot.read(line.robot.at)
         came = _message(JointCommand(NAMES, HOME + 1e-4 * k, np.full(6, 1e-4 / DT)))
-        fill = rb"\g<1>" + 3 * bytes([k])
-        filled, count = re.subn(rb"(joint_a\d\0)...", fill, came, flags=re.DOTALL)
-        assert count == len(NAMES)
-        line.sends(filled)
-    assert line.followed[2:] == 48 * [True]
+        line.sends(fill(came, k))
+    return line.followed
+
+
+def _filled(came: bytes, number: int) -> bytes:
+    fill = 3 * bytes([number])
+    filled, count = re.subn(
+        rb"(joint_a\d\0)...", lambda name: name[1] + fill, came, flags=re.DOTALL
+    )
+    assert count == len(NAMES)
+    return filled
+
+
+def test_of_an_even_stream_all_targets_but_the_first_two_are_usual() -> None:
+    assert _follows(lambda came, number: came)[2:] == 198 * [True]
+
+
+def test_what_fills_up_after_a_name_may_be_anything() -> None:
+    assert _follows(_filled)[2:] == 198 * [True]
