@@ -23,19 +23,22 @@ import numpy as np
 
 from bench.startup import EXECUTABLES
 from bench.tables import Goal, Table
+from robocal_ros.ground.frames import Array
 
 if TYPE_CHECKING:
     from bench.stream_probe import Probe, Stream
 
 ROOT = Path(__file__).parents[1]
 RATES_HZ = (500, 1000)
-SECONDS = 60.0  # of each stream
-BLOCK_S = 2.0  # each in its turn
+SECONDS = 60.0  # of each stream through the node, and through the relay that it is judged by
+BLOCK_S = 1.0  # each in its turn: a machine may change its speed within seconds
+OTHERS_IN = 5  # rounds; the other relays are there to be looked at
 DRIFT_M = 0.5e-3
 POINTS, PATHS, PATH_S = 10_000, 10, 3.0
 STEP_NS = 200_000  # between two of them
 OWN_HZ, BLOCK, BLOCKS = 500, 100, 50
-NODE, RELAY, BYTES, SINGLE = "corrected", "relayed", "relayed_bytes", "relayed_single"
+JUDGED = NODE, RELAY = "corrected", "relayed"
+BYTES, SINGLE = "relayed_bytes", "relayed_single"
 IN_WORDS = {
     NODE: "joint_correction_node",
     RELAY: "bare relay, EventsExecutor",
@@ -70,7 +73,8 @@ def in_tables(found: dict[str, Any]) -> Sequence[Table]:
         "Streams through joint_correction_node and through a bare relay",
         ("through", "topic", "Hz", "n", "lost", "p50, ms", "p99, ms", "p99.9, ms", "longest, ms",
          "CPU per message, µs"),
-        f"Position and velocity of six joints, there and back, {BLOCK_S:g} s of each by turns; "
+        f"Position and velocity of six joints, there and back, {BLOCK_S:g} s of each by turns (of "
+        f"the other relays in one round of {OTHERS_IN}); "
         "joint_states run beside the targets. The model in force has drifted by up to "
         f"{DRIFT_M * 1e3:g} mm. CPU: of the whole process, both topics. Load of the machine in "
         f"the last minute before and after: {found['load'][0]:.2f}, {found['load'][1]:.2f}; "
@@ -79,8 +83,9 @@ def in_tables(found: dict[str, Any]) -> Sequence[Table]:
     beside = Table(
         "correction_beside_relay",
         "joint_correction_node beside a bare relay in the same executor",
-        ("targets, Hz", "figure", "relay", "node", "node / relay", "goal"),
-        "Of the rows above: joint_targets, there and back, ms; CPU in µs.",
+        ("targets, Hz", "figure", "relay", "node", "node / relay", "half of the rounds", "goal"),
+        "Of joint_targets, there and back, ms; CPU in µs: medians of rounds in which one block "
+        "follows the other.",
     )
     for row in found["streams"]:
         figures = [row[f"p{q * 100:g}"] for q in QUANTILES]
@@ -89,11 +94,12 @@ def in_tables(found: dict[str, Any]) -> Sequence[Table]:
             *figures, row["longest"], row["cpu_us"],
         )  # fmt: skip
     for rate in sorted({row["rate_hz"] for row in found["streams"]}):
-        node, relay = (_targets(found["streams"], name, rate) for name in (NODE, RELAY))
         for figure, words in GOALS.items():
-            ratio = node[figure] / relay[figure]
-            goal = Goal(ratio, MOST[figure])
-            beside.add(rate, words, relay[figure], node[figure], ratio, goal)
+            node, relay = (_of_rounds(found["streams"], name, rate, figure) for name in JUDGED)
+            least, ratio, most = np.quantile(node / relay, (0.25, 0.5, 0.75)).tolist()
+            middles = (float(np.median(of)) for of in (relay, node))
+            spread = f"{least:.3f} to {most:.3f}"
+            beside.add(rate, words, *middles, ratio, spread, Goal(ratio, MOST[figure]))
     paths = Table(
         "correction_path",
         f"A whole trajectory of {POINTS} points, there and back",
@@ -117,11 +123,13 @@ def in_tables(found: dict[str, Any]) -> Sequence[Table]:
     return [streams, beside, own, paths]
 
 
-def _targets(rows: list[dict[str, Any]], through: str, rate: int) -> dict[str, Any]:
-    return next(
+def _of_rounds(rows: list[dict[str, Any]], through: str, rate: int, figure: str) -> Array:
+    """A figure of each block of the targets."""
+    row = next(
         row for row in rows
         if (row["through"], row["topic"], row["rate_hz"]) == (through, "joint_targets", rate)
     )  # fmt: skip
+    return np.array(row["rounds"][figure])
 
 
 def measure(seconds: float) -> dict[str, Any]:
@@ -250,23 +258,35 @@ def _correct(probe: "Probe", stream: "Stream", arm: Any) -> None:
 def _stream(
     probe: "Probe", streams: "list[Stream]", rate: int, seconds: float
 ) -> Iterator[dict[str, Any]]:
-    """Blocks of each by turns, there and back, so that all meet the same machine."""
+    """Blocks of each by turns, there and back, so that all meet the same machine.
+
+    Rows of all blocks, those of what is judged with the figures of each block too.
+    """
+    judged = [stream for stream in streams if stream.subject.name in JUDGED]
     took: dict[tuple[str, str], list[float]] = defaultdict(list)
     sent: dict[tuple[str, str], int] = defaultdict(int)
     lost: dict[tuple[str, str], int] = defaultdict(int)
     cpu_s: dict[str, float] = defaultdict(float)
+    rounds: dict[str, dict[str, list[float]]] = {n: defaultdict(list) for n in JUDGED}
     for block in range(max(1, round(seconds / BLOCK_S))):
-        for stream in streams if block % 2 else reversed(streams):
+        chosen = streams if block % OTHERS_IN == 0 else judged
+        for stream in chosen if block % 2 else reversed(chosen):
             name = stream.subject.name
             stream.forget()
             begin = stream.subject.cpu_s()
             probe.stream(stream, rate, BLOCK_S)
             probe.drain()
-            cpu_s[name] += stream.subject.cpu_s() - begin
+            used_s = stream.subject.cpu_s() - begin
+            cpu_s[name] += used_s
             for topic, count in stream.sent.items():
                 sent[name, topic] += count
                 lost[name, topic] += count - len(stream.took[topic])
                 took[name, topic] += stream.took[topic]
+            if name in rounds:
+                ms = 1e3 * np.array(stream.took["joint_targets"])
+                rounds[name]["p50"].append(float(np.quantile(ms, 0.5)))
+                rounds[name]["p99"].append(float(np.quantile(ms, 0.99)))
+                rounds[name]["cpu_us"].append(1e6 * used_s / sum(stream.sent.values()))
     for (name, topic), times in took.items():
         ms = np.array(times) * 1e3
         messages = sum(count for (of, _), count in sent.items() if of == name)
@@ -279,6 +299,7 @@ def _stream(
             "lost": lost[name, topic],
             "longest": float(ms.max()),
             "cpu_us": cpu_s[name] / messages * 1e6,
+            "rounds": rounds.get(name),
         } | figures
 
 

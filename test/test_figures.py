@@ -259,3 +259,68 @@ def test_what_is_said_of_streams_has_the_kept_figures():
         (faster, faster_kept),
     ):
         assert rounded(quoted, figure), (quoted, figure)
+
+
+def test_how_fast_a_correction_is_has_the_kept_figures():
+    _, rows = figures("correction", "correction_speed")
+    kept = {row[0]: row[1:4] for row in rows}
+    tasks = {
+        "one point, compiled": "one point, compiled entry",
+        "the same, full model": "one point, full model",
+        "one point, `Joint": "one point, with a whole report",
+        "batch of 10 000 ": "10000 points",
+        "batch of 10 000, full model": "10000 points, full model",
+        "batch of 10 000, free axis": "10000 points, free axis",
+    }
+    name = "joint_correction_figures.md"
+    *ours, peer = rows_quoted("KR 150, 1 mm drift, tool 2 mm and 0.5 deg", name)
+    for (first, us, share, _), (words, task) in zip(ours, tasks.items(), strict=True):
+        assert first.strip(" ").startswith(words.strip())
+        assert (us.strip(), share.strip()) == (f"{kept[task][0]:.2f}", f"{kept[task][2]:.3f}")
+    assert rounded(peer[1], kept["10000 points"][1])
+    page = " ".join((DOCS / name).read_text().split())
+    words = (
+        r"arrays in and out: ([\d.]+) ms at 0\.12 mm .*? and ([\d.]+) ms at 1 mm "
+        r".*? accelerations (\d+) ms"
+    )
+    _, times = figures("correction", "correction_trajectory")
+    quoted = re.search(words, page).groups()
+    assert all(rounded(one, row[1]) for one, row in zip(quoted, times[:3], strict=True)), quoted
+
+
+def test_crossings_of_singularities_have_the_kept_figures():
+    """Of a drift: wanted, out, left, off; of tools bent by 2 and by 9 mm: wanted, left, off."""
+    _, rows = figures("correction", "correction_crossings")
+    kept = [[c["value"] if isinstance(c, dict) else c for c in row] for row in rows]
+    drifts = rows_quoted("a drift", "joint_correction_figures.md")
+    bent = rows_quoted("a bent tool", "joint_correction_figures.md")
+    groups = zip(kept[::3], kept[1::3], kept[2::3], drifts, bent, strict=True)
+    for drift, by_2_mm, by_9_mm, cells, pairs in groups:
+        assert cells[1].strip() == pairs[1].strip() == drift[1]
+        wanted, left, off, out = (5, 8, 10, 12)
+        for cell, column in zip(cells[2:], (wanted, out, left, off), strict=True):
+            assert rounded(cell, drift[column]), (cells, drift)
+        for cell, column in zip(pairs[2:], (wanted, left, off), strict=True):
+            quoted = zip(cell.split("/"), (by_2_mm, by_9_mm), strict=True)
+            assert all(rounded(one, row[column]) for one, row in quoted), (pairs, cell)
+
+
+def test_where_a_correction_gets_has_the_kept_figures():
+    """Postures and iterations of six equations and of five, all robots together."""
+    tools = ("0 mm, 0 deg", "2 mm, 0.5 deg", "20 mm, 7 deg")
+    _, rows = figures("correction", "correction_reach")
+    reached = rows_quoted("tool | postures | 2 | 3", "joint_correction_figures.md")
+    _, ways = figures("correction", "correction_round_trip")
+    back = rows_quoted("tool | six equations", "joint_correction_figures.md")
+    for tool, cells, told in zip(tools, reached, back, strict=True):
+        of = [[row for row in rows if row[1:3] == [tool, equations]] for equations in (6, 5)]
+        for cell, column in zip(cells[1:], (4, 6, 7, 8, 9, 10), strict=True):
+            quoted = [int(one.replace(" ", "")) for one in cell.split("/")]
+            assert quoted == [sum(row[column] for row in part) for part in of], cells
+        for cell, equations in zip(told[1:], (6, 5), strict=True):
+            found = [row for row in ways if row[1:3] == [tool, equations]]
+            count = sum(row[3] for row in found)
+            beyond = sum(row[5] for row in found)
+            words = f"all of {count:,}".replace(",", " ") if count >= 10_000 else f"all of {count}"
+            assert beyond == 0
+            assert cell.strip().startswith(words if count else "none"), cell

@@ -56,6 +56,7 @@ DISCOVERY_S = 0.25
 GONE_WITHIN_S = 0.25  # of another one
 LEAVES_WITHIN_S = 3.0
 TRIES = 8
+SHOWN_OF_RERUN = 3000
 LATE_S = 0.03  # half of what stops begin ahead of now
 
 
@@ -81,6 +82,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if isinstance(item, pytest.Function) and hasattr(item.module, "given"):
                 item.add_marker(pytest.mark.flaky(reruns=0))
     items.sort(key=lambda item: item.path.stem not in WHOLE_CELLS)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Tell why a test was run again: what it counts on can be mended only if it is seen."""
+    for report in terminalreporter.stats.get("rerun", []):
+        terminalreporter.section(f"run again: {report.nodeid}")
+        terminalreporter.write_line(report.longreprtext[-SHOWN_OF_RERUN:])
 
 
 Waits = dict[str, int]
