@@ -259,6 +259,12 @@ def test_what_is_said_of_streams_has_the_kept_figures():
         (faster, faster_kept),
     ):
         assert rounded(quoted, figure), (quoted, figure)
+    told = r"99 % \(([\d.]+), ([\d.]+)\) and processor time \(([\d.]+), ([\d.]+)\)"
+    wanted = [
+        kept[rate, what][2] for what in ("99 %", "CPU time per message") for rate in (500, 1000)
+    ]
+    quoted = re.search(told, page).groups()
+    assert all(rounded(one, of) for one, of in zip(quoted, wanted, strict=True)), quoted
 
 
 def test_how_fast_a_correction_is_has_the_kept_figures():
