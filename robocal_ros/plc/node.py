@@ -157,6 +157,8 @@ class PlcBridgeNode(HouseNode):
         folder = Path(settings["security_dir"]).expanduser()
         found = document(folder)
         self._expires = read_certificate(folder / "server.der").not_valid_after_utc
+        # rclpy's first line looks at each module's file, which beside the server takes seconds
+        self.get_logger().info(f"{folder}: certificate valid until {self._expires:%Y-%m-%d}")
         if not found["users"]:
             self.get_logger().warning(f"{folder}: nobody can log in: robocal plc user DIR NAME")
         self._gap = self.add_output(GapOpen, GAP_OPEN, endpoints.HEARTBEAT)
