@@ -139,6 +139,7 @@ UNTOLD = pytest.param(
 
 SLOW = 3.3  # rad/s^2
 LATE_S = 0.012  # of a stop beyond `REACTION_S`, which it comes with less of where cores are free
+STARVED_S = 0.05  # so long unseen, a robot that slows down may be taken for one that does not
 TRIES = 10
 
 
@@ -169,6 +170,7 @@ def test_a_stop_slows_down_evenly_and_never_goes_back(own):
 
 @pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, *more(UNTOLD)], indirect=True)
 def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
+    """Done anew where a busy computer hid for long how the robot slows down."""
     for slow, how in (
         (10.0, {"lost": 1}),  # planned: 0.12 s
         (10.0, {"lost": 2}),
@@ -176,17 +178,20 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         (SLOW, {"lost": COPIES}),  # all of one: seen by the robot
         (SLOW, {"rejected": 2}),
     ):
-        own.at_speed(0.3, slow=slow)
-        waits = own.graph.waits
-        own.order(stop=True, **how)
-        stood = own.stopped()
-        starved_s = own.graph.starved_s(waits)
-        assert stood["failed"] == ""
+        for _ in range(TRIES):
+            own.at_speed(0.3, slow=slow)
+            waits = own.graph.waits
+            own.order(stop=True, **how)
+            stood = own.stopped()
+            starved_s = own.graph.starved_s(waits)
+            own.arrive()
+            if starved_s < STARVED_S:
+                break
+        assert stood["failed"] == "", (how, starved_s)
         # Once more where a busy computer hides for 20 ms that it slows down: that does no harm.
         anew = how.get("rejected", how.get("lost") == COPIES)
-        assert stood["sent"] - 1 - anew in (0, 1)
+        assert stood["sent"] - 1 - anew in (0, 1), (how, starved_s)
         assert stood["took_s"] < 1.5 * stood["planned_s"] + starved_s, (how, stood)
-        own.arrive()
 
 
 @pytest.mark.parametrize("own", [*POSITIONS, *more(BY_TOPIC)], indirect=True)
