@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.srv import CancelGoal
+from conftest import Waits
 from control_msgs.msg import JointTrajectoryControllerState
 from long_form import more
 from own_motions import DEEP
@@ -97,9 +98,27 @@ class Own:
             self.wait("stood")
         pytest.fail(f"it was stopped three times on its way: {self.reports}")
 
+    def stop_on_its_way(
+        self, away: float, slow: float, **how: Any
+    ) -> tuple[np.ndarray, float, list[Waits]]:
+        """Drive, and order a stop, again where a busy computer was so late that it had arrived.
+
+        The direction, and before the order the controller's time and how long who has waited.
+        """
+        for _ in range(TRIES):
+            way, begin_s = self.at_speed(away, slow=slow), self.controller.now_s - 0.05
+            waits = self.graph.waits
+            self.order(stop=True, **how)
+            told = lambda: {report["what"] for report in self.reports} & {"stops", "refused"}  # noqa: E731
+            self.graph.spin_until(told, "it stops, or there is nothing to stop")
+            if "stops" in told():
+                return way, begin_s, waits
+        pytest.fail(f"it had arrived {TRIES} times: {self.reports}")
+
     def stopped(self) -> dict[str, Any]:
         """Wait until it has been stopped, and stands; the report, with how long that ``took``."""
         stood, stops = self.wait("stood"), self.wait("stops")
+        self.graph.spin_until(lambda: self.controller.now_s > stood["unix_s"], "its states")
         self.controller.stands()
         at_s, sent = self.controller.sent(stops["unix_s"] - 0.05)
         moved = np.max(np.abs(np.diff(sent, axis=0)), axis=1) > 1e-6
@@ -147,10 +166,7 @@ TRIES = 10
 def test_a_stop_slows_down_evenly_and_never_goes_back(own):
     """Done anew where a busy computer had it wait on its way for as long as it may be late."""
     for _ in range(TRIES):
-        way = own.at_speed(slow=SLOW)
-        begin_s, waits = own.controller.now_s - 0.05, own.graph.waits
-        own.order(stop=True)
-        own.wait("stops")
+        way, begin_s, waits = own.stop_on_its_way(0.45, SLOW)
         own.graph.spin_for(0.03)  # until it is there
         starved_s = own.graph.starved_s(waits)
         stood = own.stopped()
@@ -179,9 +195,7 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         (SLOW, {"rejected": 2}),
     ):
         for _ in range(TRIES):
-            own.at_speed(0.3, slow=slow)
-            waits = own.graph.waits
-            own.order(stop=True, **how)
+            *_, waits = own.stop_on_its_way(0.3, slow, **how)
             stood = own.stopped()
             starved_s = own.graph.starved_s(waits)
             own.arrive()
