@@ -37,7 +37,11 @@ from robocal_ros.ground.frames import Array, Document
 from robocal_ros.ground.samples import cloud_points, joint_sample
 from robocal_ros.kinematics import SerialArm
 
-__all__ = ["BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "read_bag"]
+__all__ = [
+    "BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "open_bag",
+    "read_bag",
+]  # fmt: skip
+ROS1, SQLITE = ".bag", ".db3"
 
 
 class BagMessage(NamedTuple):
@@ -228,6 +232,29 @@ class BagReader:
             return self._stack.enter_context(file.path.open("rb"))
         except OSError as error:
             raise InputError(f"cannot be read: {error.strerror}", file=str(file.path)) from error
+
+
+def open_bag(path: str | Path) -> BagReader:
+    """Open a bag of any kind: MCAP, SQLite (``.db3``), or of ROS 1 (``.bag``).
+
+    ``path``: a file, or a folder of them.
+
+    Raises `InputError` when it is no such bag, or broke off before any message.
+    """
+    path = Path(path)
+    if path.suffix in (ROS1, SQLITE) and not path.exists():
+        raise InputError("there is no such file or folder", file=str(path))
+    files = [path]
+    if path.is_dir():
+        files = sorted(path.glob(f"*{ROS1}"))
+        if not files and not list(path.glob("*.mcap")) and list(path.glob(f"*{SQLITE}*")):
+            described = path / "metadata.yaml"
+            files = [path] if described.is_file() else sorted(path.glob(f"*{SQLITE}"))
+    if files and (path.is_dir() or path.suffix in (ROS1, SQLITE)):
+        from robocal_ros.bags.foreign import ForeignBagReader
+
+        return ForeignBagReader(path, files)
+    return BagReader(path)
 
 
 def _bag_files(path: Path) -> tuple[list[Path], list[str]]:

@@ -19,7 +19,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import Stores, get_typestore
 
-from robocal_ros.bags.bags import BagInfo, BagMessage, BagReader, TopicInfo
+from robocal_ros.bags.bags import ROS1, BagInfo, BagMessage, BagReader, TopicInfo
 from robocal_ros.bags.mcap_files import register_schema
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array, nearest_rotation
@@ -35,29 +35,6 @@ from robocal_ros.ground.samples import (
     pose_sample,
 )
 from robocal_ros.kinematics import SerialArm
-
-ROS1, SQLITE = ".bag", ".db3"
-
-
-def open_bag(path: str | Path) -> BagReader:
-    """Open a bag of any kind: MCAP, SQLite (``.db3``), or of ROS 1 (``.bag``).
-
-    ``path``: a file, or a folder of them.
-
-    Raises `InputError` when it is no such bag, or broke off before any message.
-    """
-    path = Path(path)
-    if path.suffix in (ROS1, SQLITE) and not path.exists():
-        raise InputError("there is no such file or folder", file=str(path))
-    files = [path]
-    if path.is_dir():
-        files = sorted(path.glob(f"*{ROS1}"))
-        if not files and not list(path.glob("*.mcap")) and list(path.glob(f"*{SQLITE}*")):
-            described = path / "metadata.yaml"
-            files = [path] if described.is_file() else sorted(path.glob(f"*{SQLITE}"))
-    if files and (path.is_dir() or path.suffix in (ROS1, SQLITE)):
-        return ForeignBagReader(path, files)
-    return BagReader(path)
 
 
 class ForeignBagReader(BagReader):

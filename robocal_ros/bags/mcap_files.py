@@ -37,7 +37,7 @@ from robocal_ros.ground.files import share_folders
 from robocal_ros.ground.samples import JointBlock, joint_sample
 
 if TYPE_CHECKING:
-    from robocal_ros.ground.serialized_joints import JointLayout
+    from robocal_ros.ground.serialized import JointLayout
 
 
 INTERFACES = "robocal_msgs"
@@ -493,7 +493,7 @@ def _add_block(stream: IO[bytes], file: McapFile, block: Block) -> None:
 
 def _stored(content: memoryview) -> Messages:
     """Messages among MCAP records, as they are stored; ValueError when these are not whole."""
-    from robocal_ros.ground.mcap_records import find_messages
+    from robocal_ros.ground.serialized import find_messages
 
     return Messages(content, *find_messages(content))
 
@@ -632,7 +632,7 @@ class _JointReader:
 
     def _learn(self, found: Messages, place: int) -> bool:
         """Take the layout of a message, if it is one that can be used."""
-        from robocal_ros.ground.serialized_joints import JointLayout
+        from robocal_ros.ground.serialized import JointLayout
 
         layout = JointLayout.of(bytes(found.data(place)))
         if layout is None:

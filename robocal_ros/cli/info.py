@@ -66,7 +66,7 @@ def _typed(name: Path | str) -> str:
 
 
 def _bag(path: Path) -> tuple[str, Facts, list[str], "list[BagTopicDocument]"]:
-    from robocal_ros.bags.foreign import open_bag
+    from robocal_ros.bags.bags import open_bag
     from robocal_ros.bags.replay import EVENTS, first_configuration
     from robocal_ros.cli.recording import event_topics, is_simulated
     from robocal_ros.session.events import session_kind

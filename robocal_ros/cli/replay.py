@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robocal_ros import __version__
-from robocal_ros.bags.bags import BagMessage
-from robocal_ros.bags.foreign import StreamAverage, open_bag, stream_timing
+from robocal_ros.bags.bags import BagMessage, open_bag
+from robocal_ros.bags.foreign import StreamAverage, stream_timing
 from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
 from robocal_ros.cli.identify import show_identification
 from robocal_ros.cli.main import (

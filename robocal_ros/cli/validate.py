@@ -60,8 +60,7 @@ _PRELOADED = [
     "robocal_ros.cli.validating",
     # what a bag needs in the course of things
     "robocal_ros.kinematics.kernels",
-    "robocal_ros.ground.mcap_records",
-    "robocal_ros.ground.serialized_joints",
+    "robocal_ros.ground.serialized",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_svg",
     "scipy.special",

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.bags.bags import BagMessage, BagReader
-from robocal_ros.bags.foreign import open_bag
+from robocal_ros.bags.bags import BagMessage, BagReader, open_bag
 from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
 from robocal_ros.cell_sim.faults import SIZES
 from robocal_ros.cli.main import Document, refusal

@@ -15,7 +15,7 @@ import numpy as np
 
 from robocal_ros.cli.main import CliResult, Document, print_words, progress_console
 from robocal_ros.correction.session import load_kernels
-from robocal_ros.ground import compiled, frames, mcap_records, serialized_joints
+from robocal_ros.ground import compiled, frames, serialized
 from robocal_ros.ground.samples import Measurements
 from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import fit_pairs
@@ -63,17 +63,13 @@ def warming() -> Mapping[str, Callable[[], object]]:
         T = arm.fk(q)
         fit_pairs(PosePairs(T, frames.invert(T), names))
 
-    def messages() -> None:
-        for serialized in (mcap_records, serialized_joints):
-            serialized.load_kernels()
-
     return {
         "the arm": arms,
         "its inverse": back,
         "identification": models,
         "hand-eye": cameras,
         "joint correction": lambda: load_kernels(arm),
-        "messages": messages,
+        "messages": serialized.load_kernels,
     }
 
 

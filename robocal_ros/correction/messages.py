@@ -42,7 +42,7 @@ from robocal_ros.correction.serialized_target import STAMPS, SerializedTarget
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import CORRECTED
-from robocal_ros.ground.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
+from robocal_ros.ground.serialized import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.ros.conversions import NS, header
 
 HEAD = b"\0\1\0\0"  # plain, little endian

@@ -51,7 +51,7 @@ from robocal_ros.correction.streams import StreamPhase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import CORRECTED, TAUGHT
-from robocal_ros.ground.serialized_joints import (
+from robocal_ros.ground.serialized import (
     FIELDS,
     SECOND_NS,
     gather_rows,

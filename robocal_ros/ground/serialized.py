@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint states as they come over the wire, many at a time, and the points of trajectories.
+"""Serialized data that is read in machine code: joint states, many at a time, points of
+trajectories, and where messages lie in a run of MCAP records.
 
-Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState``: after four bytes
-of encapsulation a stamp, ``frame_id``, joint names, then positions, velocities and efforts
-(sequences of double). Numbers are aligned to their size, counted from the end of the
+Layout of the first two: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState``:
+after four bytes of encapsulation a stamp, ``frame_id``, joint names, then positions, velocities and
+efforts (sequences of double). Numbers are aligned to their size, counted from the end of the
 encapsulation. One publisher's messages are nearly always alike but for stamp and numbers.
+Of records: the MCAP specification, https://mcap.dev/spec: an opcode (1 byte) and a length (8
+bytes), then the content; a message's is channel (2), sequence (4), log time (8) and publish time
+(8), then data, numbers little endian.
 """
 
 import struct
@@ -13,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.ground.compiled import kernel
+from robocal_ros.ground.compiled import kernel, lean
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -25,6 +29,10 @@ STAMP = 8  # bytes
 SEQUENCES = 3  # positions, velocities, efforts
 FIELDS = 4  # sequences of a trajectory's point
 SECOND_NS = 1_000_000_000
+RECORD_HEAD = 9  # bytes
+MESSAGE = 5  # opcode
+MESSAGE_HEAD = 22
+CHANNEL, LOG_TIME = 0, 6  # places in a message's head
 
 
 @kernel
@@ -167,6 +175,58 @@ def scatter_rows(rows: Array, places: Places, doubles: Array) -> None:
             doubles[places[i, 0] + j] = rows[i, j]
 
 
+@lean
+def _number(content: Bytes, at: int, size: int) -> int:
+    """A little-endian number of at most 63 bits; negative when it has more."""
+    value = np.int64(0)
+    for i in range(size):
+        value |= np.int64(content[at + i]) << np.int64(8 * i)
+    return int(value)
+
+
+@kernel
+def _scan(content: Bytes, columns: Places) -> int:
+    """Fill columns (4, k): log time, channel, begin, end. How many, or -1 - place of damage."""
+    at = count = 0
+    size = content.shape[0]
+    while at < size:
+        if at + RECORD_HEAD > size:
+            return -1 - at
+        length, first = _number(content, at + 1, 8), at + RECORD_HEAD
+        if length < 0 or length > size - first:
+            return -1 - at
+        if content[at] == MESSAGE:
+            if length < MESSAGE_HEAD:
+                return -1 - at
+            log_time = _number(content, first + LOG_TIME, 8)
+            if log_time < 0:
+                return -1 - at
+            columns[0, count] = log_time
+            columns[1, count] = _number(content, first + CHANNEL, 2)
+            columns[2, count] = first + MESSAGE_HEAD
+            columns[3, count] = first + length
+            count += 1
+        at = first + length
+    return count
+
+
+def find_messages(content: memoryview) -> Places:
+    """Messages among the records in ``content``, as they are stored.
+
+    Columns (4, k): log time, ns; channel; begin and end of the data in ``content``.
+
+    Raises
+    ------
+    ValueError
+        When the bytes are not whole records; the message names the place.
+    """
+    columns = np.empty((4, len(content) // (RECORD_HEAD + MESSAGE_HEAD)), dtype=np.int64)
+    count = _scan(np.frombuffer(content, dtype=np.uint8), columns)
+    if count < 0:
+        raise ValueError(f"no whole record at byte {-1 - count} of the content")
+    return columns[:, :count].copy()
+
+
 def load_kernels() -> None:
     """Have the kernel's machine code before the first bag."""
     message = bytes([*LITTLE_ENDIAN, *bytes(ENCAPSULATION - 2 + STAMP + 4 * (2 + SEQUENCES))])
@@ -174,3 +234,4 @@ def load_kernels() -> None:
     if layout is not None:
         content = np.frombuffer(message, dtype=np.uint8)
         layout.gather(content, np.zeros(1, dtype=np.int64), np.full(1, len(message)))
+    find_messages(memoryview(bytes(RECORD_HEAD)))

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from robocal_ros.bags.bags import DATA_SET, read_data_set
-from robocal_ros.bags.foreign import open_bag
+from robocal_ros.bags.bags import DATA_SET, open_bag, read_data_set
 from robocal_ros.bags.replay import topic_kind
 from robocal_ros.cli.main import (
     ROBOT_HELP,

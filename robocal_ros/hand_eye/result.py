@@ -192,8 +192,10 @@ def said_of_joints(result: HandEyeResult, found: JointErrors | None) -> HandEyeR
 
     ``found``: None where that is not known; the document has null.
     """
-    more = {**result.more, "joint_errors": None if found is None else found.document()}
-    return replace(result, verdict=with_joint_errors(result.verdict, found, "mount"), more=more)
+    if found is None:
+        return replace(result, more={**result.more, "joint_errors": None})
+    verdict = with_joint_errors(result.verdict, found, "mount")
+    return replace(result, verdict=verdict, more={**result.more, "joint_errors": found.document()})
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,9 +71,9 @@ class JointErrors:
         }
 
 
-def with_joint_errors(verdict: Verdict, found: JointErrors | None, what: str) -> Verdict:
-    """A verdict on ``what`` was found that says them, where they are known and more than told."""
-    words = "" if found is None else found.words(what)
+def with_joint_errors(verdict: Verdict, found: JointErrors, what: str) -> Verdict:
+    """A verdict on ``what`` was found that says them, where they are more than told."""
+    words = found.words(what)
     return replace(verdict, reason=f"{verdict.reason}; {words}") if words else verdict
 
 

@@ -221,7 +221,9 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> CliResult:
             last_s = max(edge.time_s for edge in steps[-1].edges)
             q = path.q[np.searchsorted(path.time_s, last_s)]
             erring = tip_errors(arm, size_rad, (q, found.tip), None, found.covariance[:3, :3])
-        tool = run_document(known, found, circles, with_joint_errors(verdict, erring, "tip"))
+        if erring is not None:
+            verdict = with_joint_errors(verdict, erring, "tip")
+        tool = run_document(known, found, circles, verdict)
         if args.figures is not None:
             left: dict[str, list[float]] = {step.name: [] for step in steps}
             for step, value in zip(found.edge_step, 1e3 * found.edge_m, strict=True):

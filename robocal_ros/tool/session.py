@@ -76,8 +76,7 @@ from robocal_ros.tool.station import (
     station_shift,
     station_verdict,
 )
-from robocal_ros.tool.sweeps import SweepLog
-from robocal_ros.tool.touch_points import HandMeasured, TouchLog
+from robocal_ros.tool.touch_points import HandMeasured, SweepLog, TouchLog
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"
 WITNESS, WITNESS_REFERENCE, LASER = OF_MANDREL = "witness", "witness reference", "laser"
@@ -171,7 +170,8 @@ class ToolResults:
         witness = self._with_mandrel(witness, found, shift, command)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         erring = self._joint_errors(run, estimate, found)
-        verdict = with_joint_errors(verdict, erring, "tip")
+        if erring is not None:
+            verdict = with_joint_errors(verdict, erring, "tip")
         document = run_document(found, estimate, run.circles, verdict) | {
             "joint_errors": None if erring is None else erring.document(),
             "change": change_between(in_force.T_flange_tool, found.T_flange_tool).document(),

@@ -22,8 +22,8 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from robocal_ros.bags.bags import BagMessage
-from robocal_ros.bags.foreign import StreamAverage, StreamTiming, delay_between, open_bag
+from robocal_ros.bags.bags import BagMessage, open_bag
+from robocal_ros.bags.foreign import StreamAverage, StreamTiming, delay_between
 from robocal_ros.cli.main import main
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import PointSample

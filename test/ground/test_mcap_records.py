@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
-from robocal_ros.ground.mcap_records import find_messages
+from robocal_ros.ground.serialized import find_messages
 
 HEAD = struct.Struct("<BQ")
 

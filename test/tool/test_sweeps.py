@@ -19,8 +19,7 @@ from robocal_ros.session.events import ACCEPT, CLEAR_SWEEPS, SOLVE_SWEEPS, SWEEP
 from robocal_ros.tool.edges import MOST_EDGES, EdgeSample
 from robocal_ros.tool.run import ToolConfig
 from robocal_ros.tool.session import ToolSession
-from robocal_ros.tool.sweeps import LONGEST_NS
-from robocal_ros.tool.touch_points import PLUNGE
+from robocal_ros.tool.touch_points import LONGEST_NS, PLUNGE
 
 TRUTH = bent(TAUGHT, [0.0015, -0.001, 0.0006], [0.012, 0.018, 0.0])
 POLLED = TrueInput(latency_s=0.004, sample_period_s=0.002)
