@@ -526,7 +526,13 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
         deleted.append(folder)
         # counted, not looked at again: some disks give free later what was deleted
         total, free = total - size, free + size
-    return FreedSpace(tuple(deleted), left, max(least_free_bytes - free, 0), tuple(rivals))
+    # names need not be UTF-8, which no log and no message takes
+    told = {_printable(name): _printable(why) for name, why in left.items()}
+    return FreedSpace(tuple(deleted), told, max(least_free_bytes - free, 0), tuple(rivals))
+
+
+def _printable(text: str) -> str:
+    return text.encode(errors="backslashreplace").decode()
 
 
 def keep(folder: Path, why: str) -> None:
@@ -570,7 +576,7 @@ def _recording(folder: Path, disk: int) -> MarkedRecording:
         mark = json.loads(read_text(marker, "marker"))
         maker = Maker(*(str(mark[key]) for key in ("node", "serial", "place", "run")))
         name, number, begun_ns = mark["folder"], int(mark["number"]), int(mark["begun_ns"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"has a {MARKER} that cannot be read: {error}") from error
     if name != folder.name:
         raise InputError(f"was copied or renamed: its {MARKER} names {name}")

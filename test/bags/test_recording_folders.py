@@ -92,6 +92,28 @@ def test_links_files_copies_and_other_recorders_are_left_alone_and_hold_nothing_
     assert newest.exists()
 
 
+def test_what_has_an_odd_name_or_marker_is_left_alone_and_can_be_told(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"robocal_Pr\xfcfung")).mkdir()
+    odd = {
+        "robocal_endless": '{"number": 1e999}',
+        "robocal_deep": "[" * 100_000,
+        "robocal_renamed": '{"number": 1, "folder": "\\udc80"}',
+    }
+    who = '"node": "/n", "serial": "", "place": "", "run": "1", "folder": "f", "begun_ns": 1, '
+    for name, mark in odd.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / MARKER).write_text(mark.replace("{", "{" + who))
+    old, new = made(tmp_path, 100), made(tmp_path, 200)
+    (old / os.fsdecode(b"\xfc")).touch()
+    room = make_room(tmp_path, MINE, 0, 0)
+    assert names(room.deleted) == [old.name]
+    assert set(room.left) == {*odd, old.name, "robocal_Pr\\udcfcfung"}
+    for words in (*room.left, *room.left.values()):
+        words.encode()  # as logs and messages do
+    assert new_folder(tmp_path, MINE, 300 * SECOND_NS).is_dir()
+    assert new.is_dir()
+
+
 def test_what_somebody_put_into_a_recording_stays(tmp_path: Path) -> None:
     old, _ = made(tmp_path, 100), made(tmp_path, 200)
     (old / "notes.txt").write_text("what we found")
