@@ -12,7 +12,7 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.maintenance.sharing import SharedPlace
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.base import HouseNode, run
-from robocal_ros.ros.endpoints import WARN, Health
+from robocal_ros.ros.endpoints import ERROR, WARN, Health
 from robocal_ros.ros.parameters import Setting, number
 
 LOOK_S = 0.05
@@ -40,9 +40,9 @@ class SharingNode(HouseNode):
         robots = self.settings["robots"]
         if len(set(robots)) < 2 or len(set(robots)) != len(robots) or "" in robots:
             raise InputError(f"robots is {robots}: name two namespaces or more, each once")
-        self._gaps = {}
+        self._gaps, self._wanting = {}, {}
         for name in robots:
-            self.add_input(
+            self._wanting[name] = self.add_input(
                 GapOpen, f"{name}/gap_wanted", partial(self._wanted, name), endpoints.HEARTBEAT
             )
             self.add_input(
@@ -64,9 +64,21 @@ class SharingNode(HouseNode):
 
     def _wanted(self, name: str, message: Any) -> None:
         # As it came: only its own PLC may echo a robot's beat, and a late one counts as late.
-        message.open = self._place.want(name, bool(message.open), time.monotonic())
+        wanted = bool(message.open) and not self._doubt(name)
+        message.open = self._place.want(name, wanted, time.monotonic())
         self._gaps[name].publish(message)
         self._look()
+
+    def _doubt(self, name: str) -> str:
+        """Why what asks for a robot's gap does not count; empty: it does.
+
+        Of two that ask, one may say open while the other says closed; maintenance_node, which
+        hears this node alone, could not tell.
+        """
+        asking = self._wanting[name]
+        if (count := asking.get_publisher_count()) < 2:
+            return ""
+        return f"{asking.topic_name} has {count} publishers: let one alone publish it"
 
     def _status(self, name: str, message: Any) -> None:
         out = bool(message.at_home) and message.state not in BUSY
@@ -87,6 +99,9 @@ class SharingNode(HouseNode):
         health.values = {"holder": self._told or "nobody"}
         if why := self._place.why(now_s):
             health.worsen(WARN, why)
+        for name in self._wanting:
+            if why := self._doubt(name):
+                health.worsen(ERROR, why)
         return health
 
 

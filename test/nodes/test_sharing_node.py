@@ -105,3 +105,19 @@ def test_what_is_passed_on_is_as_it_came(cells):
     cells.until(lambda: cells.has() == "right" and cells.gaps["right"][-1].open)
     echoes = [message.echo for message in cells.gaps["right"]]
     assert echoes == sorted(set(echoes)), "each beat once, in its order"
+
+
+def test_of_two_plcs_that_ask_for_one_robot_none_has_it(graph, cells):
+    told, gaps = cells.told, cells.gaps["left"]
+    told.want["left"] = True
+    cells.until(lambda: cells.has() == "left" and gaps[-1].open)
+    second = graph.publisher(GapOpen, "/left/gap_wanted", endpoints.HEARTBEAT)
+    cells.until(lambda: not gaps[-1].open)
+    count = len(gaps)
+    for _ in range(8):
+        cells.step()
+    assert len(gaps) > count
+    assert not any(message.open for message in gaps[count:])
+    assert "/left/gap_wanted has 2 publishers" in cells.node.health().message
+    graph.probe.destroy_publisher(second)
+    cells.until(lambda: cells.has() == "left" and gaps[-1].open)
