@@ -468,6 +468,7 @@ class HistoryReader:
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
         """One consistent view of the present state."""
+        self._file.require_in_place()  # else other processes' decisions would never be seen
         with self._transaction("BEGIN") as connection:
             yield connection
 

@@ -71,7 +71,8 @@ class TestTrouble:
         history.path.unlink()
         if verb == "replace":
             history.path.write_bytes(b"")
-        for call in (history.data_version, lambda: history.propose(proposal())):
+        changes = (history.data_version, lambda: history.propose(proposal()))
+        for call in (*changes, history.head, history.pending, history.list):
             with pytest.raises(StorageError, match="deleted or replaced"):
                 call()
 

@@ -15,9 +15,12 @@ from maintenance_cell import (
     POSES,
     Cell,
     kinds,
+    opened,
+    over,
     passed,
     proposed,
     thermal_proposed,
+    until_moving,
 )
 from maintenance_tools import (
     automatic,
@@ -336,3 +339,28 @@ def test_an_acceptance_without_an_id_is_repeated_for_a_minute(cell):
     for late_s in (61, -1):  # after a clock that was set back it is nobody's either
         with pytest.raises(ConflictError, match="one candidate must wait"):
             cell.session.decide_only(ACCEPT, "a person", cell.wall_ns + late_s * 10**9)
+
+
+def test_a_history_that_was_replaced_is_not_what_the_line_goes_by(history, tmp_path):
+    cell = opened(history, drift=KNOWN, check=passed())
+    cell.ran("c1")
+    thermal_proposed(history, 10.0)
+    assert level(cell) is AccuracyLevel.OK
+    history.path.rename(tmp_path / "elsewhere")
+    with pytest.raises(StorageError, match="deleted or replaced"):
+        level(cell)
+    status = cell.session.status(cell.now_s)
+    assert status.thermal_pending == 0
+    assert "deleted or replaced" in status.trouble
+    (tmp_path / "elsewhere").rename(history.path)
+    assert level(cell) is AccuracyLevel.OK
+    assert not cell.session.status(cell.now_s).trouble
+
+
+def test_a_history_that_is_taken_away_amid_a_cycle_ends_it_at_home(history, tmp_path):
+    cell = opened(history, drift=KNOWN, check=passed())
+    until_moving(cell, "thermal")
+    history.path.rename(tmp_path / "elsewhere")
+    result = cell.finish()
+    assert result.code is Code.STORAGE_FAILED
+    over(cell)
