@@ -184,6 +184,8 @@ class StatedController:
         if found is None or self.scalings.at(now_s) not in (None, 1.0):
             return None
         stated_ns, q, qd = found
+        if not stated_ns:  # it tells no time
+            return None
         times = np.arange(-STATED_S, at_s + STATED_S, GRID_S)
         places, speeds = plan.at(np.maximum(times, 0.0))
         places = places + np.minimum(times, 0.0)[:, None] * plan.qd[0]

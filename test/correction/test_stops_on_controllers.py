@@ -44,8 +44,16 @@ class Driven:
     What it tells since ``waits_s`` waits for a busy node, which now takes the first of it.
     """
 
-    def __init__(self, velocities: bool, lag_s: float, told: bool, waits_s: float = 0.0) -> None:
-        self.robot, self.velocities = Robot(), velocities
+    def __init__(
+        self,
+        velocities: bool,
+        lag_s: float,
+        told: bool,
+        waits_s: float = 0.0,
+        *,
+        stamps: bool = True,
+    ) -> None:
+        self.robot, self.velocities, self.stamps = Robot(), velocities, stamps
         robot = self.robot
         robot.at = Q[0]
         robot.rest()
@@ -74,6 +82,7 @@ class Driven:
         self.state.read(np.arange(6), q, now_s, velocity=speeds, late_s=late_s)
         if told:
             stamp = SimpleNamespace(sec=int(state), nanosec=round(state % 1 * 1e9))
+            stamp = stamp if self.stamps else Time()
             self.stated.take(
                 SimpleNamespace(
                     header=SimpleNamespace(stamp=stamp),
@@ -152,6 +161,17 @@ def test_a_stop_on_a_controller_that_tells_its_reference_never_steps(stop, veloc
         cycles = 1.05 if stop is by_its_path else 2.0
         assert np.max(np.abs(np.diff(speed))) < cycles * BRAKES * CYCLE_S
         assert speed[-1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("velocities", [True, False])
+def test_by_states_without_a_stamp_no_stop_is_stamped(velocities, stop):
+    """Finding: it began by a clock at 0, at -1 s even, and the controller rejected it."""
+    speed, stamped = stop(Driven(velocities, 0.0, told=True, stamps=False), 0.008)
+    assert not stamped
+    assert np.min(speed) > -1e-3
+    assert np.max(np.abs(np.diff(speed))) < even_change(velocities)
+    assert speed[-1] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("stop", STOPS)
