@@ -55,7 +55,7 @@ from robocal_ros.correction.settings import (
 from robocal_ros.correction.trajectories import AHEAD_S, on_its_path
 from robocal_ros.ground.errors import Code
 from robocal_ros.ground.samples import stamp_ns
-from robocal_ros.motion.driver import HardStopService, StatedController
+from robocal_ros.motion.driver import TRUSTED, HardStopService, StatedController
 from robocal_ros.motion.plan import REACTION_S, SHORTEST_STOP_S, JointPlan, MotionLimits
 from robocal_ros.motion.robot_watch import BEHIND_S
 from robocal_ros.motion.stopping import WatchedStop
@@ -87,7 +87,6 @@ ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two 
 # First point of a stop that is not stamped: the controller makes a cubic to it from where and as
 # fast as it is, which does not turn back where the message comes 60 ms late.
 FIRST_S = 0.12 - REACTION_S
-TRUSTED = 2  # a stop that is sent more often is not stamped: the controller may reject what is
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02

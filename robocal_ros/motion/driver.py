@@ -60,6 +60,7 @@ from robocal_ros.ros.graph import actions_beside
 from robocal_ros.ros.parameters import Setting, advanced, given_pose, number, pose_settings
 
 COPIES, COPY_S = 3, 0.006  # the last one that arrives alone still steps no command back
+TRUSTED = 2  # a stop that is sent more often is not stamped: the controller may reject what is
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
 SPOKEN_S = 1.0  # a controller whose state is newer tells whether there are velocities
@@ -431,6 +432,7 @@ class MotionDriver:
         self._controller = StatedController()
         self.lateness = Lateness("joint states")
         self._rejected = False
+        self._stops = 0  # since the last motion
         self._first = self._newest = 0  # what was sent of the present motion, or stop
         self._stop: Callable[[], JointTrajectory] | None = None  # that may have been lost
         self._copies, self._until_s = 0, 0.0
@@ -466,9 +468,9 @@ class MotionDriver:
         """Send a motion, which takes the place of what the controller drives.
 
         A stop is worded by what the controller says of itself (`StatedController`). After a
-        rejection no stamp is trusted.
+        rejection no stamp is trusted, nor by a stop that is sent more often than `TRUSTED`.
         """
-        self._rejected = self._rejected and stop
+        self._rejected, self._stops = self._rejected and stop, (self._stops + 1) * stop
         self._repeats.cancel()
         self._first = self._newest + 1
         if not stop:
@@ -483,7 +485,7 @@ class MotionDriver:
                 going_on, self._names, now_s, at_s=now_s - begin_s, trusted=trusted
             )
 
-        first = message(trusted=not self._rejected)
+        first = message(trusted=not self._rejected and self._stops <= TRUSTED)
         stamped = first.header.stamp != Time()
         by_action = self._send(first, {})
         if stamped or by_action:

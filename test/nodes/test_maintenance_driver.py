@@ -20,7 +20,7 @@ from robocal_ros.maintenance.node import MaintenanceDriver
 from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
 from robocal_ros.motion.driver import COPY_S, MotionDriver, SteadyClock
-from robocal_ros.motion.plan import JointPlan, MotionLimits
+from robocal_ros.motion.plan import JointPlan, MotionLimits, stop
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
 from robocal_ros.ros.graph import actions_beside
@@ -152,6 +152,43 @@ def test_a_stop_is_not_sent_again_too_late_and_a_copy_that_is_rejected_is_no_fau
     graph.spin_until(lambda: len(asked) > 1, "the stop and its copy")
     graph.spin_for(0.1)
     assert not any(report.failed for report in reports)
+
+
+def test_a_stop_that_is_sent_on_the_topic_again_and_again_is_not_stamped(graph: Any) -> None:
+    """Finding: a controller whose states are stamped by another clock took none of them."""
+    names = load_robot("ur10").joint_names
+    _, motion = driving(graph, names)
+    inbox = graph.collect(JointTrajectory, "/driver/joint_trajectory")
+    told = graph.publisher(JointTrajectoryControllerState, "controller_state")
+    graph.spin_until(lambda: motion.topic.get_subscription_count() > 0, "the probe listens")
+    speed, begin_s = 0.1 * np.eye(6)[0], time.monotonic()
+
+    def tell() -> bool:
+        """Where it is, by a clock of its own."""
+        at_s = time.monotonic() - begin_s
+        point = JointTrajectoryPoint(
+            positions=(Q_UR10 + at_s * speed).tolist(), velocities=speed.tolist()
+        )
+        state = JointTrajectoryControllerState(
+            joint_names=names, speed_scaling_factor=1.0, feedback=point, reference=point
+        )
+        state.header.stamp.sec, state.header.stamp.nanosec = 3600 + int(at_s), int(at_s % 1 * 1e9)
+        told.publish(state)
+        graph.spin_for(0.01)
+        return motion._controller.reference(names, time.monotonic()) is not None
+
+    stamps = []
+    for _ in range(4):
+        graph.spin_until(tell, "the reference is known")
+        tell()
+        found = motion._controller.reference(names, time.monotonic())
+        assert found is not None
+        inbox.clear()
+        motion.send(stop(ARM, MotionLimits(), found[0], found[1]), stop=True)
+        graph.spin_until(lambda: inbox, "the stop")
+        stamps.append(inbox[0].header.stamp.sec)
+    assert stamps[0] == pytest.approx(3600, abs=60)
+    assert stamps[2:] == [0, 0]
 
 
 def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> None:
