@@ -242,6 +242,10 @@ class RobotWatch:
             if stamp_s > self._readings[-1][0] - BACK_S:
                 return  # a clock that stands still is heard as silence
             self._readings.clear()
+        elif self._readings:  # of one that was set back stamps do not tell how long that was
+            passed_s, told_s = now_s - self.heard_s, stamp_s - self._readings[-1][0]
+            if passed_s - told_s > self._driving.silence_s:
+                self._readings.clear()
         self._readings.append((stamp_s, np.clip(q, -FARTHEST, FARTHEST)))
         self.heard_s, self._away = now_s, None
         self.silence.heard(now_s)

@@ -19,6 +19,7 @@ from robocal_ros.motion.robot_watch import (
     LATELY_S,
     LEAST,
     PACE_S,
+    REST_RAD,
     STANDS_S,
     STEADY_S,
     TOLD_S,
@@ -366,6 +367,27 @@ def test_readings_that_waited_for_a_busy_node_are_no_robot_beside_its_path(stall
         watch.reading(at_s, plan.at(at_s)[0], heard_s)
         waited = stalls_s + 0.008 < at_s < stalls_s + stall_s - 0.008
         assert waited or watch.keeps(*watch.away()), at_s
+
+
+@pytest.mark.parametrize("by_s", [0.15, 0.5, 0.9])
+@pytest.mark.parametrize("period_s", [0.004, 0.008])
+def test_of_a_robot_that_came_to_rest_while_its_clock_was_set_back_no_stop_is_made_a_motion(
+    period_s: float, by_s: float
+) -> None:
+    """Finding: its way over all of the silence was taken for that of a cycle, at 0.4 rad/s."""
+    halt = stop(ARM, LIMITS, HOME, 0.3 * WAY)
+    watch, stopping = RobotWatch(ARM, DRIVING), WatchedStop(ARM, LIMITS)
+    for at_s in np.arange(-0.5, by_s + 1.0, period_s):
+        q = halt.at(at_s)[0] if at_s > 0.0 else HOME + at_s * 0.3 * WAY
+        if not stopping.under_way and 0.0 <= at_s < period_s:
+            stopping.begin((HOME, 0.3 * WAY), at_s)
+        watch.reading(10.0 + at_s - by_s * (at_s > 0.0), q, at_s)
+        watch.silence.look(at_s)
+        plan = stopping.look(watch, at_s)
+        assert plan is None or np.max(np.abs(plan.qd)) == 0.0
+        if at_s > by_s + period_s:
+            assert not watch.speed(at_s) > REST_RAD
+    assert not stopping.under_way
 
 
 def test_a_scaling_that_is_not_told_again_is_as_planned():
