@@ -19,7 +19,7 @@ from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.maintenance.node import MaintenanceDriver
 from robocal_ros.maintenance.robot_interface import Move
 from robocal_ros.motion.cell import DrivingConfig, Housing
-from robocal_ros.motion.driver import COPY_S, MotionDriver, SteadyClock
+from robocal_ros.motion.driver import COPIES, COPY_S, MotionDriver, SteadyClock
 from robocal_ros.motion.plan import JointPlan, MotionLimits, stop
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.ros.endpoints import EndpointNode
@@ -163,8 +163,8 @@ def test_a_stop_that_is_sent_on_the_topic_again_and_again_is_not_stamped(graph: 
     graph.spin_until(lambda: motion.topic.get_subscription_count() > 0, "the probe listens")
     speed, begin_s = 0.1 * np.eye(6)[0], time.monotonic()
 
-    def tell() -> bool:
-        """Where it is, by a clock of its own."""
+    def tell() -> Any:
+        """Where it is, by a clock of its own; its reference, where that is known."""
         at_s = time.monotonic() - begin_s
         point = JointTrajectoryPoint(
             positions=(Q_UR10 + at_s * speed).tolist(), velocities=speed.tolist()
@@ -175,20 +175,25 @@ def test_a_stop_that_is_sent_on_the_topic_again_and_again_is_not_stamped(graph: 
         state.header.stamp.sec, state.header.stamp.nanosec = 3600 + int(at_s), int(at_s % 1 * 1e9)
         told.publish(state)
         graph.spin_for(0.01)
-        return motion._controller.reference(names, time.monotonic()) is not None
+        return motion._controller.reference(names, time.monotonic())
 
-    stamps = []
-    for _ in range(4):
-        graph.spin_until(tell, "the reference is known")
-        tell()
-        found = motion._controller.reference(names, time.monotonic())
-        assert found is not None
+    def sent(*, stops: bool) -> int:
+        """Seconds of the stamp of a stop from there, sent as one or as a motion."""
+        graph.spin_for(COPIES * COPY_S + 0.02)  # copies of the one before have come
+        while (found := tell()) is None:
+            pass
         inbox.clear()
-        motion.send(stop(ARM, MotionLimits(), found[0], found[1]), stop=True)
-        graph.spin_until(lambda: inbox, "the stop")
-        stamps.append(inbox[0].header.stamp.sec)
+        motion.send(stop(ARM, MotionLimits(), *found[:2]), stop=stops)
+        graph.spin_until(lambda: inbox, "it")
+        return int(inbox[0].header.stamp.sec)
+
+    for _ in range(10):  # a state that a busy computer had wait is not gone by
+        sent(stops=False)
+        stamps = [sent(stops=True) for _ in range(4)]
+        assert stamps[2:] == [0, 0]
+        if stamps[0]:
+            break
     assert stamps[0] == pytest.approx(3600, abs=60)
-    assert stamps[2:] == [0, 0]
 
 
 def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> None:
