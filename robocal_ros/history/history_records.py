@@ -163,6 +163,12 @@ class Head:
     calibration_id: int | None
     model: dict[str, Any] | None
 
+    @property
+    def digest(self) -> str:
+        """Of the model: revisions and ids of a history that has begun anew come again."""
+        text = json.dumps(self.model, sort_keys=True, allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Entry(Candidate):

@@ -184,7 +184,9 @@ class ToolRecord:
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
     revision: int = 0  # of the tool that was in force in the last run
+    tool_digest: str = ""  # of it; empty: not known, as of a version that did not keep it
     thermal_id: int = 0  # thermal model that was in force in it; 0: the nominal one
+    thermal_digest: str = ""
     candidate: int = 0  # calibration that a full measurement proposes in its place; 0: none
     postponed: bool = False  # only the time for its check was missing to accept it without a person
     # wall_ns, full_ns: of its last result, and of the last full one; 0: none
@@ -194,6 +196,25 @@ class ToolRecord:
     # drift_rms_m, drift_bound_m: error of the thermal model through which a tool was last measured
     drift_rms_m: float = 0.0
     drift_bound_m: float = 0.0
+
+    @staticmethod
+    def measured_with(tool: Head, thermal: Head) -> dict[str, Any]:
+        """Fields of what was in force in a measurement."""
+        return {
+            "revision": tool.revision,
+            "tool_digest": tool.digest,
+            "thermal_id": thermal.calibration_id or 0,
+            "thermal_digest": thermal.digest,
+        }
+
+    def is_of(self, tool: Head) -> bool:
+        """Whether it was measured with this tool in force."""
+        return self.revision == tool.revision and self.tool_digest in ("", tool.digest)
+
+    def is_through(self, thermal: Head) -> bool:
+        """Whether it was measured with this thermal model in force."""
+        same = self.thermal_id == (thermal.calibration_id or 0)
+        return same and self.thermal_digest in ("", thermal.digest)
 
 
 @dataclass
@@ -336,14 +357,14 @@ def accuracy_of(
     uncorrected: str,
     memory: Memory,
     tool: Head,
-    thermal_id: int,
+    thermal: Head,
     wall_ns: int,
 ) -> Accuracy:
     """Judge everything at once; the worst part gives the level.
 
     ``drift``: None: the thermal node is silent.
     ``uncorrected``: why commands are not corrected with what is in force; empty: they are.
-    ``tool``, ``thermal_id``: tool and thermal model (0: nominal) in force.
+    ``tool``, ``thermal``: in force.
     """
     parts = []
     if len(config.poses) and drift is None:
@@ -352,7 +373,7 @@ def accuracy_of(
     elif len(config.poses) and drift is not None:
         parts.append(replace(drift, reason=f"drift: {drift.reason}"))
     if config.T_base_laser is not None:
-        parts.append(_tool(config, memory.tool, tool, thermal_id, wall_ns))
+        parts.append(_tool(config, memory.tool, tool, thermal, wall_ns))
     if parts and uncorrected:  # what is known of model and tool is not what the line makes
         parts.append(Accuracy(AccuracyLevel.DEGRADED, f"correction: {uncorrected}", None, np.inf))
     errors = [part.error for part in parts if part.error is not None]
@@ -376,7 +397,7 @@ def accuracy_of(
 
 
 def _tool(
-    config: MaintenanceConfig, record: ToolRecord, tool: Head, thermal_id: int, wall_ns: int
+    config: MaintenanceConfig, record: ToolRecord, tool: Head, thermal: Head, wall_ns: int
 ) -> Accuracy:
     age_s = (wall_ns - record.wall_ns) / NS
     due_in_s = config.tool_due_s - age_s
@@ -385,7 +406,7 @@ def _tool(
     if age_s < 0.0:  # the clock was set back: nobody knows how old it is
         return Accuracy(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
-    same = record.revision == tool.revision
+    same = record.is_of(tool)
     error = _tool_error(record, tool) if same else None
     if age_s > config.tool_expires_s:
         return Accuracy(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
@@ -401,11 +422,11 @@ def _tool(
     if not same:
         words = "tool: another one is in force than was checked: check it"
         return Accuracy(AccuracyLevel.DUE, words, None, 0.0)
-    if record.thermal_id != thermal_id:
+    if not record.is_through(thermal):
         # A newer model knows the drift since the check. An older one was left for a reason, which
         # may be in the tool.
         words = "tool: another thermal model is in force than it was checked with: check it"
-        known = error if thermal_id > record.thermal_id else None
+        known = error if (thermal.calibration_id or 0) > record.thermal_id else None
         return Accuracy(AccuracyLevel.DUE, words, known, 0.0)
     if record.answer == "cannot tell" or due_in_s <= 0.0:
         words = f"tool: {when}, {record.words}"

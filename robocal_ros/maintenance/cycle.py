@@ -8,7 +8,7 @@ import numpy as np
 
 from robocal_ros.ground.errors import Code, RobocalError
 from robocal_ros.ground.frames import Array
-from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL
+from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL, Head
 from robocal_ros.maintenance.accuracy import CycleResult, Memory, ToolRecord
 from robocal_ros.maintenance.deciding import BY, Decider, is_accepted, patiently, settled
 from robocal_ros.maintenance.fixture_part import EACH_POSE, JUDGED, FixturePart, FixtureVisits
@@ -243,8 +243,7 @@ class ToolPart:
         self._cell, self._thermal, self._decider, self._memory = cell, thermal, decider, memory
         self._decided, self._unsure, self._drift = decided, unsure, drift
         self._late = False  # nothing but the time for its check was against the last candidate
-        self._revision = 0  # of the tool that the last measurement was about
-        self._through = 0  # thermal model that gave its flange poses
+        self._tool, self._through = (Head(kind, 0, None, None) for kind in (TOOL, THERMAL))
         self.outcome = ToolOutcome()
         self.wall_ns = 0  # of the tick
 
@@ -320,9 +319,8 @@ class ToolPart:
         record, config = self._memory.tool, self._cell.config
         if config.T_base_laser is None or self._decider.newest(TOOL):
             return ""
-        known = 0 < record.wall_ns <= self.wall_ns
-        known = known and record.revision == self._decider.revision(TOOL)
-        known = known and record.thermal_id == self._decider.thermal_id()
+        head, known = self._decider.head, 0 < record.wall_ns <= self.wall_ns
+        known = known and record.is_of(head(TOOL)) and record.is_through(head(THERMAL))
         if known and record.answer in MEASURED_ANEW:
             return FULL
         if not known or record.answer == "failed":
@@ -383,7 +381,7 @@ class ToolPart:
             return None
         cell.doing = f"tool measurement ({mode})"
         yield from cell.stand(STANDS_S)
-        self._revision, self._through = self._decider.revision(TOOL), self._decider.thermal_id()
+        self._tool, self._through = self._decider.head(TOOL), self._decider.head(THERMAL)
         try:
             answer = yield from cell.arm()
             if answer.done:
@@ -414,7 +412,7 @@ class ToolPart:
                 outcome.station = f"beam station: {answer.message}"
             return
         outcome.take(answer)
-        about = {"revision": self._revision, "thermal_id": self._through, "words": answer.message}
+        about = ToolRecord.measured_with(self._tool, self._through) | {"words": answer.message}
         moved = answer.code is Code.STATION_MOVED
         if moved or not answer.has_result:
             if moved or answer.code in FAILED:  # what an older check found holds no more
@@ -445,7 +443,7 @@ class ToolPart:
     def _credited(self, mode: str, answer: DriverAnswer, before: ToolRecord) -> DriverAnswer | None:
         """The answer, where it is of the tool in force; kept while nothing moves."""
         outcome = self.outcome
-        current = self._revision == self._decider.revision(TOOL)
+        current = self._tool == self._decider.head(TOOL)
         if answer.has_result and not current and mode not in OF_STATION:
             self._memory.tool, outcome.fault = before, ""
         self._memory.save()
@@ -511,7 +509,8 @@ class ToolPart:
             # a try before did it, or somebody else
             message = "the accepted tool failed its check and is no longer in force"
             return Outcome(Command(ROLLBACK, {}), Code.ACCEPT, message, repeated=True)
-        return self._decider.roll_back(TOOL, self._revision, BY, "its check failed", self.wall_ns)
+        revision = self._tool.revision
+        return self._decider.roll_back(TOOL, revision, BY, "its check failed", self.wall_ns)
 
     def _took_back(self, back: Outcome) -> None:
         """Of the tool that is back nothing is known: two measurements contradict each other."""
@@ -523,7 +522,8 @@ class ToolPart:
         outcome.accepted, outcome.fault, outcome.note = False, "", back.message
         if not back.repeated:
             outcome.note = "the accepted tool failed its check and was taken back: look at it"
-            self._memory.note_tool(answer="failed", revision=back.revision, words=outcome.note)
+            about = ToolRecord.measured_with(self._decider.head(TOOL), self._through)
+            self._memory.note_tool(**about, answer="failed", words=outcome.note)
 
     def _stays(self, why: str) -> None:
         number = self.outcome.candidate_id

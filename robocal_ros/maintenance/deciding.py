@@ -100,10 +100,6 @@ class Decider:
         """Of what is in force."""
         return self.head(kind).revision
 
-    def thermal_id(self) -> int:
-        """The thermal model in force; 0: the nominal one."""
-        return self.head(THERMAL).calibration_id or 0
-
     def in_force(self, kind: str, calibration_id: int) -> bool:
         """Whether it is this one."""
         return self.head(kind).calibration_id == calibration_id

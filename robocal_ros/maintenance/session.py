@@ -510,7 +510,7 @@ class MaintenanceSession:
             self._reports.uncorrected(thermal, tool, now_s),
             self.memory,
             tool,
-            thermal.calibration_id or 0,
+            thermal,
             wall_ns,
         )
 

@@ -357,6 +357,27 @@ def test_a_history_that_was_replaced_is_not_what_the_line_goes_by(history, tmp_p
     assert not cell.session.status(cell.now_s).trouble
 
 
+@pytest.mark.parametrize("kind", [TOOL, THERMAL])
+def test_a_check_is_not_of_what_another_history_has_in_force_by_the_same_numbers(
+    history, tmp_path, kind
+):
+    """Both have a first calibration in force, of revision 1."""
+    first, other = {TOOL: [(1e-3, 0.0, 0.0), (0.0, 1e-3, 0.0)], THERMAL: [10.0, 20.0]}[kind]
+    make = {TOOL: proposed, THERMAL: thermal_proposed}[kind]
+    told = {"by": "a person", "reason": "", "wall_ns": 0}
+    before = history.accept(make(history, first), **told)
+    cell = opened(history, drift=KNOWN, check=passed())
+    cell.ran("c1")
+    assert level(cell) is AccuracyLevel.OK
+    with CalibrationHistory.open("K1", state_dir=tmp_path / "anew") as anew:
+        after = anew.accept(make(anew, other), **told)
+        assert (after.revision, after.calibration_id) == (before.revision, before.calibration_id)
+        cell.history = anew
+        cell.restart()
+        cell.open_gap()
+        assert level(cell) is AccuracyLevel.DUE
+
+
 def test_a_history_that_is_taken_away_amid_a_cycle_ends_it_at_home(history, tmp_path):
     cell = opened(history, drift=KNOWN, check=passed())
     until_moving(cell, "thermal")
