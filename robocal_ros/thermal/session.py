@@ -244,7 +244,15 @@ class ThermalSession(SessionBase):
         return Outcome(command, Code.ACCEPT, f"cycle '{cycle_id}' is open{broken}")
 
     def _end_cycle(self, command: Command, wall_ns: int) -> Outcome:
-        """Identify from the cycle; when that fails it stays open, unless its time has run out."""
+        """Identify from the cycle; where the history fails it stays open, and its time begins."""
+        try:
+            return self._end(command, wall_ns)
+        except StorageError:
+            self.cycle.postponed_ns = self.desk.newest_ns.get(JOINTS, 0)
+            raise
+
+    def _end(self, command: Command, wall_ns: int) -> Outcome:
+        """What fails leaves it open, unless its time has run out."""
         cycle_id = str(command.arguments["cycle_id"])
         if self.cycle.id != cycle_id:
             if (before := self._ended(cycle_id)) is not None:
@@ -257,7 +265,6 @@ class ThermalSession(SessionBase):
         try:
             return self._identify(command, wall_ns)
         except StorageError:
-            self.cycle.postponed_ns = self.desk.newest_ns.get(JOINTS, 0)
             raise
         except Exception:
             if command.arguments.get("by") == TIME_OUT:
