@@ -146,7 +146,7 @@ class JointCorrectionNode(RobotNode):
         }
         self.add_input(KinematicModel, MODEL, self._on_model, endpoints.LATCHED)
         self.add_input(ToolFrame, TOOL, self._on_tool, endpoints.LATCHED)
-        self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED)
+        self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED_OF_SEVERAL)
         self.add_input(Float64, SCALING, self._on_scaling, endpoints.NEWEST)
         self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
         states = partial(JointMessage, JointWire(is_reading=True))

@@ -43,6 +43,9 @@ def _profile(
 LATCHED = _profile(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 """Results and states: a late subscriber gets the last one."""
 
+LATCHED_OF_SEVERAL = _profile(10, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+"""States that each of several publishers latches: at depth 1 one's would overwrite another's."""
+
 SENSOR = _profile(100, ReliabilityPolicy.BEST_EFFORT)
 """Sensor streams. Deep enough for stalls of 10 to 30 ms at 1 kHz."""
 

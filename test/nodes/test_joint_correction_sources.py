@@ -163,6 +163,29 @@ def test_a_stranger_and_then_a_lease_are_both_told(graph: Any) -> None:
     line.told(state=CorrectionStatus.LEASED)
 
 
+def test_that_one_holder_lets_go_is_heard_beside_what_another_says(graph: Any) -> None:
+    """Finding: what waited for a busy node was overwritten, and the program refused."""
+    line = Line(graph)
+    by = {
+        holder: graph.probe.create_publisher(MotionLease, "motion_lease", endpoints.LATCHED)
+        for holder in ("/tool", "/maintenance")
+    }
+
+    def says(holder: str, held: bool) -> None:
+        lease = MotionLease(robot=NOMINAL.name, serial="s1", holder=holder, held=held, purpose="x")
+        by[holder].publish(lease)
+
+    for holder in by:
+        says(holder, True)
+    line.told(state=CorrectionStatus.LEASED)
+    graph.spin_until(lambda: all(f"{h}: x" in line.statuses[-1].lease for h in by), "both hold one")
+    says("/tool", False)
+    says("/maintenance", True)
+    time.sleep(0.1)  # both wait for the node
+    graph.spin_until(lambda: "/tool: x" not in line.statuses[-1].lease, "it has let go")
+    assert "/tool" not in line.statuses[-1].lease  # not lost either
+
+
 def test_a_stream_that_is_being_ended_ends_on_its_own_topic(graph: Any) -> None:
     line = Line(graph)
     line.rest()
