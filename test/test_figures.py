@@ -330,3 +330,27 @@ def test_where_a_correction_gets_has_the_kept_figures():
             words = f"all of {count:,}".replace(",", " ") if count >= 10_000 else f"all of {count}"
             assert beyond == 0
             assert cell.strip().startswith(words if count else "none"), cell
+
+
+@pytest.mark.parametrize(
+    ("page", "words", "nodes"),
+    [
+        (
+            "thermal_node",
+            r"Measured: ([\d.]+) s in the median, ([\d.]+) s at most",
+            [("thermal_node", 1), ("thermal_node", 2)],
+        ),
+        (
+            "joint_correction_figures",
+            r"node answers ([\d.]+) s after .*? a bare node takes ([\d.]+) s",
+            [("joint_correction_node", 1), ("bare rclpy node", 1)],
+        ),
+    ],
+)
+def test_what_is_said_of_starts_has_the_kept_figures(page, words, nodes):
+    kept = {row[0]: row for row in figures("startup", "startup")[1]}
+    text = " ".join((DOCS / f"{page}.md").read_text().split())
+    quoted = re.search(words, text).groups()
+    assert all(
+        rounded(one, kept[node][column]) for one, (node, column) in zip(quoted, nodes, strict=True)
+    )
