@@ -244,7 +244,7 @@ class ThermalSession(SessionBase):
         return Outcome(command, Code.ACCEPT, f"cycle '{cycle_id}' is open{broken}")
 
     def _end_cycle(self, command: Command, wall_ns: int) -> Outcome:
-        """Identify from the cycle; where the history fails it stays open, and its time begins."""
+        """As `_end`; where the history fails the cycle stays open, and its time begins anew."""
         try:
             return self._end(command, wall_ns)
         except StorageError:
@@ -252,7 +252,7 @@ class ThermalSession(SessionBase):
             raise
 
     def _end(self, command: Command, wall_ns: int) -> Outcome:
-        """What fails leaves it open, unless its time has run out."""
+        """Identify from the cycle; when that fails it stays open, unless its time has run out."""
         cycle_id = str(command.arguments["cycle_id"])
         if self.cycle.id != cycle_id:
             if (before := self._ended(cycle_id)) is not None:
@@ -264,10 +264,8 @@ class ThermalSession(SessionBase):
             raise ConflictError(NO_REFERENCE)
         try:
             return self._identify(command, wall_ns)
-        except StorageError:
-            raise
-        except Exception:
-            if command.arguments.get("by") == TIME_OUT:
+        except Exception as error:
+            if command.arguments.get("by") == TIME_OUT and not isinstance(error, StorageError):
                 self._close_cycle(command)
             raise
 
