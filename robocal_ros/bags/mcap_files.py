@@ -171,12 +171,13 @@ def _field(store: Typestore, described: Any, value: Any) -> Any:
 
 
 #
-# What moves a robot, says that it may be moved, or how its controller moves it, lies under
-# `RECORDED`: ``/robot/gap_open`` as ``/recorded/robot/gap_open``. `BagReader` gives each topic the
-# name that it had on the graph.
+# What moves a robot, says that it may be moved, how its controller moves it, or how it is to be
+# corrected, lies under `RECORDED`: ``/robot/gap_open`` as ``/recorded/robot/gap_open``.
+# `BagReader` gives each topic the name that it had on the graph.
 RECORDED = "/recorded"
 MOVES = "it may move a robot"
 VOUCHES = "it says that a robot may move now, or how it is moved"
+CORRECTS = "a robot would be corrected by it"
 _BY_TYPE = {
     "trajectory_msgs/msg/JointTrajectory": MOVES,
     "trajectory_msgs/msg/MultiDOFJointTrajectory": MOVES,
@@ -192,6 +193,9 @@ _BY_TYPE = {
     "robocal_msgs/msg/AccuracyState": VOUCHES,  # by which the line goes on
     "control_msgs/msg/JointTrajectoryControllerState": VOUCHES,  # where its reference is, how fast
     "control_msgs/msg/SpeedScalingFactor": VOUCHES,
+    "robocal_msgs/msg/KinematicModel": CORRECTS,
+    "robocal_msgs/msg/ToolFrame": CORRECTS,
+    "robocal_msgs/msg/CorrectionStatus": VOUCHES,  # by which maintenance_node says OK
 }
 _BY_NAME = {"speed_scaling": VOUCHES, "gap_open": VOUCHES}  # last parts of names
 # Of these types there are readings, by the last parts of their names, and commands of any name:
@@ -601,7 +605,8 @@ class _JointReader:
 
     def __init__(self, decode: Decode) -> None:
         self._decode = decode
-        self._layouts: list[tuple[JointLayout, tuple[str, ...]]] = []
+        # with the joints that have a position, and which these are among all
+        self._layouts: list[tuple[JointLayout, tuple[str, ...], NDArray[np.bool_]]] = []
 
     def __call__(self, found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:
         while start < stop:
@@ -617,17 +622,17 @@ class _JointReader:
                 start += len(block)
 
     def _block(self, found: Messages, start: int, stop: int) -> JointBlock | None:
-        """The readings from ``start`` on that are laid out alike and finite; None without."""
+        """The readings from ``start`` on of the same layout and joints; None without."""
         begin, end = found.begin[start:stop], found.end[start:stop]
         content = np.frombuffer(found.content, dtype=np.uint8)
-        for layout, names in self._layouts:
+        for layout, names, known in self._layouts:
             if len(layout.pattern) != end[0] - begin[0]:
                 continue
             stamps, position = layout.gather(content, begin, end)
-            finite = np.isfinite(position).all(axis=1)
-            count = len(stamps) if finite.all() else int(np.argmin(finite))
+            alike = (np.isfinite(position) == known).all(axis=1)
+            count = len(stamps) if alike.all() else int(np.argmin(alike))
             if count:
-                return JointBlock(stamps[:count], names, position[:count])
+                return JointBlock(stamps[:count], names, position[:count, known])
         return None
 
     def _learn(self, found: Messages, place: int) -> bool:
@@ -638,9 +643,10 @@ class _JointReader:
         if layout is None:
             return False
         try:
-            sample = joint_sample(self._decode(found, place))
+            message = self._decode(found, place)
+            names, known = joint_sample(message).names, np.isfinite(message.position)
         except InputError:  # said where the message is taken
             return False
-        self._layouts.insert(0, (layout, sample.names))
+        self._layouts.insert(0, (layout, names, known))
         del self._layouts[MOST_LAYOUTS:]
         return True

@@ -144,21 +144,34 @@ def tolerances_of(
     return Tolerances(path, end, resolved(own.goal_time_s, over_s))
 
 
+SPINDLE, SPINDLE_RAD_S = "a_spindle", 300.0  # before the arm's joints by alphabet
+
+
 def joint_state(
-    names: tuple[str, ...], stamp_ns: int, q: Array, qd: Array | None, missing: int = 0
+    names: tuple[str, ...],
+    stamp_ns: int,
+    q: Array,
+    qd: Array | None,
+    missing: int = 0,
+    *,
+    spindle: bool = False,
 ) -> JointState:
     """A reading as joint_state_broadcaster tells it: by alphabet, without effort.
 
-    ``qd`` None: hardware that has positions alone. ``missing``: as `odd_length`.
+    ``qd`` None: hardware that has positions alone. ``missing``: as `odd_length`. ``spindle``: a
+    joint that has a velocity alone is among them.
     """
+    velocity = np.full(len(names), np.nan) if qd is None else qd
+    if spindle:
+        names, q = (*names, SPINDLE), np.append(q, np.nan)
+        velocity = np.append(velocity, SPINDLE_RAD_S)
     order = sorted(range(len(names)), key=lambda i: names[i])
     nothing = np.full(len(names), np.nan)
-    velocity = nothing if qd is None else qd[order]
     return JointState(
         header=header(stamp_ns, ""),
         name=[names[i] for i in order],
         position=array("d", q[order].tobytes()),
-        velocity=array("d", odd_length(velocity, missing).tobytes()),
+        velocity=array("d", odd_length(velocity[order], missing).tobytes()),
         effort=array("d", nothing.tobytes()),
     )
 
@@ -238,7 +251,8 @@ class CellOutputs:
             else:
                 self._reset_ns = 0
             speed = qd if settings["velocities"] else None
-            self._send("joint_states", joint_state(names, at, q, speed, missing))
+            state = joint_state(names, at, q, speed, missing, spindle=settings["spindle"])
+            self._send("joint_states", state)
         station = station_name(settings["station"], self._cell.faults)
         for edge in came.edges:
             event = BeamEvent(

@@ -87,6 +87,11 @@ SETTINGS = (
         "~/controller_state, as of hardware that has positions alone",
     ),
     Setting(
+        "spindle",
+        False,
+        "joint_states name a spindle too, whose velocity alone is known: its position is NaN",
+    ),
+    Setting(
         "limits",
         False,
         "Drives refuse a command that is more than 5 % faster than their greatest speed; nobody "

@@ -16,8 +16,9 @@ import contextlib
 import math
 import struct
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from itertools import compress
 from operator import itemgetter
 from typing import Any
 
@@ -116,12 +117,13 @@ class _Layout:
 class JointWire:
     """Reads the joint messages of one topic and writes what goes out for them.
 
-    With ``is_reading`` velocities and efforts of which one is not finite are none: many drivers
-    have none, and say NaN. ``is_finite`` says whether every number of the message read last is.
+    ``readings_of``: the joints of the robot that reads; none of commands. Of readings, velocities
+    and efforts of which one is not finite are none: many drivers have none, and say NaN.
+    ``is_finite`` says whether every number of the message read last is.
     """
 
-    def __init__(self, *, is_reading: bool = False) -> None:
-        self.is_reading = is_reading
+    def __init__(self, readings_of: Collection[str] = ()) -> None:
+        self.readings_of = readings_of
         self.is_finite = True
         self._layout: _Layout | None = None
         self._efforts = 0  # how many go out
@@ -145,7 +147,7 @@ class JointWire:
         given = layout.numbers.unpack_from(data, STAMP)
         self.is_finite = math.isfinite(sum(given))
         if not self.is_finite:
-            if not (self.is_reading and np.isfinite(position).all()):
+            if not (self.readings_of and np.isfinite(position).all()):
                 return None
             if velocity is not None and not np.isfinite(velocity).all():
                 velocity = None
@@ -264,7 +266,9 @@ class JointMessage:
     """A serialized ``JointState`` that came in, its command, and what goes out for it.
 
     Of a reading velocities that are as many as joints, and efforts, go out empty where one is not
-    finite: many drivers have none. Raises `InputError` when it cannot be read.
+    finite: many drivers have none. Joints beside the robot's of which no position is known are
+    left out: joint_state_broadcaster tells so of a spindle that has a velocity alone. Raises
+    `InputError` when it cannot be read.
     """
 
     __slots__ = "_command", "_data", "_message", "_wire"
@@ -275,12 +279,19 @@ class JointMessage:
         self._message: Any = None
         if self._command is None:
             self._message = read_message(data, JointState)
-            if wire.is_reading:
+            if wire.readings_of:
                 self._drop_unknown(self._message)
 
-    @staticmethod
-    def _drop_unknown(message: Any) -> None:
-        """Empty what a driver does not know: numbers that are not finite, or too few."""
+    def _drop_unknown(self, message: Any) -> None:
+        """Leave out what a driver does not know: numbers that are not finite, or too few."""
+        names, position, own = message.name, message.position, self._wire.readings_of
+        if len(position) == len(names) and not all_finite(position):
+            known = [math.isfinite(q) or one in own for one, q in zip(names, position, strict=True)]
+            for field in ("velocity", "effort", "position", "name") if any(known) else ():
+                values = getattr(message, field)
+                if len(values) == len(known):
+                    kept = list(compress(values, known))
+                    setattr(message, field, kept if field == "name" else array("d", kept))
         for name in ("velocity", "effort"):
             values = getattr(message, name)
             if not (all_finite(values) and len(values) in (0, len(message.name))):
@@ -295,7 +306,7 @@ class JointMessage:
         """Build the session's command; raises `RefusedError` as `finite_command`."""
         if self._command:
             return self._command
-        build = joint_command if self._wire.is_reading else finite_command
+        build = joint_command if self._wire.readings_of else finite_command
         return build(self._message)
 
     def target(self) -> SerializedTarget | None:
@@ -318,7 +329,7 @@ class JointMessage:
         message.position = doubles(command.position)
         if command.velocity is not None:
             message.velocity = doubles(command.velocity)
-        elif self._wire.is_reading:
+        elif self._wire.readings_of:
             message.velocity = array("d")
         return message
 

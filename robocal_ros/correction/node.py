@@ -149,7 +149,7 @@ class JointCorrectionNode(RobotNode):
         self.add_input(MotionLease, LEASE, self._on_lease, endpoints.LATCHED_OF_SEVERAL)
         self.add_input(Float64, SCALING, self._on_scaling, endpoints.NEWEST)
         self.add_input(ControllerState, CONTROLLER, self._on_controller, endpoints.NEWEST)
-        states = partial(JointMessage, JointWire(is_reading=True))
+        states = partial(JointMessage, JointWire(readings_of=self._arm_names))
         targets, act = partial(JointMessage, JointWire()), self._on_target
         self._listen(STATES, states, self._on_states, endpoints.SENSOR)
         self._listen(

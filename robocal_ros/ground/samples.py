@@ -7,6 +7,7 @@ bag readers make the same samples from the same bytes.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ class JointSample:
         missing = [name for name in names if name not in self.names]
         if missing:
             there = ", ".join(self.names)
-            raise InputError(f"joint state lacks {', '.join(missing)}; it has {there}")
+            raise InputError(f"joint state has no position of {', '.join(missing)}; it has {there}")
         return np.array([self.names.index(name) for name in names], dtype=np.int64)
 
 
@@ -185,8 +186,11 @@ def stamp_ns(stamp: Any) -> int:
 def joint_sample(message: Any) -> JointSample:
     """Build a sample from a ``sensor_msgs/JointState``; a sample is one already.
 
-    Raises `InputError` when names and positions differ in number, a name is doubled or a value is
-    not finite, or the readings are not the controller's own.
+    Joints whose position is not finite are left out: joint_state_broadcaster names those that have
+    no position, as a spindle that has a velocity alone.
+
+    Raises `InputError` when names and positions differ in number, a name is doubled or no value is
+    finite, or the readings are not the controller's own.
     """
     if isinstance(message, JointSample):
         return message
@@ -201,9 +205,11 @@ def joint_sample(message: Any) -> JointSample:
         raise InputError(f"joint state has {len(names)} names but {len(position)} positions")
     if len(set(names)) != len(names):
         raise InputError(f"joint state names a joint twice: {', '.join(names)}")
-    if not np.all(np.isfinite(position)):
-        bad = names[int(np.flatnonzero(~np.isfinite(position))[0])]
-        raise InputError(f"joint state of '{bad}' is not finite")
+    known = np.isfinite(position)
+    if not known.all():
+        if not known.any():
+            raise InputError(f"joint state of '{names[0]}' is not finite")
+        names, position = tuple(compress(names, known)), position[known]
     return JointSample(stamp_ns(message.header.stamp), names, position)
 
 

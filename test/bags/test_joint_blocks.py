@@ -94,6 +94,23 @@ def write_joints(path: Path, times_ms: list[int], first: int = 0) -> None:
             bag.write("/joint_states", JOINT_STATE, message, ms * MS)
 
 
+def test_readings_beside_a_joint_without_a_position_come_together(tmp_path):
+    """joint_state_broadcaster says NaN of a spindle that has a velocity alone."""
+    with BagWriter(tmp_path / "x.mcap") as bag:
+        for i in range(100):
+            header = {"stamp": ros_time((1 + i) * MS), "frame_id": ""}
+            position = [np.nan, 0.1 * i if i != 50 else np.nan, 2.0]
+            message = {"header": header, "name": ["a_spindle", "b", "c"], "position": position}
+            bag.write("/joint_states", JOINT_STATE, message, i * MS)
+    found = read(tmp_path / "x.mcap", blocks=True)
+    assert [(len(m.message), m.message.names) for m in found] == [
+        (50, ("b", "c")),
+        (1, ("c",)),
+        (49, ("b", "c")),
+    ]
+    assert told(found) == told(read(tmp_path / "x.mcap", blocks=False))
+
+
 def test_joint_states_that_follow_each_other_come_together(tmp_path):
     write_joints(tmp_path / "x.mcap", [*range(500)])
     (message,) = read(tmp_path / "x.mcap", blocks=True)

@@ -264,7 +264,7 @@ class TestRefused:
         words = ["--bag", bag("sphere"), "--robot", "kr150_r3100", *known("sphere")]
         refused = robocal("sphere", *words, status=3)["error"]
         assert refused["code"] == "TOO_FEW_SAMPLES"
-        assert "joint state lacks joint_a1" in refused["message"]
+        assert "joint state has no position of joint_a1" in refused["message"]
 
     def test_a_bag_without_profiles(self, tmp_path):
         path = copied("sphere", tmp_path / "joints.mcap", (EVENTS, "/profile"))

@@ -138,6 +138,16 @@ def test_joint_states_come_at_their_rate_with_exact_stamps(graph):
     assert list(cell.states[0].name) == sorted(ARM.joint_names)
 
 
+@pytest.mark.parametrize("velocities", [True, False])
+def test_a_spindle_has_a_velocity_alone(graph, velocities):
+    state = Cell(graph, spindle=True, velocities=velocities).states[0]
+    assert list(state.name) == sorted(state.name) == ["a_spindle", *sorted(ARM.joint_names)]
+    assert np.isnan(state.position[0])
+    assert in_order(state, state.position) == pytest.approx(HOME, abs=1e-12)
+    assert state.velocity[0] > 0.0
+    assert np.isnan(in_order(state, state.velocity)).all() == (not velocities)
+
+
 def test_a_trajectory_is_followed_by_name_and_in_time(graph):
     cell = Cell(graph, velocities=True)
     start_ns = cell.node.now_ns() + 300_000_000

@@ -58,6 +58,7 @@ class FixtureCell(BeatingPlc):
         self.verdicts = graph.collect(CalibrationQuality, "/fixture_node/quality", latched)
         self.frames = graph.collect(PoseWithCovarianceStamped, "/fixture_node/frame", latched)
         simulated = {"cell": "kr150", "fixture": True, "seed": SEED, "cloud_points": 0}
+        simulated["spindle"] = True
         graph.start("cell_sim_node", simulated, {"joint_trajectory": ROBOT})
         own = {"robot": "kr150_r3100", "serial": SERIAL}
         sigma = {"point_sigma_mm": 1e3 * LIMITS.sigma_m}

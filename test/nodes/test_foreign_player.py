@@ -7,7 +7,16 @@ from typing import Any
 from control_msgs.msg import JointTrajectoryControllerState, SpeedScalingFactor
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
-from robocal_msgs.msg import AccuracyState, GapOpen, MaintenanceStatus, MotionLease, ToolStep
+from robocal_msgs.msg import (
+    AccuracyState,
+    CorrectionStatus,
+    GapOpen,
+    KinematicModel,
+    MaintenanceStatus,
+    MotionLease,
+    ToolFrame,
+    ToolStep,
+)
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
@@ -25,7 +34,9 @@ from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.tool.node import TcfNode
 
-COMMANDS = {  # what moves a robot, or says that it may be moved, by the name on the graph
+# What moves a robot, says that it may be moved, or how it is to be corrected, by the name on the
+# graph.
+COMMANDS = {
     "/gap_open": GapOpen,
     "/robot/gap_open": Bool,
     "/joint_trajectory": JointTrajectory,
@@ -45,6 +56,10 @@ COMMANDS = {  # what moves a robot, or says that it may be moved, by the name on
     "/speed_scaling": Float64,
     "/arm/speed_scaling_input": SpeedScalingFactor,
     "/arm/controller_state": JointTrajectoryControllerState,
+    "/kinematic_model": KinematicModel,
+    "/thermal_node/candidate": KinematicModel,
+    "/tool": ToolFrame,
+    "/joint_correction_node/status": CorrectionStatus,
 }
 READINGS = {
     "/joint_states": JointState,
@@ -80,7 +95,8 @@ def test_what_another_player_publishes_reaches_no_node(graph: Any, tmp_path: Pat
     graph.add(TcfNode, {"motion": "trajectory", "laser": laser})
     graph.add(CellSimNode, {})
     heard = {topic for topic in COMMANDS if graph.probe.count_subscribers(topic)}
-    assert {"/gap_open", "/joint_trajectory", "/joint_targets"} <= heard  # as named on the graph
+    taken = {"/gap_open", "/joint_trajectory", "/joint_targets", "/kinematic_model", "/tool"}
+    assert taken <= heard  # as named on the graph
     with AnyReader([bag]) as reader:  # as a player does: each message under its recorded name
         played = {c.topic: c.msgtype for c in reader.connections}
         assert len(played) == len(COMMANDS | READINGS)

@@ -435,7 +435,7 @@ def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> Non
         gripper.fields["name"] = ["finger"]
         sensor.give(gripper)
         graph.spin_for(0.02)
-    assert "joint state lacks" in sensor.ended(2).reason
+    assert "joint state has no position of" in sensor.ended(2).reason
 
 
 def test_nothing_is_left_of_an_earlier_session(graph: Any, sensor: LiveSensor) -> None:

@@ -213,6 +213,27 @@ def test_velocities_that_a_driver_does_not_know_are_none(graph: Any) -> None:
     assert line.node.inputs["joint_states"].invalid == 0
 
 
+def test_a_spindle_without_a_position_stands_beside_the_arm(graph: Any) -> None:
+    """joint_state_broadcaster says NaN of a joint that has a velocity alone."""
+    line = Line(graph)
+
+    line.to_states.publish(
+        JointState(
+            name=["a_spindle", *NAMES],
+            position=[np.nan, *HOME],
+            velocity=[300.0, *[0.1] * 6],
+            effort=[np.nan] * 7,
+        )
+    )
+    out = line.wait(line.states)
+    assert (list(out.name), list(out.position)) == (list(NAMES), HOME.tolist())
+    assert (list(out.velocity), list(out.effort)) == ([0.1] * 6, [])
+    assert line.node.inputs["joint_states"].invalid == 0
+    of_the_arm = joints(np.array([np.nan, *HOME[1:]]))
+    line.refused(line.to_states, of_the_arm, "joint_states")
+    line.told(refused_reasons=["a value is not finite"])
+
+
 def test_a_robot_that_stands_elsewhere_gets_nothing_until_the_operator_says_so(graph: Any) -> None:
     line = Line(graph, enable_on_start=True)
     line.take(model_message(drifted()), line.to_model, "kinematic_model")

@@ -2,6 +2,7 @@
 """Joint messages that came in, and what goes out for them: irregular ones by way of a message."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,7 +19,7 @@ from robocal_ros.correction.messages import ArrayMessage, JointMessage, JointWir
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.samples import CORRECTED
 
-NAN = math.nan
+NAN, NAMES = math.nan, ("a", "b")
 
 
 def a_state(**fields: Any) -> JointState:
@@ -33,8 +34,8 @@ def a_path(**fields: Any) -> JointTrajectory:
     return JointTrajectory(joint_names=["a", "b"], points=points)
 
 
-def came(state: JointState, *, is_reading: bool = False) -> JointMessage:
-    return JointMessage(JointWire(is_reading=is_reading), serialize_message(state))
+def came(state: JointState, *, readings_of: Sequence[str] = ()) -> JointMessage:
+    return JointMessage(JointWire(readings_of), serialize_message(state))
 
 
 def as_message(out: Any, kind: type) -> Any:
@@ -45,7 +46,7 @@ def as_message(out: Any, kind: type) -> Any:
 @pytest.mark.parametrize("effort", [[], [3.0, 4.0], [NAN, 4.0]])
 def test_a_reading_goes_out_with_other_values(velocity: list[float], effort: list[float]) -> None:
     state = a_state(velocity=velocity, effort=effort)
-    message = came(state, is_reading=True)
+    message = came(state, readings_of=NAMES)
     assert message.is_finite()
     command = message.command()
     faster = None if command.velocity is None else 2.0 * command.velocity
@@ -60,7 +61,7 @@ def test_a_reading_goes_out_with_other_values(velocity: list[float], effort: lis
 
 
 def test_a_reading_without_efforts_goes_out_unchanged_but_for_them() -> None:
-    message = came(a_state(effort=[NAN, NAN]), is_reading=True)
+    message = came(a_state(effort=[NAN, NAN]), readings_of=NAMES)
     assert message.unchanged() == a_state()
 
 
@@ -112,16 +113,37 @@ def test_what_is_no_message_is_told(read: Any) -> None:
 
 def test_a_velocity_of_another_joint_that_is_no_number_does_not_go_out() -> None:
     """A gripper's, which the correction does not touch."""
-    message = came(a_state(velocity=[0.1, NAN]), is_reading=True)
+    message = came(a_state(velocity=[0.1, NAN]), readings_of=NAMES)
     command = message.command()
     out = as_message(message.changed(replace(command, mark=CORRECTED)), JointState)
     assert list(out.velocity) == []
     assert list(out.position) == [1.0, 2.0]
 
 
+@pytest.mark.parametrize("rows", [{}, {"velocity": []}, {"effort": [3.0, NAN]}])
+def test_another_joint_without_a_position_is_left_out(rows: dict[str, list[float]]) -> None:
+    state = a_state(position=[1.0, NAN], **rows)
+    out = a_state(name=["a"], position=[1.0], velocity=rows.get("velocity", [0.1]))
+    out.effort = rows.get("effort", [])[:1]
+    message = came(state, readings_of=["a"])
+    assert message.is_finite()
+    assert message.command().names == ("a",)
+    assert message.unchanged() == out
+    for of in (["a", "b"], ["b"]):  # the robot's own
+        with pytest.raises(RefusedError) as refused:
+            came(state, readings_of=of).command()
+        assert refused.value.reason is Reason.NOT_FINITE
+
+
+def test_readings_of_which_nothing_is_known_are_refused() -> None:
+    with pytest.raises(RefusedError) as refused:
+        came(a_state(position=[NAN, NAN]), readings_of=["c"]).command()
+    assert refused.value.reason is Reason.NOT_FINITE
+
+
 @pytest.mark.parametrize("velocity", [[NAN, NAN], [0.1, NAN], [0.1], [0.1, 0.2, 0.3]])
 def test_velocities_of_a_reading_that_are_unknown_are_absent(velocity: list[float]) -> None:
-    message = came(a_state(velocity=velocity, effort=[NAN, NAN]), is_reading=True)
+    message = came(a_state(velocity=velocity, effort=[NAN, NAN]), readings_of=NAMES)
     assert message.is_finite()
     assert message.command().velocity is None
     assert message.unchanged() == a_state(velocity=[])

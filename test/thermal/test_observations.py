@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pairing of measurements and joints: by stamps alone."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -114,10 +116,11 @@ def test_a_measurement_before_the_first_joints_is_named():
     assert d.from_ns == 1300 * MS  # from here on windows are complete
 
 
-def test_joints_by_name_in_any_order_beside_others():
+@pytest.mark.parametrize("other", [9.0, math.nan])
+def test_joints_by_name_in_any_order_beside_others(other):
     d = desk()
     for ms in range(1000, 2001, 100):
-        d.add_joints(joints(ms, 9.0, 0.2, 0.1, names=("gripper", "b", "a")))
+        d.add_joints(joints(ms, other, 0.2, 0.1, names=("gripper", "b", "a")))
     d.add_measurement(point(1500))
     assert everything(d)[0].q == pytest.approx([0.1, 0.2])
 
@@ -132,7 +135,7 @@ def test_unusable_joints_are_counted_by_reason():
     assert sum(d.ignored[JOINTS].values()) == 4
     assert d.ignored[JOINTS]["joint state at # ns is not after # ns"] == 2
     assert d.ignored[JOINTS]["no time stamp"] == 1
-    assert d.ignored[JOINTS]["joint state lacks b; it has a"] == 1
+    assert d.ignored[JOINTS]["joint state has no position of b; it has a"] == 1
     assert d.newest_ns[JOINTS] == 2000 * MS
 
 
