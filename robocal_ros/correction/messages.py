@@ -118,8 +118,9 @@ class JointWire:
     """Reads the joint messages of one topic and writes what goes out for them.
 
     ``readings_of``: the joints of the robot that reads; none of commands. Of readings, velocities
-    and efforts of which one is not finite are none: many drivers have none, and say NaN.
-    ``is_finite`` says whether every number of the message read last is.
+    of which one of the robot's is not finite, and efforts of which any is not, are none: many
+    drivers have none, and say NaN. ``is_finite`` says whether every number of the message read
+    last is.
     """
 
     def __init__(self, readings_of: Collection[str] = ()) -> None:
@@ -149,8 +150,9 @@ class JointWire:
         if not self.is_finite:
             if not (self.readings_of and np.isfinite(position).all()):
                 return None
-            if velocity is not None and not np.isfinite(velocity).all():
-                velocity = None
+            if velocity is not None:
+                own = [name in self.readings_of for name in layout.names]
+                velocity = velocity if np.isfinite(velocity[own]).all() else None
             if not np.isfinite(numbers[len(numbers) - self._efforts :]).all():
                 self._efforts = 0
         stamp_ns = given[0] * NS + given[1]

@@ -110,7 +110,8 @@ class StatedController:
     def hear(self, velocity: ArrayLike, count: int, now_s: float) -> None:
         """Take velocities of ``count`` joint states: they count where the controller is silent.
 
-        Some hardware says 0 in motion; a stop of a robot that stands may be of either kind.
+        Of the controller's own joints. Some hardware says 0 in motion; a stop of a robot that
+        stands may be of either kind.
         """
         if now_s - self._heard_s > SPOKEN_S:
             self._tells(np.asarray(velocity, dtype=np.float64), count)
@@ -578,9 +579,12 @@ class MotionDriver:
         One without all joints is another driver's, and tells nothing of that.
         """
         now_s, at_ns = self._now(), stamp_ns(message.header.stamp)
-        self._controller.hear(message.velocity, len(message.name), now_s)
-        if not set(self._names) <= set(message.name):
+        names, velocity = list(message.name), message.velocity
+        if not set(self._names) <= set(names):
             return 0.0
+        if len(velocity) == len(names):  # a gripper or a spindle may have others
+            velocity = [velocity[names.index(name)] for name in self._names]
+        self._controller.hear(velocity, len(self._names), now_s)
         return self.lateness.take(at_ns / NS, now_s, (self._node.now_ns() - at_ns) / NS)
 
     def late(self) -> str:

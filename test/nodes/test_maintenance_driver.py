@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the maintenance session asks is carried out in the right order, by a clock that is right."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionServer, GoalResponse
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from trajectory_controllers import HOME as Q_UR10
 from trajectory_controllers import accepted_goals
@@ -194,6 +196,26 @@ def test_a_stop_that_is_sent_on_the_topic_again_and_again_is_not_stamped(graph: 
         if stamps[0]:
             break
     assert stamps[0] == pytest.approx(3600, abs=60)
+
+
+def test_velocities_of_other_joints_say_nothing_of_the_hardware(graph: Any) -> None:
+    """A stop with velocities makes hardware that has none stand for a moment, and goes on."""
+    names = load_robot("ur10").joint_names
+    _, motion = driving(graph, names)
+    plan = stop(load_robot("ur10"), MotionLimits(), Q_UR10, np.full(6, 0.1))
+
+    def told(others: Sequence[str], velocity: Sequence[float], arm: Sequence[str] = names) -> bool:
+        state = JointState(name=[*others, *arm], velocity=velocity)
+        motion.hear(state)
+        return bool(motion._controller.stop_message(plan, names, 0.0).points[0].velocities)
+
+    nothing = [math.nan] * 6
+    assert not told([], nothing)
+    assert not told(["spindle"], [300.0], ())  # of another driver
+    assert not told(["spindle"], [300.0, *nothing])
+    assert told(["gripper"], [math.nan, *[0.1] * 6])
+    assert told([], [0.1] * 6)
+    assert not told([], [0.1] * 5)
 
 
 def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> None:

@@ -112,9 +112,13 @@ def test_what_is_no_message_is_told(read: Any) -> None:
 
 
 def test_a_velocity_of_another_joint_that_is_no_number_does_not_go_out() -> None:
-    """A gripper's, which the correction does not touch."""
-    message = came(a_state(velocity=[0.1, NAN]), readings_of=NAMES)
+    """A gripper's, which the correction does not touch; the arm's are read all the same."""
+    message = came(a_state(velocity=[0.1, NAN]), readings_of=["a"])
     command = message.command()
+    assert command.velocity is not None
+    assert command.velocity[0] == 0.1
+    assert message.unchanged() == a_state(velocity=[])
+    command = replace(command, velocity=None)  # as the session leaves them out
     out = as_message(message.changed(replace(command, mark=CORRECTED)), JointState)
     assert list(out.velocity) == []
     assert list(out.position) == [1.0, 2.0]
