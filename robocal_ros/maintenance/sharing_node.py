@@ -40,16 +40,18 @@ class SharingNode(HouseNode):
         robots = self.settings["robots"]
         if len(set(robots)) < 2 or len(set(robots)) != len(robots) or "" in robots:
             raise InputError(f"robots is {robots}: name two namespaces or more, each once")
-        self._gaps, self._wanting = {}, {}
+        self._gaps, self._inputs = {}, {}
         for name in robots:
-            self._wanting[name] = self.add_input(
-                GapOpen, f"{name}/gap_wanted", partial(self._wanted, name), endpoints.HEARTBEAT
-            )
-            self.add_input(
-                MaintenanceStatus,
-                f"{name}/maintenance_node/status",
-                partial(self._status, name),
-                endpoints.LATCHED,
+            self._inputs[name] = (
+                self.add_input(
+                    GapOpen, f"{name}/gap_wanted", partial(self._wanted, name), endpoints.HEARTBEAT
+                ),
+                self.add_input(
+                    MaintenanceStatus,
+                    f"{name}/maintenance_node/status",
+                    partial(self._status, name),
+                    endpoints.LATCHED,
+                ),
             )
             self._gaps[name] = self.add_output(GapOpen, f"{name}/gap_open", endpoints.HEARTBEAT)
         self._holder = self.add_output(String, "~/holder", endpoints.LATCHED)
@@ -70,18 +72,19 @@ class SharingNode(HouseNode):
         self._look()
 
     def _doubt(self, name: str) -> str:
-        """Why what asks for a robot's gap does not count; empty: it does.
+        """Why what is said of a robot's gap does not count; empty: it does.
 
-        Of two that ask, one may say open while the other says closed; maintenance_node, which
-        hears this node alone, could not tell.
+        Of two that ask, one may say open while the other says closed, which maintenance_node could
+        not tell, as it hears this node alone. Of two that tell where the robot is, one may say that
+        it is out while it works in the place.
         """
-        asking = self._wanting[name]
-        if (count := asking.get_publisher_count()) < 2:
-            return ""
-        return f"{asking.topic_name} has {count} publishers: let one alone publish it"
+        for told in self._inputs[name]:
+            if (count := told.get_publisher_count()) > 1:
+                return f"{told.topic_name} has {count} publishers: let one alone publish it"
+        return ""
 
     def _status(self, name: str, message: Any) -> None:
-        out = bool(message.at_home) and message.state not in BUSY
+        out = bool(message.at_home) and message.state not in BUSY and not self._doubt(name)
         self._place.tell(name, out, time.monotonic())
         self._look()
 
@@ -99,7 +102,7 @@ class SharingNode(HouseNode):
         health.values = {"holder": self._told or "nobody"}
         if why := self._place.why(now_s):
             health.worsen(WARN, why)
-        for name in self._wanting:
+        for name in self._inputs:
             if why := self._doubt(name):
                 health.worsen(ERROR, why)
         return health

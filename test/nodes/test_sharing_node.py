@@ -107,6 +107,26 @@ def test_what_is_passed_on_is_as_it_came(cells):
     assert echoes == sorted(set(echoes)), "each beat once, in its order"
 
 
+def test_where_two_tell_of_one_robot_it_is_not_out(graph, cells):
+    """One that says so would give the place away in which the robot works."""
+    told, gaps = cells.told, cells.gaps["left"]
+    told.want["left"] = True
+    cells.until(lambda: cells.has() == "left" and gaps[-1].open)
+    told.out["left"], told.want["right"] = False, True
+    topic = "/left/maintenance_node/status"
+    second = graph.publisher(MaintenanceStatus, topic, endpoints.LATCHED)
+    cells.until(lambda: not gaps[-1].open)
+    told.want["left"] = False
+    for _ in range(8):
+        second.publish(MaintenanceStatus(state=MaintenanceStatus.IDLE, at_home=True))
+        cells.step()
+        assert cells.has() == "left"
+    assert f"{topic} has 2 publishers" in cells.node.health().message
+    graph.probe.destroy_publisher(second)
+    told.out["left"] = True
+    cells.until(lambda: cells.has() == "right")
+
+
 def test_of_two_plcs_that_ask_for_one_robot_none_has_it(graph, cells):
     told, gaps = cells.told, cells.gaps["left"]
     told.want["left"] = True
