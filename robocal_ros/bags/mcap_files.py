@@ -34,7 +34,7 @@ from zstandard import ZstdError
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.files import share_folders
-from robocal_ros.ground.samples import JointBlock, joint_sample
+from robocal_ros.ground.samples import RECORDED, JointBlock, joint_sample
 
 if TYPE_CHECKING:
     from robocal_ros.ground.serialized import JointLayout
@@ -174,7 +174,6 @@ def _field(store: Typestore, described: Any, value: Any) -> Any:
 # What moves a robot, says that it may be moved, how its controller moves it, or how it is to be
 # corrected, lies under `RECORDED`: ``/robot/gap_open`` as ``/recorded/robot/gap_open``.
 # `BagReader` gives each topic the name that it had on the graph.
-RECORDED = "/recorded"
 MOVES = "it may move a robot"
 VOUCHES = "it says that a robot may move now, or how it is moved"
 CORRECTS = "a robot would be corrected by it"

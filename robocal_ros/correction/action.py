@@ -412,16 +412,19 @@ class TrajectoryProxy:
             if not goal.servers <= servers:
                 if goal.result is not None:
                     goal.result.cancel()  # rclpy would keep it for ever
-                why = f"the controller that offered {self.controller} vanished"
-                goal.stopped = why  # its path ends when the robot is seen to stand
-                self._lost(why)
-                self._forward_cancel(goal)
-                self._fail(goal, f"{why}; the robot may still move")
+                self._give_up(goal, f"the controller that offered {self.controller} vanished")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
-                what = "cancel, the robot may still move" if goal.cancel else "goal"
-                self._fail(
+                what = "cancel" if goal.cancel else "goal"
+                self._give_up(
                     goal, f"{self.controller} did not answer within {ANSWER_S:g} s to the {what}"
                 )
+
+    def _give_up(self, goal: _Goal, why: str) -> None:
+        """End a goal of which nothing is heard; the robot is stopped, as it may follow it."""
+        goal.stopped = why  # its path ends when the robot is seen to stand
+        self._lost(why)
+        self._forward_cancel(goal)
+        self._fail(goal, f"{why}; the robot may still move")
 
     def _servers(self) -> frozenset[bytes]:
         """Who offers the controller's action: a restarted controller is another one."""

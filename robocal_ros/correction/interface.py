@@ -370,12 +370,13 @@ class CorrectionStatus:
             return CorrectionState.BLENDING
         if not self.enabled:
             return CorrectionState.OFF
-        known = self.revision is not None or self.new_tool
+        known = self.new_tool or (self.revision is not None and not self.stale)
         return CorrectionState.ON if known else CorrectionState.WITHOUT_MODEL
 
     def in_words(self) -> str:
         """What the correction does now, in one line."""
-        parts = [] if self.revision is None else [f"model revision {self.revision}"]
+        model = self.revision is not None and not self.stale
+        parts = [f"model revision {self.revision}"] if model else []
         parts += [f"tool revision {self.tool_revision}"] if self.new_tool else []
         settled = "on" if self.settled else "on, the offset changes with the next commands"
         if self.held:
@@ -387,6 +388,9 @@ class CorrectionStatus:
             words = "off, the offset goes to zero with the next commands" if self.active else "off"
         elif parts:
             words = f"{settled}: {' and '.join(parts)}"
+            words += f", without the model: {self.stale}" if self.stale else ""
+        elif self.stale:
+            words = f"on, but nothing is corrected: {self.stale}"
         else:
             words = "on, but there is no model and no tool yet: nothing is corrected"
         return f"shadow, nothing is changed; it would be {words}" if self.shadow else words
@@ -432,10 +436,10 @@ def uncorrected(
         idle = f"puts nothing out, {told.commanders}: end them"
     elif not told.enabled:
         idle = "is OFF: call ~/enable"
-    elif told.state is CorrectionState.WITHOUT_MODEL:
-        idle = "has heard of no model and no tool: wire its inputs kinematic_model and tool"
     elif told.stale and not no_model:
         idle = f"corrects without the model, {told.stale}: accept a newer one"
+    elif told.state is CorrectionState.WITHOUT_MODEL:
+        idle = "has heard of no model and no tool: wire its inputs kinematic_model and tool"
     if needed and idle:
         return f"{NODE} {idle}"
     silent = told.state in (CorrectionState.MISMATCH, CorrectionState.OTHER_COMMANDER)

@@ -289,7 +289,7 @@ class JointMessage:
         names, position, own = message.name, message.position, self._wire.readings_of
         if len(position) == len(names) and not all_finite(position):
             known = [math.isfinite(q) or one in own for one, q in zip(names, position, strict=True)]
-            for field in ("velocity", "effort", "position", "name") if any(known) else ():
+            for field in ("velocity", "effort", "position", "name"):
                 values = getattr(message, field)
                 if len(values) == len(known):
                     kept = list(compress(values, known))

@@ -365,6 +365,8 @@ class JointCorrectionNode(RobotNode):
     def _on_states(self, message: JointMessage, now: float) -> None:
         session = self._session
         command = session.counted(message.command)
+        if not command.names:  # of another driver, which knows no position
+            return
         self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         self._put_out(STATES, message, command, session.reading(command, now, age))

@@ -202,6 +202,8 @@ class RobotState:
 
         ``late_s``: they are so much older than when they came, whatever the clocks differ by.
         """
+        if not len(position):  # another driver's: where the arm was last is not where it is
+            return
         at_s = now_s - late_s
         blind = self.blind(at_s)
         if blind:

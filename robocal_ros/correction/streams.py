@@ -243,12 +243,13 @@ class TargetStream:
         self._velocity[:] = 0.0
         if velocity is not None:
             self._velocity[index] = velocity
-        output.path = None
         self._came_s, self._command, self.phase = now_s, command, StreamPhase.RUNNING
         self.is_usual = False
         self._advance(now_s)
         self.is_usual = self._whole and self.lag_s == 0.0 and not self._held_up
-        return self._message(command)
+        message = self._message(command)
+        output.path = None  # which the controller goes on with where the target is refused
+        return message
 
     def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
         """Go on after a pause only where the robot is where it was left, and can be there soon.

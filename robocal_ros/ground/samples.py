@@ -26,6 +26,7 @@ REFERENCE_SPHERE = "reference_sphere_center"  # a sphere fixed in the cell
 MEASURED_POINT = "measured_point"  # the input that a point comes from where nothing else is said
 MEASURING = (MEASURED_POINT, SPHERE_CENTER, SPHERE_CLOUD, MEASURED_POSE, REFERENCE_SPHERE)
 JUMPS = "clock_jumps"  # beside topics in marks
+RECORDED = "/recorded"  # before the names of what must not act where it is played again
 UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
 TAUGHT = "robocal_taught"  # frame_id of joint states from which the correction was removed
 TEMPERATURES = "motor_temperatures"

@@ -28,7 +28,7 @@ from std_msgs.msg import Bool, Empty
 
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array
-from robocal_ros.ground.samples import JOINTS, UNCORRECTED
+from robocal_ros.ground.samples import JOINTS, RECORDED, UNCORRECTED
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.endpoints import EndpointNode, NotActiveError
 from robocal_ros.ros.parameters import Setting
@@ -250,7 +250,7 @@ class SourceGuard:
         correcting = {
             who
             for topic, kinds in self._node.get_topic_names_and_types()
-            if _STATUS in kinds
+            if _STATUS in kinds and not topic.startswith(f"{RECORDED}/")  # a player's
             for who in publishers(self._node, topic)
         }
         culprits = sorted({one.name for one in found & correcting})

@@ -569,6 +569,29 @@ def test_a_trajectory_that_begins_at_once_beside_a_moving_robot_does_not_go_out(
     assert np.abs(out[0] - robot.at).max() <= ROUNDING
 
 
+@pytest.mark.parametrize("on", [False, True])
+def test_a_target_that_is_refused_leaves_the_trajectory_that_it_came_beside(on: bool) -> None:
+    """The controller drives it on: it must be known, to be stopped."""
+    robot = Robot()
+    if on:
+        robot.session.offer_model(offer(drifted()))
+        robot.session.enable(True)
+    way = TrajectoryCommand(NAMES, np.stack([HOME, HOME + 1.0]), np.array([0.0, 2.0]))
+    robot.session.trajectory(way, robot.now)
+    path = robot.session.output.path
+    assert path is not None
+    path.begin(robot.now)
+    for _ in range(100):
+        robot.now += 0.01
+        robot.at = path.place(robot.now)
+        robot.read(robot.at)
+    beside = JointCommand(NAMES, HOME + 0.5, np.full(6, np.degrees(1.0)))  # in deg/s
+    refused(Reason.VELOCITY_LIMIT, robot.session.target, beside, robot.now)
+    assert robot.session.output.path is path
+    assert robot.session.moves(robot.now)
+    assert robot.session.stop(robot.now, 0.05) is not None
+
+
 def test_refused_messages_leave_nothing_to_jump_to() -> None:
     """Twenty-three refused, then one that could be taken: the robot is no longer there."""
     speed, held = np.radians(60.0), []

@@ -51,6 +51,7 @@ def test_in_each_state_the_line_reads_whether_commands_are_corrected():
         (OTHER, RIVAL),
         (replace(OTHER, enabled=False), RIVAL),
         (replace(ON, stale="model revision 4 is 90 s old, allowed 60 s"), "90 s old"),
+        (replace(WITHOUT, stale="model revision 4 is 90 s old, allowed 60 s"), "90 s old"),
     ],
     ids=str,
 )

@@ -30,7 +30,13 @@ from hypothesis import strategies as st
 from test_correction_over_time import Watch
 
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
-from robocal_ros.correction.interface import JointCommand, Reason, RefusedError, TrajectoryCommand
+from robocal_ros.correction.interface import (
+    CorrectionState,
+    JointCommand,
+    Reason,
+    RefusedError,
+    TrajectoryCommand,
+)
 from robocal_ros.correction.sent_path import spline
 
 SECOND = 1_000_000_000
@@ -67,6 +73,10 @@ def test_an_old_model_is_blended_out_and_a_fresh_one_in(aged: Robot) -> None:
         last = aged.at
     assert np.array_equal(aged.settle(), HOME)
     assert session.offset(aged.now).revision is None
+    status = session.status(aged.now)
+    assert status.state is CorrectionState.WITHOUT_MODEL
+    assert "nothing is corrected: " in status.in_words()
+    assert "61.0 s old" in status.in_words()
     session.offer_model(offer(drifted(3.0), stamp_ns=161 * SECOND))  # the same, seen again
     session.look(aged.now, 162 * SECOND)
     assert not session.status().stale

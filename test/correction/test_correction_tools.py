@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from correction_robot import HOME, NAMES, NOMINAL, REST, ROUNDING, Robot, bent_tool, refused, still
 
-from robocal_ros.correction.interface import Reason, TrajectoryCommand, offered_tool
+from robocal_ros.correction.interface import (
+    JointCommand,
+    Reason,
+    TrajectoryCommand,
+    offered_tool,
+)
 
 
 def waiting(robot: Robot) -> int | None:
@@ -56,6 +61,19 @@ def test_it_waits_for_a_robot_that_stands(robot: Robot) -> None:
     robot.at = HOME + 2.0 * np.radians(0.02) * 20
     robot.rest()
     assert waiting(robot) is None
+
+
+def test_a_gripper_does_not_tell_that_the_arm_stands() -> None:
+    """Of its own driver; the arm's readings pause while it moves."""
+    robot = Robot(joint_state_age_s=1.0)
+    for i in range(20):
+        robot.now += 0.01
+        robot.read(HOME + 0.01 * i)
+    for _ in range(40):
+        robot.now += 0.01
+        robot.session.reading(JointCommand(("gripper",), np.zeros(1)), robot.now)
+    assert not robot.session.robot.stands(np.arange(6), robot.now)
+    refused(Reason.STALE_JOINTS, robot.session.target, JointCommand(NAMES, robot.at), robot.now)
 
 
 def test_without_joint_states_nobody_knows_whether_it_stands(robot: Robot) -> None:

@@ -26,11 +26,12 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.bags.bag_writer import recordings
 from robocal_ros.bags.bags import BagReader
-from robocal_ros.bags.mcap_files import RECORDED, graph_name, message_class, recorded_name
+from robocal_ros.bags.mcap_files import graph_name, message_class, recorded_name
 from robocal_ros.bags.recorder_node import RecorderNode
 from robocal_ros.bags.replay_node import chosen_topics
 from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.ground.samples import RECORDED
 from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.tool.node import TcfNode
 

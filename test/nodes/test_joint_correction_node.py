@@ -144,6 +144,17 @@ def test_the_output_of_a_renamed_correction_node_is_not_corrected_again(graph: A
     graph.spin_until(lambda: count.invalid > 0, "the target is refused")
 
 
+def test_a_player_of_a_recording_is_no_correction_node(graph: Any) -> None:
+    graph.publisher(CorrectionStatus, "/recorded/joint_correction_node/status", subscribers=0)
+    graph.publisher(JointState, "/joint_states", subscribers=0)
+    guard = SourceGuard(graph.probe, "/joint_states")
+    graph.spin_until(
+        lambda: graph.probe.count_publishers("/recorded/joint_correction_node/status"), "it plays"
+    )
+    guard.look()
+    assert guard.fault == ""
+
+
 def test_a_robot_in_a_namespace_named_like_a_correction_node_is_heard(graph: Any) -> None:
     """The name is a hint as long as nobody is discovered; then who publishes decides."""
     topic = "/joint_correction_cell/joint_states"
@@ -228,7 +239,12 @@ def test_a_spindle_without_a_position_stands_beside_the_arm(graph: Any) -> None:
     out = line.wait(line.states)
     assert (list(out.name), list(out.position)) == (list(NAMES), HOME.tolist())
     assert (list(out.velocity), list(out.effort)) == ([0.1] * 6, [])
-    assert line.node.inputs["joint_states"].invalid == 0
+    count, received = line.node.inputs["joint_states"], len(line.states)
+    before = count.received
+    alone = JointState(name=["a_spindle"], position=[np.nan], velocity=[300.0])  # its own driver
+    line.to_states.publish(alone)
+    graph.spin_until(lambda: count.received > before, "it is heard")
+    assert (count.invalid, len(line.states)) == (0, received)
     of_the_arm = joints(np.array([np.nan, *HOME[1:]]))
     line.refused(line.to_states, of_the_arm, "joint_states")
     line.told(refused_reasons=["a value is not finite"])

@@ -25,6 +25,7 @@ from jumps import no_jump
 from robocal_msgs.msg import CorrectionStatus, JointOffset, KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from std_srvs.srv import SetBool
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
@@ -285,6 +286,9 @@ def test_an_old_model_blends_out_and_the_status_says_so(graph: Any) -> None:
 
     graph.spin_until(stale, "the model is stale")
     assert list(line.settle().position) == HOME.tolist()
+    answer = graph.call(SetBool, f"{NODE}/enable", data=True)
+    assert not answer.success
+    assert "nothing is corrected: " in answer.message
 
 
 def test_what_exceeds_a_bound_is_clamped_and_counted(graph: Any) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The action of the joint correction before a controller's, over DDS."""
 
+import math
 import signal
 import time
 from collections.abc import Iterator
@@ -610,6 +611,21 @@ def test_a_goal_accepted_too_late_is_cancelled(apart: Any, monkeypatch: Any) -> 
     cell.controller.process.send_signal(signal.SIGCONT)
     cell.graph.spin_for(1.0)  # a tenth of the way, if it were not cancelled
     assert np.abs(cell.taught() - HOME).max() < 0.01 * np.abs(MOVED - HOME).max()
+
+
+def test_a_goal_of_which_nothing_is_heard_is_stopped(cell: Any) -> None:
+    """The robot may follow it all the same."""
+    cell.begin()
+    sent, received = cell.send(HOME, MOVED, lasts_s=20.0).moves(), len(cell.robot.goals)
+    (goal,) = cell.node._proxy._goals
+    goal.asked_s = -math.inf  # as where the answer to a cancel is lost
+    result = sent.ends(GoalStatus.STATUS_ABORTED)
+    assert "did not answer within" in result.error_string
+    assert "the robot may still move" in result.error_string
+    cell.graph.spin_until(lambda: len(cell.robot.goals) > received, "a stop is sent")
+    cell.graph.spin_until(lambda: not cell.robot.speed.any(), "the robot stands")
+    session = cell.node._session
+    cell.graph.spin_until(lambda: not session.moves(time.monotonic()), "and is known to")
 
 
 def test_hostile_feedback_does_not_end_the_process(graph: Any) -> None:
