@@ -73,7 +73,8 @@ def test_a_gripper_does_not_tell_that_the_arm_stands() -> None:
         robot.now += 0.01
         robot.session.reading(JointCommand(("gripper",), np.zeros(1)), robot.now)
     assert not robot.session.robot.stands(np.arange(6), robot.now)
-    refused(Reason.STALE_JOINTS, robot.session.target, JointCommand(NAMES, robot.at), robot.now)
+    at = HOME + 0.01 * 19
+    refused(Reason.START_MISMATCH, robot.session.target, JointCommand(NAMES, at), robot.now)
 
 
 def test_without_joint_states_nobody_knows_whether_it_stands(robot: Robot) -> None:
