@@ -7,7 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from robocal_ros.ground.errors import Code, InputError, LimitError, RobocalError, TooFewSamplesError
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    LimitError,
+    RobocalError,
+    TooFewSamplesError,
+)
 from robocal_ros.ground.frames import Array
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.maintenance.accuracy import MaintenanceConfig
@@ -223,6 +230,13 @@ class Mover:
             raise TooFewSamplesError(f"{self.unheard}: nobody knows whether the robot is at home")
         if away := self.beside_home():
             raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
+
+    def require_stopped(self) -> None:
+        """Refuse what needs a robot at rest while a stop was not seen yet, as in a pause."""
+        if self.stopping.under_way:
+            raise ConflictError(
+                "a stop is under way: wait until the robot stands, and let a paused one run"
+            )
 
     @property
     def unheard(self) -> str:

@@ -302,7 +302,8 @@ class MaintenanceNode(RobotNode):
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
             self._carry_out(self._session.give_up(ENDS, self._steady.now_s()))
-            self._lease.hold("")
+            if self._motion.see_through(self._stops):
+                self._lease.hold("")  # else it lapses, and counts until the robot stands
             self._session.close()
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
@@ -310,6 +311,10 @@ class MaintenanceNode(RobotNode):
         if self._calls is not None:
             self._calls.break_off(ENDS)
         self._session = None
+
+    def _stops(self) -> bool:
+        self._tick()
+        return self._running().robot.stopping.under_way
 
     def cleanup(self) -> None:
         """Take action and clients down, close the history."""
@@ -441,6 +446,8 @@ class MaintenanceNode(RobotNode):
             return
         try:
             found = self._session.accuracy(*self._clocks())
+            if self.robot_fault:  # what is known is of another robot
+                found = Accuracy(AccuracyLevel.FAULT, f"robot: {self.robot_fault}")
         except RobocalError as error:
             found = Accuracy(AccuracyLevel.FAULT, str(error))
         self._outputs.accuracy(found, self._config.tolerance_m, self.now_ns())

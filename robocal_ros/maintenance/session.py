@@ -328,9 +328,9 @@ class MaintenanceSession:
     def run(self, cycle_id: str, gap_s: float, now_s: float, wall_ns: int) -> CycleResult:
         """Begin a cycle; one that runs or has ended gives what it has, and nothing runs twice.
 
-        Raises `RobocalError` when it cannot begin: CONFLICT in a fault, while another one runs, or
-        while the gap is not open; TOO_FEW_SAMPLES while joint states are silent; LIMIT_EXCEEDED,
-        and a fault, where the robot is not at home; STORAGE_FAILED.
+        Raises `RobocalError` when it cannot begin: CONFLICT in a fault, while another one runs or a
+        stop was not seen yet, or while the gap is not open; TOO_FEW_SAMPLES while joint states are
+        silent; LIMIT_EXCEEDED, and a fault, where the robot is not at home; STORAGE_FAILED.
         """
         if not 0 < len(cycle_id) <= MOST_ID:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
@@ -343,6 +343,7 @@ class MaintenanceSession:
         if (open_run := self._conductor.run) is not None:
             raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
         cell.tool.require_disarmed()
+        self.robot.require_stopped()
         if why := self._second or cell.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
         cell.begin(gap_s)
@@ -401,13 +402,15 @@ class MaintenanceSession:
         """End a fault, in words; without one nothing happens.
 
         Raises `ConflictError` while the tool node has not confirmed that it is disarmed, and is not
-        gone, or what it sent may still be driven; `TooFewSamplesError` while joint states are
+        gone, or what it sent may still be driven, or while a stop was not seen yet;
+        `TooFewSamplesError` while joint states are
         silent; `LimitError` while the robot is not at home; `StorageError` when it cannot be kept;
         the fault stays.
         """
         if not self.memory.fault:
             return "there is no fault"
         self._cell.tool.require_disarmed()
+        self.robot.require_stopped()
         self.robot.require_home()
         words = f"acknowledged: {self.memory.fault}"
         self.memory.clear_fault()

@@ -42,7 +42,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.ground.errors import InputError
 from robocal_ros.ground.frames import Array
-from robocal_ros.ground.samples import stamp_ns
+from robocal_ros.ground.samples import JOINTS, stamp_ns
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import DrivingConfig, Housing, ToolBody
 from robocal_ros.motion.plan import LEAD_S, REACTION_S, JointPlan, MotionLimits
@@ -68,6 +68,8 @@ BESIDE = 1e-3  # rad (m); a plan that passes the controller's reference further 
 GRID_S = 1e-3  # instants of a plan that a reference is looked for at
 PACE_S = 0.01  # of two instants as near to it the one counts that is as fast
 AT_REST = 5e-3  # rad/s (m/s); slower references move nothing
+STATE, SCALING = "controller_state", "speed_scaling"  # topics of a controller
+SEEN_THROUGH_S = 1.0  # the stop of a node that is deactivated or ends, at most
 
 
 class StatedController:
@@ -426,10 +428,8 @@ class MotionDriver:
         check_for_type_support(FollowJointTrajectory)  # its libraries: 80 ms, else at a motion
         self.look()
         self.hard_stop = HardStopService(node, hard_stop)
-        node.add_input(
-            JointTrajectoryControllerState, "controller_state", self._take_state, endpoints.NEWEST
-        )
-        node.add_input(Float64, "speed_scaling", self._take_scaling, endpoints.NEWEST)
+        node.add_input(JointTrajectoryControllerState, STATE, self._take_state, endpoints.NEWEST)
+        node.add_input(Float64, SCALING, self._take_scaling, endpoints.NEWEST)
         self._controller = StatedController()
         self.lateness = Lateness("joint states")
         self._rejected = False
@@ -493,6 +493,22 @@ class MotionDriver:
             self._stop, self._copies = (lambda: first) if stamped else message, 1
             self._until_s = begin_s + COPIES * COPY_S
             self._repeats.reset()
+
+    def see_through(self, moves: Callable[[], bool]) -> bool:
+        """See a stop through while nothing spins, as ``moves`` looks at it; whether it stands."""
+        node, until_s = self._node, time.monotonic() + SEEN_THROUGH_S
+        node.is_active = True  # until what it moves stands
+        try:
+            while moves():
+                if time.monotonic() > until_s:
+                    node.get_logger().warning("deactivated while the robot is still being stopped")
+                    return False
+                time.sleep(COPY_S)
+                self._repeat()
+                node.take_waiting(JOINTS, STATE, SCALING)
+        finally:
+            node.is_active = False
+        return True
 
     def _repeat(self) -> None:
         in_time = self._now() <= self._until_s

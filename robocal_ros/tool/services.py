@@ -288,8 +288,13 @@ class TcfMotion:
         """Stop what moves."""
         if self.driver is not None:
             self.driver.disarm("the node was deactivated", self._steady.now_s())
-            self._lease.hold("")
+            if self._motion.see_through(self._stops):
+                self._lease.hold("")  # else it lapses, and counts until the robot stands
         self.driver = None
+
+    def _stops(self) -> bool:
+        self._tick()
+        return self.driver is not None and self.driver.moves
 
     def close(self) -> None:
         """Take the controller's client down."""

@@ -354,7 +354,7 @@ def test_a_pose_takes_its_worst_case_and_no_more(history):
     cell = Cell(history, config_of(poses=POSES[:2], T_base_laser=None), services={"sensor": SILENT})
     cell.open_gap()
     least_s = cell.session.worst_cases()["the first measuring pose"] + TIMES.reserve_s
-    cell.run("c1", least_s + TICK_S)
+    cell.run("c1", least_s + 1.5 * TICK_S)  # a tick goes by before it begins
     sent: list[tuple[float, ask.Move]] = []
     while cell.state is MaintenanceState.RUNNING:
         if sent:

@@ -147,6 +147,17 @@ def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     assert cell.log == []
 
 
+def test_a_fault_is_not_acknowledged_before_its_stop_was_seen(cell):
+    until_moving(cell, "thermal")
+    cell.is_open = False
+    while cell.state is not MaintenanceState.FAULT:
+        cell.step()
+    words = "a stop is under way: wait until the robot stands"
+    assert refused(lambda: cell.session.acknowledge("me"), words) is Code.CONFLICT
+    over(cell, fault=True)
+    assert refused(lambda: cell.session.acknowledge("me"), "not at home") is Code.LIMIT_EXCEEDED
+
+
 def test_a_fault_away_from_home_is_not_acknowledged(cell):
     until_moving(cell, "tool")
     cell.is_open = False

@@ -13,7 +13,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
-from robocal_msgs.msg import CorrectionStatus
+from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -294,6 +294,17 @@ def test_nothing_is_moved_with_a_file_of_another_robot(
     answer = graph.call(SetBool, "/tcf_node/arm", data=True)
     assert not answer.success
     assert "is another robot than ur10" in answer.message
+
+
+def test_the_line_hears_that_it_is_another_robot(graph: Any, described: Described) -> None:
+    """What is known of its accuracy is of that in the file."""
+    states = graph.collect(AccuracyState, "/accuracy_state", endpoints.LATCHED)
+    graph.add(MaintenanceNode, {"robot": "ur10", "home_deg": HOME_DEG})
+    described.describe(longer("elbow_joint", 0.001))
+    graph.spin_until(lambda: states and "another robot" in states[-1].reason, "the line is told")
+    assert states[-1].state == AccuracyState.FAULT
+    described.describe(TEXT)
+    graph.spin_until(lambda: "another robot" not in states[-1].reason, "and that it is right")
 
 
 def test_a_description_without_the_robot_is_a_doubt_alone(graph: Any, described: Described) -> None:
