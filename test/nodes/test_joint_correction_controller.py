@@ -145,17 +145,31 @@ def test_what_was_overtaken_is_counted_and_ends_nothing(graph: Any) -> None:
 def test_a_stream_that_is_faster_than_the_robot_may_be_is_told_to_lag(graph: Any) -> None:
     speed = 0.1
     line = Line(graph, velocity_limits=[speed] * 6)
-    line.target()
-    begin_s, q = time.monotonic(), HOME.copy()
+    begin_s = begin = 0.0
 
     def stream() -> None:
-        q[0] = HOME[0] + 1.04 * speed * (time.monotonic() - begin_s)
+        q = HOME.copy()
+        q[0] = begin + 1.04 * speed * (time.monotonic() - begin_s)
         line.stand()
         line.to_target.publish(joints(q))
         if line.targets:
             line.at = line.targets[-1].position
 
-    timer = graph.probe.create_timer(0.02, stream)
-    graph.spin_until(lambda: line.statuses[-1].lag_s > 0.02, "the lag is told")
-    assert line.statuses[-1].lag_s < 0.11
-    graph.probe.destroy_timer(timer)
+    def lags() -> list[float]:
+        return [status.lag_s for status in line.statuses if status.lag_s > 0.02]
+
+    count, refused = line.node.inputs["joint_targets"], 0
+    for _ in range(10):  # a stream that this machine holds up is ended
+        line.rest()
+        line.target(line.at)
+        line.statuses.clear()
+        begin_s, begin = time.monotonic(), line.at[0]
+        timer = graph.probe.create_timer(0.02, stream)
+        graph.spin_until(lambda: lags() or count.invalid > refused, "the lag is told")  # noqa: B023
+        graph.probe.destroy_timer(timer)
+        if lags():
+            break
+        line.rest()
+        graph.call(Trigger, f"{NODE}/acknowledge")
+        refused = count.invalid
+    assert 0.0 < max(lags(), default=0.0) < 0.11
