@@ -149,8 +149,9 @@ class TrajectoryProxy:
     """Serves the action ``name`` with a controller's action, from `open` to `close`.
 
     ``correct`` makes a corrected trajectory of a taught one, and its path, or raises
-    `RefusedError`; ``sent`` is called when it has gone out, ``lost`` when nothing more is heard of
-    it, and the robot may still follow it.
+    `RefusedError`; ``sent`` is called when it has gone out, ``lost`` when its controller is gone,
+    and the robot may still follow it; ``unheard`` when it does not answer, which tells whether the
+    robot may.
 
     Both ends stay until `destroy`, which must not be called while the node spins: rclpy's events
     executor reads freed memory when an action goes that something waits for. When closed, goals
@@ -164,8 +165,10 @@ class TrajectoryProxy:
         correct: Callable[[Any], tuple[Any, SentPath | None]],
         sent: Callable[[], None],
         lost: Callable[[str], object],
+        unheard: Callable[[str], bool],
     ) -> None:
         self._node, self._correct, self._sent, self._lost = node, correct, sent, lost
+        self._unheard = unheard
         self._safe = partial(guarded, node)
         self._goals: list[_Goal] = []
         self._clients: dict[str, ActionClient] = {}
@@ -412,19 +415,18 @@ class TrajectoryProxy:
             if not goal.servers <= servers:
                 if goal.result is not None:
                     goal.result.cancel()  # rclpy would keep it for ever
-                self._give_up(goal, f"the controller that offered {self.controller} vanished")
+                why = f"the controller that offered {self.controller} vanished"
+                goal.stopped = why  # its path ends when the robot is seen to stand
+                self._lost(why)
+                self._forward_cancel(goal)
+                self._fail(goal, f"{why}; the robot may still move")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
                 what = "cancel" if goal.cancel else "goal"
-                self._give_up(
-                    goal, f"{self.controller} did not answer within {ANSWER_S:g} s to the {what}"
-                )
-
-    def _give_up(self, goal: _Goal, why: str) -> None:
-        """End a goal of which nothing is heard; the robot is stopped, as it may follow it."""
-        goal.stopped = why  # its path ends when the robot is seen to stand
-        self._lost(why)
-        self._forward_cancel(goal)
-        self._fail(goal, f"{why}; the robot may still move")
+                why = f"{self.controller} did not answer within {ANSWER_S:g} s to the {what}"
+                later = self._goals[self._goals.index(goal) + 1 :]
+                if not any(other.accepted for other in later) and self._unheard(why):
+                    goal.stopped = why  # its path goes on, as the robot may follow it
+                self._fail(goal, f"{why}; the robot may still move")
 
     def _servers(self) -> frozenset[bytes]:
         """Who offers the controller's action: a restarted controller is another one."""

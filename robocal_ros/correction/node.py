@@ -182,6 +182,7 @@ class JointCorrectionNode(RobotNode):
                     self._goal_sent,
                     # the robot may still follow it, and is stopped by where it is
                     self._stop_lost,
+                    self._unheard,
                 )
             self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
@@ -477,7 +478,18 @@ class JointCorrectionNode(RobotNode):
         if self._stopping.under_way:
             self._stop_timer.reset()
 
+    def _unheard(self, why: str) -> bool:
+        """Whether the robot may follow what nobody answers for; a stop of ours would wait there."""
+        self._catch_up()
+        if self._shadow or self._session.robot.at_rest(time.monotonic()):
+            return False
+        self._stop_fault = f"{why}; the robot may still move"
+        self._hard_stop(self._stop_fault)
+        return True
+
     def _stop_lost(self, why: str) -> bool:
+        if self._shadow:  # nothing is changed
+            return False
         self._catch_up()
         return self._stop_by_readings(why, time.monotonic())
 

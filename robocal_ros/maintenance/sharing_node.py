@@ -78,13 +78,11 @@ class SharingNode(HouseNode):
         not tell, as it hears this node alone. Of two that tell where the robot is, one may say that
         it is out while it works in the place.
         """
-        for told in self._inputs[name]:
-            if (count := told.get_publisher_count()) > 1:
-                return f"{told.topic_name} has {count} publishers: let one alone publish it"
-        return ""
+        return next(filter(None, map(_several, self._inputs[name])), "")
 
     def _status(self, name: str, message: Any) -> None:
-        out = bool(message.at_home) and message.state not in BUSY and not self._doubt(name)
+        told = self._inputs[name][1]
+        out = bool(message.at_home) and message.state not in BUSY and not _several(told)
         self._place.tell(name, out, time.monotonic())
         self._look()
 
@@ -106,6 +104,12 @@ class SharingNode(HouseNode):
             if why := self._doubt(name):
                 health.worsen(ERROR, why)
         return health
+
+
+def _several(told: Any) -> str:
+    if (count := told.get_publisher_count()) < 2:
+        return ""
+    return f"{told.topic_name} has {count} publishers: let one alone publish it"
 
 
 def main() -> None:

@@ -311,7 +311,7 @@ class TestSignals:
             try:
                 assert process.stderr.readline() == b"ready\n"
                 process.send_signal(signal.SIGINT)
-                assert process.wait(timeout=10) == 130
+                assert process.wait(timeout=60) == 130
                 assert process.stderr.read() == b"robocal: interrupted\n"
             finally:
                 process.kill()

@@ -91,7 +91,7 @@ def test_a_clock_jump_starts_anew():
 
 def test_a_missing_joint_is_named():
     stream = JointStream(("a", "b"))
-    with pytest.raises(InputError, match="lacks b; it has a, c"):
+    with pytest.raises(InputError, match="no position of b; it has a, c"):
         stream.add(JointSample(1, ("a", "c"), np.zeros(2)), MS)
 
 

@@ -613,8 +613,8 @@ def test_a_goal_accepted_too_late_is_cancelled(apart: Any, monkeypatch: Any) -> 
     assert np.abs(cell.taught() - HOME).max() < 0.01 * np.abs(MOVED - HOME).max()
 
 
-def test_a_goal_of_which_nothing_is_heard_is_stopped(cell: Any) -> None:
-    """The robot may follow it all the same."""
+def test_a_goal_of_which_nothing_is_heard_may_be_followed_all_the_same(cell: Any) -> None:
+    """So it can be stopped later; what is sent to who does not answer would wait there."""
     cell.begin()
     sent, received = cell.send(HOME, MOVED, lasts_s=20.0).moves(), len(cell.robot.goals)
     (goal,) = cell.node._proxy._goals
@@ -622,10 +622,24 @@ def test_a_goal_of_which_nothing_is_heard_is_stopped(cell: Any) -> None:
     result = sent.ends(GoalStatus.STATUS_ABORTED)
     assert "did not answer within" in result.error_string
     assert "the robot may still move" in result.error_string
+    assert len(cell.robot.goals) == received
+    assert "the robot may still move" in cell.node.health().message
+    assert cell.node._session.moves(time.monotonic())
+    cell.change(Transition.TRANSITION_DEACTIVATE)
     cell.graph.spin_until(lambda: len(cell.robot.goals) > received, "a stop is sent")
     cell.graph.spin_until(lambda: not cell.robot.speed.any(), "the robot stands")
-    session = cell.node._session
-    cell.graph.spin_until(lambda: not session.moves(time.monotonic()), "and is known to")
+
+
+def test_a_goal_that_was_never_answered_ends_alone_where_a_later_one_is_driven(cell: Any) -> None:
+    cell.begin()
+    first = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    (goal,) = cell.node._proxy._goals
+    second = cell.send(cell.taught(), MOVED, lasts_s=1.0, starts_s=0.5)
+    cell.graph.spin_until(lambda: second.handle, "it is accepted")
+    if not goal.over:  # as where the end of the first is lost
+        goal.asked_s = -math.inf
+    second.ends(GoalStatus.STATUS_SUCCEEDED)
+    assert first.answer.status == GoalStatus.STATUS_ABORTED
 
 
 def test_hostile_feedback_does_not_end_the_process(graph: Any) -> None:
