@@ -370,13 +370,17 @@ class CorrectionStatus:
             return CorrectionState.BLENDING
         if not self.enabled:
             return CorrectionState.OFF
-        known = self.new_tool or (self.revision is not None and not self.stale)
+        known = self.new_tool or self.has_model
         return CorrectionState.ON if known else CorrectionState.WITHOUT_MODEL
+
+    @property
+    def has_model(self) -> bool:
+        """Whether there is a model that is not stale."""
+        return self.revision is not None and not self.stale
 
     def in_words(self) -> str:
         """What the correction does now, in one line."""
-        model = self.revision is not None and not self.stale
-        parts = [f"model revision {self.revision}"] if model else []
+        parts = [f"model revision {self.revision}"] if self.has_model else []
         parts += [f"tool revision {self.tool_revision}"] if self.new_tool else []
         settled = "on" if self.settled else "on, the offset changes with the next commands"
         if self.held:

@@ -403,9 +403,8 @@ class MaintenanceSession:
 
         Raises `ConflictError` while the tool node has not confirmed that it is disarmed, and is not
         gone, or what it sent may still be driven, or while a stop was not seen yet;
-        `TooFewSamplesError` while joint states are
-        silent; `LimitError` while the robot is not at home; `StorageError` when it cannot be kept;
-        the fault stays.
+        `TooFewSamplesError` while joint states are silent; `LimitError` while the robot is not at
+        home; `StorageError` when it cannot be kept; the fault stays.
         """
         if not self.memory.fault:
             return "there is no fault"

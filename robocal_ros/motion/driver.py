@@ -598,9 +598,9 @@ class MotionDriver:
         names, velocity = list(message.name), message.velocity
         if not set(self._names) <= set(names):
             return 0.0
-        if len(velocity) == len(names):  # a gripper or a spindle may have others
-            velocity = [velocity[names.index(name)] for name in self._names]
-        self._controller.hear(velocity, len(self._names), now_s)
+        whole = len(velocity) == len(names)  # a gripper or a spindle may have others
+        own = [velocity[names.index(name)] for name in self._names] if whole else []
+        self._controller.hear(own, len(self._names), now_s)
         return self.lateness.take(at_ns / NS, now_s, (self._node.now_ns() - at_ns) / NS)
 
     def late(self) -> str:

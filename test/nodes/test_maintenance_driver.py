@@ -216,6 +216,7 @@ def test_velocities_of_other_joints_say_nothing_of_the_hardware(graph: Any) -> N
     assert told(["gripper"], [math.nan, *[0.1] * 6])
     assert told([], [0.1] * 6)
     assert not told([], [0.1] * 5)
+    assert not told(["spindle"], [0.1] * 6)  # whose they are nobody knows
 
 
 def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> None:
