@@ -298,9 +298,14 @@ class DriftFollower:
             moved_s=(time_s if state.moved_s is None else state.moved_s) if moved else None,
         )
 
-    def clock_jumped(self, stamp_ns: int) -> None:
-        """Go on at a stamp of another clock; how long it was since the last cycle is not known."""
-        unknown_ns = round(self._tracker.process.steady_s * 1e9)
+    def clock_jumped(self, left_ns: int, stamp_ns: int) -> None:
+        """Go on at a stamp of another clock, after the last one of the clock before.
+
+        How long it was since the last cycle is not known; no less than it was before.
+        """
+        unknown_ns = max(
+            round(self._tracker.process.steady_s * 1e9), left_ns - self.state.anchor_ns
+        )
         self.state = replace(self.state, anchor_ns=stamp_ns - unknown_ns)
         self.read_ns = stamp_ns - unknown_ns
 

@@ -391,8 +391,14 @@ class Windows:
         return self._desk.from_ns if self._cycle.id else self._desk.last_run_ns(self._pause_ns)
 
     def from_ns(self, command: Command) -> int:
-        """Stamp of the first measurement that counts."""
-        calibrates = self._current.reference is None or command.name in events.SET_UP
+        """Stamp of the first measurement that counts.
+
+        A calibration takes all that no command has used; a cold visit is one, as a cycle is: what
+        was measured before a pause may be of a warm robot.
+        """
+        calibrates = command.name == events.CALIBRATE_SENSOR or (
+            self._current.reference is None and command.name != events.CAPTURE_REFERENCE
+        )
         return self._desk.from_ns if calibrates else self._cycle_ns()
 
     def of(self, command: Command) -> tuple[Measurements, Array]:
@@ -404,6 +410,10 @@ class Windows:
         desk, reference = self._desk, self._current.reference
         desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", desk.from_ns)) - 1
+        for early in desk.unused(desk.from_ns):
+            if early.sample.stamp_ns <= after and command.name == events.CAPTURE_REFERENCE:
+                words = f"before a pause of over {self._config.cycle_timeout_s:g} s"
+                desk.ignored.add(early.sample.topic, words)
         observed = desk.window(after, command.stamp_ns or 0, command.marks or {})
         fixed = [o.sample.position_m for o in observed if o.sample.topic == REFERENCE_SPHERE]
         found = [o for o in observed if o.sample.topic != REFERENCE_SPHERE]

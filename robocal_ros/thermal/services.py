@@ -131,10 +131,14 @@ class MeasuringRobotInterface:
         self._publish(session)
 
     def _publish(self, session: ThermalSession) -> None:
-        reference = session.reference
-        if self._queue is None or reference is None or reference.spheres is None:
+        if self._queue is None:
             return
-        sensor = reference.spheres.T_flange_sensor
+        try:
+            sensor = _placed_sensor(session).T_flange_sensor
+        except RobocalError as error:
+            for shot, _ in self._queue.end():
+                session.refuse(shot.name, error)
+            return
         for shot, placed in self._queue.ready(session.current.arm, sensor):
             if isinstance(placed, PlacedShot):
                 self._send(placed)
@@ -195,6 +199,7 @@ def _placed_sensor(session: ThermalSession) -> SpheresInCell:
     reference = session.reference
     if reference is None or reference.spheres is None:
         raise InputError(UNPLACED)
+    session.require_unmoved()
     return reference.spheres
 
 

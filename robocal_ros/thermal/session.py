@@ -125,14 +125,14 @@ class ThermalSession(SessionBase):
     def add(self, sample: JointSample | PointSample | TemperatureSample) -> None:
         """Take a sample."""
         if isinstance(sample, JointSample):
-            jumps = self.desk.jumps
+            jumps, left_ns = self.desk.jumps, self.desk.newest_ns.get(JOINTS, 0)
             self.desk.add_joints(sample)
             if self.desk.jumps > jumps:  # what an earlier clock stamped cannot be compared any more
                 self.temperatures = MotorTemperatures(self.nominal.joint_names)
                 self.cycle.begun_ns = sample.stamp_ns
                 with suppress(RobocalError):  # said by `accuracy`
                     if self.follower is not None:
-                        self.follower.clock_jumped(sample.stamp_ns)
+                        self.follower.clock_jumped(left_ns, sample.stamp_ns)
         elif isinstance(sample, TemperatureSample):
             self.temperatures.add(sample)
             self.desk.newest_ns[TEMPERATURES] = self.temperatures.newest_ns or 0
@@ -291,6 +291,11 @@ class ThermalSession(SessionBase):
         except RobocalError as error:
             return Accuracy(AccuracyLevel.FAULT, str(error))
 
+    def require_unmoved(self) -> None:
+        """Raise `ConflictError` where the last cycle found that something was moved."""
+        if self.follower is not None and self.follower.state.moved:
+            raise ConflictError(self.follower.state.moved)
+
     def placing_sigma_m(self, placed: Sequence[PlacedShot]) -> Array:
         """One sigma (m,), m, the norm over all axes, of the first point of shots in base.
 
@@ -300,11 +305,10 @@ class ThermalSession(SessionBase):
 
         Raises `ConflictError` where something was moved since.
         """
+        self.require_unmoved()
         follower, reference = self.follower, self.reference
         if follower is None or reference is None or not placed:
             return np.zeros(0)
-        if follower.state.moved:
-            raise ConflictError(follower.state.moved)
         static_m = reference.static_error_m
         last_ns = max(one.shot.stamp_ns for one in placed)
         found = []
@@ -329,6 +333,9 @@ class ThermalSession(SessionBase):
             level, words = AccuracyLevel.FAULT, follower.state.moved
         elif left_s <= 0.0:
             words = f"last measured {age_s / 3600.0:.1f} h ago: measure a cycle"
+            level = AccuracyLevel.EXPIRED
+        elif stamp_ns < follower.state.anchor_ns:
+            words = "the clock is before the last cycle, whose age is not known: measure a cycle"
             level = AccuracyLevel.EXPIRED
         elif error.bound_m > config.tolerance_m:
             level, words = AccuracyLevel.DEGRADED, f"{words}: measure a cycle, accept its model"

@@ -168,3 +168,25 @@ def test_points_are_placed_on_call_with_what_they_are_worth(measuring, graph):
     assert [s < 0.0 for s in part.sigma_mm] == [True, True, True, False]
     assert np.isnan(part.corrected[0].point.x)
     assert part.corrected[3].point == told.corrected[3].point
+
+
+def test_a_knocked_sensor_sees_nothing_in_base(measuring, graph):
+    """After a step that no drift explains neither the call nor the topics give a place."""
+    cell, shift = measuring.cell, measuring.shift
+    knock = frames.transform(frames.exp_rotation([0.0, 1e-3, 0.0]), [8e-4, 0.0, 5e-4])
+    shift.T_flange_sensor = T_FLANGE_SENSOR @ knock
+    cell.play(shift.visit(measuring.cold, measuring.q, after_h=0.1))
+    found = cell.call("identify", cycle_id="knocked")
+    assert found.status == Code.SENSOR_OR_ROBOT_MOVED, found.message
+    way = list(shift.visit(measuring.cold, looking(1, seed=3)))
+    measuring.send(way[-1].stamp_ns)
+    cell.play([s for s in way if isinstance(s, JointSample)])
+
+    def told() -> bool:
+        status = cell.status()
+        words = "" if status is None else " ".join(v.value for v in status.values)
+        return words.count("the sensor moved on the flange") >= 2  # of either topic
+
+    graph.spin_until(told, "why nothing is placed")
+    assert not measuring.points
+    assert not measuring.clouds

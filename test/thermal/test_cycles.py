@@ -102,6 +102,19 @@ def test_a_new_cycle_breaks_off_the_open_one(cell):
     assert found.document["cycle_id"] == "c2"
 
 
+def test_a_cold_reference_holds_nothing_of_a_warm_day_before(tmp_path):
+    """Taught poses that were visited, and nobody's command used them: one cold visit counts."""
+    alone, after = Cell(tmp_path / "alone"), Cell(tmp_path / "after")
+    for made in (alone, after):
+        for kelvin in [20.0] * (made is after) + [0.0]:
+            made.visit(kelvin, after_h=12.0)
+    one, other = (made.ask(events.CAPTURE_REFERENCE) for made in (alone, after))
+    assert one.samples == other.samples == POSES
+    positions = [made.session.reference.data.position for made in (alone, after)]
+    assert np.max(np.abs(positions[0] - positions[1])) < 6.0 * CONFIG.sigma_m  # 20 K: 0.5 mm
+    assert after.session.ignored.words().count("before a pause of over 60 s") == 1
+
+
 def test_a_cycle_needs_a_cold_reference(tmp_path):
     cell = Cell(tmp_path)
     for name in (events.BEGIN_CYCLE, events.END_CYCLE):
@@ -271,6 +284,22 @@ def test_accuracy_ages(cell):
     assert levels[0] is AccuracyLevel.OK
     assert levels[1] in (AccuracyLevel.DUE, AccuracyLevel.DEGRADED)
     assert levels[2] is AccuracyLevel.EXPIRED
+
+
+def test_a_clock_set_back_makes_nothing_younger(tmp_path):
+    """Neither while the session runs nor over a restart, however long a model may be in force."""
+    cell = Cell(tmp_path, replace(CONFIG, expires_after_s=24.0 * 3600.0, tolerance_m=1.0))
+    cell.capture()
+    cell.idle(25 * 3600.0)
+    assert cell.session.accuracy(cell.shift.now_ns).level is AccuracyLevel.EXPIRED
+    cell.idle(-30.0)
+    assert cell.session.desk.jumps == 1
+    assert cell.session.accuracy(cell.shift.now_ns).level is AccuracyLevel.EXPIRED
+    cell.start()
+    before_ns = cell.session.reference.data.middle_ns - 3600 * NS
+    found = cell.session.accuracy(before_ns)
+    assert found.level is AccuracyLevel.EXPIRED
+    assert "the clock is before the last cycle" in found.reason
 
 
 def test_without_a_reference_nothing_is_known(tmp_path):
