@@ -35,15 +35,29 @@ class ToolInForce(HistoryFollower):
         self.station: Head = self.history.head(LASER_FRAME)
 
     @property
+    def foreign(self) -> bool:
+        """Whether what the history has in force was measured of a tool that was taught otherwise.
+
+        It says nothing of this one: it may be another tool.
+        """
+        made = (self.head.model or {}).get("made_with")
+        return made is not None and not alike(made["taught"], self._made_with["taught"])
+
+    @property
+    def model(self) -> dict[str, Any] | None:
+        """Of the tool in force; None without one of this taught tool."""
+        return None if self.foreign else self.head.model
+
+    @property
     def tool(self) -> KnownTool:
         """The tool in force; without one the taught one."""
-        model = self.head.model
+        model = self.model
         return self._taught if model is None else KnownTool.of_document(model)
 
     @property
     def anchor(self) -> Array:
         """Tip (3,) of the last tool whose cause was known: in force, or before small changes."""
-        known = (self.head.model or {}).get("anchor")
+        known = (self.model or {}).get("anchor")
         return self.tool.T_flange_tool[:3, 3] if known is None else np.array(known)
 
     @property

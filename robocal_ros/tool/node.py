@@ -363,6 +363,10 @@ class TcfServices:
 
 
 WATCH_S = 0.02
+FOREIGN = (
+    "was measured of a tool that was taught otherwise and is not used: measure the mounted tool "
+    "and accept it, roll back, or put taught_xyz_mm and taught_quat_xyzw right"
+)
 INPUTS = {JOINTS: (JointState, endpoints.STREAM), EDGES: (BeamEvent, endpoints.RELIABLE)}
 
 
@@ -549,10 +553,10 @@ class TcfNode(SessionNode[ToolSession]):
         if self._shown == shown and not self._outputs.events.need_configuration:
             return
         if self._shown != shown:
-            head = current.head
+            head, model = current.head, current.model
             stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
-            thermal = 0 if head.model is None else int(head.model["thermal_revision"])
-            self._outputs.tool(current.tool, head.revision, thermal, stamp)
+            thermal = 0 if model is None else int(model["thermal_revision"])
+            self._outputs.tool(current.tool, head.revision, thermal, stamp, taught=current.foreign)
         self._shown = shown
         self._outputs.events.tell(configuration(session, self._topics), None)
 
@@ -569,6 +573,9 @@ class TcfNode(SessionNode[ToolSession]):
         values["last run"] = "none" if self.last is None else self.last.message
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
+        if session.current.foreign:
+            number = session.current.head.calibration_id
+            health.worsen(ERROR, f"calibration {number} {FOREIGN}")
 
 
 def main() -> None:

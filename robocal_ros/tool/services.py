@@ -164,9 +164,11 @@ class TcfOutputs:
         self._step.publish(message)
         return message
 
-    def tool(self, known: KnownTool, revision: int, thermal: int, stamp_ns: int) -> None:
-        """Say what is in force."""
-        state = ToolFrame.ACCEPTED if revision else ToolFrame.NONE
+    def tool(
+        self, known: KnownTool, revision: int, thermal: int, stamp_ns: int, *, taught: bool
+    ) -> None:
+        """Say what is in force; ``taught``: it is the taught tool, whatever the revision."""
+        state = ToolFrame.NONE if taught or not revision else ToolFrame.ACCEPTED
         message = self._messages.frame(known, revision, thermal, state, stamp_ns)
         self._tool.publish(message)
         transform = TransformStamped(

@@ -82,7 +82,12 @@ FULL, QUICK, REFERENCE = "full", "quick", "reference"
 WITNESS, WITNESS_REFERENCE, LASER = OF_MANDREL = "witness", "witness reference", "laser"
 MODES = (FULL, QUICK, REFERENCE, *OF_MANDREL)
 WITNESS_NS = 600 * 10**9  # so long a mandrel's answer holds for measurements of the tool after it
+TOGETHER_NS = 3600 * 10**9  # so long after a tool a mandrel is first measured with the same station
 REMEMBERED = 200  # answers, and calibrations back to which a cycle's id is known
+YOUNG = (
+    "the mandrel cannot tell, as it was first measured over an hour after the tool that this is "
+    "counted from: measure the healthy tool anew (mode REFERENCE)"
+)
 CODE_OF: dict[Answer, Code] = {
     "pass": Code.ACCEPT,
     "recalibrate": Code.LIMIT_EXCEEDED,
@@ -162,19 +167,21 @@ class ToolResults:
         absolute = healthy is None
         if healthy is not None:
             found = changed_tool(taught, healthy, found)
+        stands = self._current.tool if self._current.model else in_force
         anchor = self._current.anchor
+        since = anchor + in_force.T_flange_tool[:3, 3] - stands.T_flange_tool[:3, 3]
         shift = run.path.at(run.last_edge_s)[0][0, :3, :3] @ difference(found, in_force)[:3]
-        witness = witness_of(found, in_force, self._config.bend, anchor)
+        witness = witness_of(found, in_force, self._config.bend, since)
         if turned := run.turned(estimate):
             witness = replace(witness, cause="station", reason=turned)
         witness = self._with_mandrel(witness, found, shift, command)
-        verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
+        verdict = judge_tool(found, estimate, taught, stands, self._config.limits, witness)
         erring = self._joint_errors(run, estimate, found)
         if erring is not None:
             verdict = with_joint_errors(verdict, erring, "tip")
         document = run_document(found, estimate, run.circles, verdict) | {
             "joint_errors": None if erring is None else erring.document(),
-            "change": change_between(in_force.T_flange_tool, found.T_flange_tool).document(),
+            "change": change_between(stands.T_flange_tool, found.T_flange_tool).document(),
             "absolute": absolute,
             "witness": witness.document(),
         }
@@ -209,6 +216,8 @@ class ToolResults:
         taught, mandrel = self.taught(run.mode), run.mode == WITNESS_REFERENCE
         kind = MANDREL if mandrel else HEALTHY_TOOL
         verdict = judge_healthy(found, estimate, taught)
+        if not mandrel and self._current.model is not None:
+            verdict = replace(verdict, reason=f"{verdict.reason}; {self._other_in_force()}")
         document: Document = {**run_document(found, estimate, run.circles, verdict)}
         document["change"] = change_between(taught, found.T_flange_tool).document()
         own: Document = {
@@ -221,6 +230,14 @@ class ToolResults:
         if verdict.accept:
             self._accept(kept, command, verdict, wall_ns)
         return Outcome(command, verdict.code, verdict.reason, document, kept)
+
+    def _other_in_force(self) -> str:
+        taught, tool = self._config.T_flange_taught, self._current.tool
+        away_mm = 1e3 * change_between(taught, tool.T_flange_tool).tip_m
+        return (
+            f"calibration {self._current.head.calibration_id}, {away_mm:.3f} mm from the taught "
+            "tool, is in force still: roll it back, or measure in mode FULL"
+        )
 
     def _accept(self, kept: int, command: Command, verdict: Verdict, wall_ns: int) -> None:
         """Bring into force what moves nothing."""
@@ -245,7 +262,9 @@ class ToolResults:
         first = self._current.commissioned_station
         shift = station_shift(first or found, found)
         limit_m, trend = config.check.limit_m, self._current.station_trend
-        verdict = station_verdict(found, None if first is None else shift, limit_m)
+        verdict = station_verdict(
+            found, None if first is None else shift, limit_m, config.limits.sigma_m
+        )
         if verdict.accept:  # a knock is no drift
             trend = trend.after(command.stamp_ns or 0, shift)
         if told := trend.words(limit_m):
@@ -283,22 +302,35 @@ class ToolResults:
         """Ask the mandrel, while its answer is fresh: whose is the change?
 
         It was measured after this change where what was seen then is within `SMALL_M` of what is
-        found now: more cannot have come since.
+        found now: more cannot have come since. One that was first measured later than the tool
+        that the change is counted from says nothing of the time between.
         """
+        young = self._mandrel_is_young()
         if self._station is not None:
             stamp_ns, station, changed = self._station
             if 0 <= (command.stamp_ns or 0) - stamp_ns <= WITNESS_NS:
-                after = changed is not None and (
-                    change_between(changed.T_flange_tool, found.T_flange_tool).tip_m <= SMALL_M
+                after = not young and (
+                    changed is not None
+                    and change_between(changed.T_flange_tool, found.T_flange_tool).tip_m <= SMALL_M
                 )
                 witness = with_mandrel(witness, station, shift, after=after)
         if witness.cause == "tool":
             return witness
         self._changed = found
         if witness.cause == "doubt" and self._current.measured_mandrel is not None:
-            reason = f"{witness.reason}; measure the mandrel (mode WITNESS), then repeat"
-            return replace(witness, reason=reason)
+            what = YOUNG if young else "measure the mandrel (mode WITNESS), then repeat"
+            return replace(witness, reason=f"{witness.reason}; {what}")
         return witness
+
+    def _mandrel_is_young(self) -> bool:
+        """Whether the station may have moved between tool in force and first mandrel's run."""
+        current = self._current
+        counted_from = current.healthy if current.model is None else current.head
+        both = counted_from.calibration_id, current.mandrel.calibration_id
+        if not all(both):
+            return False
+        tool_ns, mandrel_ns = (self._history.get(number or 0).stamp_ns for number in both)
+        return mandrel_ns > tool_ns + TOGETHER_NS
 
     def early(self, run: ToolRun, command: Command) -> Outcome | None:
         """The answer of a quick check whose circle says enough; None: go on."""
@@ -341,11 +373,19 @@ class ToolResults:
         return KnownTool(measures, spread_between(tool, healthy))  # of two healthy runs: whole
 
     def _in_force(self) -> KnownTool:
-        """The tool in force, the taught one as no change against the healthy tool's run."""
-        healthy = self._current.measured_healthy
-        if healthy is None or self._current.head.model is not None:
-            return self._current.tool
-        return KnownTool.taught(self._config.T_flange_taught, healthy)
+        """The tool in force, as a change against the healthy tool's run where these beams know it.
+
+        The taught one is none; of one that they measured before they knew the healthy tool, what
+        is common to both runs goes.
+        """
+        healthy, tool = self._current.measured_healthy, self._current.tool
+        if healthy is None:
+            return tool
+        if self._current.model is None:
+            return KnownTool.taught(self._config.T_flange_taught, healthy)
+        if tool.against is None and tool.own_covariance is not None:
+            return changed_tool(self._config.T_flange_taught, healthy, tool)
+        return tool
 
     def _keep(
         self,

@@ -222,11 +222,13 @@ def station_shift(before: StationMeasurement, now: StationMeasurement) -> Statio
 
 
 def station_verdict(
-    found: StationMeasurement, shift: StationShift | None, limit_m: float
+    found: StationMeasurement, shift: StationShift | None, limit_m: float, sigma_limit_m: float
 ) -> Verdict:
     """Whether the laser file still holds; ``shift``: against the first time, None of that.
 
-    ``limit_m``: so far the crossing may move. A turn that a tool's full run tells is one here.
+    ``limit_m``: so far the crossing may move; a move beyond it that may be chance is no answer. A
+    turn that a tool's full run tells is one here. ``sigma_limit_m``: so well the first one must
+    know the beams, as all later ones are compared with it.
     """
     if shift is None:
         words = f"the beams are known to {1e3 * found.sigma_m:.3f} mm at each point"
@@ -235,6 +237,9 @@ def station_verdict(
                 f"; the mandrel's shadows are {1e3 * wider_m:+.3f} mm from what mandrel_radius_mm "
                 "and the laser file's reach_mm say: where the radius is wrong the height is"
             )
+        if not found.sigma_m <= sigma_limit_m:
+            words += f"; allowed {1e3 * sigma_limit_m:.1f} mm: read the beams faster, or repeat it"
+            return Verdict(Code.RESIDUAL_TOO_LARGE, words)
         return Verdict(Code.ACCEPT, words)
     words = (
         f"the crossing is {1e3 * shift.size_m:.3f} mm from where it was first "
@@ -246,6 +251,8 @@ def station_verdict(
             words += f", and the station has turned by {np.degrees(shift.turned_rad):.2f} deg"
         words += ": write its new laser file (robocal tool station), and use it"
         return Verdict(Code.STATION_MOVED, words)
+    if shift.size_m > limit_m:
+        return Verdict(Code.TOO_FEW_SAMPLES, f"{words}, which may be chance: repeat it")
     if shift.moved:
         words += ", more than chance, less than matters"
     return Verdict(Code.ACCEPT, words)

@@ -14,14 +14,17 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
-from tool_driver import TAUGHT, TRUTH
+from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 from transforms import away_of, matrix_of
 
 from bench.measured_runs import laser_of
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
+from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.ros import conversions, endpoints
+from robocal_ros.session.events import ACCEPT, Command
+from robocal_ros.tool.session import ToolSession
 
 QUICK = MeasureTool.Goal.QUICK
 MANDREL = bent(TAUGHT, [-0.02, 0.01, -0.01], [0.0, 0.0, 0.0])
@@ -61,6 +64,26 @@ def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCe
     quick = cell.measure(QUICK)
     assert quick.answer == MeasureTool.Result.RECALIBRATE
     assert abs(quick.deviation_mm - 1.0) < 4.0 * quick.sigma_mm
+
+
+def test_a_tool_of_another_taught_one_is_told_as_none(graph: Any, tmp_path: Any) -> None:
+    made = noisy_cell()
+    with CalibrationHistory.open("K7", model_hash=made.arm.model_hash) as history:
+        session = ToolSession(made.arm, history, config_of(made), "test")
+        driver = Driver(session, made, RoundTool.cylinder(TRUTH, 0.0025))
+        found = driver.measure()
+        driver.command(Command(ACCEPT, {"id": found.calibration_id, "by": "me"}))
+    tools = graph.collect(ToolFrame, "/tcf_node/tool", endpoints.LATCHED)
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    xyz_mm = [*(1e3 * TAUGHT[:2, 3]).tolist(), float(1e3 * TAUGHT[2, 3] + 6.0)]
+    LiveCell(graph, tmp_path, TAUGHT, taught_xyz_mm=xyz_mm)
+    graph.spin_until(lambda: tools, "the tool in force")
+    assert tools[-1].state == ToolFrame.NONE
+    assert matrix_of(tools[-1].tool)[:3, 3] == pytest.approx(np.array(xyz_mm) * 1e-3)
+    words = "calibration 1 was measured of a tool that was taught otherwise"
+    graph.spin_until(
+        lambda: any(words in s.message for array in said for s in array.status), "the error"
+    )
 
 
 def test_it_moves_nothing_without_a_heartbeat(graph: Any, tmp_path: Any) -> None:

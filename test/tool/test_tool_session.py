@@ -329,6 +329,41 @@ def test_a_reference_of_another_tool_counts_for_nothing(history):
     assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3
 
 
+def test_a_tool_of_another_taught_one_is_not_in_force(history):
+    """The history has one tool for a robot: that of a shorter one would drive this one too low."""
+    first = driver_of(history)
+    found = first.measure()
+    assert first.command(Command(ACCEPT, {"id": found.calibration_id, "by": "me"})).done
+    longer = bent(TAUGHT, [0.0, 0.0, 0.006], [0.0, 0.0, 0.0])
+    driver = driver_of(history, longer, taught=rows_of(longer))
+    assert driver.session.current.foreign
+    assert driver.session.current.tool.T_flange_tool == pytest.approx(longer)
+    assert driver.session.in_force.revision == 1  # what decisions count on
+    assert driver.measure("quick").status is Code.ACCEPT
+    own = driver.measure()
+    assert driver.command(Command(ACCEPT, {"id": own.calibration_id, "by": "me"})).done
+    assert not driver.session.current.foreign
+    assert driver_of(history).session.current.foreign  # nor the other way round
+
+
+def test_a_tool_from_before_the_healthy_run_is_no_change_against_it(history):
+    """What the beams are placed wrongly by is in both, and counted once."""
+    cell = noisy_cell()
+    cell.laser = replace(cell.laser, points=cell.laser.points + np.array([4e-4, -3e-4, 2e-4]))
+    driver = driver_of(history, TAUGHT, cell)
+    absolute = driver.measure()
+    assert driver.command(Command(ACCEPT, {"id": absolute.calibration_id, "by": "me"})).done
+    healthy = driver.measure("reference")
+    assert healthy.done
+    away_mm = absolute.document["change"]["tip_mm"]
+    assert f"{away_mm:.3f} mm from the taught tool, is in force still" in healthy.message
+    assert driver.measure("quick").document["answer"] == "pass"
+    full = driver.measure()
+    assert full.status in (Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN), full.message
+    assert full.document["witness"]["tip_mm"] < 0.15  # two runs' own noise
+    assert full.document["change"]["tip_mm"] == pytest.approx(away_mm, abs=0.15)
+
+
 def test_the_healthy_tool_counts_after_its_beams_went_through_a_file(history, tmp_path):
     """In millimetres their last digits are others; beams that were placed anew are other beams."""
     driver = driver_of(history, TAUGHT)

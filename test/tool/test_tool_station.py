@@ -191,9 +191,9 @@ def test_a_wrong_radius_counts_in_the_height_and_is_said(wrong_m):
     assert z @ away == pytest.approx(-wrong_m, abs=8e-5)
     height = z @ found.frame_covariance[:3, :3] @ z
     assert (z @ away) ** 2 < chi2.ppf(0.999, 1) * height
-    told = station_verdict(found, None, 2e-4).reason
+    told = station_verdict(found, None, 2e-4, 2e-4).reason
     assert f"{1e3 * found.wider_m:+.3f} mm from what mandrel_radius_mm" in told
-    right = station_verdict(driven(cell, 15), None, 2e-4).reason
+    right = station_verdict(driven(cell, 15), None, 2e-4, 2e-4).reason
     assert "mandrel_radius_mm" not in right
 
 
@@ -216,6 +216,19 @@ def test_two_stations_are_not_one_that_moved():
     far = replace(found, laser=replace(found.laser, points=found.laser.points + 0.05))
     with pytest.raises(InputError, match="two stations"):
         station_shift(found, far)
+
+
+def test_beams_that_are_known_badly_are_no_answer():
+    """Neither the first time, nor where they may have moved by more than they may."""
+    found = driven(noisy_cell(), 14)
+    shaky = replace(found, laser=replace(found.laser, sigma_m=3e-4), covariance=9e-8 * np.eye(8))
+    first = station_verdict(shaky, None, 2e-4, 2e-4)
+    assert first.code is Code.RESIDUAL_TOO_LARGE
+    assert "allowed 0.2 mm" in first.reason
+    points = shaky.laser.points + np.array([4e-4, 0.0, 0.0])
+    away = station_shift(shaky, replace(shaky, laser=replace(shaky.laser, points=points)))
+    assert not away.moved
+    assert station_verdict(shaky, away, 2e-4, 2e-4).code is Code.TOO_FEW_SAMPLES
 
 
 def test_a_measurement_is_kept_bit_for_bit():

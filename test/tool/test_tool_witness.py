@@ -293,6 +293,24 @@ def test_a_mandrel_says_nothing_of_a_second_change(with_mandrel, seed):
     assert not (found.done and found.document["witness"]["cause"] == "tool"), found.message
 
 
+def test_a_mandrel_younger_than_the_tool_says_nothing_of_the_time_between(tmp_path):
+    """Its first run may have been beside a station that had moved already."""
+    cell = noisy_cell()
+    config = config_of(cell, mandrel=rows_of(MANDREL))
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        session = ToolSession(cell.arm, history, config, "test")
+        driver = Driver(session, cell, RoundTool.cylinder(TAUGHT, RADIUS_M))
+        assert driver.measure("reference").done
+        driver.cell.station = knocked(driver.cell.station, "station_knocked_shift", 0.3, 1)
+        driver.program.now_s += 7200.0
+        assert of_mandrel(driver, "witness reference").done
+        for _ in range(2):
+            found = driver.measure("full")
+            assert found.document["witness"]["cause"] == "doubt", found.message
+            assert "measure the healthy tool anew (mode REFERENCE)" in found.message
+            assert of_mandrel(driver).done
+
+
 def test_a_mandrel_that_tilted_is_no_witness(with_mandrel):
     hit = bent(MANDREL, [2e-3, 0.0, 0.0], [0.0, 0.015, 0.0])
     found = of_mandrel(with_mandrel, mandrel=hit)
