@@ -89,3 +89,20 @@ def test_a_fixture_is_taught_found_moved_accepted_and_rolled_back(cell):
     assert cell.call("rollback")[0]
     cell.graph.spin_until(lambda: len(cell.frame) == 3)
     assert cell.frame[-1].pose.pose.position.x == cell.frame[0].pose.pose.position.x
+
+
+def test_after_a_rollback_to_nothing_a_late_subscriber_gets_no_frame(cell):
+    world = MeasuredFixture(3)
+    topic = PoseWithCovarianceStamped, f"{NAME}/frame", endpoints.LATCHED
+    cell.show(world.points(world.faults(), 1, 1), 10.0)
+    assert cell.call("teach")[0]
+    assert cell.call("accept")[0]
+    cell.graph.spin_until(lambda: len(cell.frame) == 1)
+    assert cell.call("rollback")[0]
+    late = cell.graph.collect(*topic)
+    cell.show(world.points(world.faults(), 1, 2), 100.0)
+    assert cell.call("teach")[0]
+    assert not late
+    assert cell.call("accept")[0]
+    cell.graph.spin_until(lambda: late and len(cell.frame) == 2)
+    assert late == cell.frame[1:], "who was there before hears of the next one too"
