@@ -415,6 +415,7 @@ def add_frame_shift(parser: argparse.ArgumentParser) -> None:
 
 def run_frame_shift(args: argparse.Namespace) -> CliResult:
     _check_shift(args)
+    revision = _thermal_revision(args) if args.keep else 0
     models, warnings = given_models(args)
     nominal = models.nominal
     work, weight = _shifted_work(args, nominal)
@@ -462,9 +463,15 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
     if args.keep:
         with model_history(args, nominal) as history:
             document["calibration_id"] = keep_shift(
-                history, nominal, shift, q, T_first, document, verdict, time.time_ns()
+                history, nominal, shift, q, T_first, document, verdict, revision, time.time_ns()
             )
     return CliResult(document, _show_shift)
+
+
+def _thermal_revision(args: argparse.Namespace) -> int:
+    """In force before its model is read: where another one comes meanwhile, the shift is stale."""
+    with model_history(args, describe_robot(args.robot)[0].arm) as history:
+        return history.head(THERMAL).revision
 
 
 def _check_shift(args: argparse.Namespace) -> None:

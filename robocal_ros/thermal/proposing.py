@@ -537,9 +537,13 @@ def keep_shift(
     T_flange_tool: Array,
     document: Mapping[str, Any],
     verdict: Verdict,
+    thermal_revision: int,
     wall_ns: int,
 ) -> int:
-    """Put a shift for the thermal model in force into the history; its number there."""
+    """Put a shift into the history; its number there.
+
+    ``thermal_revision``: of the model that it was found for, though another one may be in force.
+    """
     return history.propose(
         Proposal(
             kind=FRAME_SHIFT,
@@ -557,7 +561,7 @@ def keep_shift(
             model={
                 "T_base_shift": shift.T_base_shift.tolist(),
                 "T_tool_shift": shift.T_tool_shift.tolist(),
-                "thermal_revision": history.head(THERMAL).revision,
+                "thermal_revision": thermal_revision,
             },
             inputs={"q": q, "T_flange_tool": T_flange_tool},
         )

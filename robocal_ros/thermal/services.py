@@ -258,7 +258,15 @@ class FrameShiftInterface:
         document = {**found, "in_force": was, "shift_frames_of": of}
         verdict = shift_verdict(found, was, only_judged=False)
         number = keep_shift(
-            self._history, session.nominal, shift, q, T, document, verdict, time.time_ns()
+            self._history,
+            session.nominal,
+            shift,
+            q,
+            T,
+            document,
+            verdict,
+            current.head.revision,
+            time.time_ns(),
         )
         response.success = verdict.accept
         response.message = trigger_text(number, verdict.code, verdict.reason)

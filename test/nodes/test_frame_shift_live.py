@@ -56,3 +56,18 @@ def test_a_shift_is_found_accepted_told_and_rolled_back(graph, tmp_path, poses):
     assert call("rollback_shift")[0]
     graph.spin_until(lambda: all(len(told[part]) == 3 for part in PARTS))
     assert np.array_equal(matrix_of(told["base"][-1].transform), np.eye(4))
+
+
+def test_a_shift_that_was_found_for_the_model_before_is_stale(graph, tmp_path):
+    """Another model came into force, and the node has not looked yet."""
+    work = np.degrees(WORK).ravel().tolist()
+    settings = {"serial": "S1", "state_dir": str(tmp_path), "tip_mm": (1e3 * TIP).tolist()}
+    with CalibrationHistory.open("S1", model_hash=NOMINAL.model_hash, state_dir=tmp_path) as kept:
+        bring_into_force(kept, THERMAL, NOMINAL, model_document(ACTUAL), "test")
+        node = graph.add(ThermalNode, settings | {"work_poses_deg": work})
+        other = model_document(drifted(NOMINAL, 2))
+        bring_into_force(kept, THERMAL, NOMINAL, other, "test")
+        found = node._shifts._find(Trigger.Request(), Trigger.Response())
+        assert found.success, found.message
+    accepted = graph.call(Trigger, "/thermal_node/accept_shift_trigger")
+    assert (accepted.success, accepted.message.split()[1]) == (False, "STALE"), accepted.message
