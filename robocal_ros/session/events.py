@@ -19,6 +19,7 @@ from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample, J
 from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_records import (
     BEFORE_ANY,
+    FIXTURE,
     FRAME_SHIFT,
     REFERENCE,
     THERMAL,
@@ -307,12 +308,15 @@ def measured_with(history: CalibrationHistory, entry: Entry) -> dict[str, int]:
     A tool's flange poses came from a thermal model: with another one, what the drift did to the
     flange would stay in the tool, and be corrected a second time. Frames were shifted for one. A
     drift is counted from a cold reference: the one in force from then on knows another cold robot.
+    A fixture's points were placed by tool or sensor: what these erred would stay in its frame.
     """
     model = history.model(entry.id)
     if entry.kind in (TOOL, FRAME_SHIFT):
         return {THERMAL: int(model["thermal_revision"])}
     if entry.kind == THERMAL and "reference_revision" in model:  # older ones do not tell
         return {REFERENCE: int(model["reference_revision"])}
+    if entry.kind.split("/")[0] == FIXTURE:
+        return {kind: int(its) for kind, its in model.get("measured_with", {}).items()}
     return {}
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from fixture_driver import mounted, visit
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rclpy.qos import HistoryPolicy, QoSProfile
@@ -15,6 +16,7 @@ from std_srvs.srv import Trigger
 from transforms import matrix_of
 
 from bench.measured_fixture import ARM, FRAME, PLATE, MeasuredFixture
+from robocal_ros.cell_sim.fixture import T_FLANGE_SENSOR
 from robocal_ros.fixture.files import fixture_document
 from robocal_ros.fixture.node import FixtureNode
 from robocal_ros.fixture.session import POINT
@@ -106,3 +108,19 @@ def test_after_a_rollback_to_nothing_a_late_subscriber_gets_no_frame(cell):
     assert cell.call("accept")[0]
     cell.graph.spin_until(lambda: late and len(cell.frame) == 2)
     assert late == cell.frame[1:], "who was there before hears of the next one too"
+
+
+def test_diagnostics_warn_of_a_fixture_that_another_place_of_the_sensor_taught(cell, tmp_path):
+    world = MeasuredFixture(3)
+    said = cell.graph.collect(DiagnosticArray, "/diagnostics")
+    newest = lambda: said[-1].status[0] if said else DiagnosticStatus()  # noqa: E731
+    cell.show(world.points(world.faults(), 1, 1), 10.0)
+    assert cell.call("teach")[0]
+    assert cell.call("accept")[0]
+    taught = lambda: any(one.value == "yes" for one in newest().values)  # noqa: E731
+    cell.graph.spin_until(taught)
+    assert "taught" not in newest().message
+    with CalibrationHistory.open("F1", model_hash=ARM.model_hash, state_dir=tmp_path) as history:
+        mounted(history, T_FLANGE_SENSOR @ frames.transform(np.eye(3), [1e-4, 0.0, 0.0]))
+    cell.graph.spin_until(lambda: "another place of feature_sensor" in newest().message)
+    assert newest().level == DiagnosticStatus.WARN

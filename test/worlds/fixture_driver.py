@@ -38,13 +38,13 @@ class Sent:
     message: Any
 
 
-def mounted(history):
+def mounted(history, T_flange_sensor=T_FLANGE_SENSOR):
     """The sensor's place on the flange comes into force, as hand_eye_node proposes it."""
     events.bring_into_force(
         history,
         hand_eye_kind(FRAME),
         ARM,
-        {"parent": "tool0", "child": FRAME, "T_parent_sensor": T_FLANGE_SENSOR.tolist()},
+        {"parent": "tool0", "child": FRAME, "T_parent_sensor": T_flange_sensor.tolist()},
         "test",
     )
 
