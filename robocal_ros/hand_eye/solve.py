@@ -236,7 +236,8 @@ def _classic(
 ) -> HandEyeResult:
     """The classic estimate from all profiles that gave a feature; it tells no covariance.
 
-    Its error is its distance from the best estimate, with that one's own.
+    Its error is its distance from the best estimate, with that one's own: what refuses that one
+    leaves nothing to judge by.
     """
     views, shots = (read.view,), len(data.names)
     state = task.classic(read.view, best.state)
@@ -245,7 +246,11 @@ def _classic(
     own_m = float(expected_error_m(best.covariance[:6, :6], field - pivot))
     apart_m = apart(state.T_flange_sensor, best.state.T_flange_sensor, field)
     error_m = float(np.hypot(apart_m, own_m))
-    refused = judge_residuals(residual, shots, shots - _shots(views))
+    verdict = judge_residuals(residual, shots, shots - _shots(views))
+    if verdict is None:
+        verdict = judge(best, shots, shots - _shots(best.views), own_m, settings)
+    if verdict.accept:
+        verdict = judge_classic(apart_m, error_m, settings.limit_m)
     return HandEyeResult(
         kind=task.kind,
         method="classic",
@@ -258,7 +263,7 @@ def _classic(
         target=task.found(state.places[0]),
         place=state.places[0],
         working_error_m=error_m,
-        verdict=refused or judge_classic(apart_m, error_m, settings.limit_m),
+        verdict=verdict,
     )
 
 

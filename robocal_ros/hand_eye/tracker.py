@@ -562,9 +562,7 @@ def _classic(classic: Classic, best: HandEyeResult, limit_m: float) -> HandEyeRe
         _result(classic, _state(classic), "classic"),
         leave_one_out_m=_left_out(classic, states),
         working_error_m=error_m,
-        verdict=best.verdict
-        if best.verdict.code is Code.RESIDUAL_TOO_LARGE
-        else judge_classic(away_m, error_m, limit_m),
+        verdict=judge_classic(away_m, error_m, limit_m) if best.verdict.accept else best.verdict,
     )
 
 

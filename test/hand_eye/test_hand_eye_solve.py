@@ -45,6 +45,7 @@ from robocal_ros.ground.errors import (
     ResidualError,
     RobocalError,
 )
+from robocal_ros.hand_eye import solve as solving
 from robocal_ros.hand_eye.mount_fit import LARGEST_POSE_M, distances, first_look, fit_mount
 from robocal_ros.hand_eye.mount_problem import in_plane
 from robocal_ros.hand_eye.result import HandEyeSettings, apart, at_origin, expected_error_m
@@ -53,6 +54,7 @@ from robocal_ros.hand_eye.solve import (
     field_of,
     held_out,
     look,
+    looked,
     solve_joint,
     solve_task,
     verify,
@@ -439,3 +441,19 @@ def test_two_poses_cannot_tell_the_robots_noise():
     found = solve_step(shots)
     assert found.verdict.code is Code.TOO_FEW_SAMPLES
     assert "robot's noise" in found.verdict.reason
+    assert solve_task(step_task(), shots, "classic", SETTINGS).verdict == found.verdict
+
+
+def test_a_closed_form_is_refused_where_the_best_estimate_that_judges_it_is():
+    """Three profiles of a known line are six numbers for six unknowns: they fit whatever erred."""
+    few = data_of(edge_shots(CELL, T_BASE_USER, 3, np.random.default_rng(1)))
+    best, classic = (solve_task(line_task(LINE), few, way, SETTINGS) for way in ("best", "classic"))
+    assert best.verdict.code is Code.TOO_FEW_SAMPLES
+    assert classic.verdict == best.verdict
+
+
+def test_a_doubt_of_the_best_estimate_is_one_of_the_closed_form(data, monkeypatch):
+    monkeypatch.setattr(solving, "looked", lambda *given: (looked(*given)[0], "another place fits"))
+    for method in ("best", "classic"):
+        verdict = solve_task(sphere_task(), data, method, HandEyeSettings(limit_m=1.0)).verdict
+        assert (verdict.code, verdict.reason) == (Code.POSES_NOT_INFORMATIVE, "another place fits")

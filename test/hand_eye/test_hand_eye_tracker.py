@@ -157,6 +157,20 @@ def test_classic_is_judged_by_its_distance_from_the_best():
     assert "use method best" in verdict.reason
 
 
+def test_a_fit_that_crept_on_judges_no_closed_form(monkeypatch):
+    """The closed form is as far from it as it says, and what it crept towards is not known."""
+
+    def crept(first):
+        problem, estimate = solve_best(first)
+        return problem, replace(estimate, converged=False)
+
+    monkeypatch.setattr(tracker, "solve_best", crept)
+    best, classic = solve(noisy()), solve(noisy(), "classic")
+    assert best.verdict.code is Code.POSES_NOT_INFORMATIVE
+    assert classic.verdict.code is best.verdict.code
+    assert classic.verdict.reason.startswith(best.verdict.reason.partition(";")[0])
+
+
 @cache
 def repeated(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors (n, 6) of best and classic, covariances (n, 6, 6)."""
