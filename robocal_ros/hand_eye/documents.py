@@ -279,7 +279,7 @@ class TouchedPointDocument(TypedDict):
     scans: Ordinal
     xyz_mm: Three
     three_sigma_mm: Annotated[
-        float | None, "Along the worst axis of the base; null of fewer than three scans."
+        float | None, "Along the worst axis of the base; null of fewer than three poses."
     ]
     off_mm: Annotated[float | None, "Of the mean from where it was touched."]
 

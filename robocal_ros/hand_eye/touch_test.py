@@ -16,14 +16,15 @@ from robocal_ros.estimation.assessment import ErrorSummary, Verdict, errors_docu
 from robocal_ros.estimation.edge import EdgeRule, fit_edge
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError, RobocalError, TooFewSamplesError
-from robocal_ros.ground.frames import Array
+from robocal_ros.ground.frames import Array, Index
 from robocal_ros.hand_eye.files import ScannedPoints, SensorMount
+from robocal_ros.hand_eye.mount_problem import same_pose
 from robocal_ros.hand_eye.profiles import Profile
 
 if TYPE_CHECKING:
     from robocal_ros.hand_eye.documents import TouchedPointsDocument
 
-FEWEST_SCANS = 3  # of a point, for a standard deviation
+FEWEST_POSES = 3  # from which a point is scanned, for a standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,7 @@ class TouchTest:
     """What scanned points say of a mount.
 
     ``points``: names, p of them; ``place`` (p, 3): mean of each, base, m; ``count`` (p,).
-    ``three_sigma_m`` (p,): along the worst axis; not a number of fewer than three scans.
+    ``three_sigma_m`` (p,): along the worst axis; not a number of fewer than three poses.
     ``distance_m`` (m,): of each scan of a touched point from there; empty where none was touched.
     ``off_m``: by name, of the mean of a touched point from there. ``limit_m``: what is allowed.
     """
@@ -68,7 +69,7 @@ class TouchTest:
             words.append("no point was touched, so what all scans share does not show")
         worst_m = stability_m if accuracy is None else accuracy.rms_m
         if worst_m is None:
-            what = f"no point was touched, and none scanned from {FEWEST_SCANS} poses or more"
+            what = f"no point was touched, and none scanned from {FEWEST_POSES} poses or more"
             return Verdict(Code.TOO_FEW_SAMPLES, what)
         if worst_m > self.limit_m:
             words.append(f"allowed are {1e3 * self.limit_m:g} mm: the mount is not this one")
@@ -142,19 +143,22 @@ def touch_test(
     names = tuple(dict.fromkeys(scanned.point))
     own = [np.array([name == one for one in scanned.point]) for name in names]
     place = np.array([p_base[rows].mean(axis=0) for rows in own])
-    three = np.array(
-        [
-            3.0 * float(p_base[rows].std(axis=0, ddof=1).max())
-            if rows.sum() >= FEWEST_SCANS
-            else np.nan
-            for rows in own
-        ]
-    )
+    pose = same_pose(scanned.T_base_flange)
+    three = np.array([_three_sigma_m(p_base[rows], pose[rows]) for rows in own])
     known = [i for i, name in enumerate(scanned.point) if name in touched]
     truth = np.array([touched[scanned.point[i]] for i in known]).reshape(-1, 3)
     distance = np.linalg.norm(p_base[known] - truth, axis=1)
     off = {n: float(np.linalg.norm(place[names.index(n)] - p)) for n, p in touched.items()}
     return TouchTest(names, place, tuple(int(r.sum()) for r in own), three, distance, off, limit_m)
+
+
+def _three_sigma_m(place: Array, pose: Index) -> float:
+    """Of places (n, 3) of one point along the worst axis, not a number from too few poses.
+
+    Scans from one ``pose`` (n,) count with their mean: they agree, wherever the sensor sits.
+    """
+    seen = np.array([place[pose == one].mean(axis=0) for one in np.unique(pose)])
+    return 3.0 * float(seen.std(axis=0, ddof=1).max()) if len(seen) >= FEWEST_POSES else np.nan
 
 
 def compared(found: Mapping[str, TouchTest]) -> Verdict:

@@ -67,15 +67,54 @@ def test_a_turned_mount_is_off_by_the_lever():
 
 
 def test_what_all_scans_share_shows_only_where_a_point_was_touched():
-    """Twelve times from one pose: steady, wherever the sensor sits."""
-    data = scans(6, sigma_m=0.0)
-    seen, T = (part[:1].repeat(12, 0) for part in (data.points, data.T_base_flange))
-    same = ScannedPoints(data.point, seen, T)
-    places = {name: np.zeros(3) for name in POINTS}
-    alone, against = judged(TRUE, same, {}), judged(TRUE, same, places)
+    """The flange never turns: steady, wherever on it the sensor sits."""
+    data = scans(1, sigma_m=0.0)
+    names = tuple(np.repeat(data.point, 3))
+    seen, T = data.points.repeat(3, 0), data.T_base_flange.repeat(3, 0)
+    step = 0.01 * np.tile(np.arange(3.0), 2)  # along the sensor's x
+    seen[:, 0] -= step
+    T[:, :3, 3] += step[:, None] * (T @ TRUE)[:, :3, 0]
+    moved = ScannedPoints(names, seen, T)
+    elsewhere = frames.transform(TRUE[:3, :3], TRUE[:3, 3] + [0.0, 0.05, 0.0])
+    alone, against = judged(elsewhere, moved, {}), judged(elsewhere, moved)
     assert alone.verdict.code is Code.ACCEPT
     assert "no point was touched" in alone.verdict.reason
     assert against.verdict.code is Code.RESIDUAL_TOO_LARGE
+
+
+def at_one_pose(data, rng, count):
+    """What is scanned again and again by a robot that stands: its readings tremble by 1 um."""
+    rows = np.repeat(np.arange(len(data.point)), count)
+    T = data.T_base_flange[rows]
+    T[:, :3, 3] += 1e-6 * rng.standard_normal((len(rows), 3))
+    seen = data.points[rows] + 1e-5 * rng.standard_normal((len(rows), 2))
+    return ScannedPoints(tuple(data.point[i] for i in rows), seen, T)
+
+
+def test_scans_from_one_pose_tell_no_steadiness():
+    """Twelve of each point, or twelve from the first of two poses: any mount would pass."""
+    rng = np.random.default_rng(3)
+    wrong = np.eye(4)
+    for poses in (1, 2):
+        found = judged(wrong, at_one_pose(scans(poses, sigma_m=0.0), rng, 12), {})
+        assert found.verdict.code is Code.TOO_FEW_SAMPLES
+        assert "none scanned from 3 poses" in found.verdict.reason
+        assert (found.stability_m, found.count) == (None, (12 * poses, 12 * poses))
+    assert judged(wrong, at_one_pose(scans(3), rng, 12), {}).verdict.code is Code.RESIDUAL_TOO_LARGE
+
+
+def test_scanning_often_from_one_pose_makes_no_mount_steadier():
+    data, rng = scans(3), np.random.default_rng(4)
+    often = at_one_pose(data, rng, 1)
+    first = [data.point.index(name) for name in POINTS for _ in range(50)]
+    again = ScannedPoints(
+        (*often.point, *(data.point[i] for i in first)),
+        np.concatenate([often.points, data.points[first]]),
+        np.concatenate([often.T_base_flange, data.T_base_flange[first]]),
+    )
+    turned = frames.transform(frames.exp_rotation([0.01, 0.0, 0.0]), np.zeros(3)) @ TRUE
+    once, many = judged(turned, often, {}), judged(turned, again, {})
+    assert many.stability_m == pytest.approx(once.stability_m, rel=0.05)
 
 
 def test_too_little_to_say_anything():
