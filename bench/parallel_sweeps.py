@@ -23,7 +23,14 @@ WAY = 40  # poses on the way to a sweep
 
 
 class SweepProgram(RobotProgram):
-    """Drives sweeps; ``q`` and ``now_s`` as of `RobotProgram`."""
+    """Drives sweeps; ``q`` and ``now_s`` as of `RobotProgram`.
+
+    Attributes
+    ----------
+    back : whether sweeps along x go back through the beams, too.
+    """
+
+    back = True
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -55,7 +62,9 @@ class SweepProgram(RobotProgram):
             T[0, 3] = x_m
         duration_s = float(np.linalg.norm(along)) / speed
         there = self._passed(Sweep(T, along, duration_s))
-        return there + self._passed(Sweep(raised(T, along), -along, duration_s)) + self.rest(0.3)
+        if self.back or name == PLUNGE:
+            there += self._passed(Sweep(raised(T, along), -along, duration_s))
+        return there + self.rest(0.3)
 
     def _passed(self, way: Sweep) -> list[Sample]:
         """One pass; the robot has rested at its begin, and the readings tell its true joints."""

@@ -9,7 +9,7 @@ A tool by two parallel beams may also be recorded by the node while the robot's 
 through them: `SweepLog` takes each of the sweeps of `fit_parallel`, in its order, once it is over.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
@@ -205,7 +205,8 @@ def fit_parallel(station: ParallelStation, edges: Edges) -> ParallelFit:
     """Axis from the sweeps ``straight`` and ``turned``; the tip where it was straightened too.
 
     ``edges``: flange poses T_base_flange (m, 4, 4) at the edges, by sweep and beam: break and
-    restore, or several of both; ``plunge`` of the upper beam has its first break.
+    restore, or several of both; ``plunge`` of the upper beam has its break, better with the restore
+    on the way up: what a late input reads too low and too high is right in the mean.
 
     Raises `TooFewSamplesError` when a sweep is missing; `InputError` when edges are odd in number,
     the flange is turned otherwise than methods say, or the place of the beams is missing;
@@ -381,9 +382,30 @@ def judge_tip(
     return verdict
 
 
-STEP_M = 1e-6  # of numeric derivatives; the fit is linear but for the axis' length
+SHARE = 1e-2  # of a sigma, in numeric derivatives; the fit is linear but for the axis' length
+MEND = "sweep there and back, the plunge down as fast as up, and more often"
 LONGEST_NS = 120_000_000_000  # of a sweep: edges from before it are those of other work
 QUARTER = frames.exp_rotation([0.0, 0.0, 0.5 * np.pi])
+
+
+WAYS: Mapping[str, int] = {name: 2 if name == PLUNGE else 0 for name in SWEEPS}  # axis of base
+FURTHEST_M = 1e-3  # across its way, between a plunge's edges: a round tip would meet the beam late
+
+
+@dataclass(frozen=True, eq=False)
+class SeenEdges:
+    """Edges of one beam in one sweep, in order of time.
+
+    ``T`` (m, 4, 4): the flange then, in base. Along the sweep's way ``sigma_m`` (m,) of each, and
+    ``speed_m_s`` (m,), by which a late one is read too far.
+    """
+
+    T: Array
+    sigma_m: Array
+    speed_m_s: Array
+
+
+Seen = Mapping[tuple[str, Height], SeenEdges]
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,17 +417,15 @@ class RecordedSweep:
     time_s: Array
     q: Array
 
-    def seen(self, arm: SerialArm, noise: RobotNoise) -> dict[Height, tuple[Array, Array]]:
-        """By beam the flange (m, 4, 4) at its edges, and sigma (m,) of each along its way, m."""
-        path, found = JointPath(arm, self.time_s, self.q), {}
-        for beam in HEIGHTS:
+    def seen(self, arm: SerialArm, noise: RobotNoise) -> dict[Height, SeenEdges]:
+        """By beam what it showed; of a plunge the upper one alone."""
+        path, found = JointPath(arm, self.time_s, self.q), dict[Height, SeenEdges]()
+        for beam in HEIGHTS[:1] if self.name == PLUNGE else HEIGHTS:
             own = [edge for edge in self.edges if edge.beam == beam]
-            if self.name == PLUNGE:
-                own = own[:1] if beam == "up" else []
-            if own:
-                T, twist = path.at(np.array([edge.time_s for edge in own]))
-                late_m = np.linalg.norm(twist[:, :3], axis=1) * [edge.sigma_s for edge in own]
-                found[beam] = T, np.hypot(noise.edge_m, late_m)
+            T, twist = path.at(np.array([edge.time_s for edge in own]))
+            late_m = np.linalg.norm(twist[:, :3], axis=1) * [edge.sigma_s for edge in own]
+            speed = twist[:, WAYS[self.name]]
+            found[beam] = SeenEdges(T, np.hypot(noise.edge_m, late_m), speed)
         return found
 
 
@@ -459,13 +479,17 @@ class SweepLog:
         sweep = RecordedSweep(name, edges, time_s, q)
         seen = sweep.seen(arm, self._config.noise)  # refuses what has no readings around it
         if name in FIRST:
-            require_turn(name, np.concatenate([T for T, _ in seen.values()]))
+            require_turn(name, np.concatenate([one.T for one in seen.values()]))
+        if name == PLUNGE:
+            _require_plunge(seen["up"])
         self._sweeps.append(sweep)
         words = f"sweep {name} ({len(self._sweeps)} of {len(SWEEPS)}) is taken: {len(edges)} edges"
+        if all(np.ptp(np.sign(one.speed_m_s)) == 0.0 for one in seen.values()):
+            words += ", all of one way: there and back a delay of the input cancels"
         if name == FIRST[-1]:
             words += f"; {self._upright(arm)}"
         elif name == AGAIN[-1]:  # a round tip beside the beam's plane meets it late
-            x_mm = 1e3 * np.mean([T[:, 0, 3].mean() for T, _ in seen.values()])
+            x_mm = 1e3 * np.mean([one.T[:, 0, 3].mean() for one in seen.values()])
             words += f"; plunge as it is turned, with the flange at x_mm {x_mm:.4f} of the base"
         return Outcome(command, Code.ACCEPT, words, samples=len(edges))
 
@@ -490,17 +514,16 @@ class SweepLog:
             missing = ", ".join(SWEEPS[len(self._sweeps) :])
             raise TooFewSamplesError(f"sweeps {missing} are missing: take them first")
         seen = self._seen(arm)
-        edges = {key: T for key, (T, _) in seen.items()}
+        edges = {key: one.T for key, one in seen.items()}
         axis, tip = self._fit(edges)
         columns, sides = [], across(axis).T
-        for keys, way, sigma in _errors(seen, config.noise):
+        for error in _errors(seen, config.noise):
             moved = dict(edges)
-            for key, rows in keys.items():
+            for key, away_m in error.items():
                 moved[key] = moved[key].copy()
-                moved[key][rows, way, 3] += STEP_M
+                moved[key][:, WAYS[key[0]], 3] += SHARE * away_m
             other_axis, other_tip = self._fit(moved)
-            by = np.concatenate([other_tip - tip, sides @ (other_axis - axis)]) / STEP_M
-            columns.append(sigma * by)
+            columns.append(np.concatenate([other_tip - tip, sides @ (other_axis - axis)]) / SHARE)
         T = frames.transform(retaught(in_force.T_flange_tool[:3, :3], axis), tip)
         own = np.array(columns).T
         turn = np.eye(5)  # the axis' part is told along the tool's own x and y
@@ -508,9 +531,7 @@ class SweepLog:
         covariance = turn @ (own @ own.T) @ turn.T
         sigma_m = np.sqrt(np.diag(covariance)[:3])
         words = f"the tip is known to {1e3 * sigma_m.max():.3f} mm"
-        verdict = judge_tip(
-            Verdict(Code.ACCEPT, words), float(sigma_m.max()), T, config, "sweep more often"
-        )
+        verdict = judge_tip(Verdict(Code.ACCEPT, words), float(sigma_m.max()), T, config, MEND)
         leans = [np.diff([edges[name, beam][:, 0, 3].mean() for beam in HEIGHTS]) for name in AGAIN]
         count = sum(len(sweep.edges) for sweep in self._sweeps)
         document: Document = {
@@ -529,7 +550,7 @@ class SweepLog:
             "parallel beams", count, known, verdict, document, thermal_revision, self._arrays()
         )
 
-    def _seen(self, arm: SerialArm) -> dict[tuple[str, Height], tuple[Array, Array]]:
+    def _seen(self, arm: SerialArm) -> Seen:
         """By sweep and beam what `RecordedSweep.seen` gives."""
         return {
             (sweep.name, beam): one
@@ -547,7 +568,7 @@ class SweepLog:
 
     def _upright(self, arm: SerialArm) -> str:
         """In words how the flange stands for the next two sweeps."""
-        axis, _ = self._fit({key: T for key, (T, _) in self._seen(arm).items()})
+        axis, _ = self._fit({key: one.T for key, one in self._seen(arm).items()})
         straight = R_BASE_FLANGE[FIRST[0]]
         upright = minimal_rotation(straight @ axis, [0.0, 0.0, -1.0]) @ straight
         told = []
@@ -571,21 +592,32 @@ class SweepLog:
         }
 
 
-Places = dict[tuple[str, Height], list[int]]
-
-
-def _errors(
-    seen: Mapping[tuple[str, Height], tuple[Array, Array]], noise: RobotNoise
-) -> list[tuple[Places, int, float]]:
-    """Independent errors: the edges that one moves, along which axis of the base, its sigma, m."""
-    found: list[tuple[Places, int, float]] = []
-    for (name, beam), (_, sigma_m) in seen.items():
-        way = 2 if name == PLUNGE else 0
-        found += [({(name, beam): [row]}, way, float(s)) for row, s in enumerate(sigma_m)]
+def _errors(seen: Seen, noise: RobotNoise) -> Iterator[dict[tuple[str, Height], Array]]:
+    """Independent errors: by how much one sigma of each moves edges (m,) along their way, m."""
+    for key, one in seen.items():
+        for row, sigma_m in enumerate(one.sigma_m):
+            yield {key: np.eye(len(one.T))[row] * sigma_m}
     for name in SWEEPS:  # a motion's own scatter, common to its edges
-        every = {key: list(range(len(T))) for key, (T, _) in seen.items() if key[0] == name}
-        found.append((every, 2 if name == PLUNGE else 0, noise.step_m))
-    return found
+        own = {key: one for key, one in seen.items() if key[0] == name}
+        yield {key: np.full(len(one.T), noise.step_m) for key, one in own.items()}
+    # A delay, common to all, cancels there and back. Its size shows, as well as these scatter, in
+    # how far a plunge's restore is above its break; a receiver's hysteresis is in that, too.
+    plunge = seen[PLUNGE, "up"]
+    above_m, faster_m_s = (
+        np.mean(of[1::2] - of[::2]) for of in (plunge.T[:, 2, 3], plunge.speed_m_s)
+    )
+    size_m = np.linalg.norm([above_m, noise.step_m, noise.step_m, *plunge.sigma_m])
+    yield {key: one.speed_m_s * size_m / faster_m_s for key, one in seen.items()}
+
+
+def _require_plunge(seen: SeenEdges) -> None:
+    """Refuse a plunge that does not break the beam downwards and leave it upwards."""
+    rises = seen.speed_m_s > 0.0
+    if np.any(rises != (np.arange(len(rises)) % 2 == 1)) or np.ptp(seen.T[:, 0, 3]) > FURTHEST_M:
+        raise BeamError(
+            f"sweep {PLUNGE}: the tip must come down into beam up and leave it on the same way up: "
+            "sweep again"
+        )
 
 
 def _require_passes(name: str, edges: list[BeamEdge]) -> None:

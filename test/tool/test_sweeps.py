@@ -23,7 +23,9 @@ from robocal_ros.tool.touch_points import LONGEST_NS, PLUNGE
 
 TRUTH = bent(TAUGHT, [0.0015, -0.001, 0.0006], [0.012, 0.018, 0.0])
 POLLED = TrueInput(latency_s=0.004, sample_period_s=0.002)
+LATE = TrueInput(latency_s=0.02, sample_period_s=0.008)
 RADIUS_M = 0.0025
+LEFT_M = 0.02**2 * 0.04  # without noise: second order in the lean (0.02 rad, 40 mm)
 RUNS = amount(12, 40)
 ROOT = Path(__file__).parents[2]
 
@@ -88,9 +90,71 @@ def test_without_noise_only_the_sources_approximations_are_left(tmp_path):
         driver.command(Command(ACCEPT, {"id": found.calibration_id, "by": "me"}))
         error, _ = away(driver)
         # The plunge meets the beam with the edge of a flat end, which is square to the axis, so the
-        # height is the tip's; what is left is of second order in the lean (0.02 rad, 40 mm).
-        assert np.abs(error[:3]).max() < 0.02**2 * 0.04
+        # height is the tip's.
+        assert np.abs(error[:3]).max() < LEFT_M
         assert np.abs(error[3:]).max() < 0.02**2
+
+
+def told_m(found):
+    """Of a tip: its error and sigma (3,), m."""
+    error_m = 1e-3 * np.array(found.document["tcp_mm"]) - TRUTH[:3, 3]
+    return error_m, 1e-3 * np.array(found.document["sigma_mm"])
+
+
+def test_a_delay_of_the_input_moves_nothing_there_and_back(tmp_path):
+    """24 ms: at 5 mm/s the plunge down alone reads 0.12 mm too low."""
+    late = TrueInput(latency_s=0.024, jitter_s=0.0)
+    driver = made(tmp_path, noise=TrueNoise(0.0, 0.0), source=late)
+    with driver.history:
+        found = whole(driver)
+        assert found.status is Code.ACCEPT, found.message
+        error_m, sigma_m = told_m(found)
+        assert np.abs(error_m).max() < LEFT_M
+        assert sigma_m.max() < 4e-5  # no more than without it
+
+
+def test_what_is_swept_one_way_is_known_as_well_as_the_delay(tmp_path):
+    """24 ms at 20 mm/s are 0.48 mm across: more than is allowed, and what is told."""
+    driver = made(tmp_path, source=LATE)
+    driver.program.back = False
+    with driver.history:
+        told = swept(driver, STRAIGHT["straight"], TAUGHT[:3, 3], "straight")
+        assert "4 edges, all of one way" in told.message
+        assert driver.command(Command(CLEAR_SWEEPS, {})).done
+        found = whole(driver)
+        error_m, sigma_m = told_m(found)
+        assert np.all(np.abs(error_m[:2]) > 3e-4)
+        assert np.all(np.abs(error_m[:2]) < 2.0 * sigma_m[:2])
+        assert found.status is Code.RESIDUAL_TOO_LARGE
+        assert "sweep there and back" in found.message
+
+
+def test_a_small_delay_of_one_way_is_a_weak_answer(tmp_path):
+    """5 ms at 20 mm/s: 0.1 mm, and the plunge tells the delay to as much."""
+    for seed in range(4):
+        driver = made(tmp_path, seed=seed)
+        driver.program.back = False
+        with driver.history:
+            found = whole(driver)
+            error_m, sigma_m = told_m(found)
+            assert np.all(np.abs(error_m) < 3.0 * sigma_m)
+            assert sigma_m[:2].min() > 8e-5
+            assert found.status is (
+                Code.ACCEPT if sigma_m.max() < 2e-4 else Code.RESIDUAL_TOO_LARGE
+            )
+
+
+def test_a_plunge_goes_down_and_up_on_one_way(tmp_path):
+    driver = made(tmp_path)
+    with driver.history:
+        for name in ("straight", "turned"):
+            told = swept(driver, STRAIGHT[name], TAUGHT[:3, 3], name)
+        for name, R in upright_of(told.message).items():
+            told = swept(driver, R, TAUGHT[:3, 3], name)
+        across = swept(driver, R, TAUGHT[:3, 3], "another sweep along x")
+        assert across.status is Code.BEAM_EDGES_WRONG
+        assert "leave it on the same way up" in across.message
+        assert swept(driver, R, TAUGHT[:3, 3], PLUNGE, plunge_at(told.message)).done
 
 
 def test_sweeps_that_are_no_whole_passes_are_refused(tmp_path):
