@@ -579,7 +579,7 @@ class ToolGate:
         """Let a tool wait for its adoption; one that is in use already only ends the wait.
 
         A revision that is not newer than the last one must be newer by its stamp, or be looked
-        at (``again``).
+        at (``again``); that it says nothing of the mounted tool any more, or does again, is news.
 
         Raises `RefusedError` when it is not accepted, its frames are not the configured ones, it
         is older than the last one, or too far from the taught tool.
@@ -596,7 +596,7 @@ class ToolGate:
         self.refused = None
         last = self.waiting or self.in_use
         known = last is not None and _same_tool(tool, last)
-        later = last is None or _later(tool, last)
+        later = last is None or _later(tool, last) or _retaught(tool, last)
         if not (known or later or again):
             self.refused = tool
             raise RefusedError(
@@ -627,6 +627,12 @@ def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:
     if a.T_flange_tool is None or b.T_flange_tool is None:
         return a.revision == b.revision and a.T_flange_tool is b.T_flange_tool
     return a.revision == b.revision and np.array_equal(a.T_flange_tool, b.T_flange_tool)
+
+
+def _retaught(a: OfferedTool, b: OfferedTool) -> bool:
+    """Whether one is told as the taught tool and the other is not, both of one revision."""
+    same = (a.revision, a.stamp_ns) == (b.revision, b.stamp_ns)
+    return same and (a.T_flange_tool is None) != (b.T_flange_tool is None)
 
 
 def _later(a: OfferedCalibration, b: OfferedCalibration) -> bool:

@@ -4,7 +4,7 @@
 The state that the line reads is judged by all that is known: `accuracy_of`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +24,7 @@ from robocal_ros.thermal.accuracy import (
     both_errors,
     offset_error,
 )
+from robocal_ros.tool.run import ANOTHER_M, ANOTHER_RAD, away_from
 
 NS, MM = 1_000_000_000, 1e-3
 REMEMBERED = 200  # ended cycles
@@ -196,6 +197,17 @@ class ToolRecord:
     # drift_rms_m, drift_bound_m: error of the thermal model through which a tool was last measured
     drift_rms_m: float = 0.0
     drift_bound_m: float = 0.0
+    taught: Sequence[Sequence[float]] = ()  # T_flange_tool (4, 4) of then; empty: not known
+
+    def of_taught(self, T_flange_tool: Array) -> "ToolRecord":
+        """It, where it was of the tool that is taught so (4, 4), else of one never checked."""
+        rows = T_flange_tool.tolist()
+        if len(self.taught):
+            size_m, angle_rad = away_from(np.array(self.taught), T_flange_tool)
+            if size_m > ANOTHER_M or angle_rad > ANOTHER_RAD:
+                words = "the tool was taught otherwise when it was checked"
+                return ToolRecord(words=words, laser_ns=self.laser_ns, taught=rows)
+        return replace(self, taught=rows)
 
     @staticmethod
     def measured_with(tool: Head, thermal: Head) -> dict[str, Any]:

@@ -288,11 +288,10 @@ class ToolPart:
     def _ask_mandrel(self, cycle_id: str, candidate: int) -> Script[bool]:
         """Whose is a change in doubt, the tool's or the station's? Whether that is settled.
 
-        Where the station has moved the candidate is rejected. Where it stands the tool is measured
-        once more, and judged with that; unless a person has decided meanwhile.
+        A station that stands: the tool is measured again; unless a person has decided meanwhile.
         """
         cell, outcome = self._cell, self.outcome
-        if cell.config.driving.mandrel is None or not self._decider.in_doubt(candidate):
+        if cell.config.driving.mandrel is None or not self._decider.is_for_mandrel(candidate):
             return False
         told = yield from self._measured(WITNESS, f"{cycle_id}/witness")
         if told is None or not (told.done or told.code is Code.STATION_MOVED):
@@ -403,7 +402,8 @@ class ToolPart:
         """Remember it at once: the run may be broken off on the way home."""
         outcome, memory = self.outcome, self._memory
         if mode == LASER and (answer.has_result or answer.code in FAILED):
-            memory.note_tool(laser_ns=self.wall_ns)  # what came of it; all else is tried again
+            if answer.code is not Code.TOO_FEW_SAMPLES:  # what came of it; all else is tried again
+                memory.note_tool(laser_ns=self.wall_ns)
             outcome.station_code, outcome.station_id = answer.code, answer.candidate_id
         if mode in OF_STATION and answer.code is not Code.STATION_MOVED:
             if mode == WITNESS:

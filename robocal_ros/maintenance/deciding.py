@@ -108,6 +108,11 @@ class Decider:
         """Whether nothing proves that a tool candidate is the tool's change, not the station's."""
         return self._history.model(calibration_id).get("cause") != "tool"
 
+    def is_for_mandrel(self, calibration_id: int) -> bool:
+        """Whether it is in doubt and the mandrel was first measured beside the same station."""
+        young = self._history.model(calibration_id).get("mandrel_young", False)
+        return not young and self.in_doubt(calibration_id)
+
     def decided(self, calibration_id: int) -> str:
         """What became of a candidate; empty while it waits."""
         state = self._history.get(calibration_id).state

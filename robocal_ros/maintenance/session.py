@@ -262,6 +262,7 @@ class MaintenanceSession:
     ) -> None:
         self.config, self.ways = config, Ways(nominal, config)
         self.memory = Memory.load(keeper)
+        self.memory.tool = self.memory.tool.of_taught(config.T_flange_tool)
         self._decider = Decider(nominal, history, config)
         fixture = None
         if config.fixture_poses is not None:

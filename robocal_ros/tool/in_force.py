@@ -11,7 +11,15 @@ from robocal_ros.history.history_records import HEALTHY_TOOL, LASER_FRAME, MANDR
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import HistoryFollower
 from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.run import RunTraits, ToolConfig, alike, made_with
+from robocal_ros.tool.run import (
+    ANOTHER_M,
+    ANOTHER_RAD,
+    RunTraits,
+    ToolConfig,
+    alike,
+    away_from,
+    made_with,
+)
 from robocal_ros.tool.station import StationMeasurement, StationTrend, measurement_of
 
 
@@ -35,13 +43,29 @@ class ToolInForce(HistoryFollower):
         self.station: Head = self.history.head(LASER_FRAME)
 
     @property
-    def foreign(self) -> bool:
-        """Whether what the history has in force was measured of a tool that was taught otherwise.
+    def foreign(self) -> str:
+        """Why what the history has in force says nothing of this tool; empty: it does.
 
-        It says nothing of this one: it may be another tool.
+        It was measured of one that was taught otherwise, by more than a pendant rounds.
         """
         made = (self.head.model or {}).get("made_with")
-        return made is not None and not alike(made["taught"], self._made_with["taught"])
+        if made is None:
+            return ""
+        size_m, angle_rad = away_from(np.array(made["taught"]), self._taught.T_flange_tool)
+        if size_m <= ANOTHER_M and angle_rad <= ANOTHER_RAD:
+            return ""
+        return (
+            f"calibration {self.head.calibration_id} was measured of a tool that was taught "
+            f"{1e3 * size_m:.2f} mm and {np.degrees(angle_rad):.2f} deg from this one and is not "
+            "used: measure the mounted tool and accept it, roll back, or put taught_xyz_mm and "
+            "taught_quat_xyzw right"
+        )
+
+    @property
+    def by_these_beams(self) -> bool:
+        """Whether the tool in force was measured with this taught tool, beams and station."""
+        model = self.model
+        return model is not None and alike(model.get("made_with"), self._made_with)
 
     @property
     def model(self) -> dict[str, Any] | None:

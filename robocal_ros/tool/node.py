@@ -363,10 +363,6 @@ class TcfServices:
 
 
 WATCH_S = 0.02
-FOREIGN = (
-    "was measured of a tool that was taught otherwise and is not used: measure the mounted tool "
-    "and accept it, roll back, or put taught_xyz_mm and taught_quat_xyzw right"
-)
 INPUTS = {JOINTS: (JointState, endpoints.STREAM), EDGES: (BeamEvent, endpoints.RELIABLE)}
 
 
@@ -556,7 +552,9 @@ class TcfNode(SessionNode[ToolSession]):
             head, model = current.head, current.model
             stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
             thermal = 0 if model is None else int(model["thermal_revision"])
-            self._outputs.tool(current.tool, head.revision, thermal, stamp, taught=current.foreign)
+            self._outputs.tool(
+                current.tool, head.revision, thermal, stamp, taught=bool(current.foreign)
+            )
         self._shown = shown
         self._outputs.events.tell(configuration(session, self._topics), None)
 
@@ -574,8 +572,7 @@ class TcfNode(SessionNode[ToolSession]):
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
         if session.current.foreign:
-            number = session.current.head.calibration_id
-            health.worsen(ERROR, f"calibration {number} {FOREIGN}")
+            health.worsen(ERROR, session.current.foreign)
 
 
 def main() -> None:

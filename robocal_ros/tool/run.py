@@ -451,6 +451,16 @@ def alike(one: object, other: object) -> bool:
     return one == other
 
 
+ANOTHER_M, ANOTHER_RAD = 1e-4, float(np.radians(0.1))  # a pendant rounds by less
+
+
+def away_from(taught: Array, other: Array) -> tuple[float, float]:
+    """How far one taught tool (4, 4) is from another one: m, and rad about any axis."""
+    away = frames.invert(taught) @ other
+    angle = float(np.linalg.norm(frames.log_rotation(away[:3, :3])))
+    return float(np.linalg.norm(away[:3, 3])), angle
+
+
 PLANNING = Held(along_m=5e-3)  # before any plunge the tip is taken where it was taught
 BEFORE_NS = AFTER_NS = 1_000_000_000  # joint readings kept about the edges of a step
 

@@ -86,7 +86,8 @@ TOGETHER_NS = 3600 * 10**9  # so long after a tool a mandrel is first measured w
 REMEMBERED = 200  # answers, and calibrations back to which a cycle's id is known
 YOUNG = (
     "the mandrel cannot tell, as it was first measured over an hour after the tool that this is "
-    "counted from: measure the healthy tool anew (mode REFERENCE)"
+    "counted from: look at tool and station, then accept it, or measure the healthy tool anew "
+    "(mode REFERENCE)"
 )
 CODE_OF: dict[Answer, Code] = {
     "pass": Code.ACCEPT,
@@ -185,7 +186,7 @@ class ToolResults:
             "absolute": absolute,
             "witness": witness.document(),
         }
-        known: Document = {"cause": witness.cause}
+        known: Document = {"cause": witness.cause, "mandrel_young": self._mandrel_is_young()}
         if witness.cause == "tool" and witness.tip_m <= SMALL_M:  # many of them do not add up
             known["anchor"] = anchor.tolist()
         model = found.document() | known
@@ -323,14 +324,16 @@ class ToolResults:
         return witness
 
     def _mandrel_is_young(self) -> bool:
-        """Whether the station may have moved between tool in force and first mandrel's run."""
+        """Whether the station may have moved between tool and first mandrel's run.
+
+        The change is between two tools, both against the healthy one: the station counts from the
+        later of the two. By the stamps that the models bear, which a recording holds too.
+        """
         current = self._current
-        counted_from = current.healthy if current.model is None else current.head
-        both = counted_from.calibration_id, current.mandrel.calibration_id
-        if not all(both):
-            return False
-        tool_ns, mandrel_ns = (self._history.get(number or 0).stamp_ns for number in both)
-        return mandrel_ns > tool_ns + TOGETHER_NS
+        tools = current.model or {}, current.healthy.model or {}
+        tool_ns = max(int(model.get("stamp_ns", 0)) for model in tools)
+        mandrel_ns = int((current.mandrel.model or {}).get("stamp_ns", 0))
+        return 0 < tool_ns < mandrel_ns - TOGETHER_NS
 
     def early(self, run: ToolRun, command: Command) -> Outcome | None:
         """The answer of a quick check whose circle says enough; None: go on."""
@@ -373,10 +376,10 @@ class ToolResults:
         return KnownTool(measures, spread_between(tool, healthy))  # of two healthy runs: whole
 
     def _in_force(self) -> KnownTool:
-        """The tool in force, as a change against the healthy tool's run where these beams know it.
+        """The tool in force, as a change against the healthy tool's run where that is known.
 
-        The taught one is none; of one that they measured before they knew the healthy tool, what
-        is common to both runs goes.
+        The taught one is none; of one that beams measured before the healthy tool, what is common
+        to both runs goes. What other beams err by is not.
         """
         healthy, tool = self._current.measured_healthy, self._current.tool
         if healthy is None:
@@ -384,7 +387,8 @@ class ToolResults:
         if self._current.model is None:
             return KnownTool.taught(self._config.T_flange_taught, healthy)
         if tool.against is None and tool.own_covariance is not None:
-            return changed_tool(self._config.T_flange_taught, healthy, tool)
+            change = changed_tool(self._config.T_flange_taught, healthy, tool)
+            return change if self._current.by_these_beams else replace(change, against=None)
         return tool
 
     def _keep(
@@ -412,7 +416,11 @@ class ToolResults:
                 reason=verdict.reason,
                 document=document,
                 model=model
-                | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)},
+                | {
+                    "thermal_revision": run.thermal_revision,
+                    "made_with": made_with(self._config),
+                    "stamp_ns": command.stamp_ns or 0,
+                },
                 inputs=run.inputs,
             )
         )

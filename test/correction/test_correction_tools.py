@@ -146,6 +146,16 @@ def test_an_older_tool_waits_for_a_newer_stamp_or_the_operator(robot: Robot) -> 
     assert robot.session.status().tool_revision == 4
 
 
+def test_that_a_tool_says_nothing_of_the_mounted_one_is_news(robot: Robot) -> None:
+    """tcf_node says so of the same revision, once another tool is taught; and takes it back."""
+    robot.change_tool(bent_tool(revision=5, stamp_ns=10))
+    robot.change_tool(bent_tool(revision=5, stamp_ns=10, T_flange_tool=None))
+    assert not robot.session.status().new_tool
+    assert np.array_equal(robot.settle(), HOME)
+    robot.change_tool(bent_tool(revision=5, stamp_ns=10))
+    assert np.abs(robot.settle() - HOME).max() > 1e-3
+
+
 def test_the_tool_in_use_again_ends_the_wait_of_another(robot: Robot) -> None:
     first = bent_tool(stamp_ns=1)
     robot.change_tool(first)

@@ -19,12 +19,19 @@ from robocal_ros.cell_sim import cell as simulated
 from robocal_ros.cell_sim.beams import RoundTool, bent
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.history import history_records
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import LASER_FRAME, THERMAL, TOOL, Proposal
+from robocal_ros.history.history_records import (
+    LASER_FRAME,
+    THERMAL,
+    TOOL,
+    CalibrationState,
+    Proposal,
+)
 from robocal_ros.kinematics.robots import load_robot
-from robocal_ros.maintenance.accuracy import AcceptBounds, Times
+from robocal_ros.maintenance.accuracy import AcceptBounds, Times, ToolRecord
 from robocal_ros.maintenance.mover import STATION
-from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command
+from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command, bring_into_force
 from robocal_ros.thermal.accuracy import AccuracyLevel
 from robocal_ros.thermal.drift_following import ThermalConfig
 from robocal_ros.thermal.identification import drift_prior
@@ -563,3 +570,31 @@ def test_a_mandrel_settles_in_the_cycle_what_has_changed(witnessed, tmp_path, kn
             assert result.accepted == (result.tool_id,), result.message
             found = KnownTool.of_document(history.model(result.tool_id)).T_flange_tool
             assert np.linalg.norm(found[:3, 3] - SMALL_BEND[:3, 3]) < 1.5e-4
+
+
+def test_a_mandrel_that_cannot_tell_is_not_asked_in_every_gap(witnessed, tmp_path):
+    """First measured two hours after the healthy tool: a change in doubt waits for a person."""
+    with witnessed.opened(tmp_path) as history:
+        model = history.head(history_records.MANDREL).model
+        later = model | {"stamp_ns": model["stamp_ns"] + 2 * 3600 * 10**9}
+        cell = beside_a_mandrel(history, witnessed.now_s)
+        bring_into_force(history, history_records.MANDREL, cell.cell.arm, later, "test")
+        cell.rng = deepcopy(witnessed.rng)
+        cell.run(0.5)
+        cell.tool = RoundTool.cylinder(SMALL_BEND, 0.0025)
+        for name in ("c1", "c2"):
+            result = cell.maintain(name, 1.5 * GAP_S)
+            assert result.accepted == (), result.message
+            (waiting,) = [entry for entry in history.list() if entry.kind == TOOL]
+            assert waiting.state is CalibrationState.PENDING
+            assert "the mandrel cannot tell" in waiting.reason
+
+
+def test_a_check_of_another_taught_tool_is_none():
+    """Over a restart with another one in the parameters; what a pendant rounds is the same."""
+    checked = ToolRecord(answer="pass", words="passed", wall_ns=5, laser_ns=3).of_taught(TAUGHT)
+    rounded, longer = (bent(TAUGHT, [0.0, 0.0, by_m], [0.0, 0.0, 0.0]) for by_m in (5e-6, 5e-3))
+    assert checked.of_taught(rounded).answer == "pass"
+    other = checked.of_taught(longer)
+    assert (other.answer, other.wall_ns, other.laser_ns) == ("", 0, 3)
+    assert other.words == "the tool was taught otherwise when it was checked"

@@ -339,6 +339,8 @@ def test_a_tool_of_another_taught_one_is_not_in_force(history):
     assert driver.session.current.foreign
     assert driver.session.current.tool.T_flange_tool == pytest.approx(longer)
     assert driver.session.in_force.revision == 1  # what decisions count on
+    rounded = bent(TAUGHT, [0.0, 0.0, 5e-6], [0.0, 0.0, 0.0])  # as a pendant writes it
+    assert not driver_of(history, rounded, taught=rows_of(rounded)).session.current.foreign
     assert driver.measure("quick").status is Code.ACCEPT
     own = driver.measure()
     assert driver.command(Command(ACCEPT, {"id": own.calibration_id, "by": "me"})).done
@@ -362,6 +364,22 @@ def test_a_tool_from_before_the_healthy_run_is_no_change_against_it(history):
     assert full.status in (Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN), full.message
     assert full.document["witness"]["tip_mm"] < 0.15  # two runs' own noise
     assert full.document["change"]["tip_mm"] == pytest.approx(away_mm, abs=0.15)
+
+
+def test_what_other_beams_err_by_is_not_taken_out(history):
+    """A tool from before a new laser file: what both files are off by stays in its sigma."""
+    first = driver_of(history, TAUGHT)
+    absolute = first.measure()
+    assert first.command(Command(ACCEPT, {"id": absolute.calibration_id, "by": "me"})).done
+    assert first.measure("reference").done
+    same = first.measure("quick").document["sigma_mm"]
+    cell = noisy_cell()
+    cell.laser = replace(cell.laser, points=cell.laser.points + np.array([3e-4, -2e-4, 0.0]))
+    driver = driver_of(history, TAUGHT, cell)
+    assert driver.measure("reference").done
+    assert not driver.session.current.by_these_beams
+    file_mm = 1e3 * cell.laser.sigma_m
+    assert driver.measure("quick").document["sigma_mm"] > np.hypot(same, file_mm)
 
 
 def test_the_healthy_tool_counts_after_its_beams_went_through_a_file(history, tmp_path):

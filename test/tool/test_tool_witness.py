@@ -308,7 +308,12 @@ def test_a_mandrel_younger_than_the_tool_says_nothing_of_the_time_between(tmp_pa
             found = driver.measure("full")
             assert found.document["witness"]["cause"] == "doubt", found.message
             assert "measure the healthy tool anew (mode REFERENCE)" in found.message
+            assert history.model(found.calibration_id)["mandrel_young"]
             assert of_mandrel(driver).done
+        assert driver.measure("reference").done  # the knock is in both now
+        slip(driver, 1e-4)
+        found = driver.measure("full")
+        assert not history.model(found.calibration_id)["mandrel_young"]
 
 
 def test_a_mandrel_that_tilted_is_no_witness(with_mandrel):
