@@ -20,7 +20,14 @@ from robocal_ros.ground.samples import (
     stamp_ns,
 )
 from robocal_ros.session import events
-from robocal_ros.session.events import Command, Outcome, SessionBase, digest, read_command
+from robocal_ros.session.events import (
+    Command,
+    Outcome,
+    SessionBase,
+    digest,
+    in_force_beside,
+    read_command,
+)
 from robocal_ros.session.inputs import Between
 
 EVENTS = "session_events"
@@ -93,15 +100,15 @@ def read_events(
 ) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
     """Read the recorded commands, each with its outcome, and the configuration before them.
 
-    A later configuration with another thermal model is a command too, without an outcome, where
-    the session takes this model from the thermal node.
+    A later configuration with another model of other nodes is a command too, without an outcome;
+    the thermal one is the thermal session's own.
 
     ``from_ns`` is the stamp of the first recorded joint reading. What was commanded before it is
     in the bag only because the topic is latched; its samples are not. It is left out, and the
     configuration is the one that it led to.
     """
     configured: Command | None = None
-    model: Any = None
+    beside = in_force_beside(Command(events.CONFIGURE))
     before = 0  # jumps of the clock
     found: list[tuple[Command, dict[str, Any]]] = []
     for recorded in messages:
@@ -110,9 +117,9 @@ def read_events(
         if command.name == events.CONFIGURE:
             if not found:
                 configured, before = command, _jumps(command)
-            elif "reference" not in command.arguments and command.arguments.get("model") != model:
+            elif "reference" not in command.arguments and in_force_beside(command) != beside:
                 found.append((command, {}))  # another node brought another model into force
-            model = command.arguments.get("model")
+            beside = in_force_beside(command)
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
         elif not found:

@@ -558,14 +558,18 @@ class SessionBase:
         return decide(self._history, command, self.in_force.revision, wall_ns, self._kind)
 
     def _reconfigured(self, command: Command, wall_ns: int) -> Outcome:
-        """A thermal model that another node brought into force while this was recorded."""
-        model = command.arguments["model"]
-        if model is None:
-            why = {"by": BY, "reason": WHILE}
-            self._history.rollback(to=0, kind=THERMAL, **why, expected_head=None, wall_ns=wall_ns)
-        else:
-            bring_into_force(self._history, THERMAL, self.nominal, model, __version__, WHILE)
-        return Outcome(command, Code.ACCEPT, f"thermal model {WHILE}")
+        """What other nodes brought into force while this was recorded."""
+        history, changed = self._history, []
+        for kind, model in in_force_beside(command).items():
+            if model == history.head(kind).model:
+                continue
+            changed.append(kind)
+            if model is None:
+                why = {"by": BY, "reason": WHILE}
+                history.rollback(to=0, kind=kind, **why, expected_head=None, wall_ns=wall_ns)
+            else:
+                bring_into_force(history, kind, self.nominal, model, __version__, WHILE)
+        return Outcome(command, Code.ACCEPT, f"{', '.join(changed) or 'as before'} {WHILE}")
 
 
 Document = Mapping[str, Any]
@@ -586,6 +590,12 @@ def configured_with(
         **in_force,
     }
     return Command(CONFIGURE, arguments, session.newest_joints_ns, session.marks)
+
+
+def in_force_beside(configured: Command) -> dict[str, Any]:
+    """Models, by kind, that a configuration has of other nodes: thermal, and of instruments."""
+    arguments = configured.arguments  # of most sessions, and of older recordings, without these
+    return {THERMAL: arguments.get("model"), **arguments.get("instruments", {})}
 
 
 def recorded_arguments(nominal: SerialArm, configured: Command, names: Sequence[str]) -> Document:

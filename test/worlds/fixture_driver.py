@@ -69,7 +69,15 @@ class Driven:
     def __init__(self, history):
         self.session = FixtureSession(ARM, history, CONFIG, "test")
         self.configured = fixture_configuration(self.session, {kind: f"/{kind}" for kind in TYPE})
-        self.sent, self.told, self.all = [], [], []
+        self.newest, self.sent, self.told, self.all = self.configured, [], [], []
+
+    def look(self):
+        """As the node before each command: what came into force is told."""
+        self.session.poll()
+        now = fixture_configuration(self.session, self.newest.arguments["topics"])
+        if now.arguments != self.newest.arguments:
+            self.newest = now
+            self.all.append(now)
 
     def feed(self, sent):
         for one in sent:
@@ -83,6 +91,7 @@ class Driven:
         stamp, q = self.session.newest_joints_ns, fixture_poses()[-1]
         for k in range(1, 12):
             self.feed([Sent(JOINTS, JointSample(stamp + k * 20_000_000, ARM.joint_names, q))])
+        self.look()
         done = self.session.step(wall_ns=self.session.newest_joints_ns)
         self.told += [(outcome.command, json.loads(outcome_text(outcome))) for outcome in done]
         self.all += done
