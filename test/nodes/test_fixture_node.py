@@ -121,6 +121,7 @@ def test_diagnostics_warn_of_a_fixture_that_another_place_of_the_sensor_taught(c
     cell.graph.spin_until(taught)
     assert "taught" not in newest().message
     with CalibrationHistory.open("F1", model_hash=ARM.model_hash, state_dir=tmp_path) as history:
-        mounted(history, T_FLANGE_SENSOR @ frames.transform(np.eye(3), [1e-4, 0.0, 0.0]))
-    cell.graph.spin_until(lambda: "another place of feature_sensor" in newest().message)
+        mounted(history, T_FLANGE_SENSOR @ frames.transform(np.eye(3), [4e-4, 0.0, 0.0]))
+    words = "another place of feature_sensor 0.400 mm away"
+    cell.graph.spin_until(lambda: words in newest().message)
     assert newest().level == DiagnosticStatus.WARN
