@@ -120,6 +120,8 @@ def test_diagnostics_warn_of_a_fixture_that_another_place_of_the_sensor_taught(c
     taught = lambda: any(one.value == "yes" for one in newest().values)  # noqa: E731
     cell.graph.spin_until(taught)
     assert "taught" not in newest().message
+    placed = {one.key: one.value for one in newest().values}["placed"]
+    assert placed == "tool by the robot file, feature_sensor by calibration 1"
     with CalibrationHistory.open("F1", model_hash=ARM.model_hash, state_dir=tmp_path) as history:
         mounted(history, T_FLANGE_SENSOR @ frames.transform(np.eye(3), [4e-4, 0.0, 0.0]))
     words = "another place of feature_sensor 0.400 mm away"
