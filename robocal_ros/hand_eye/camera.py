@@ -302,15 +302,16 @@ def unsettled(fit: PairFit) -> Verdict | None:
     )
 
 
-def judge_camera(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdict:
-    """Whether a solution may be used; ``size`` (n,) of the residuals used, m."""
-    count, total = len(size), len(fit.pairs)
+def judge_camera(fit: PairFit, limit_m: float) -> Verdict:
+    """Whether a solution may be used."""
+    if refused := unsettled(fit):
+        return refused
+    size = np.linalg.norm(fit.differences[~fit.rejected][:, :3], axis=1)
+    count, total, error_m = len(size), len(fit.pairs), working_error(fit)
     words = (
         f"{count} of {total} samples within {rms(size) * 1e3:.3f} mm rms; expected error "
         f"{error_m * 1e3:.3f} mm at {fit.pairs.distance_m * 1e3:.0f} mm"
     )
-    if fit.estimate.creeping:
-        return Verdict(Code.POSES_NOT_INFORMATIVE, f"{fit.estimate.creeping}; {words}")
     if rms(size) > LARGEST_RMS_M:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
@@ -490,7 +491,6 @@ def _reasons(fit: PairFit) -> dict[str, str]:
 
 def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
     kept, miss = fit.pairs.take(~fit.rejected), fit.differences[~fit.rejected]
-    size, error_m = np.linalg.norm(miss[:, :3], axis=1), working_error(fit)
     forms = {name: closed_form(name, kept) for name in CLOSED_FORMS}
     result = replace(
         _unjudged(kept, fit.at, miss, how.method, forms, fit.pairs.distance_m),
@@ -498,8 +498,8 @@ def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
         covariance=fit.covariance[:6, :6],
         leave_one_out_m=left_out(fit),
         rejected=_reasons(fit),
-        working_error_m=error_m,
-        verdict=unsettled(fit) or judge_camera(fit, size, error_m, how.limit_m),
+        working_error_m=working_error(fit),
+        verdict=judge_camera(fit, how.limit_m),
     )
     erring = joint_errors(fit, how.joint_error_rad, how.noise) if how.joint_error_rad else None
     return said_of_joints(result, erring), fit.estimate.state
@@ -531,7 +531,8 @@ def joint_errors(fit: PairFit, size_rad: float, given: GivenNoise) -> JointError
 def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
     """The closed form that fits all samples best; the most likely placement judges it.
 
-    Its error to expect is its distance from that placement, where the boards were, with that one's.
+    Its error to expect is its distance from that placement, where the boards were, with that one's:
+    what refuses that one leaves nothing to judge by.
     """
     pairs = fit.pairs
     forms = {name: closed_form(name, pairs) for name in CLOSED_FORMS}
@@ -545,16 +546,18 @@ def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairStat
     away_m = apart(at.X, fit.at.X, pairs.T_camera_board[:, :3, 3])
     error_m = float(np.hypot(away_m, working_error(fit)))
     words = f"{name} fits {len(size)} samples within {rms(size) * 1e3:.3f} mm rms"
-    judged = judge_classic(away_m, error_m, how.limit_m)
-    judged = Verdict(judged.code, f"{words}; {judged.reason}")
-    if rms(size) > LARGEST_RMS_M:
+    judged = judge_camera(fit, how.limit_m)
+    if judged.accept and rms(size) > LARGEST_RMS_M:
         words += f" (allowed {LARGEST_RMS_M * 1e3:.0f} mm): use method best"
         judged = Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    elif judged.accept:
+        judged = judge_classic(away_m, error_m, how.limit_m)
+        judged = Verdict(judged.code, f"{words}; {judged.reason}")
     result = replace(
         _unjudged(pairs, at, miss, name, forms, pairs.distance_m),
         leave_one_out_m=left_out_of_form(name, pairs, at),
         working_error_m=error_m,
-        verdict=unsettled(fit) or judged,
+        verdict=judged,
     )
     return result, PairState(at, np.zeros(0))
 

@@ -334,6 +334,23 @@ def test_classic_is_judged_by_its_distance_from_the_best(mount: str) -> None:
     assert "use method best" in refused.verdict.reason
 
 
+def test_classic_is_refused_where_the_best_that_judges_it_is() -> None:
+    """Two boards: one placement fits neither, and two in five samples are left out."""
+    _, pairs = measured(40, 18)
+    T = pairs.T_camera_board.copy()
+    for i in range(0, 40, 5):
+        for row in (i, i + 2):
+            T[row] = moved(T[row], np.array([3e-3, 0.0, 0.0, 0.0, 0.0, 0.0]) * (1.0 + row / 40))
+    of_two = replace(pairs, T_camera_board=T)
+    best, classic = (
+        calibrate_camera(of_two, CameraSettings(method, KNOWN, limit_m=0.1))
+        for method in ("best", "classic")
+    )
+    assert best.verdict.code is Code.RESIDUAL_TOO_LARGE
+    assert "too many samples miss the others" in best.verdict.reason
+    assert classic.verdict == best.verdict
+
+
 def test_classic_leaves_each_out_in_turn() -> None:
     _, pairs = measured(9, 18)
     found = calibrate_camera(pairs, CameraSettings("classic"))
