@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from robocal_ros.estimation.assessment import pose_groups
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.ground.frames import Array
@@ -38,6 +39,7 @@ from robocal_ros.session import events
 from robocal_ros.session.events import Command
 from robocal_ros.session.inputs import Ignored
 from robocal_ros.thermal.drift_following import InForce
+from robocal_ros.thermal.reference import SAME_VISIT_RAD
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
 MOST_KEPT = 20000  # observations that no command has used
@@ -401,6 +403,29 @@ class Windows:
         )
         return self._desk.from_ns if calibrates else self._cycle_ns()
 
+    def left_out(self, from_ns: int) -> str:
+        """Say what of the unused was measured before the pause that ended at a stamp; or nothing.
+
+        Named are poses not visited since: a run that a stop has parted is no whole cold visit.
+        """
+        from scipy.spatial import cKDTree
+
+        unused = self._desk.unused(self._desk.from_ns)
+        early = np.array([o.q for o in unused if o.sample.stamp_ns < from_ns])
+        if not len(early):
+            return ""
+        pause = f"a pause of over {self._config.cycle_timeout_s:g} s"
+        words = f"; left out: {len(early)} measurements before {pause}"
+        since = cKDTree([o.q for o in unused if o.sample.stamp_ns >= from_ns])
+        lost = early[since.query(early, p=np.inf)[0] >= SAME_VISIT_RAD]
+        if len(lost):
+            words += (
+                f", poses among them not visited since: {pose_groups(lost).max() + 1} (to have "
+                "these count, visit all without such a pause or with a longer cycle_timeout_s, "
+                "and capture again)"
+            )
+        return words
+
     def of(self, command: Command) -> tuple[Measurements, Array]:
         """Targets on the flange, and centres (n, 3) of a sphere fixed in the cell.
 
@@ -410,10 +435,6 @@ class Windows:
         desk, reference = self._desk, self._current.reference
         desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", desk.from_ns)) - 1
-        for early in desk.unused(desk.from_ns):
-            if early.sample.stamp_ns <= after and command.name == events.CAPTURE_REFERENCE:
-                words = f"before a pause of over {self._config.cycle_timeout_s:g} s"
-                desk.ignored.add(early.sample.topic, words)
         observed = desk.window(after, command.stamp_ns or 0, command.marks or {})
         fixed = [o.sample.position_m for o in observed if o.sample.topic == REFERENCE_SPHERE]
         found = [o for o in observed if o.sample.topic != REFERENCE_SPHERE]

@@ -277,7 +277,7 @@ class Proposer:
                 f"{', '.join(reference.rejected)}"
             )
         command, expected, from_what = self._expected(command)
-        message += which_arm + from_what
+        message += str(command.arguments.get(LEFT_OUT, "")) + which_arm + from_what
         if words := other_sides(reference.spots, reference.data):
             message += f"; {words}"
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
@@ -373,6 +373,7 @@ class Proposer:
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
 
 
+LEFT_OUT = "left_out"  # argument of a capture: words on what was measured before its visit
 NAMED_SHARE = 0.25  # of a joint's backlash
 
 

@@ -10,7 +10,14 @@ import numpy as np
 
 from robocal_ros.estimation.sphere import SphereRule, cloud_sample
 from robocal_ros.ground import frames
-from robocal_ros.ground.errors import Code, ConflictError, InputError, RobocalError, StorageError
+from robocal_ros.ground.errors import (
+    Code,
+    ConflictError,
+    InputError,
+    RobocalError,
+    StorageError,
+    TooFewSamplesError,
+)
 from robocal_ros.ground.frames import Array
 from robocal_ros.ground.samples import (
     JOINTS,
@@ -65,7 +72,7 @@ from robocal_ros.thermal.observations import (
     PlacedShot,
     Windows,
 )
-from robocal_ros.thermal.proposing import Proposer
+from robocal_ros.thermal.proposing import LEFT_OUT, Proposer
 from robocal_ros.thermal.reference import SAME_VISIT_RAD, ColdReference
 
 SAME_CLOCK_NS = 1_000_000_000
@@ -174,8 +181,11 @@ class ThermalSession(SessionBase):
         if (begins or command.name in events.CYCLE) and not arguments.get("cycle_id"):
             by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
             arguments["cycle_id"] = by_time if begins else self.cycle.id or by_time
-        if command.marks is None and command.name in events.MEASURED:
-            arguments.setdefault("from_ns", self.windows.from_ns(command))
+        chosen = "from_ns" in arguments or command.marks is not None  # by the caller, or recorded
+        if command.name in events.MEASURED and not chosen:
+            arguments["from_ns"] = from_ns = self.windows.from_ns(command)
+            if command.name == events.CAPTURE_REFERENCE:
+                arguments[LEFT_OUT] = self.windows.left_out(from_ns)
         return super()._completed(replace(command, arguments=arguments))
 
     def _handlers(self) -> Mapping[str, Handler]:
@@ -196,7 +206,10 @@ class ThermalSession(SessionBase):
         data, fixed = self.windows.of(command)
         beside = self._beside(command, data, fixed)
         frame = self.desk.frame or ""
-        outcome = self._proposer.capture(command, data, beside, frame, wall_ns)
+        try:
+            outcome = self._proposer.capture(command, data, beside, frame, wall_ns)
+        except TooFewSamplesError as error:
+            raise TooFewSamplesError(f"{error}{command.arguments.get(LEFT_OUT, '')}") from error
         self._close_cycle(command)
         return outcome
 

@@ -112,7 +112,55 @@ def test_a_cold_reference_holds_nothing_of_a_warm_day_before(tmp_path):
     assert one.samples == other.samples == POSES
     positions = [made.session.reference.data.position for made in (alone, after)]
     assert np.max(np.abs(positions[0] - positions[1])) < 6.0 * CONFIG.sigma_m  # 20 K: 0.5 mm
-    assert after.session.ignored.words().count("before a pause of over 60 s") == 1
+    assert f"left out: {POSES} measurements before a pause of over 60 s" in other.message
+    assert "left out" not in one.message
+    assert "not visited since" not in other.message
+
+
+def test_a_cold_visit_that_a_stop_parted_says_what_it_lacks(tmp_path):
+    cell = Cell(tmp_path / "live")
+    cell.q = postures(cell.nominal, 2 * POSES)
+    cell.visit(poses=slice(POSES))
+    later = list(cell.shift.visit(cell.cold, cell.q[POSES:], after_h=0.1))
+    cell.feed(later)
+    parted = cell.ask(events.CAPTURE_REFERENCE)
+    assert (parted.status, parted.samples) == (Code.ACCEPT, POSES)
+    words = f"; left out: {POSES} measurements before a pause of over 60 s, poses among them "
+    assert f"{words}not visited since: {POSES} (to have these count, visit all" in parted.message
+    again = Cell(tmp_path / "again")  # from a recording that began after the stop
+    again.feed(later)
+    again.session.submit(parted.command)
+    (replayed,) = again.session.advance(wall_ns=1, force=True)
+    assert (replayed.message, replayed.samples) == (parted.message, parted.samples)
+    cell.visit(after_h=0.1)
+    whole = cell.ask(events.CAPTURE_REFERENCE)
+    assert (whole.status, whole.samples) == (Code.ACCEPT, 2 * POSES)
+    assert "left out" not in whole.message
+
+
+def test_a_refused_capture_says_what_a_stop_parted_and_keeps_it(tmp_path):
+    cell = Cell(tmp_path)
+    cell.visit(poses=slice(6))
+    cell.visit(poses=slice(6, POSES), after_h=0.1)
+    refused = cell.ask(events.CAPTURE_REFERENCE)
+    assert refused.status is Code.TOO_FEW_SAMPLES
+    assert "left out: 6 measurements before a pause of over 60 s" in refused.message
+    assert "not visited since: 6" in refused.message
+    cell.visit(poses=slice(6))
+    whole = cell.ask(events.CAPTURE_REFERENCE)
+    assert (whole.status, whole.samples) == (Code.ACCEPT, POSES)
+    assert "not visited since" not in whole.message
+
+
+def test_a_window_that_the_caller_chose_lacks_nothing(tmp_path):
+    cell = Cell(tmp_path)
+    cell.visit()
+    from_ns = cell.shift.now_ns
+    cell.visit(after_h=0.1)
+    found = cell.ask(events.CAPTURE_REFERENCE, from_ns=from_ns)
+    assert (found.status, found.samples) == (Code.ACCEPT, POSES)
+    assert "left out" not in found.message + cell.session.ignored.words()
+    assert "before a pause" not in found.message + cell.session.ignored.words()
 
 
 def test_a_cycle_needs_a_cold_reference(tmp_path):
