@@ -148,6 +148,11 @@ class OfferedTool(OfferedCalibration):
     T_flange_tool: Array | None  # (4, 4); None: the taught tool again
     child: str
 
+    @property
+    def used_revision(self) -> int:
+        """The one corrected with; 0: the taught tool, also where another one's is in force."""
+        return 0 if self.T_flange_tool is None else self.revision
+
 
 def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:
     if len(values) == 0:

@@ -486,7 +486,7 @@ class CorrectionSession:
             offset=offset,
             withheld=withheld,
             revision=self._gate.revision if self._enabled and not self._gate.stale else None,
-            tool_revision=None if tool is None else tool.revision,
+            tool_revision=None if tool is None else tool.used_revision,
         )
 
     def counted(self, act: Callable[[], Answer]) -> Answer:
@@ -555,7 +555,7 @@ class CorrectionSession:
             survey=self._gate.survey,
             waiting_revision=None if self._gate.waiting is None else self._gate.waiting.revision,
             new_tool=tools.T_flange_tool is not None,
-            tool_revision=None if tools.in_use is None else tools.in_use.revision,
+            tool_revision=None if tools.in_use is None else tools.in_use.used_revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
             stale=self._gate.stale,
             payload=self._gate.payload,

@@ -411,11 +411,13 @@ class Windows:
         from scipy.spatial import cKDTree
 
         unused = self._desk.unused(self._desk.from_ns)
-        early = np.array([o.q for o in unused if o.sample.stamp_ns < from_ns])
-        if not len(early):
+        before = [o for o in unused if o.sample.stamp_ns < from_ns]
+        if not before:
             return ""
         pause = f"a pause of over {self._config.cycle_timeout_s:g} s"
-        words = f"; left out: {len(early)} measurements before {pause}"
+        words = f"; left out: {len(before)} measurements before {pause}"
+        visits = one_per_visit(before, self._config.standstill.tolerance_rad)
+        early = np.array([o.q for o in visits])
         since = cKDTree([o.q for o in unused if o.sample.stamp_ns >= from_ns])
         lost = early[since.query(early, p=np.inf)[0] >= SAME_VISIT_RAD]
         if len(lost):

@@ -42,6 +42,17 @@ class ToolInForce(HistoryFollower):
         self.mandrel: Head = self.history.head(MANDREL)
         self.station: Head = self.history.head(LASER_FRAME)
 
+    def stamp_ns(self, head: Head) -> int:
+        """When what is in force was measured; 0: nothing is, or a recording does not tell."""
+        if head.model is None or head.calibration_id is None:
+            return 0
+        return int(head.model.get("stamp_ns") or self.history.get(head.calibration_id).stamp_ns)
+
+    def stamped(self, head: Head) -> dict[str, Any] | None:
+        """Its model with that stamp, which those of older versions lack."""
+        stamp_ns = self.stamp_ns(head)
+        return head.model | {"stamp_ns": stamp_ns} if head.model and stamp_ns else head.model
+
     @property
     def foreign(self) -> str:
         """Why what the history has in force says nothing of this tool; empty: it does.

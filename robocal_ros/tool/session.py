@@ -327,13 +327,12 @@ class ToolResults:
         """Whether the station may have moved between tool and first mandrel's run.
 
         The change is between two tools, both against the healthy one: the station counts from the
-        later of the two. By the stamps that the models bear, which a recording holds too.
+        later of the two.
         """
         current = self._current
-        tools = current.model or {}, current.healthy.model or {}
-        tool_ns = max(int(model.get("stamp_ns", 0)) for model in tools)
-        mandrel_ns = int((current.mandrel.model or {}).get("stamp_ns", 0))
-        return 0 < tool_ns < mandrel_ns - TOGETHER_NS
+        tools = (current.head, current.model), (current.healthy, current.measured_healthy)
+        tool_ns = max((current.stamp_ns(head) for head, used in tools if used), default=0)
+        return 0 < tool_ns < current.stamp_ns(current.mandrel) - TOGETHER_NS
 
     def early(self, run: ToolRun, command: Command) -> Outcome | None:
         """The answer of a quick check whose circle says enough; None: go on."""
@@ -631,9 +630,9 @@ def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
     current = session.current
     in_force = {
         "model": current.thermal.model,
-        "tool": current.head.model,
-        OWN["tool"]: current.healthy.model,
-        "mandrel": current.mandrel.model,
+        "tool": current.stamped(current.head),
+        OWN["tool"]: current.stamped(current.healthy),
+        "mandrel": current.stamped(current.mandrel),
         "station": current.station.model,
     }
     return configured_with(session, topics, session.config.document(), in_force)

@@ -150,7 +150,8 @@ def test_that_a_tool_says_nothing_of_the_mounted_one_is_news(robot: Robot) -> No
     """tcf_node says so of the same revision, once another tool is taught; and takes it back."""
     robot.change_tool(bent_tool(revision=5, stamp_ns=10))
     robot.change_tool(bent_tool(revision=5, stamp_ns=10, T_flange_tool=None))
-    assert not robot.session.status().new_tool
+    status = robot.session.status()
+    assert (status.new_tool, status.tool_revision) == (False, 0)  # not the one in force
     assert np.array_equal(robot.settle(), HOME)
     robot.change_tool(bent_tool(revision=5, stamp_ns=10))
     assert np.abs(robot.settle() - HOME).max() > 1e-3

