@@ -269,7 +269,7 @@ def test_a_measured_tool_waits_for_the_robot_to_stand(graph: Any) -> None:
     # rolled back: the taught tool again
     back = tool_message(np.eye(4), 6, state=ToolFrame.NONE)
     line.take(back, line.to_tool, "tool")
-    graph.spin_until(lambda: adopted(6), "the taught tool is back")
+    graph.spin_until(lambda: adopted(0), "the taught tool is back")
     assert np.allclose(line.settle().position, HOME, rtol=0.0, atol=1e-12)
 
 
