@@ -24,7 +24,7 @@ from robocal_ros.thermal.accuracy import (
     both_errors,
     offset_error,
 )
-from robocal_ros.tool.run import ANOTHER_M, ANOTHER_RAD, away_from
+from robocal_ros.tool.run import taught_apart
 
 NS, MM = 1_000_000_000, 1e-3
 REMEMBERED = 200  # ended cycles
@@ -202,11 +202,9 @@ class ToolRecord:
     def of_taught(self, T_flange_tool: Array) -> "ToolRecord":
         """It, where it was of the tool that is taught so (4, 4), else of one never checked."""
         rows = T_flange_tool.tolist()
-        if len(self.taught):
-            size_m, angle_rad = away_from(np.array(self.taught), T_flange_tool)
-            if size_m > ANOTHER_M or angle_rad > ANOTHER_RAD:
-                words = "the tool was taught otherwise when it was checked"
-                return ToolRecord(words=words, laser_ns=self.laser_ns, taught=rows)
+        if self.taught and taught_apart(np.array(self.taught), T_flange_tool):
+            words = "the tool was taught otherwise when it was checked"
+            return ToolRecord(words=words, laser_ns=self.laser_ns, taught=rows)
         return replace(self, taught=rows)
 
     @staticmethod

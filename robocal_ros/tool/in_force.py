@@ -11,15 +11,7 @@ from robocal_ros.history.history_records import HEALTHY_TOOL, LASER_FRAME, MANDR
 from robocal_ros.kinematics import SerialArm
 from robocal_ros.session.events import HistoryFollower
 from robocal_ros.tool.judging import KnownTool
-from robocal_ros.tool.run import (
-    ANOTHER_M,
-    ANOTHER_RAD,
-    RunTraits,
-    ToolConfig,
-    alike,
-    away_from,
-    made_with,
-)
+from robocal_ros.tool.run import RunTraits, ToolConfig, alike, made_with, taught_apart
 from robocal_ros.tool.station import StationMeasurement, StationTrend, measurement_of
 
 
@@ -62,14 +54,13 @@ class ToolInForce(HistoryFollower):
         made = (self.head.model or {}).get("made_with")
         if made is None:
             return ""
-        size_m, angle_rad = away_from(np.array(made["taught"]), self._taught.T_flange_tool)
-        if size_m <= ANOTHER_M and angle_rad <= ANOTHER_RAD:
+        apart = taught_apart(np.array(made["taught"]), self._taught.T_flange_tool)
+        if not apart:
             return ""
         return (
             f"calibration {self.head.calibration_id} was measured of a tool that was taught "
-            f"{1e3 * size_m:.2f} mm and {np.degrees(angle_rad):.2f} deg from this one and is not "
-            "used: measure the mounted tool and accept it, roll back, or put taught_xyz_mm and "
-            "taught_quat_xyzw right"
+            f"{apart} from this one and is not used: measure the mounted tool and accept it, "
+            "roll back, or put taught_xyz_mm and taught_quat_xyzw right"
         )
 
     @property

@@ -454,11 +454,14 @@ def alike(one: object, other: object) -> bool:
 ANOTHER_M, ANOTHER_RAD = 1e-4, float(np.radians(0.1))  # a pendant rounds by less
 
 
-def away_from(taught: Array, other: Array) -> tuple[float, float]:
-    """How far one taught tool (4, 4) is from another one: m, and rad about any axis."""
+def taught_apart(taught: Array, other: Array) -> str:
+    """By how much one taught tool (4, 4) is from another one, in words; empty: it is the same."""
     away = frames.invert(taught) @ other
-    angle = float(np.linalg.norm(frames.log_rotation(away[:3, :3])))
-    return float(np.linalg.norm(away[:3, 3])), angle
+    size_m = float(np.linalg.norm(away[:3, 3]))
+    angle_rad = float(np.linalg.norm(frames.log_rotation(away[:3, :3])))
+    if size_m <= ANOTHER_M and angle_rad <= ANOTHER_RAD:
+        return ""
+    return f"{1e3 * size_m:.2f} mm and {np.degrees(angle_rad):.2f} deg"
 
 
 PLANNING = Held(along_m=5e-3)  # before any plunge the tip is taken where it was taught

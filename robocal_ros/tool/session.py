@@ -175,7 +175,8 @@ class ToolResults:
         witness = witness_of(found, in_force, self._config.bend, since)
         if turned := run.turned(estimate):
             witness = replace(witness, cause="station", reason=turned)
-        witness = self._with_mandrel(witness, found, shift, command)
+        young = self._mandrel_is_young()
+        witness = self._with_mandrel(witness, found, shift, young, command)
         verdict = judge_tool(found, estimate, taught, stands, self._config.limits, witness)
         erring = self._joint_errors(run, estimate, found)
         if erring is not None:
@@ -186,7 +187,7 @@ class ToolResults:
             "absolute": absolute,
             "witness": witness.document(),
         }
-        known: Document = {"cause": witness.cause, "mandrel_young": self._mandrel_is_young()}
+        known: Document = {"cause": witness.cause, "mandrel_young": young}
         if witness.cause == "tool" and witness.tip_m <= SMALL_M:  # many of them do not add up
             known["anchor"] = anchor.tolist()
         model = found.document() | known
@@ -298,15 +299,14 @@ class ToolResults:
         return Outcome(command, verdict.code, verdict.reason, station.document())
 
     def _with_mandrel(
-        self, witness: Witness, found: KnownTool, shift: Array, command: Command
+        self, witness: Witness, found: KnownTool, shift: Array, young: bool, command: Command
     ) -> Witness:
         """Ask the mandrel, while its answer is fresh: whose is the change?
 
         It was measured after this change where what was seen then is within `SMALL_M` of what is
-        found now: more cannot have come since. One that was first measured later than the tool
-        that the change is counted from says nothing of the time between.
+        found now: more cannot have come since. One that is ``young``, first measured later than the
+        tool that the change is counted from, says nothing of the time between.
         """
-        young = self._mandrel_is_young()
         if self._station is not None:
             stamp_ns, station, changed = self._station
             if 0 <= (command.stamp_ns or 0) - stamp_ns <= WITNESS_NS:
