@@ -21,12 +21,13 @@ from robocal_ros.ground.samples import (
 )
 from robocal_ros.session import events
 from robocal_ros.session.events import (
+    CHANGED,
     Command,
     Outcome,
     SessionBase,
     digest,
-    in_force_beside,
     read_command,
+    with_changes,
 )
 from robocal_ros.session.inputs import Between
 
@@ -108,7 +109,7 @@ def read_events(
     configuration is the one that it led to.
     """
     configured: Command | None = None
-    beside = in_force_beside(Command(events.CONFIGURE))
+    newest = Command(events.CONFIGURE)
     before = 0  # jumps of the clock
     found: list[tuple[Command, dict[str, Any]]] = []
     for recorded in messages:
@@ -117,9 +118,11 @@ def read_events(
         if command.name == events.CONFIGURE:
             if not found:
                 configured, before = command, _jumps(command)
-            elif "reference" not in command.arguments and in_force_beside(command) != beside:
-                found.append((command, {}))  # another node brought another model into force
-            beside = in_force_beside(command)
+            elif "reference" not in command.arguments:
+                command = with_changes(command, newest)
+                if command.arguments[CHANGED]:  # another node brought another model into force
+                    found.append((command, {}))
+            newest = command
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
         elif not found:

@@ -371,6 +371,11 @@ class HistoryFollower:
         self.thermal: Head = self.head if own else self.history.head(THERMAL)
         self.__dict__.pop("arm", None)
 
+    @property
+    def beside(self) -> tuple[Head, ...]:
+        """Heads of other nodes' kinds that its own calibrations are measured with."""
+        return () if self.kind == THERMAL else (self.thermal,)
+
     @cached_property
     def arm(self) -> SerialArm:
         """The arm with the thermal model in force; the same one until a look reads heads anew."""
@@ -399,6 +404,7 @@ class HistoryFollower:
 
 
 WHILE = "in force while this was recorded"
+CHANGED = "changed"  # of a recorded configuration: kinds that the one before had otherwise
 GAP_NS = 250_000_000
 MOST_LOST = 500  # stretches of an input between two commands; the count of the joints tells more
 Handler = Callable[[Command, int], Outcome]
@@ -433,6 +439,11 @@ class SessionBase:
     def in_force(self) -> Head:
         """Head of its kind as the session last saw it."""
         return self._followed.head
+
+    @property
+    def revisions_beside(self) -> dict[str, int]:
+        """Revisions, by kind, of what other nodes brought into force, as of the last look."""
+        return {head.kind: head.revision for head in self._followed.beside}
 
     @property
     def fault(self) -> str:
@@ -559,16 +570,14 @@ class SessionBase:
 
     def _reconfigured(self, command: Command, wall_ns: int) -> Outcome:
         """What other nodes brought into force while this was recorded."""
-        history, changed = self._history, []
-        for kind, model in in_force_beside(command).items():
-            if model == history.head(kind).model:
-                continue
-            changed.append(kind)
-            if model is None:
+        history, changed = self._history, command.arguments[CHANGED]
+        for kind in changed:
+            model = in_force_beside(command)[kind]
+            if model is not None:
+                bring_into_force(history, kind, self.nominal, model, __version__, WHILE)
+            elif history.head(kind).model is not None:
                 why = {"by": BY, "reason": WHILE}
                 history.rollback(to=0, kind=kind, **why, expected_head=None, wall_ns=wall_ns)
-            else:
-                bring_into_force(history, kind, self.nominal, model, __version__, WHILE)
         return Outcome(command, Code.ACCEPT, f"{', '.join(changed) or 'as before'} {WHILE}")
 
 
@@ -588,6 +597,7 @@ def configured_with(
         "topics": dict(topics),
         "config": dict(config),
         **in_force,
+        "revisions": session.revisions_beside,
     }
     return Command(CONFIGURE, arguments, session.newest_joints_ns, session.marks)
 
@@ -596,6 +606,17 @@ def in_force_beside(configured: Command) -> dict[str, Any]:
     """Models, by kind, that a configuration has of other nodes: thermal, and of instruments."""
     arguments = configured.arguments  # of most sessions, and of older recordings, without these
     return {THERMAL: arguments.get("model"), **arguments.get("instruments", {})}
+
+
+def with_changes(configured: Command, before: Command) -> Command:
+    """A configuration with the kinds of other nodes that ``before`` had otherwise.
+
+    The same model brought into force again is another revision; older recordings tell none.
+    """
+    beside, had = in_force_beside(configured), in_force_beside(before)
+    its, had_its = (one.arguments.get("revisions", {}) for one in (configured, before))
+    changed = [k for k in beside if beside[k] != had.get(k) or its.get(k) != had_its.get(k)]
+    return replace(configured, arguments={**configured.arguments, CHANGED: changed})
 
 
 def recorded_arguments(nominal: SerialArm, configured: Command, names: Sequence[str]) -> Document:
