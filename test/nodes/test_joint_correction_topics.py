@@ -247,7 +247,8 @@ def test_the_status_is_latched_and_goes_out_every_second(graph: Any) -> None:
 
 
 def test_a_measured_tool_waits_for_the_robot_to_stand(graph: Any) -> None:
-    line = Line(graph, enable_on_start=True, taught_xyz_mm=[0.0, 0.0, 250.0])
+    patient = {"stream_gap_s": 1.0}  # a stream that waits for a core is no pause
+    line = Line(graph, enable_on_start=True, taught_xyz_mm=[0.0, 0.0, 250.0], **patient)
     T = np.eye(4)
     T[:3, 3] = (0.002, 0.0, 0.25)
     line.target()
