@@ -9,7 +9,7 @@ A point's frames are those of the motions that name it. Sources are in docs/prog
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,8 @@ _MOVES = re.compile(
     r"\b((?:Move|Trigg|Arc|Spot|Search|Paint|Disp)\w*)\b([^;:]*(?::=[^;:]*)*);", re.I
 )
 _PLAIN = {"movej": 1, "movel": 1, "movec": 2, "moveabsj": 1}
+_BY_JOINTS = re.compile(r"(?:Move|Trigg|Spot|Paint)J", re.I)
+_CONF = re.compile(r"\bConf([JL])\b\s*(?:\\\s*(On|Off)\b)?\s*;", re.I)
 _COMPUTED = re.compile(r"\b(Offs|RelTool)\s*\(\s*(\w+)", re.I)
 _CHANGED = re.compile(
     r"\b\w+(?:\{[^}]*\})?\.(?:trans|rot|robconf|extax|robax|tframe|uframe|oframe)\b[^;:]*:=[^;]*"
@@ -55,6 +57,27 @@ _CHANGED = re.compile(
     r"|\b(?:PDisp|EOffs)(?:On|Set)\b[^;]*",
     re.I,
 )
+
+
+@dataclass
+class _Motions:
+    """The motions that name a point: tool and work object, `MANY` where they differ.
+
+    ``at``: where the first of them stands. ``free``: all are run with ConfL or ConfJ off.
+    """
+
+    tool: str
+    frame: str
+    at: int
+    free: bool
+
+    def joined(self, other: "_Motions") -> "_Motions":
+        """Both, this one first."""
+        tool, frame = (
+            one if one == two else MANY
+            for one, two in ((self.tool, other.tool), (self.frame, other.frame))
+        )
+        return _Motions(tool, frame, self.at, self.free and other.free)
 
 
 class RapidDialect(Dialect):
@@ -88,15 +111,17 @@ class RapidDialect(Dialect):
             if found.start(1) not in declared and name in frames.keys() | problems.keys():
                 problems[name] = f"{name} is set again in line {line}"
         uses = _uses(text, clean, frames, points)
-        framed = [_framed(name, point, uses, problems) for name, point in points]
+        framed = [
+            _framed(name, replace(point, order=len(text) + point.fields[0].start), uses, problems)
+            for name, point in points
+        ]
         framed.sort(key=lambda point: point.fields[0].start)
         made = [
             (found.start(), f"{found[1]}({found[2]}, …)") for found in _COMPUTED.finditer(clean)
         ]
         made += [(found.start(), " ".join(found[0].split())) for found in _CHANGED.finditer(clean)]
         computed = tuple((line_of(text, at), words) for at, words in sorted(made))
-        ordered = tuple(replace(point, order=i) for i, point in enumerate(framed))
-        return Program(text, ordered, frames, computed)
+        return Program(text, tuple(framed), frames, computed, _notes(text, clean))
 
     def marks(self, point: ProgramPoint, stance: Stance) -> dict[str, str]:
         """Quadrants and cfx that have changed."""
@@ -208,14 +233,39 @@ def _read_frame(
     del problems[name]
 
 
+def _notes(text: str, clean: str) -> tuple[str, ...]:
+    return tuple(
+        f"line {line_of(text, found.start())}: Conf{found[1].upper()} is off: of a point that only "
+        "such motions go to, the posture nearest to the point before is taken, whatever its "
+        "configuration says"
+        for found in _CONF.finditer(clean)
+        if (found[2] or "").lower() == "off"
+    )
+
+
+def _is_free(kind: str, at: int, switches: Sequence["re.Match[str]"]) -> bool:
+    """Whether a motion that begins at ``at`` goes to the nearest posture (ConfJ, ConfL off).
+
+    Where no switch stands above it, one in a routine below may have been run before.
+    """
+    off = [
+        (found.start(), (found[2] or "").lower() == "off")
+        for found in switches
+        if found[1].upper() == kind
+    ]
+    above = [value for start, value in off if start < at]
+    return above[-1] if above else any(value for _, value in off)
+
+
 def _uses(
     text: str, clean: str, frames: dict[str, Array], points: list[tuple[str, ProgramPoint]]
-) -> dict[str, tuple[str, str]]:
-    """Tool and work object of the motions that name a point; `MANY` where they differ.
+) -> dict[str, _Motions]:
+    """What the motions say that name a point.
 
     Points that are written in a motion are added to ``points``.
     """
-    uses: dict[str, tuple[str, str]] = {}
+    uses: dict[str, _Motions] = {}
+    switches = list(_CONF.finditer(clean))
     for found in _MOVES.finditer(clean):
         parts = arguments(clean, found.start(2), found.end(2))
         parts = [part for part in parts if part.text and not re.fullmatch(r"\\\s*\w+", part.text)]
@@ -227,7 +277,9 @@ def _uses(
         else:
             tool = next((one.lower() for one in plain[1:] if one.lower() in frames), NONE)
         wobj = re.search(r"\\\s*WObj\s*:=\s*(\w+)", found[2], re.I)
-        pair = (tool, wobj[1].lower() if wobj else "wobj0")
+        kind = "J" if _BY_JOINTS.match(found[1]) else "L"
+        free = _is_free(kind, found.start(), switches)
+        use = _Motions(tool, wobj[1].lower() if wobj else "wobj0", found.start(), free)
         for part in parts[: _PLAIN.get(found[1].lower(), 2)]:
             at = clean.find("[", part.start, part.end)
             literal = (
@@ -238,12 +290,10 @@ def _uses(
             if literal:
                 name = f"{found[1]} in line {line_of(text, at)}"
                 points += _points(text, name, f"@{at}", _tree(clean, at))
-                uses[f"@{at}"] = pair
+                uses[f"@{at}"] = use
                 continue
             for name in _named(part.text):
-                before = uses.get(name, pair)
-                one, other = (a if a == b else MANY for a, b in zip(before, pair, strict=True))
-                uses[name] = (one, other)
+                uses[name] = uses[name].joined(use) if name in uses else use
     return uses
 
 
@@ -257,13 +307,19 @@ def _named(word: str) -> Sequence[str]:
 
 
 def _framed(
-    name: str, point: ProgramPoint, uses: dict[str, tuple[str, str]], problems: dict[str, str]
+    name: str, point: ProgramPoint, uses: dict[str, _Motions], problems: dict[str, str]
 ) -> ProgramPoint:
-    if point.joints or name not in uses:
+    if name not in uses:
         return point
-    tool, frame = uses[name]
-    problem = next((problems[one] for one in (tool, frame) if one in problems), "")
-    if MANY in (tool, frame):
+    use = uses[name]
+    point = replace(point, order=use.at)
+    if point.joints:
+        return point
+    if use.free:
+        point = replace(point, posture=Posture(), marks={})
+    ends = use.tool, use.frame
+    problem = next((problems[one] for one in ends if one in problems), "")
+    if MANY in ends:
         problem = "motions with different tools or work objects go to it"
-    known = (None if one in (NONE, MANY) else one for one in (tool, frame))
+    known = (None if one in (NONE, MANY) else one for one in ends)
     return replace(point, tool=next(known), frame=next(known), problem=point.problem or problem)

@@ -20,6 +20,7 @@ from bench.robot_programs import (
     poses_in,
     postures,
     programs,
+    rapid,
     side_view,
 )
 from robocal_ros.ground.errors import InputError
@@ -329,6 +330,26 @@ def test_without_a_configuration_the_posture_is_that_of_the_point_before():
     done = ProgramCorrection(dialect_of(".script"), MODELS, posture=q[0] + 0.05).correct(path)
     for one, joints in zip(done.points, q, strict=False):
         np.testing.assert_allclose(one.q, joints, atol=1e-7)
+
+
+def test_a_configuration_that_the_controller_does_not_follow_says_no_posture():
+    """Programs made off line leave it at zeros, with ConfL off: the arm stays as it came."""
+    q = POINTS[0] + np.linspace(0.05, 0.3, 5)[:, None] * [1.0, 0.3, -0.5, 0.4, 0.2, 1.0]
+    zeros = re.sub(r"\[-?\d,-?\d,-?\d,\d\](?=,\[9E9)", "[0,0,0,0]", rapid(q, POINTS[:1]))
+    none = "[0,0,0,0],[9E9,9E9"
+    assert zeros.count(none) == len(q)
+    found, _ = reasons(zeros, ".mod")
+    assert found[:-1] == ["no joints reach it in the configuration that it says"] * len(q)
+    free = zeros.replace("PROC main()\n", "PROC main()\n    ConfL \\Off;\n")
+    found, done = reasons(free, ".mod")
+    assert found == [""] * (len(q) + 1)
+    assert done.text.count(none) == len(q)  # it says as little as before
+    assert "nearest to the point before" in done.program.notes[0]
+    taught, told = poses_in("abb", zeros)[0], poses_in("abb", done.text)[0]
+    for one, joints, meant, T in zip(done.points, q, taught, told, strict=False):
+        np.testing.assert_allclose(one.q, joints, atol=2e-5)  # three decimals of a mm
+        away = missed(ACTUAL.fk(inverse(NOMINAL, T[None], joints)[0]), meant)
+        assert away[0] < 1e-6
 
 
 def test_an_ending_that_is_no_program():

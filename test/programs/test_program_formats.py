@@ -205,6 +205,33 @@ def test_a_switch_before_the_point_of_a_motion():
     assert (point.tool, point.frame) == ("tool0", "w1")
 
 
+@pytest.mark.parametrize(
+    ("switch", "motion", "followed"),
+    [
+        ("ConfL\\Off;", "MoveL", False),
+        ("ConfL\\Off;", "MoveJ", True),
+        ("ConfJ \\Off;", "MoveJ", False),
+        ("ConfL\\Off;\nConfL\\On;", "MoveL", True),
+        ("ConfL\\Off;\nMoveJ p1,v100,z10,tool0;", "MoveL", True),  # one of its motions follows it
+        ("! ConfL\\Off;", "MoveL", True),
+    ],
+)
+def test_a_configuration_holds_where_a_motion_follows_it(switch, motion, followed):
+    target = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    text = f"CONST robtarget p1:={target};\n{switch}\n{motion} p1,v100,z10,tool0;\n"
+    (point,) = dialect_of(".mod").read(text).points
+    assert point.posture.told is followed
+    assert bool(point.marks) is followed
+
+
+def test_points_come_in_the_order_of_their_motions():
+    target = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    text = "".join(f"CONST robtarget p{i}:={target};\n" for i in (1, 2, 3))
+    text += "MoveL p3,v100,z10,tool0;\nMoveL p1,v100,z10,tool0;\n"
+    points = sorted(dialect_of(".mod").read(text).points, key=lambda point: point.order)
+    assert [point.name for point in points] == ["p3", "p1", "p2"]
+
+
 def test_urscript_with_named_arguments_and_targets_that_are_not_read():
     script = (
         "movel(pose=p[1,2,3,0,0,0], a=1)\nl=[p[1,2,3,0,0,0]]\nmovel(l[0])\nmovej(q=[0,1,2,3,4,5])\n"
