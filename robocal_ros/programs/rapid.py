@@ -36,7 +36,7 @@ Tree = Field | list["Tree"]
 
 QUADRANT = 90.0 * DEGREE
 QUADRANT_OF = {"cf1": 0, "cf4": 3, "cf6": 5}
-NONE, MANY = "", "?"
+MANY = "?"
 
 _DECLARED = re.compile(
     r"\b(?P<type>robtarget|jointtarget|tooldata|wobjdata)\s+(?P<name>\w+)\s*(?:\{[^}]*\})?\s*:=\s*(?=\[)",
@@ -48,6 +48,7 @@ _MOVES = re.compile(
     r"\b((?:Move|Trigg|Arc|Spot|Search|Paint|Disp)\w*)\b([^;:]*(?::=[^;:]*)*);", re.I
 )
 _PLAIN = {"movej": 1, "movel": 1, "movec": 2, "moveabsj": 1}
+_TOOL_LAST = re.compile(r"Move(?:[JLC]|AbsJ)|(?:Trigg|Search|Arc|Spot|Paint|Disp)\w*", re.I)
 _BY_JOINTS = re.compile(r"(?:Move|Trigg|Spot|Paint)J", re.I)
 _CONF = re.compile(r"\bConf([JL])\b\s*(?:\\\s*(On|Off)\b)?\s*;", re.I)
 _COMPUTED = re.compile(r"\b(Offs|RelTool)\s*\(\s*(\w+)", re.I)
@@ -269,18 +270,15 @@ def _uses(
     for found in _MOVES.finditer(clean):
         parts = arguments(clean, found.start(2), found.end(2))
         parts = [part for part in parts if part.text and not re.fullmatch(r"\\\s*\w+", part.text)]
-        plain = [re.sub(r"\s*\\.*", "", part.text, flags=re.S) for part in parts]
         if not parts:
             continue
-        if found[1].lower() in _PLAIN:
-            tool = plain[-1].lower()
-        else:
-            tool = next((one.lower() for one in plain[1:] if one.lower() in frames), NONE)
-        wobj = re.search(r"\\\s*WObj\s*:=\s*(\w+)", found[2], re.I)
+        tool, frame = _ends(parts, found[1], line_of(text, found.start()), frames)
         kind = "J" if _BY_JOINTS.match(found[1]) else "L"
         free = _is_free(kind, found.start(), switches)
-        use = _Motions(tool, wobj[1].lower() if wobj else "wobj0", found.start(), free)
-        for part in parts[: _PLAIN.get(found[1].lower(), 2)]:
+        use = _Motions(tool, frame, found.start(), free)
+        first = 2 if found[1].lower().startswith("search") else 0  # behind its signal and result
+        parts = [part for part in parts if not re.match(r"\\\s*\w+\s*:=", part.text)]
+        for part in parts[first : first + _PLAIN.get(found[1].lower(), 2)]:
             at = clean.find("[", part.start, part.end)
             literal = (
                 at >= 0
@@ -295,6 +293,20 @@ def _uses(
             for name in _named(part.text):
                 uses[name] = uses[name].joined(use) if name in uses else use
     return uses
+
+
+def _ends(
+    parts: Sequence[Field], motion: str, line: int, frames: dict[str, Array]
+) -> tuple[str, str]:
+    """Tool and work object that a motion's arguments name."""
+    unknown, words = f"of {motion} in line {line}", list[str]()
+    for part in parts:
+        words += filter(None, [re.sub(r"\s*\\.*", "", part.text, flags=re.S).lower()])
+        if wobj := re.search(r"\\\s*WObj\s*:=\s*(\w+)", part.text, re.I):  # a switch of the tool
+            return words[-1] if words else unknown, wobj[1].lower()
+    if words and _TOOL_LAST.fullmatch(motion):
+        return words[-1], "wobj0"
+    return next((one for one in words[1:] if one in frames), unknown), "wobj0"
 
 
 def _named(word: str) -> Sequence[str]:
@@ -321,5 +333,5 @@ def _framed(
     problem = next((problems[one] for one in ends if one in problems), "")
     if MANY in ends:
         problem = "motions with different tools or work objects go to it"
-    known = (None if one in (NONE, MANY) else one for one in ends)
+    known = (None if one == MANY else one for one in ends)
     return replace(point, tool=next(known), frame=next(known), problem=point.problem or problem)

@@ -206,6 +206,25 @@ def test_a_switch_before_the_point_of_a_motion():
 
 
 @pytest.mark.parametrize(
+    ("motion", "tool", "frame"),
+    [
+        ("MoveLDO p1,v9,fine,tGun\\WObj:=wFix,doGrip,1", "tgun", "wfix"),
+        ("ArcLStart p1,v9,sSeam,wWeld\\Weave:=wv,fine,tGun\\WObj:=wFix", "tgun", "wfix"),
+        ("TriggL p1,v9,trOn\\T2:=trOff,z20,tGun", "tgun", "wobj0"),
+        ("SearchL\\Stop,diTouch,pFound,p1,v9,tGun\\WObj:=wFix", "tgun", "wfix"),
+        ("SearchC\\Stop,diTouch,pFound,pVia,p1,v9,tGun", "tgun", "wobj0"),
+        ("MoveJ \\ID:=5,p1,v9,z1,tGun,\\WObj:=wFix", "tgun", "wfix"),
+        ("MoveLDO p1,v9,fine,tGun,doGrip,1", "of MoveLDO in line 2", "wobj0"),
+    ],
+)
+def test_a_motion_says_its_tool_wherever_that_is_declared(motion, tool, frame):
+    """What is not found is unknown: `--tool` is of motions that say none."""
+    target = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    (point,) = dialect_of(".mod").read(f"CONST robtarget p1:={target};\n{motion};\n").points
+    assert (point.tool, point.frame) == (tool, frame)
+
+
+@pytest.mark.parametrize(
     ("switch", "motion", "followed"),
     [
         ("ConfL\\Off;", "MoveL", False),
