@@ -4,7 +4,8 @@
     DECL E6POS XP1={X 1250.5,Y -20.0,Z 980.25,A 90.0,B 0.0,C 180.0,S 2,T 35,E1 0.0,…}
     DECL FDAT FP1={TOOL_NO 1,BASE_NO 2,IPO_FRAME #BASE,…}
 
-Of a point of an inline form (XP1) the frames are in FP1; elsewhere those that were set last above.
+Of a point of an inline form (XP1) the frames are in FP1; elsewhere those that were set last above
+in its routine, or by the WITH of its motion or spline block.
 Sources are in docs/programs.md.
 """
 
@@ -26,6 +27,7 @@ from robocal_ros.programs.points import (
     Program,
     ProgramPoint,
     Stance,
+    arguments,
     line_of,
     masked,
     require_numbers,
@@ -58,9 +60,15 @@ _FDAT = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{([^{}]*)\}", re.I)
 _FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
 _SET = re.compile(
     r"\$(?P<kind>TOOL|BASE)(?P<part>\.\w+)?\s*=(?!=)\s*(?P<value>\{[^{}]*\}|[$\w]+(?:\[[^\]\r\n]*\])?[^\r\n;]*)"
-    r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)",
-    re.I,
+    r"|\bBAS\s*\(\s*#(?P<bas>TOOL|BASE|INITMOV)\s*,\s*(?P<number>[^)\r\n]*)\)"
+    r"|^[ \t]*(?:GLOBAL\s+)?(?P<routine>DEF(?:FCT)?)\b",
+    re.I | re.M,
 )
+_WITH = re.compile(
+    rf"^(?P<motion>[ \t]*(?:(?P<block>(?:PTP_)?SPLINE)|{MOVES})\b[^\r\n=]*?\bWITH\b)[^\r\n]*",
+    re.I | re.M,
+)
+_END_OF_BLOCK = re.compile(r"^[ \t]*ENDSPLINE\b", re.I | re.M)
 _COMPUTED = re.compile(rf"\b{MOVES}(?:_REL)?\b[^\r\n{{}}]*(?:\w\s*:\s*[\w{{$]|\w\()[^\r\n]*", re.I)
 _CHANGED = re.compile(
     r"\b(?:TOOL|BASE)_DATA\[[^\]\r\n]*\](?:\.\w+)?\s*=(?![\s=]*\{)[^\r\n]*"
@@ -98,7 +106,7 @@ class KrlDialect(Dialect):
             points.append(replace(point, order=len(points)))
         computed = tuple(
             (line_of(text, found.start()), text[found.start() : found.end()].strip())
-            for found in chain(_COMPUTED.finditer(clean), _CHANGED.finditer(clean))
+            for found in chain(_COMPUTED.finditer(_without(clean)), _CHANGED.finditer(clean))
         )
         status = [bits_of(point.marks["S"]) for point in points if "S" in point.marks]
         exact = sum(1 for one in status if one is not None and one & ABSOLUTE)
@@ -209,33 +217,53 @@ def _posture(parts: dict[str, Field]) -> Posture:
 
 @dataclass
 class _Set:
-    """Tool and base that are set from a place in the text on."""
+    """Tool and base that are set from a place in the text on.
+
+    ``until``: where what a WITH sets ends; None: it holds until something else is set.
+    """
 
     at: int
     names: dict[str, str] = field(default_factory=dict)
+    until: int | None = None
+
+
+def _without(clean: str) -> str:
+    """The text with what is behind a WITH blanked, every character at its place."""
+    return _WITH.sub(lambda found: found["motion"].ljust(len(found[0])), clean)
 
 
 def _settings(text: str, clean: str, frames: dict[str, Array]) -> Iterator[_Set]:
+    for found in _WITH.finditer(clean):
+        end = _END_OF_BLOCK.search(clean, found.end()) if found["block"] else None
+        inside = _Set(found.start(), until=end.start() if end else found.end())
+        for part in arguments(clean, found.end("motion"), found.end()):
+            if given := _SET.match(part.text):
+                inside.names |= _given(line_of(text, part.start), given, frames) or {}
+        if inside.names:
+            yield inside
     now: dict[str, str] = {}
-    for found in _SET.finditer(clean):
-        here = f"of line {line_of(text, found.start())}"  # of what is not read here: unknown
-        if found["bas"]:
-            kind, number = found["bas"].upper(), found["number"].strip()
-            if kind == "INITMOV":
-                now = {}
-            else:
-                plain = f"{kind}_DATA[{number}]"
-                now = now | {kind: plain if number.isdigit() else f"${kind} {here}"}
-        else:
-            kind, value = found["kind"].upper(), found["value"].strip()
-            name = f"${kind} {here}"
-            T = _frame(value[1:-1]) if value.startswith("{") else None
-            if T is not None:
-                frames[name] = T
-            elif not found["part"] and re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
-                name = value.upper()
-            now = now | {kind: name}
+    for found in _SET.finditer(_without(clean)):
+        given_here = _given(line_of(text, found.start()), found, frames)
+        now = {} if given_here is None else now | given_here
         yield _Set(found.start(), now)
+
+
+def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[str, str] | None:
+    """Tool or base that a place in the text sets; None where neither is known from it on."""
+    if found["routine"] or (found["bas"] or "").upper() == "INITMOV":
+        return None
+    here = f"of line {line}"  # of what is not read here: unknown
+    if found["bas"]:
+        kind, number = found["bas"].upper(), found["number"].strip()
+        return {kind: f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind} {here}"}
+    kind, value = found["kind"].upper(), found["value"].strip()
+    name = f"${kind} {here}"
+    T = _frame(value[1:-1]) if value.startswith("{") else None
+    if T is not None:
+        frames[name] = T
+    elif not found["part"] and re.fullmatch(r"[$\w]+(?:\[\d+\])?", value):
+        name = value.upper()
+    return {kind: name}
 
 
 def _framed(
@@ -255,8 +283,12 @@ def _framed(
             tool=None if tool is None else f"TOOL_DATA[{tool.text.strip()}]",
             frame=None if base is None else f"BASE_DATA[{base.text.strip()}]",
         )
-    names: dict[str, str] = {}
+    above: dict[str, str] = {}
+    inside: dict[str, str] = {}
     for one in set_above:
-        if one.at < at:
-            names = one.names
+        if one.until is None and one.at < at:
+            above = one.names
+        elif one.until is not None and one.at <= at < one.until:
+            inside |= one.names
+    names = above | inside
     return replace(point, tool=names.get("TOOL"), frame=names.get("BASE"))

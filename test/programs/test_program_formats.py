@@ -174,6 +174,33 @@ def test_what_a_program_changes_itself_is_told():
 POINT = "{X 1,Y 2,Z 3,A 0,B 0,C 0}"
 
 
+def test_what_with_sets_holds_for_its_motion_or_block_alone():
+    """As inline forms of KSS 8 write it; SVEL_CP( ) and its like make no point."""
+    krl = (
+        "$TOOL=TOOL_DATA[1]\n$BASE=BASE_DATA[1]\n"
+        "SPTP XHOME WITH $VEL_AXIS[1] = SVEL_JOINT(100.0), $TOOL = STOOL2(F), $BASE = SBASE(F)\n"
+        f"SLIN {POINT} WITH $VEL=SVEL_CP(2.0, , L), $BASE=BASE_DATA[2]\nLIN {POINT}\n"
+        "SPLINE WITH $TOOL={X 1,Y 0,Z 0,A 0,B 0,C 0}, $BASE=BASE_DATA[3]\n"
+        f"SPL {POINT}\nSLIN {POINT} WITH $VEL.CP=1\nENDSPLINE\nLIN {POINT}\n"
+    )
+    found = dialect_of(".src").read(krl)
+    tools = [point.tool for point in found.points]
+    block = "$TOOL of line 6"
+    assert tools == ["TOOL_DATA[1]", "TOOL_DATA[1]", block, block, "TOOL_DATA[1]"]
+    assert found.frames[block][0, 3] == pytest.approx(1e-3)
+    bases = [point.frame for point in found.points]
+    assert bases == [f"BASE_DATA[{n}]" for n in (2, 1, 3, 3, 1)]
+    assert found.computed == ()
+
+
+def test_a_routine_does_not_have_the_frames_of_the_one_above():
+    """It has those of its caller, which the order of the text does not tell."""
+    krl = "DEF A()\n$BASE=BASE_DATA[1]\nB()\n$BASE=BASE_DATA[2]\nEND\n"
+    krl += f"GLOBAL DEF B()\nLIN {POINT}\nEND\n"
+    (point,) = dialect_of(".src").read(krl).points
+    assert point.frame is None
+
+
 def test_points_in_an_array_are_found_whatever_counts_them():
     text = f"P[1]={POINT}\nQ[1]={POINT}\nR[1]={POINT}\nFOR I=1 TO 2\nPTP P[I]\nLIN Q[1]\nENDFOR\n"
     assert [point.name for point in dialect_of(".src").read(text).points] == ["P[1]", "Q[1]"]
