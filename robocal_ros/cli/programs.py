@@ -32,7 +32,7 @@ from robocal_ros.history.calibrations import CalibrationHistory
 from robocal_ros.history.history_file import state_folder
 from robocal_ros.history.history_records import THERMAL
 from robocal_ros.kinematics import SerialArm
-from robocal_ros.kinematics.arm import arm_of, layer_of, payload_note
+from robocal_ros.kinematics.arm import ALPHA, BETA, THETA, arm_of, layer_of, payload_note
 from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.tables import check_plain, read_cells, read_samples
 from robocal_ros.programs.conventions import COUNT, base_text, tool_text
@@ -71,7 +71,7 @@ _MODEL = (
 _EXAMPLE = """example:
   robocal correct-program weld.dat --robot kr150_r3100 --model identified.yaml \\
       --frames '$config.dat' --output corrected/weld.dat
-  robocal correct-program part.script --robot ur10 --robot-serial 20205501 --output part_c.script
+  robocal correct-program part.script --robot my_ur.yaml --robot-serial 20205501 --output new.script
 """
 
 
@@ -136,6 +136,17 @@ def given_models(args: argparse.Namespace) -> tuple[CorrectionModels, list[str]]
     actual = given_model(args, nominal, warnings)
     reference = nominal if args.reference is None else read_model(args.reference, nominal)[0]
     return CorrectionModels(nominal, actual, reference), warnings
+
+
+def factory_note(maker: str | None, nominal: SerialArm) -> list[str]:
+    """What is wrong where a UR controller, which has a factory calibration, is taken as nominal."""
+    if maker != "ur" or np.abs(np.sin(2.0 * nominal.mdh[:, [THETA, ALPHA, BETA]])).max() > 1e-6:
+        return []
+    return [
+        f"a Universal Robots controller reckons with its arm's factory calibration, a millimetre "
+        f"or two from a nominal model such as {nominal.name}: what is corrected is off by as "
+        "much; give as --robot the file that 'robocal import-ur' or 'import-urdf' makes of it"
+    ]
 
 
 def given_model(args: argparse.Namespace, nominal: SerialArm, warnings: list[str]) -> SerialArm:
@@ -311,7 +322,7 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         "model_hash": models.nominal.model_hash,
         "output": str(args.output) if written else None,
         **told,
-        "warnings": warnings + told["warnings"],
+        "warnings": [*warnings, *factory_note(dialect.maker, models.nominal), *told["warnings"]],
         "verdict": verdict_document(verdict),
     }
     return CliResult(document, _show_corrected)

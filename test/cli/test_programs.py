@@ -26,10 +26,17 @@ from robocal_ros.cli.main import main
 from robocal_ros.cli.programs import given_models
 from robocal_ros.ground.frames import log_rotation, transform_from_quat
 from robocal_ros.history.calibrations import CalibrationHistory
-from robocal_ros.kinematics.arm import model_document
+from robocal_ros.kinematics.arm import inverse, model_document
 from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.robots import save_robot
 from robocal_ros.kinematics.tables import joint_texts, write_cells
+from robocal_ros.kinematics.universal_robots import (
+    factory_arm,
+    nominal_arm,
+    parse_settings,
+    read_panel_poses,
+)
+from robocal_ros.programs.conventions import pose_of
 from robocal_ros.programs.correcting import dialect_of
 
 ACTUAL = drifted(NOMINAL, 1)
@@ -403,6 +410,46 @@ def test_a_shift_for_a_model_that_is_gone_is_stale(cell):
     status, document = history("accept", str(first["calibration_id"]))
     assert (status, document["error"]["code"]) == (3, "STALE")
     assert shift("--keep", "--in-force")[0] == 2
+
+
+@pytest.mark.data
+def test_a_nominal_arm_in_place_of_a_calibrated_controller_is_told(
+    tmp_path: Path, data_dir: Path, capsys
+):
+    """Of the real UR5e the nominal model is 1.1 mm off what its controller shows."""
+    folder = data_dir / "ur5e_factory"
+    nominal, delta = (
+        parse_settings((folder / name).read_text(), name)
+        for name in ("urcontrol.conf.UR5", "calibration.conf")
+    )
+    factory = factory_arm(nominal, delta, "ur5e")
+    save_robot(nominal_arm(nominal, "ur5e"), tmp_path / "nominal.yaml")
+    save_robot(factory, tmp_path / "factory.yaml")
+    actual = drifted(factory, 3, 1e-4, 5e-5)
+    save_robot(actual, tmp_path / "actual.yaml")
+    shown = read_panel_poses(folder / "joint-eef-data.csv")
+    rows = []
+    for q, place, R in zip(shown.q, shown.position, shown.rotation, strict=True):
+        pose = ", ".join(f"{v:.12f}" for v in (*place, *log_rotation(R)))
+        rows.append(f"movej(get_inverse_kin(p[{pose}], qnear={q.tolist()}))")
+    text = "\n".join(["set_tcp(p[0, 0, 0, 0, 0, 0])", *rows, ""])
+    (tmp_path / "part.script").write_text(text)
+    largest_mm = {}
+    for name in ("nominal", "factory"):
+        robot, model = (str(tmp_path / f"{one}.yaml") for one in (name, "actual"))
+        output = tmp_path / f"{name}.script"
+        words = ["correct-program", str(tmp_path / "part.script"), "--robot", robot, "--json"]
+        main([*words, "--model", model, "--output", str(output)])
+        told = json.loads(capsys.readouterr().out)
+        assert told["verdict"]["accept"]
+        assert any("factory calibration" in w for w in told["warnings"]) == (name == "nominal")
+        corrected = re.findall(r"p\[([^]]*)\], qnear", output.read_text())
+        poses = [pose_of("ur", [float(v) for v in one.split(",")]) for one in corrected]
+        pairs = zip(poses, shown.q, strict=True)
+        moved = np.array([inverse(factory, T[None], q)[0] for T, q in pairs])  # by the controller
+        off = actual.fk(moved)[:, :3, 3] - shown.position
+        largest_mm[name] = 1e3 * float(np.max(np.linalg.norm(off, axis=1)))
+    assert largest_mm["factory"] < 1e-3 < 1.0 < largest_mm["nominal"]
 
 
 def test_what_is_kept_needs_a_history(work: Path, capsys):
