@@ -101,10 +101,6 @@ class TrackerUnknowns:
             mismatch=self.mismatch + step[MISMATCH],
         )
 
-    def sensor_poses(self, motion: Array) -> Array:
-        """T_tracker_sensor (m, 4, 4) of the profiles, from their T_flange0_flange (m, 4, 4)."""
-        return np.asarray(self.T_tracker_flange @ motion @ self.T_flange_sensor)
-
 
 # The axes of a real arm stand to each other a little otherwise than its model says. Both are taken
 # to miss the model by half of it: they turn about their common perpendicular, and shift along it,
@@ -166,6 +162,11 @@ class AxisPair:
         foot = np.cross(across, self.screws[:3, 0])
         C = frames.transform(R, foot - R @ foot + gap * across)
         return np.asarray(C @ motion @ frames.invert(C))
+
+    def sensor_poses(self, data: TrackerData, state: TrackerUnknowns) -> Array:
+        """T_tracker_sensor (m, 4, 4) of the profiles."""
+        motion = self.carried(data.motion, state.mismatch, self.share_of(data.q))
+        return np.asarray(state.T_tracker_flange @ motion @ state.T_flange_sensor)
 
     def twists(self, carried: Array, share: float) -> Array:
         """Left twists (n, 6, 2) of carried motions by the mismatch."""
@@ -269,7 +270,7 @@ class TrackerProblem:
         """Rows (m, 7) of the profiles, their Jacobian (m, 7, 26), and by the sensor's twist."""
         share = self.axes.share_of(self.data.q)
         motion = self.axes.carried(self.data.motion, state.mismatch, share)
-        P = state.sensor_poses(motion)
+        P = self.axes.sensor_poses(self.data, state)
         root, s = self.caps.root, sphere_in(P, state.cube.centre)
         shift = np.einsum("mij,mj->mi", root, s - self.caps.place) + self.caps.offset
         by_place = np.zeros((len(P), 3, UNKNOWNS))
@@ -396,8 +397,8 @@ def profile_distances(
 
     ``states`` (m,): for each profile, where sensor and target are.
     """
-    motion = zip(states, classic.data.motion, strict=True)
-    P = np.array([state.sensor_poses(T) for state, T in motion])
+    axes = AxisPair.of(classic.data, classic.axes)
+    P = np.array([axes.sensor_poses(classic.data, state)[i] for i, state in enumerate(states)])
     normals = np.array([state.cube.normals for state in states])
     offsets = np.array([state.cube.offsets for state in states])
     centres = np.array([state.cube.centre for state in states])
@@ -599,13 +600,13 @@ def solve_best(classic: Classic) -> tuple[TrackerProblem, Estimate[TrackerUnknow
     ]
     state = _state(classic)
     axes = AxisPair.of(data, classic.axes)
-    place = sphere_in(state.sensor_poses(data.motion), state.cube.centre)
+    place = sphere_in(axes.sensor_poses(data, state), state.cube.centre)
     for _ in range(MOST_ROUNDS):
         caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m)
         problem = TrackerProblem(data, target, classic.noise, state, axes, lines, caps)
         estimate = solve(problem, state)
         state, before = estimate.state, place
-        place = sphere_in(state.sensor_poses(data.motion), state.cube.centre)
+        place = sphere_in(axes.sensor_poses(data, state), state.cube.centre)
         if np.abs(place - before).max() < NEAR_M:
             return problem, estimate
     raise ResidualError(

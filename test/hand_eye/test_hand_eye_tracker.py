@@ -308,6 +308,9 @@ def test_axes_that_are_not_quite_square(off_deg):
     assert found.verdict.accept
     assert not found.rejected
     assert found.more["residual_over_noise"] < 1.2
+    # the points scatter along the beam, and less square to what they lie on
+    for distance_m in (found.residual_m, found.leave_one_out_m):
+        assert np.sqrt(np.mean(distance_m**2)) < made.sensor.noise_m
     # the line's direction is known to 0.015 mm / (75 mm sqrt(16)) = 0.003 deg
     assert abs(found.more["axes_off_nominal"]["angle_deg"] - off_deg) < 4.0 * 0.003
     half = frames.exp_rotation([-0.5 * np.radians(off_deg), 0.0, 0.0])
