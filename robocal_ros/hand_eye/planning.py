@@ -409,7 +409,7 @@ class PlannedStairs:
         return self.target.T_base_user
 
     def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> TargetView:
-        """All corners of the mark on which each pose lays the light."""
+        """All corners of each pose's mark; those out of the field of view tell nothing."""
         marks = self.lit(T_base_flange @ T_flange_sensor)
         corners = [self.target.corners[mark] for mark in marks]
         shot = np.repeat(np.arange(len(corners)), [len(each) for each in corners])
@@ -417,8 +417,9 @@ class PlannedStairs:
         seen = model.see(T_base_flange[shot] @ T_flange_sensor, place)
         step = self.sensor.width_m / self.sensor.points
         sigma = np.array([0.5 * step, self.sensor.noise_m / np.sqrt(EDGE_POINTS), 0.0])
-        spread = np.diag(sigma**2 + self.target.sigma_m**2)
-        return _expected(model, seen, T_base_flange, shot, np.tile(spread, (len(shot), 1, 1)))
+        spread = np.tile(np.diag(sigma**2 + self.target.sigma_m**2), (len(shot), 1, 1))
+        spread[list(self._out(seen.value))] = np.eye(3)  # tell nothing
+        return _expected(model, seen, T_base_flange, shot, spread)
 
     def lit(self, T_base_sensor: Array) -> tuple[str, ...]:
         """The mark that is nearest to the laser plane of each sensor pose (m, 4, 4)."""
@@ -434,11 +435,15 @@ class PlannedStairs:
         known = list(self.target.corners)
         return known[:1] if self.marks is None else known
 
+    def _out(self, value: Array) -> dict[int, str]:
+        """Corners out of the field of view, of m (m, 3)."""
+        x, z, _ = value.T
+        return _out_of_range(x, z, np.zeros_like(z), self.sensor)
+
     def unseen(self, view: TargetView) -> dict[int, str]:
         """Poses that see less than two corners, or not the only one of a mark."""
-        x, z, _ = view.sightings.value.T
         found: dict[int, str] = {}
-        out = _out_of_range(x, z, np.zeros_like(z), self.sensor)
+        out = self._out(view.sightings.value)
         for pose in np.unique(view.sightings.shot):
             rows = np.flatnonzero(view.sightings.shot == pose)
             if sum(int(row) not in out for row in rows) < min(2, len(rows)):

@@ -134,6 +134,23 @@ def test_marks_with_one_corner_each():
     assert plan.proposed_error_m < plan.working_error_m
 
 
+def test_corners_out_of_view_tell_nothing():
+    """Of five in a row, 14.1 mm apart and 5 mm aside at most, the field holds the middle three."""
+    narrow = replace(SENSOR, width_m=2.0 * 0.021)
+    poses = step_shots(CELL, STAIRS, 8, np.random.default_rng(4), level=True).true_T_base_flange
+    whole = stairs_target()
+    middle = replace(whole, corners={mark: rows[1:4] for mark, rows in whole.corners.items()})
+    noise = PoseNoise(POSE_M, POSE_RAD)
+    all_five, three = (
+        check_plan(
+            PlannedStairs(of, narrow, ("near", "far")), poses, CELL.T_flange_sensor, noise, 1.0
+        )
+        for of in (whole, middle)
+    )
+    assert not all_five.unseen
+    assert all_five.working_error_m == pytest.approx(three.working_error_m, rel=1e-4)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_poses_without_enough_rotation_are_refused_in_words(turned):
     still = replace(CELL, tilt_rad=0.0, roll_rad=np.radians(60.0) * turned)
