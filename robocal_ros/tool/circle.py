@@ -357,7 +357,7 @@ def driven_circle(
     (Kåsa 1976), and of its angle over time.
 
     Raises `BeamError` when a beam has fewer than four edges; `RankDeficientError` when the flange
-    went less than half a turn; `ResidualError` when the flange drove no such circle.
+    went less than half a turn; `ResidualError` when the flange drove no such circle, or turned.
     """
     for beam in BEAMS:
         edges_of(edges, beam, FEWEST_EDGES["circle"])
@@ -383,6 +383,17 @@ def driven_circle(
         raise ResidualError(
             f"the flange leaves a circle in the beam plane by {off.max() * 1e3:.3f} mm (allowed "
             f"{LARGEST_MISFIT_M * 1e3:.1f} mm): drive the circle about the laser's z"
+        )
+    ahead_m = radius * float(np.abs(angle - phase - rate * (time - middle)).max())
+    turn_rad = float(
+        np.linalg.norm(frames.log_rotation(T[:, :3, :3] @ T[0, :3, :3].T), axis=1).max()
+    )
+    if not (ahead_m <= LARGEST_MISFIT_M and turn_rad <= SAME_TURN_RAD):
+        raise ResidualError(
+            f"on the circle the flange was {ahead_m * 1e3:.3f} mm from where a constant speed has "
+            f"it (allowed {LARGEST_MISFIT_M * 1e3:.1f} mm), and turned by "
+            f"{np.degrees(turn_rad):.3f} deg (allowed {np.degrees(SAME_TURN_RAD):.2f} deg): use "
+            "method best, which takes the flange where it was at each edge"
         )
     motion = CircleMotion(
         radius_m=radius,

@@ -69,6 +69,26 @@ def test_what_is_no_circle_is_refused(run):
         driven_circle(laser, driven, low)
 
 
+@pytest.mark.parametrize(
+    ("ripple", "tilt_rad", "words"),
+    [(0.05, 0.0, r"was 0\.[56]\d\d mm from where"), (0.0, 0.01, r"turned by 1\.1\d+ deg")],
+)
+def test_a_circle_at_another_speed_or_with_a_turn_is_none_for_classic(run, ripple, tilt_rad, words):
+    """Once a turn 5 % faster and slower, 0.05 * 12 mm ahead and behind; it set a tip 0.6 mm off."""
+    low = run.steps[0].edges
+    time = np.linspace(min(e.time_s for e in low) - 0.1, max(e.time_s for e in low) + 0.1, 400)
+    turn = 2.0 * np.pi * time / 1.5
+    angle = turn + ripple * np.sin(turn)
+    flat = 0.012 * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    T = np.tile(run.commanded(0).T_base_centre, (len(time), 1, 1))
+    T[:, :3, 3] += flat @ run.cell.laser.T_base_laser[:3, :3].T
+    tilts = [frames.exp_rotation([a, 0.0, 0.0]) for a in tilt_rad * np.sin(turn)]
+    T[:, :3, :3] = T[:, :3, :3] @ np.array(tilts)
+    driven = JointPath(run.path.arm, time, joints_at(run.path.arm, T, run.cell.q_near))
+    with pytest.raises(ResidualError, match=words):
+        driven_circle(run.cell.laser, driven, low)
+
+
 def test_classic_names_what_is_missing(run):
     laser, path, (low, high, upright, *plunges) = run.cell.laser, run.path, run.steps
     with pytest.raises(RankDeficientError, match="there is no plunge"):
