@@ -34,12 +34,14 @@ from robocal_ros.hand_eye.camera_fit import (
     GivenNoise,
     PairFit,
     PairState,
+    board_scale,
     differences,
     fit_pairs,
     linearised,
     predicted,
     robust_start,
     sample_sizes,
+    scale_of_board,
     score,
 )
 from robocal_ros.hand_eye.mount_problem import same_pose
@@ -71,8 +73,8 @@ CLEARLY_BETTER = 0.3
 MOST_SHIFTED = 2  # samples by which one table may lag behind the other
 MOST_SWAPPED = 20  # rejected samples among which swaps are looked for
 SCALE_TOLERANCE = 0.02
+ROBOTS_SCALE = 5e-3  # lengths of a robot as built may be off so far: a UR10 shows 2e-3
 SCALE_SIGMAS = 5.0
-FEWEST_SCALED = 6  # samples: of fewer the sigma itself is not known
 _NEARLY = 0.1  # of a factor of a thousand
 
 
@@ -137,25 +139,15 @@ def _one_centre(T: Array) -> bool:
     return bool(spread[1] < LEAST_SHIFT_M)  # along the axis it may move
 
 
-def scale_of_board(pairs: PosePairs, at: Placement) -> tuple[float, float]:
-    """Factor by which board positions would fit the robot's better, and its sigma."""
-    carrier = pairs.T_boardside_cameraside
-    R = carrier[:, :3, :3]
-    seen = R @ (at.X[:3, :3] @ pairs.T_camera_board[:, :3, 3, None])
-    A = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape), seen], axis=2).reshape(-1, 7)
-    b = -carrier[:, :3, 3].ravel()
-    found, _, rank, _ = np.linalg.lstsq(A, b, rcond=1e-10)
-    if rank < A.shape[1] or len(pairs) < FEWEST_SCALED:
-        return 1.0, np.inf
-    variance = float(np.sum((b - A @ found) ** 2)) / (len(b) - A.shape[1])
-    return float(found[6]), float(np.sqrt(variance * np.linalg.inv(A.T @ A)[6, 6]))
-
-
 def wrong_scale(pairs: PosePairs, at: Placement) -> str:
     """Say in words that lengths of robot and board differ by a factor; empty if they do not."""
-    factor, sigma = scale_of_board(pairs, at)
+    return scale_words(*scale_of_board(pairs, at))
+
+
+def scale_words(factor: float, sigma: float, tolerance: float = SCALE_TOLERANCE) -> str:
+    """The same of a factor and its sigma; empty within the tolerance, or where it may be 1."""
     away = abs(factor - 1.0)
-    if away < SCALE_TOLERANCE or min(away, factor) < SCALE_SIGMAS * sigma:
+    if away < tolerance or min(away, factor) < SCALE_SIGMAS * sigma:
         return ""
     for thousand, words in ((1e3, "small"), (1e-3, "large")):
         if abs(factor / thousand - 1.0) < _NEARLY:
@@ -323,13 +315,19 @@ def judge_camera(fit: PairFit, limit_m: float) -> Verdict:
             Code.RESIDUAL_TOO_LARGE,
             f"{words}; too many samples miss the others: check that board and camera sit tight",
         )
+    factor, sigma, moved_m = board_scale(fit)
+    doubt = scale_words(factor, sigma, 0.0) if moved_m > error_m else ""
+    if doubt:
+        doubt = f"; with the camera {moved_m * 1e3:.2f} mm elsewhere {doubt}"
+        if moved_m > limit_m and abs(factor - 1.0) > ROBOTS_SCALE:
+            return Verdict(Code.RESIDUAL_TOO_LARGE, words + doubt)
     if error_m > limit_m:
         return Verdict(
             Code.POSES_NOT_INFORMATIVE,
             f"{words} (allowed {limit_m * 1e3:.4g}): measure at more poses, turned "
-            "further about two axes",
+            f"further about two axes{doubt}",
         )
-    return Verdict(Code.ACCEPT, words)
+    return Verdict(Code.ACCEPT, words + doubt)
 
 
 def rms(size: Array) -> float:
@@ -400,7 +398,7 @@ def calibrate_camera(
     used = ~fit.rejected
     size_m = np.linalg.norm(fit.differences[used][:, :3], axis=1)
     wrong = mistake(fit.pairs, fit.at) if rms(size_m) > LARGEST_RMS_M else ""
-    if wrong := wrong or wrong_scale(fit.pairs.take(used), fit.at):
+    if wrong := wrong or scale_words(*board_scale(fit)[:2]):
         raise InputError(wrong)
     noise = _noise_document(fit, how.noise)
     about = {"mount": pairs.mount, "noise": noise, **(more or {})}

@@ -611,3 +611,50 @@ def correlation(residual: Array) -> float:
     pairs = rho[0 : n - n % 2 : 2] + rho[1 : n + n % 2 : 2][: n // 2]
     until = int(np.argmax(pairs <= 0.0)) if np.any(pairs <= 0.0) else len(pairs)
     return max(float(2.0 * pairs[:until].sum() - 1.0), 1.0)
+
+
+# ---- whether lengths of robot and board differ by a factor ---------------------------------------
+
+
+FEWEST_SCALED = 6  # samples: of fewer the sigma itself is not known
+_SCALELESS = 1e-10  # share of what a factor does to the boards that no placement does too
+
+
+def scale_of_board(pairs: PosePairs, at: Placement) -> tuple[float, float]:
+    """Factor by which board positions would fit the robot's better, and its sigma."""
+    carrier = pairs.T_boardside_cameraside
+    R = carrier[:, :3, :3]
+    seen = R @ (at.X[:3, :3] @ pairs.T_camera_board[:, :3, 3, None])
+    A = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape), seen], axis=2).reshape(-1, 7)
+    b = -carrier[:, :3, 3].ravel()
+    found, _, rank, _ = np.linalg.lstsq(A, b, rcond=1e-10)
+    if rank < A.shape[1] or len(pairs) < FEWEST_SCALED:
+        return 1.0, np.inf
+    variance = float(np.sum((b - A @ found) ** 2)) / (len(b) - A.shape[1])
+    return float(found[6]), float(np.sqrt(variance * np.linalg.inv(A.T @ A)[6, 6]))
+
+
+def board_scale(fit: PairFit) -> tuple[float, float, float]:
+    """The same factor of a fit, its sigma, and by how much, m, the camera is elsewhere with it.
+
+    As one more unknown, to first order: what the images leave of the focal length explains its part
+    first. The noise is what is left with the factor; elsewhere: where the boards were on average.
+    """
+    used, e = ~fit.rejected, fit.estimate
+    pairs, k = fit.pairs.take(used), len(e.names)
+    column = np.zeros((len(pairs), 6, 1))
+    column[:, :3, 0] = -predicted(pairs, fit.at)[:, :3, 3]
+    rows = np.concatenate([fit.jacobian[used], column], axis=2)
+    rows = np.linalg.solve(np.linalg.cholesky(fit.expected[used]), rows)
+    J, a, left = rows[..., :k].reshape(-1, k), rows[..., k].ravel(), e.residual[used].ravel()
+    taken = e.covariance / e.scale**2 @ (a @ J)
+    told = float(a @ a - (a @ J) @ taken)
+    if len(pairs) < FEWEST_SCALED or told < _SCALELESS * float(a @ a):
+        return 1.0, np.inf, 0.0
+    away = -float(a @ left) / told
+    variance = max(float(left @ left) - told * away**2, 0.0) / (e.freedom - 1.0)
+    if pairs.time_s is not None:
+        variance *= correlation(e.residual[used])
+    where = pairs.T_camera_board[:, :3, 3].mean(axis=0)
+    moved = -away * (taken[:3] + np.cross(taken[3:6], where))
+    return 1.0 + away, float(np.sqrt(variance / told)), float(np.linalg.norm(moved))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured
+from scipy.stats import chi2
 
 from bench.hand_eye_cell import BoardCell, TruePose
 from robocal_ros.ground import frames
@@ -17,7 +18,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera, left_out, unsettled
-from robocal_ros.hand_eye.camera_data import PosePairs
+from robocal_ros.hand_eye.camera_data import PosePairs, Shared
 from robocal_ros.hand_eye.camera_fit import PairState, fit_pairs, linearised
 
 
@@ -98,6 +99,42 @@ def test_mistakes_are_named(name: str, mount: str) -> None:
     with pytest.raises(InputError) as caught:
         calibrate_camera(make(pairs))
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_squares_that_displace_the_camera_are_told(mount: str) -> None:
+    """A board's size that is wrong by a percent lets all fit within a millimetre."""
+    for seed in range(5):
+        cell, pairs = measured(20, 50 + seed, mount)
+        assert "multiplied" not in calibrate_camera(pairs).verdict.reason
+        wrong = replace(pairs, T_camera_board=scaled(pairs.T_camera_board, 1.01))
+        found = calibrate_camera(wrong)
+        off_m = float(np.linalg.norm(error(found.T_flange_sensor, cell.camera)[:3]))
+        assert off_m > 2e-3 > 3.0 * float(found.working_error_m or 0.0)
+        assert found.verdict.code is Code.RESIDUAL_TOO_LARGE
+        told = found.verdict.reason.partition("multiplied by ")[2].partition(":")[0]
+        factor, sigma = map(float, told.split(" +- "))
+        assert abs(factor - 1.0 / 1.01) < 4.0 * sigma < 4.0 * 2e-3
+        told_m = 1e-3 * float(found.verdict.reason.partition("the camera ")[2].split()[0])
+        assert told_m == pytest.approx(off_m, rel=0.3)
+        allowed = calibrate_camera(wrong, CameraSettings(limit_m=2.0 * off_m)).verdict
+        assert allowed.accept
+        assert "check the size of its squares" in allowed.reason
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_what_images_leave_open_of_the_focal_length_is_no_wrong_board(mount: str) -> None:
+    cell, pairs = measured(20, 50, mount)
+    T = scaled(pairs.T_camera_board, 1.03)
+    by_focal = np.zeros((20, 6, 1))
+    by_focal[:, :3, 0] = pairs.T_camera_board[:, :3, 3]
+    told = replace(pairs, T_camera_board=T, shared=Shared(by_focal, np.array([[0.03**2]])))
+    found = calibrate_camera(told)
+    assert found.verdict.accept
+    assert "multiplied" not in found.verdict.reason
+    e = error(found.T_flange_sensor, cell.camera)
+    assert found.covariance is not None
+    assert e @ np.linalg.solve(found.covariance, e) < chi2.ppf(0.9999, 6)
 
 
 def test_poses_that_nothing_fits_are_refused() -> None:
