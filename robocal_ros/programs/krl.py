@@ -56,6 +56,9 @@ _MOVED = re.compile(
     rf"\b(?P<move>{MOVES}(?P<relative>_REL)?)\b[^\r\n{{}}]*(?:\{{[^{{}}]*\}}\s*,\s*)?$", re.I
 )
 _USED = re.compile(rf"\b{MOVES}\s+(\w+(?:\[\w+\])?)(?:\s*,\s*(\w+(?:\[\w+\])?))?", re.I)
+_DECLARED = re.compile(
+    r"\b(?:E6POS|POS|E6AXIS|AXIS)\s+((?:\w+(?:\[[^\]\r\n]*\])?[ \t]*,?[ \t]*)+)", re.I
+)
 _FDAT = re.compile(r"\bFDAT\s+F(\w+)\s*=\s*\{([^{}]*)\}", re.I)
 _FRAME_DATA = re.compile(r"\b(TOOL_DATA|BASE_DATA)\[(\d+)\]\s*=\s*\{([^{}]*)\}", re.I)
 _SET = re.compile(
@@ -97,6 +100,8 @@ class KrlDialect(Dialect):
         set_above = list(_settings(text, clean, frames))
         used = {name.upper() for found in _USED.finditer(clean) for name in found.groups() if name}
         used |= {name.partition("[")[0] for name in used if not _NUMBERED.search(name)}
+        for found in _DECLARED.finditer(clean):  # an array's points are assigned one by one
+            used |= set(re.findall(r"\w+", re.sub(r"\[[^\]]*\]", "", found[1].upper())))
         points: list[ProgramPoint] = []
         for braces in _BRACES.finditer(clean):
             point = _point(text, clean, braces, used)

@@ -206,6 +206,17 @@ def test_points_in_an_array_are_found_whatever_counts_them():
     assert [point.name for point in dialect_of(".src").read(text).points] == ["P[1]", "Q[1]"]
 
 
+def test_points_of_an_array_that_only_another_file_goes_to():
+    """A data list declares an array and assigns its points; the motions stand in the .src."""
+    text = f"DECL GLOBAL E6POS P[2], Q\nP[1]={POINT}\nP[2]={POINT}\nQ={POINT}\n"
+    text += (
+        f"DECL E6AXIS H[1]\nH[1]={{A1 0,A2 0,A3 0,A4 0,A5 0,A6 0}}\nDECL FRAME F[1]\nF[1]={POINT}\n"
+    )
+    points = dialect_of(".dat").read(text).points
+    assert [point.name for point in points] == ["P[1]", "P[2]", "Q", "H[1]"]
+    assert not any(point.problem for point in points)
+
+
 def test_a_frame_that_is_set_but_not_read_is_unknown():
     """Not one that nothing is said of: for such the caller names what is taken."""
     krl = f"$BASE=BASE_DATA[1]:off\nLIN {POINT}\nBAS(#BASE,n)\nLIN {POINT}\n"
