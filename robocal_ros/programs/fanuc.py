@@ -40,9 +40,11 @@ _FIELD = re.compile(r"\b([XYZWPR]|J\d|E\d)\s*=(\s*[-+.\d*]+)\s*(?:mm|deg)")
 _FRAMES = re.compile(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)")
 _CONFIG = re.compile(r"CONFIG\s*:\s*'([^']*)'")
 _WORDS = re.compile(r"\s*[NF]\s+[UD]\s+[TB]\s*(?:,\s*-?\d+\s*){3}")
-_RELATIVE = re.compile(r"\bP\[\s*(\d+)[^\]]*\][^;\n]*\bINC\b")
+# Options of a motion stand up to its next position (of a circle) or its end, on further lines too.
+_OPTIONS = r"(?:(?!\bP\[)[^;])*"
+_RELATIVE = re.compile(rf"\bP\[\s*(\d+)[^\]]*\]{_OPTIONS}\bINC\b")
 _COMPUTED = re.compile(
-    r"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\][^;\n]*\b(?:Tool_)?Offset\b[^;\n]*"
+    rf"[JLCA]\s+PR\[[^\]]*\]|\bP\[[^\];\n]*\]{_OPTIONS}\b(?:\w+_)?Offset\b{_OPTIONS}"
     r"|\b(?:P|UFRAME|UTOOL)\[[^\];\n]*\]\s*=[^;\n]*",
     re.I,
 )
@@ -83,7 +85,7 @@ class FanucDialect(Dialect):
             points.append(replace(point, order=len(points)))
         frames = {"UF0": np.eye(4), "UT0": np.eye(4)}
         computed = tuple(
-            (line_of(text, found.start()), found[0].strip())
+            (line_of(text, found.start()), " ".join(found[0].split()).rstrip(" :"))
             for found in _COMPUTED.finditer(text, 0, start)
         )
         return Program(text, tuple(points), frames, computed)

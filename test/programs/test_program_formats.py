@@ -403,6 +403,17 @@ def test_fanuc_positions():
     assert found.computed == ((5, "P[3] 100mm/sec FINE Offset,PR[1]"),)
 
 
+def test_fanuc_options_on_the_line_behind():
+    """As controllers write circles and long motions; the second point is not relative."""
+    lines = "   1:C P[1] INC\n    :  P[2] 9mm/sec FINE\n    :  WKZ_Offset,PR[1]    ;\n"
+    lines += "   2:L P[3] 9mm/sec FINE\n    :  INC    ;\n"
+    blocks = FANUC[FANUC.index("/POS") :]
+    found = dialect_of(".ls").read(f"/PROG  A\n/MN\n{lines}{blocks}")
+    relative = ["relative" in point.problem for point in found.points]
+    assert relative == [True, False, True]
+    assert found.computed == ((4, "P[2] 9mm/sec FINE : WKZ_Offset,PR[1]"),)
+
+
 SCRIPT = """def P():
   global A_p=p[.4, -.3, .2, 0, 3.1416, 0]  # p[1,2,3,4,5,6]
   B=[0, -1.57, 1.57, 0, 1.57, 0]
