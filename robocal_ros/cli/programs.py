@@ -468,7 +468,7 @@ def run_frame_shift(args: argparse.Namespace) -> CliResult:
         "in_force": was,
         "calibration_id": None,
         "output": None if args.output is None else str(args.output),
-        "warnings": warnings,
+        "warnings": warnings + factory_note(args.maker, nominal),
         "verdict": verdict_document(verdict),
     }
     if args.keep:

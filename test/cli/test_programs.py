@@ -285,6 +285,8 @@ def test_each_maker_has_its_own_text(work: Path, capsys, maker, lines):
     _, alone = shifted(capsys, "--maker", maker, "--parts", "tool")
     assert len(alone["text"].splitlines()) < len(told)
     assert alone["T_base_shift"]["xyz_mm"] == [0.0, 0.0, 0.0]
+    warned = any("factory calibration" in words for words in document["warnings"])
+    assert warned == (maker == "ur")  # the robot file is a nominal one
 
 
 def test_weights_are_taken_from_the_table(work: Path, capsys):
