@@ -216,8 +216,19 @@ def find_corners(image: Image, board: Chessboard) -> Array | None:
         if not found:
             return None
     grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
+    if (board.columns + board.rows) % 2 and not begins_dark(image, grid):
+        corners, grid = corners[::-1].copy(), grid[::-1, ::-1]  # the two begin at opposite ends
     nearest_px = min(np.linalg.norm(np.diff(grid, axis=k), axis=2).min() for k in (0, 1))
     return _refined(image, corners, 0.4 * nearest_px)
+
+
+def begins_dark(image: Image, grid: Array) -> bool:
+    """Whether the square beside the first of the corners (rows, columns, 2) is a dark one."""
+    middle = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    x, y = np.rint(middle).astype(int).reshape(-1, 2).T
+    seen = image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]
+    even = (np.indices(middle.shape[:2]).sum(axis=0) % 2 == 0).ravel()
+    return bool(seen[even].mean() < seen[~even].mean())
 
 
 def _refined(image: Image, corners: Any, free_px: float) -> Array:

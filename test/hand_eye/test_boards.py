@@ -35,6 +35,7 @@ from robocal_ros.hand_eye.boards import (
     Chessboard,
     Intrinsics,
     Markers,
+    begins_dark,
     boards_of_corners,
     find_corners,
     header_size,
@@ -72,6 +73,23 @@ def behind_a_hand(seen, rng) -> list[tuple[str, np.ndarray]]:
         (pixels if i % 2 else pixels.T)[: max(edge, 0)] = 90
         images.append((str(i), pixels))
     return images
+
+
+# ---- chessboards ---------------------------------------------------------------------------------
+
+
+def test_both_of_opencvs_ways_to_find_a_board_begin_at_its_dark_end() -> None:
+    """The one for blurred and glaring boards begins at the other end: half a turn of the board."""
+    pixels = board_set(1).images[0]
+    found, corners = cv2.findChessboardCornersSB(pixels, (COLUMNS, ROWS))
+    assert found
+    ours = find_corners(pixels, BOARD)
+    assert ours is not None
+    assert np.abs(corners.reshape(-1, 2)[::-1] - ours).max() < 1.0
+    grid = np.asarray(corners, dtype=np.float64).reshape(ROWS, COLUMNS, 2)
+    assert not begins_dark(pixels, grid)
+    assert begins_dark(pixels, grid[::-1, ::-1])
+    assert begins_dark(pixels, ours.reshape(ROWS, COLUMNS, 2))
 
 
 # ---- ChArUco boards -----------------------------------------------------------------------------
