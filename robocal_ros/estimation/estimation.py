@@ -661,3 +661,20 @@ def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:
             + "; ".join(words),
             words,
         )
+
+
+def correlation(residual: Array) -> float:
+    """How many neighbours in a stream (n, c) count as one: 1 + 2 sum of autocorrelations.
+
+    Summed up to the first pair of lags that is not positive (Geyer 1992).
+    """
+    r = residual - residual.mean(axis=0)
+    n = len(r)
+    power = np.abs(np.fft.rfft(r, 2 * n, axis=0)) ** 2
+    lagged = np.fft.irfft(power.sum(axis=1))[:n]
+    if lagged[0] <= 0.0:
+        return 1.0
+    rho = lagged / lagged[0]
+    pairs = rho[0 : n - n % 2 : 2] + rho[1 : n + n % 2 : 2][: n // 2]
+    until = int(np.argmax(pairs <= 0.0)) if np.any(pairs <= 0.0) else len(pairs)
+    return max(float(2.0 * pairs[:until].sum() - 1.0), 1.0)

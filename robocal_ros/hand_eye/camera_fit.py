@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.estimation.estimation import Estimate, solve
+from robocal_ros.estimation.estimation import Estimate, correlation, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.frames import Array, Index
 from robocal_ros.hand_eye.camera_data import Placement, PosePairs, Shared, plain
@@ -594,23 +594,6 @@ def fit_pairs(
     k = len(found.names)
     spread = np.zeros((k, k)) if found_noise is None else found_noise.spread
     return PairFit(pairs, noise, V, found, settled, spread, *linearised(pairs, state))
-
-
-def correlation(residual: Array) -> float:
-    """How many neighbours in a stream (n, c) count as one: 1 + 2 sum of autocorrelations.
-
-    Summed up to the first pair of lags that is not positive (Geyer 1992).
-    """
-    r = residual - residual.mean(axis=0)
-    n = len(r)
-    power = np.abs(np.fft.rfft(r, 2 * n, axis=0)) ** 2
-    lagged = np.fft.irfft(power.sum(axis=1))[:n]
-    if lagged[0] <= 0.0:
-        return 1.0
-    rho = lagged / lagged[0]
-    pairs = rho[0 : n - n % 2 : 2] + rho[1 : n + n % 2 : 2][: n // 2]
-    until = int(np.argmax(pairs <= 0.0)) if np.any(pairs <= 0.0) else len(pairs)
-    return max(float(2.0 * pairs[:until].sum() - 1.0), 1.0)
 
 
 # ---- whether lengths of robot and board differ by a factor ---------------------------------------

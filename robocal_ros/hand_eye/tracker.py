@@ -592,17 +592,19 @@ def solve_best(classic: Classic) -> tuple[TrackerProblem, Estimate[TrackerUnknow
     """
     data, target = classic.data, classic.target
     fits = [fit_lines(scan, name) for scan, name in zip(classic.parts, FACES, strict=False)]
-    scatter_m = float(np.sqrt(np.mean([scatter**2 for _, scatter in fits])))
+    scatter_m = float(np.sqrt(np.mean([scatter**2 for _, scatter, _ in fits])))
     noise_m = max(scatter_m, SMALLEST_NOISE_M)
+    alike = float(np.mean([alike for _, _, alike in fits]))
+    shared_m = noise_m * float(np.sqrt(alike))  # as if each point had its own
     lines = [
-        replace(line, z_sigma=line.z_sigma * noise_m, slope_sigma=line.slope_sigma * noise_m)
-        for line, _ in fits
+        replace(line, z_sigma=line.z_sigma * shared_m, slope_sigma=line.slope_sigma * shared_m)
+        for line, _, _ in fits
     ]
     state = _state(classic)
     axes = AxisPair.of(data, classic.axes)
     place = sphere_in(axes.sensor_poses(data, state), state.cube.centre)
     for _ in range(MOST_ROUNDS):
-        caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m)
+        caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m, alike)
         problem = TrackerProblem(data, target, classic.noise, state, axes, lines, caps)
         estimate = solve(problem, state)
         state, before = estimate.state, place

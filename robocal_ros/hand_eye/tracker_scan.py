@@ -13,6 +13,7 @@ from itertools import permutations
 
 import numpy as np
 
+from robocal_ros.estimation.estimation import correlation
 from robocal_ros.estimation.sphere import SphereRule, fit_sphere
 from robocal_ros.estimation.surfaces import MAD
 from robocal_ros.ground import frames
@@ -219,9 +220,10 @@ def _unbroken(scan: Scan) -> Scan:
     return scan.part(np.repeat(keep, ends - begins + 1))
 
 
-# The sensor's noise is along its beam (z). Of a face a profile holds a line: its z at the middle of
-# its x, and its slope, are all that it shows. Of the sphere it shows the centre, to first order
-# about a place that is known well: three combinations of it.
+# The sensor's noise is along its beam (z), and smoothed: some neighbours count as one point. Of a
+# face a profile holds a line: its z at the middle of its x, and its slope, are all that it shows.
+# Of the sphere it shows the centre, to first order about a place that is known well: three
+# combinations of it.
 
 FEWEST_POINTS = 8  # of a part in a profile
 FEWEST_LINES = 4
@@ -260,8 +262,10 @@ class Caps:
     seen: Mask
 
 
-def fit_lines(scan: Scan, name: str) -> tuple[Lines, float]:
+def fit_lines(scan: Scan, name: str) -> tuple[Lines, float, float]:
     """The face ``name`` in each profile, for a noise of 1 m, and the scatter of its points, m.
+
+    Last: how many neighbours count as one, since they share their noise.
 
     Raises `TooFewSamplesError` when fewer than four profiles show it.
     """
@@ -298,11 +302,21 @@ def fit_lines(scan: Scan, name: str) -> tuple[Lines, float]:
         slope_sigma=np.where(seen, 1.0 / np.sqrt(np.where(seen, spread, 1.0)), 1.0),
         seen=seen,
     )
-    return lines, noise
+    return lines, noise, correlation(_side_by_side(miss[shown], scan.profile[shown]))
 
 
-def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
+def _side_by_side(values: Array, profile: Index) -> Array:
+    """Values (n,) in the order of their profiles: a column (k, m) for each, zeros below."""
+    place = np.arange(len(profile)) - np.searchsorted(profile, profile)
+    columns = np.zeros((int(place.max()) + 1, int(profile.max()) + 1))
+    columns[place, profile] = values
+    return columns
+
+
+def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float, alike: float = 1.0) -> Caps:
     """The sphere in each profile, about its centres (m, 3), sensor frames, m.
+
+    ``alike``: so many neighbours share their noise.
 
     Raises `TooFewSamplesError` when hardly anything of it is seen.
     """
@@ -333,11 +347,11 @@ def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
                 "mij,mj->mi", axes, np.where(seen, turned / np.where(seen, size, 1.0), 0.0)
             )
             used &= np.abs(r - np.sum(J * shift[scan.profile], axis=1)) < REJECT
-    length = np.sqrt(np.where(seen, size, 1.0))
+    length, share = np.sqrt(np.where(seen, size, 1.0)), np.sqrt(alike)
     return Caps(
         place=place,
-        root=np.where(seen, length, 0.0)[:, :, None] * np.swapaxes(axes, 1, 2),
-        offset=np.where(seen, turned / length, 0.0),
+        root=np.where(seen, length / share, 0.0)[:, :, None] * np.swapaxes(axes, 1, 2),
+        offset=np.where(seen, turned / length / share, 0.0),
         seen=seen,
     )
 

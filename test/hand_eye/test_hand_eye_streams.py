@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bench.hand_eye_cell import BoardCell, BoardNoise
+from robocal_ros.estimation.estimation import correlation
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import InputError, TooFewSamplesError
 from robocal_ros.hand_eye.camera import CameraSettings, calibrate_streams, pair_streams
 from robocal_ros.hand_eye.camera_data import PoseStream, coarse_offset, pairs_at, stream_of
-from robocal_ros.hand_eye.camera_fit import GivenNoise, correlation
+from robocal_ros.hand_eye.camera_fit import GivenNoise
 
 MOUNTS = ("in-hand", "to-hand")
 NOISE = BoardNoise(1e-4, 2e-4, (4e-4, 4e-4, 4e-4), (1e-3, 1e-3, 1e-3))

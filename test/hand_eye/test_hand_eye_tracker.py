@@ -333,6 +333,36 @@ def test_spikes_in_the_profiles_do_no_harm():
     assert np.all(np.abs(error(made, found.T_flange_sensor)) < 4.0 * sigma)
 
 
+@cache
+def smoothed() -> list:
+    """Four times `prp`, the noise smoothed: neighbours are alike by 0.84, 0.53, 0.21, 0.05.
+
+    So are those of real line lasers. One point in 4.3 counts: 1 + 2 (0.84 + 0.53 + 0.21 + 0.05).
+    """
+    made, found = cell("prp"), []
+    taps = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / np.sqrt(19.0)
+    for seed in range(4):
+        rng = np.random.default_rng([9, seed])
+        profiles = [
+            Profile(p.points + np.outer(np.convolve(rng.normal(0.0, made.sensor.noise_m,
+                    len(p.points) + 4), taps, "valid"), [0.0, 1.0]), p.name)
+            for p in made.exact.profiles
+        ]  # fmt: skip
+        data = replace(made.measure(rng), profiles=profiles)
+        found.append(solve_tracker(data, made.told(rng), made.sizes.noise))
+    return found
+
+
+def test_noise_that_neighbours_share_is_no_misfit_of_honest_profiles():
+    for one in smoothed():
+        assert not one.rejected  # 0.01 each by chance
+        assert one.more["residual_over_noise"] < 1.15  # of some 600 numbers: 1 +- 0.03
+    off = np.array([error(cell("prp"), one.T_flange_sensor) for one in smoothed()])
+    spread = np.array([one.covariance for one in smoothed()])
+    chi2 = np.einsum("ni,nij,nj->", off, np.linalg.inv(spread), off)
+    assert abs(chi2 / off.size - 1.0) < 4.0 * np.sqrt(2.0 / off.size)
+
+
 def with_arc(which: int, arc: Arc) -> TrackerData:
     arcs = list(noisy().arcs)
     arcs[which] = arc
