@@ -71,6 +71,8 @@ def write_target(path: Path, target: LaserTarget) -> None:
             "user_sigma_mm": target.user_sigma_m * 1e3,
             "user_sigma_deg": float(np.degrees(target.user_sigma_rad)),
         }
+        if target.convex is not None:
+            document["convex"] = [bool(one) for one in target.convex]
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=2**16)
     write_text(path, text)
 

@@ -41,6 +41,7 @@ Match = tuple[Index, Index]  # corners of a profile (rows of its fit), and the t
 PARTS = 50  # of the corners that are tried
 NO_STRETCH = 2e-3  # of their length: corners that lie on one line but for so much
 CLEAR = 1.5  # times better than the next, from which a place along the target is sure
+SURE = 4.0  # standard deviations of distances, from which the next is no such place at all
 NEAR = 0.35  # of the distance between neighbours: farther than this is another corner
 TURNED_M, TURNED = 5e-4, 0.3  # the order of the target file is kept unless it misses by so much
 HOPELESS_M = 2e-3  # misfit of the closed form that no place of the sensor makes one of right data
@@ -84,7 +85,7 @@ class StepTask(Task):
         for i, fit in fits.items():
             T = np.broadcast_to(data.T_base_flange[i] @ T_flange_sensor, (len(corners[i]), 4, 4))
             predicted = self.model(corners[i]).see(T, self.target.T_base_user).value
-            match = _match_nearest(fit, predicted[:, :2])
+            match = _match_nearest(fit, predicted[:, :2], self.target.convex)
             if len(match[0]):
                 matches[i] = match
             else:
@@ -106,7 +107,7 @@ class StepTask(Task):
 
         Where corners are nearly in line the closed form alone may be far off.
         """
-        matches = _along(fits, corners)
+        matches = self._along(fits, corners)
         view = self._view(data, fits, corners, matches)
         near = first_look((view,), self.starts(view)[0])
         if (miss := misfit((view,), near)) > TURNED_M:
@@ -114,6 +115,25 @@ class StepTask(Task):
             other = first_look((view,), self.starts(view)[0])
             near = other if misfit((view,), other) < TURNED * miss else near
         return near.T_flange_sensor
+
+    def _along(self, fits: Mapping[int, CornerFit], corners: Sequence[Array]) -> dict[int, Match]:
+        """Profiles that show the whole target, and only in one way, laid along it."""
+        convex = self.target.convex
+        kinds = None if convex is None else tuple(map(bool, convex))
+        matches = {}
+        for i, fit in fits.items():
+            apart = tuple(np.linalg.norm(np.diff(corners[i], axis=0), axis=1).tolist())
+            match = _match_along(fit, apart, kinds, self.target.sigma_m)
+            if match is not None:
+                matches[i] = match
+        if not matches:
+            shown = ", ".join(f"{len(fit.points)}" for fit in fits.values())
+            raise ResidualError(
+                f"no profile shows all {len(corners[0])} corners of the target alone, in one place "
+                f"(they show {shown} corners, concave ones too): check the target file and the "
+                "field of view, and keep what looks like one step more out of it"
+            )
+        return matches
 
     def _view(
         self,
@@ -146,7 +166,7 @@ class StepTask(Task):
         """
         fits, _ = fitted(data, lambda profile: _corners(profile, self.rule))
         corners = self._told(data)
-        matches = _along(fits, corners)
+        matches = self._along(fits, corners)
         for each in (matches, _turned(matches)):
             one = self._view(data, fits, corners, each)
             if misfit((one,), self.starts(one)[0]) < HOPELESS_M:
@@ -291,43 +311,42 @@ def _corners_apart(X: Array, value: Array, p_flange: Array) -> Array:
     return np.asarray(np.linalg.norm(found - p_flange, axis=-1))
 
 
-def _along(fits: Mapping[int, CornerFit], corners: Sequence[Array]) -> dict[int, Match]:
-    """Profiles that show the whole target, and only in one way, laid along it."""
-    matches = {}
-    for i, fit in fits.items():
-        apart = np.linalg.norm(np.diff(corners[i], axis=0), axis=1)
-        if (match := _match_along(fit, tuple(apart.tolist()))) is not None:
-            matches[i] = match
-    if not matches:
-        shown = ", ".join(f"{len(fit.points)}" for fit in fits.values())
-        raise ResidualError(
-            f"no profile shows all {len(corners[0])} corners of the target alone (they show "
-            f"{shown} corners, concave ones too): check the target file and the field of view"
-        )
-    return matches
-
-
 def _turned(matches: Mapping[int, Match]) -> dict[int, Match]:
     """The same, the corners in the other order."""
     return {i: (rows, order[::-1]) for i, (rows, order) in matches.items()}
 
 
 @lru_cache(maxsize=PROFILES)
-def _match_along(fit: CornerFit, spacing: tuple[float, ...]) -> Match | None:
-    """Lay a profile's corners along all of a target, so far apart; None where it is not clear."""
+def _match_along(
+    fit: CornerFit, spacing: tuple[float, ...], convex: tuple[bool, ...] | None, sigma_m: float
+) -> Match | None:
+    """Lay a profile's corners along all of a target, so far apart; None where it is not clear.
+
+    ``convex``: which of the target's are outer edges, None where nothing is told. ``sigma_m``: of
+    a target's corner.
+    """
     k, apart = len(spacing) + 1, np.array(spacing)
     every = np.arange(len(fit.points))
     found: list[tuple[float, Index]] = []
     for rows in (every, every[fit.convex], every[~fit.convex]):
         for first in range(len(rows) - k + 1):
             window = rows[first : first + k]
+            kinds = tuple(map(bool, fit.convex[window]))
+            if convex is not None and kinds not in (convex, convex[::-1]):
+                continue
             own = np.linalg.norm(np.diff(fit.points[window], axis=0), axis=1)
             off = min(_unlike(own, apart), _unlike(own, apart[::-1]))
             if not any(np.array_equal(window, other) for _, other in found):
                 found.append((off, window))
     found.sort(key=lambda pair: pair[0])
-    if not found or (len(found) > 1 and found[1][0] < CLEAR * found[0][0]):
+    if not found:
         return None
+    if len(found) > 1:
+        # Corners of equal steps are equally far apart: which fits better, is then chance.
+        sigma = float(np.hypot(sigma_m, fit.noise_m)) / min(spacing, default=np.inf)
+        chance = SURE * sigma * np.sqrt(2.0 / max(k - 1, 1))
+        if found[1][0] <= max(CLEAR * found[0][0], found[0][0] + chance):
+            return None
     return found[0][1], np.arange(k)
 
 
@@ -339,9 +358,14 @@ def _unlike(own: Array, spacing: Array) -> float:
     return float(np.std(ratio) + 0.1 * abs(np.mean(ratio) - 1.0))
 
 
-def _match_nearest(fit: CornerFit, predicted: Array) -> Match:
-    """The corners that lie where the target's (k, 2) are predicted, sensor frame, m."""
+def _match_nearest(fit: CornerFit, predicted: Array, convex: Array | None) -> Match:
+    """The corners that lie where the target's (k, 2) are predicted, sensor frame, m.
+
+    ``convex`` (k,): which of the target's are outer edges, None where nothing is told.
+    """
     gap = np.linalg.norm(fit.points[:, None] - predicted[None], axis=2)
+    if convex is not None:
+        gap[fit.convex[:, None] != convex] = np.inf
     apart = np.linalg.norm(predicted[:, None] - predicted[None], axis=2)
     apart[np.diag_indices_from(apart)] = np.inf
     rows = np.argmin(gap, axis=0)

@@ -77,7 +77,10 @@ class StepTarget:
     mark the corners (k, 3), m, user frame, in the order in which a profile that is laid through
     this mark shows them. ``edge_user`` (3,) unit vector along the edges, user frame. ``sigma_m``:
     machining error of each corner's coordinate, one sigma. ``user_sigma_m``, ``user_sigma_rad``:
-    error of ``T_base_user`` about each axis, one sigma; it is common to all corners.
+    error of ``T_base_user`` about each axis, one sigma; it is common to all corners. ``convex``
+    (k,): which of a mark's corners are outer edges, of each mark alike; None where nothing is told.
+
+    Raises `ValueError` where a mark has another number of corners than ``convex`` tells.
     """
 
     T_base_user: Array
@@ -86,6 +89,13 @@ class StepTarget:
     sigma_m: float = MACHINING_M
     user_sigma_m: float = 0.0
     user_sigma_rad: float = 0.0
+    convex: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.convex is not None:
+            for mark, rows in self.corners.items():
+                if len(rows) != len(self.convex):
+                    raise ValueError(f"convex tells {len(self.convex)}, {mark} has {len(rows)}")
 
     def require_marks(self, marks: Iterable[str]) -> None:
         """Raise `InputError`, naming the first of the marks that the target does not have."""
@@ -176,6 +186,14 @@ class Staircase:
         """Unit vector (3,) along the edges, user frame."""
         return np.array([1.0, 0.0, 0.0])
 
+    @property
+    def convex(self) -> Array:
+        """Which of a mark's corners (k,) are outer edges; from either end the same."""
+        if self.corners == "both":
+            return np.asarray(np.arange(2 * self.steps - 1) % 2 == 0)
+        outer = self.corners == "convex"
+        return np.full(self.steps if outer else self.steps - 1, outer)
+
     def marked_corners(self) -> dict[str, Array]:
         """Corners (k, 3) of each mark, m, user frame, in the order of a profile."""
         yz = []
@@ -252,7 +270,7 @@ def _require_numbers(name: str, value: Any) -> None:
             _require_numbers(f"corners of {mark}", rows)
         return
     shape = SHAPE_OF.get(name, (max(len(value), 1), 3) if name.startswith("corners") else ())
-    if name == "distortion":
+    if name in ("distortion", "convex"):
         shape = (max(len(value), 1),)
     if np.shape(value) != shape or not np.all(np.isfinite(np.asarray(value, dtype=np.float64))):
         raise ValueError(f"{name} must be finite numbers of shape {shape}")
@@ -338,18 +356,21 @@ def _board(top: Fields, folder: Path, marked: bool) -> BoardTarget:
 
 def _step(top: Fields) -> StepTarget:
     top.only(
-        "kind", "T_base_user", "staircase", "corners_mm", "edge_user",
+        "kind", "T_base_user", "staircase", "corners_mm", "convex", "edge_user",
         "sigma_mm", "user_sigma_mm", "user_sigma_deg",
     )  # fmt: skip
     if ("staircase" in top.values) == ("corners_mm" in top.values):
         top.fail("must give either staircase, or corners_mm with edge_user")
     if "staircase" in top.values:
-        if "edge_user" in top.values:
-            top.fail("is x for a staircase: leave it out", "edge_user")
+        for key, told in (("edge_user", "x"), ("convex", "told by corners")):
+            if key in top.values:
+                top.fail(f"is {told} for a staircase: leave it out", key)
         staircase = _staircase(top.below("staircase"))
         corners, edge = staircase.marked_corners(), staircase.edge_user
+        convex: Array | None = staircase.convex
     else:
         corners, edge = _corners(top.below("corners_mm")), _direction(top, "edge_user")
+        convex = _convex(top, corners)
     T_base_user = _user_frame(top.below("T_base_user"))
     sigma_m = top.positive("sigma_mm", MACHINING_M * 1e3) * 1e-3
     taught = {}
@@ -358,9 +379,8 @@ def _step(top: Fields) -> StepTarget:
         if taught[key] < 0.0:
             top.fail(f"is {taught[key]:g}; it must not be below 0", key)
     user_sigma_rad = float(np.radians(taught["user_sigma_deg"]))
-    return StepTarget(
-        T_base_user, corners, edge, sigma_m, taught["user_sigma_mm"] * 1e-3, user_sigma_rad
-    )
+    user_sigma_m = taught["user_sigma_mm"] * 1e-3
+    return StepTarget(T_base_user, corners, edge, sigma_m, user_sigma_m, user_sigma_rad, convex)
 
 
 def _staircase(fields: Fields) -> Staircase:
@@ -386,6 +406,19 @@ def _corners(fields: Fields) -> dict[str, Array]:
             fields.fail("must be a list of corners [x, y, z]", mark)
         corners[mark] = 1e-3 * _points(rows, "corner", fields, mark)
     return corners
+
+
+def _convex(top: Fields, corners: Mapping[str, Array]) -> Array | None:
+    """Which corners (k,) are outer edges; None where it is left out."""
+    if "convex" not in top.values:
+        return None
+    told = top.values["convex"]
+    if not isinstance(told, list) or not all(isinstance(one, bool) for one in told):
+        top.fail("must be a list of true and false, one of each corner", "convex")
+    for mark, rows in corners.items():
+        if len(rows) != len(told):
+            top.fail(f"tells {len(told)} corners, {mark} has {len(rows)}", "convex")
+    return np.array(told, dtype=np.bool_)
 
 
 def _user_frame(fields: Fields) -> Array:

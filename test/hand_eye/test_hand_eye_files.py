@@ -288,6 +288,8 @@ def test_corners_come_in_the_order_of_a_profile():
     concave = [[0.02, 0.01], [0.04, 0.02]]
     both = [convex[0], concave[0], convex[1], concave[1], convex[2]]
     for corners, expected in (("convex", convex), ("concave", concave), ("both", both)):
+        outer = [place in convex for place in expected]
+        assert Staircase(3, 0.09, 0.01, 0.02, corners).convex.tolist() == outer
         assert section(corners=corners) == pytest.approx(np.array(expected), abs=1e-15)
         turned = section(corners=corners, first="highest")
         assert turned == pytest.approx(np.array(expected[::-1]), abs=1e-15)
@@ -320,6 +322,7 @@ def test_a_target_that_is_written_is_read(tmp_path, kind):
         (LINE | {"point_mm": [8e5, 0, 0]}, "point_mm .*thousand"),
         (STEP | {"corners_mm": {}}, "either staircase, or corners_mm"),
         (STEP | {"edge_user": [1, 0, 0]}, "edge_user is x for a staircase"),
+        (STEP | {"convex": [True]}, "convex is told by corners for a staircase"),
         (STEP | {"user_sigma_mm": -1}, "user_sigma_mm is -1"),
         ({k: v for k, v in STEP.items() if k != "user_sigma_deg"}, "user_sigma_deg is missing"),
         (frame(xyz_mm=[8e5, 0, 0], rpy_deg=[0, 0, 0]), "xyz_mm .*thousand"),
@@ -347,6 +350,11 @@ def test_corners_in_full(tmp_path):
     assert found.corners["left"] == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]) * 1e-3)
     assert found.edge_user.tolist() == [0.0, 1.0, 0.0]
     assert found.T_base_user[:3, :3] @ [1, 0, 0] == pytest.approx(np.array([0, 1, 0]))
+    assert found.convex is None
+    assert target(tmp_path, document | {"convex": [True, False]}).convex.tolist() == [True, False]
+    for told, words in ((True, "must be a list of true"), ([True], "tells 1 corners, left")):
+        with pytest.raises(InputError, match=f"convex {words}"):
+            target(tmp_path, document | {"convex": told})
     document["corners_mm"] = {"left": [[1, 2, 3], [4, 5]]}
     with pytest.raises(InputError, match="corners_mm, left, corner 2 must be a list of 3 numbers"):
         target(tmp_path, document)

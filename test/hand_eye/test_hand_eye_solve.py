@@ -29,13 +29,14 @@ from bench.hand_eye_cell import (
     HandEyeCell,
     PoseRobot,
     SimulatedShots,
+    TrueStairs,
     edge_block,
     edge_shots,
     groove_shots,
     sphere_shots,
     step_shots,
 )
-from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table
+from robocal_ros.cell_sim.sensors import ProfileSensor, Scene, ball_on_table, table
 from robocal_ros.estimation import estimation
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
@@ -206,6 +207,13 @@ class TestMistakes:
         assert found.leave_one_out_m is not None
 
 
+class OnTable(HandEyeCell):
+    """What stands, stands on a table that is seen."""
+
+    def shoot(self, scene, *more):
+        return super().shoot(Scene((*scene.bodies, table(T_BASE_USER[:3, 3]))), *more)
+
+
 class TestStep:
     def shots(self, seed, count=5, **more):
         return data_of(step_shots(CELL, STAIRS, count, np.random.default_rng(seed), **more))
@@ -247,6 +255,27 @@ class TestStep:
         corners = {mark: mirror * places for mark, places in drawn.corners.items()}
         with pytest.raises(ResidualError, match="left-handed"):
             solve_step(self.shots(3, 8), replace(drawn, corners=corners))
+
+    @pytest.mark.parametrize("corners", ["convex", *more("both")])
+    def test_stairs_on_a_table_show_as_many_inner_edges_and_are_not_laid_along_these(self, corners):
+        """Else the sensor is told a step away, with all shots in use and a tenth of that told."""
+        low = TrueStairs(T_BASE_USER, steps=3)
+        target = stairs_target(stairs=low, corners=corners)
+        for seed in range(3, 3 + amount(1, 5)):
+            rng = np.random.default_rng([31, seed])
+            shots = data_of(step_shots(OnTable(), low, 8, rng, level=corners != "convex"))
+            assert chi_square(solve_step(shots, target), TRUE) < FAR_OFF
+
+    @pytest.mark.parametrize("convex", [None, np.array([False, False])])
+    def test_corners_that_lie_alike_in_two_places_are_not_laid_by_chance(self, convex):
+        """Inner edges of equal steps: the foot at the table looks as they do."""
+        low = TrueStairs(T_BASE_USER, steps=3)
+        target = stairs_target(stairs=low, corners="concave", convex=convex)
+        for seed in range(amount(1, 5)):
+            rng = np.random.default_rng([32, seed])
+            shots = data_of(step_shots(OnTable(), low, 8, rng, level=True))
+            with pytest.raises(ResidualError, match="all 2 corners of the target alone, in one"):
+                solve_step(shots, target)
 
     def test_an_unknown_mark(self):
         data = replace(self.shots(2), marks=("middle",) * 5)

@@ -23,8 +23,10 @@ LINE = LineTarget(T_BASE_USER[:3, 3], T_BASE_USER[:3, 0])
 FAR_OFF = 22.46  # chi-square of 6 numbers, exceeded once in 1000
 
 
-def stairs_target(T_base_user=T_BASE_USER, **known):
-    drawn = Staircase(STAIRS.steps, STAIRS.length_m, STAIRS.height_m, STAIRS.depth_m)
+def stairs_target(T_base_user=T_BASE_USER, stairs=STAIRS, corners="convex", **known):
+    """As a target file's ``staircase`` tells it."""
+    drawn = Staircase(stairs.steps, stairs.length_m, stairs.height_m, stairs.depth_m, corners)
+    known = {"convex": drawn.convex} | known
     return StepTarget(T_base_user, drawn.marked_corners(), drawn.edge_user, **known)
 
 
