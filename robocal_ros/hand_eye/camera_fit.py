@@ -591,9 +591,29 @@ def fit_pairs(
         if settled:
             break
         noise = found_noise.noise
-    k = len(found.names)
+    k, (differences, jacobian) = len(found.names), linearised(pairs, state)
     spread = np.zeros((k, k)) if found_noise is None else found_noise.spread
-    return PairFit(pairs, noise, V, found, settled, spread, *linearised(pairs, state))
+    if np.any(free) and not enough:
+        spread = found.covariance * (_of_few(differences, V) / found.scale**2 - 1.0)
+    return PairFit(pairs, noise, V, found, settled, spread, differences, jacobian)
+
+
+def _of_few(differences: Array, expected: Array) -> float:
+    """Square of the noise over the ``expected``, as few samples (m, 6) leave it open.
+
+    Six unknowns are of positions and six of turns, and which of the two is noisier is not known:
+    the larger is taken. What n numbers tell of a variance is its inverse chi-square: n / (n - 2) of
+    it in the mean.
+    """
+    freedom = max(3.0 * len(differences) - 6.0, 3.0)
+    parts = [
+        np.einsum("mi,mij,mj->", own, np.linalg.inv(V), own)
+        for own, V in (
+            (differences[:, :3], expected[:, :3, :3]),
+            (differences[:, 3:], expected[:, 3:, 3:]),
+        )
+    ]
+    return float(max(parts)) / (freedom - 2.0)
 
 
 # ---- whether lengths of robot and board differ by a factor ---------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured
 from scipy.stats import chi2
 
-from bench.hand_eye_cell import BoardCell, TruePose
+from bench.hand_eye_cell import BoardCell, BoardNoise, TruePose
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import (
     Code,
@@ -218,6 +218,31 @@ def test_few_noisy_poses_are_not_blamed(count: int) -> None:
         _, pairs = measured(count, 700 + seed)
         found = calibrate_camera(pairs)
         assert found.residual_m.max() < 5e-3
+
+
+PLACES = BoardNoise(3e-4, 1e-6, (3e-4,) * 3, (1e-6,) * 3)  # all of it
+
+
+@pytest.mark.parametrize("noise", [BoardNoise(), PLACES], ids=["as usual", "of positions alone"])
+@pytest.mark.parametrize("count", [4, 5])
+def test_the_expected_error_of_few_poses_holds(count: int, noise: BoardNoise) -> None:
+    """Whatever their noise is of.
+
+    The bound is of what chance does to the mean of so many squared errors, of a noise that six or
+    nine numbers told: an inverse chi-square, whose tail is long.
+    """
+    runs, numbers = 150, 3 * count - 6
+    ratio = []
+    for seed in range(runs):
+        cell, pairs = measured(count, 9000 + seed, noise=noise)
+        found = calibrate_camera(pairs)
+        where = np.append(pairs.T_camera_board[:, :3, 3].mean(axis=0), 1.0)
+        away = (found.T_flange_sensor - cell.camera.matrices()[0]) @ where
+        ratio.append(float(away @ away) / float(found.working_error_m or 0.0) ** 2)
+    rng = np.random.default_rng(1)
+    drawn = (numbers - 2.0) / rng.chisquare(numbers, (4000, runs))
+    drawn *= rng.chisquare(3, (4000, runs)) / 3.0
+    assert np.mean(ratio) < np.quantile(drawn.mean(axis=1), 0.999)
 
 
 def test_leaving_one_out_is_as_solving_without_it() -> None:
