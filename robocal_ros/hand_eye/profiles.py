@@ -223,7 +223,7 @@ def sensor_of(name: str, z_grows: str = "") -> SensorDescription:
     elif name in PRESETS:
         found = PRESETS[name]
     elif Path(name).suffix or Path(name).exists():
-        found = _read_description(Path(name))
+        return _read_description(Path(name), z_grows)
     else:
         raise InputError(
             f"sensor {quoted(name)} is no file, and none of {', '.join(PRESETS)}: describe it in "
@@ -232,7 +232,7 @@ def sensor_of(name: str, z_grows: str = "") -> SensorDescription:
     return replace(found, z_grows=z_grows) if z_grows else found
 
 
-def _read_description(path: Path) -> SensorDescription:
+def _read_description(path: Path, z_grows: str) -> SensorDescription:
     top = read_fields(path, "sensor description")
     known: Document = asdict(DEFAULT)
     top.only("preset", *known)
@@ -257,7 +257,7 @@ def _read_description(path: Path) -> SensorDescription:
             told[key] = top.positive(key)
         elif key != "preset":
             told[key] = top.number(key)
-    found = replace(base, **told)
+    found = replace(base, **told | ({"z_grows": z_grows} if z_grows else {}))
     _require_whole(found, top)
     return found
 
@@ -280,7 +280,9 @@ def _require_whole(sensor: SensorDescription, top: Fields) -> None:
             top.fail(f"is {ends[0]:g}, far_mm {ends[1]:g}: the field has no depth", "near_mm")
         if (ends[0] > ends[1]) != sensor.towards:
             top.fail(
-                f"is {ends[0]:g}, far_mm {ends[1]:g}, but z grows {sensor.z_grows} the sensor",
+                f"is {ends[0]:g}, far_mm {ends[1]:g}, but z grows "
+                f"{'towards' if sensor.towards else 'away from'} the sensor: say z_grows, or "
+                "exchange the two",
                 "near_mm",
             )
 

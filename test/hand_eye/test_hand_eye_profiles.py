@@ -321,7 +321,10 @@ def test_a_description_is_read_and_kept_by_a_recording(tmp_path):
     assert found == replace(
         PRESETS["lmi-gocator"], x="1", z="2", unit="um", near_mm=12.0, far_mm=-12.5, ordered=False
     )
-    assert sensor_of(str(path), "away") == replace(found, z_grows="away")
+    with pytest.raises(InputError, match=r"far_mm -12\.5, but z grows away from the sensor"):
+        sensor_of(str(path), "away")  # as is said beside it, for the file and its range too
+    path.write_text("z_grows: away\nnear_mm: 12\nfar_mm: -12.5\n")
+    assert sensor_of(str(path), "towards").towards
     path.write_text("no_return: -5\n")
     assert sensor_of(str(path)).no_return == (-5.0,)
     config = HandEyeConfig(sensor=found)
@@ -342,7 +345,7 @@ def test_a_description_is_read_and_kept_by_a_recording(tmp_path):
         ("z: Z\nlines: true", "must be given with the other one|lines needs x_pitch_mm"),
         ("least_intensity: 4", "least_intensity needs intensity"),
         ("near_mm: 3", "both near_mm and far_mm"),
-        ("near_mm: 12\nfar_mm: -12", "near_mm is 12, far_mm -12, but z grows away"),
+        ("near_mm: 12\nfar_mm: -12", "near_mm is 12, far_mm -12, but z grows away from .*z_grows"),
         ("near_mm: 2\nfar_mm: 2", "the field has no depth"),
         ("unit: cm", "unit is 'cm'"),
         ("x_pitch_mm: 0", "must be above 0"),
