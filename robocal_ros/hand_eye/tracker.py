@@ -497,8 +497,8 @@ def solve_tracker(
     }
     states = states_without(problem, estimate, [profile.name for profile in data.profiles])
     told = estimate.covariance[SENSOR, SENSOR]
-    z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
-    working_m = float(expected_error_m(told, np.array([[0.0, 0.0, z]])))
+    field = field_points([profile.points for profile in data.profiles])
+    working_m = float(expected_error_m(told, field))
     angle, gap_m = estimate.state.mismatch.tolist()
     more = {
         **best.more,

@@ -267,6 +267,13 @@ def test_where_the_tracker_stands_does_not_matter(method):
     assert np.abs(away - np.eye(4)).max() < 2e-6  # closed form and descent stop at 1e-6
 
 
+def test_where_x_is_counted_from_does_not_matter():
+    """As of a sensor whose x begins at one end of its line: the same points, the same error."""
+    aside = [replace(p, points=p.points + np.array([0.1, 0.0])) for p in noisy().profiles]
+    found = solve(replace(noisy(), profiles=aside))
+    assert found.working_error_m == pytest.approx(clean().working_error_m, rel=1e-3)
+
+
 def test_names_of_faces_and_arcs_do_not_matter():
     data = noisy()
     swapped = replace(data, faces=(data.faces[1], data.faces[0]), arcs=(data.arcs[1], data.arcs[0]))
