@@ -257,7 +257,7 @@ def target_of(document: Mapping[str, Any]) -> Target | None:
             elif value is not None or field.default is not None:
                 _require_numbers(field.name, value)
         return target
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"the target cannot be read: {error}") from error
 
 
