@@ -151,16 +151,23 @@ def link_transform(row: Array) -> Array:
     return T
 
 
+def parallel_row(axis: Array, meeting: Array, sign: float = 1.0) -> Array:
+    """Hayati's row (5,), m and rad, to a line along a unit ``axis`` (3,), nearly parallel to z.
+
+    ``meeting`` (3,), m: where it meets the plane z = 0. ``sign``: that of the row's a.
+    """
+    a = float(np.copysign(np.hypot(meeting[0], meeting[1]), sign))
+    theta = float(np.arctan2(meeting[1] * np.sign(a), meeting[0] * np.sign(a)))
+    c, s = np.cos(theta), np.sin(theta)
+    x, y = c * axis[0] + s * axis[1], c * axis[1] - s * axis[0]
+    # the axis in the turned frame is (sin beta, -sin alpha cos beta, cos alpha cos beta)
+    return np.array([0.0, theta, a, np.arctan2(-y, axis[2]), np.arcsin(x)])
+
+
 def _parallel_link(dh: Array, nominal: Array) -> tuple[Array, float, float]:
     """Hayati row of one link, and the turn about and shift along its z axis that remain."""
     T = link_transform(dh)
     axis, origin = T[:3, 2], T[:3, 3]
-    meeting = origin - axis * (origin[2] / axis[2])
-    a = float(np.copysign(np.hypot(meeting[0], meeting[1]), nominal[A]))
-    theta = float(np.arctan2(meeting[1] * np.sign(a), meeting[0] * np.sign(a)))
-    c, s = np.cos(theta), np.sin(theta)
-    x, y, z = c * axis[0] + s * axis[1], c * axis[1] - s * axis[0], axis[2]
-    # the axis in the turned frame is (sin beta, -sin alpha cos beta, cos alpha cos beta)
-    row = np.array([0.0, theta, a, np.arctan2(-y, z), np.arcsin(x)])
+    row = parallel_row(axis, origin - axis * (origin[2] / axis[2]), nominal[A])
     rest = np.linalg.solve(link_transform(row), T)
     return row, float(np.arctan2(rest[1, 0], rest[0, 0])), float(rest[2, 3])

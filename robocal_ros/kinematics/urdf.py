@@ -27,7 +27,7 @@ from robocal_ros.ground.frames import (
 from robocal_ros.kinematics.arm import NEARLY_PARALLEL, SerialArm
 from robocal_ros.kinematics.joint_functions import ArmLoad
 from robocal_ros.kinematics.robots import FULL_SPEED_IN_S, RobotDescription, text_hash
-from robocal_ros.kinematics.universal_robots import JOINT_NAMES, link_transform
+from robocal_ros.kinematics.universal_robots import JOINT_NAMES, link_transform, parallel_row
 
 MOVING = ("revolute", "continuous", "prismatic")
 BASES, TIPS = ("base",), ("tool0", "flange")  # of REP-199, which industrial robots have
@@ -382,13 +382,9 @@ def _parallel(axis: Array, point: Array) -> Array:
     if np.hypot(axis[0], axis[1]) < _PARALLEL:
         axis = np.array([0.0, 0.0, np.sign(axis[2])])
     meeting = point - axis * (point[2] / axis[2])
-    a = float(np.hypot(meeting[0], meeting[1]))
-    theta = float(np.arctan2(meeting[1], meeting[0])) if a > SAME_LINE_M else 0.0
-    a = a if a > SAME_LINE_M else 0.0
-    c, s = np.cos(theta), np.sin(theta)
-    x, y = c * axis[0] + s * axis[1], c * axis[1] - s * axis[0]
-    # The axis in the turned frame is (sin beta, -sin alpha cos beta, cos alpha cos beta).
-    return np.array([0.0, theta, a, np.arctan2(-y, axis[2]), np.arcsin(x)])
+    if np.hypot(meeting[0], meeting[1]) <= SAME_LINE_M:
+        meeting = np.zeros(3)
+    return parallel_row(axis, meeting)
 
 
 def _flange(T: Array) -> Array:
