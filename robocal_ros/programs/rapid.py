@@ -36,7 +36,6 @@ Tree = Field | list["Tree"]
 
 QUADRANT = 90.0 * DEGREE
 QUADRANT_OF = {"cf1": 0, "cf4": 3, "cf6": 5}
-MANY = "?"
 
 _DECLARED = re.compile(
     r"\b(?P<type>robtarget|jointtarget|tooldata|wobjdata)\s+(?P<name>\w+)\s*(?:\{[^}]*\})?\s*:=\s*(?=\[)",
@@ -60,25 +59,14 @@ _CHANGED = re.compile(
 )
 
 
-@dataclass
-class _Motions:
-    """The motions that name a point: tool and work object, `MANY` where they differ.
-
-    ``at``: where the first of them stands. ``free``: all are run with ConfL or ConfJ off.
-    """
+@dataclass(frozen=True)
+class _Motion:
+    """Tool and work object of a motion that stands at ``at``; ``free``: ConfL or ConfJ is off."""
 
     tool: str
     frame: str
     at: int
     free: bool
-
-    def joined(self, other: "_Motions") -> "_Motions":
-        """Both, this one first."""
-        tool, frame = (
-            one if one == two else MANY
-            for one, two in ((self.tool, other.tool), (self.frame, other.frame))
-        )
-        return _Motions(tool, frame, self.at, self.free and other.free)
 
 
 class RapidDialect(Dialect):
@@ -260,12 +248,12 @@ def _is_free(kind: str, at: int, switches: Sequence["re.Match[str]"]) -> bool:
 
 def _uses(
     text: str, clean: str, frames: dict[str, Array], points: list[tuple[str, ProgramPoint]]
-) -> dict[str, _Motions]:
-    """What the motions say that name a point.
+) -> dict[str, list[_Motion]]:
+    """The motions that name a point, in the order of the text.
 
     Points that are written in a motion are added to ``points``.
     """
-    uses: dict[str, _Motions] = {}
+    uses: dict[str, list[_Motion]] = {}
     switches = list(_CONF.finditer(clean))
     for found in _MOVES.finditer(clean):
         parts = arguments(clean, found.start(2), found.end(2))
@@ -275,7 +263,7 @@ def _uses(
         tool, frame = _ends(parts, found[1], line_of(text, found.start()), frames)
         kind = "J" if _BY_JOINTS.match(found[1]) else "L"
         free = _is_free(kind, found.start(), switches)
-        use = _Motions(tool, frame, found.start(), free)
+        use = _Motion(tool, frame, found.start(), free)
         first = 2 if found[1].lower().startswith("search") else 0  # behind its signal and result
         parts = [part for part in parts if not re.match(r"\\\s*\w+\s*:=", part.text)]
         for part in parts[first : first + _PLAIN.get(found[1].lower(), 2)]:
@@ -288,10 +276,10 @@ def _uses(
             if literal:
                 name = f"{found[1]} in line {line_of(text, at)}"
                 points += _points(text, name, f"@{at}", _tree(clean, at))
-                uses[f"@{at}"] = use
+                uses[f"@{at}"] = [use]
                 continue
             for name in _named(part.text):
-                uses[name] = uses[name].joined(use) if name in uses else use
+                uses.setdefault(name, []).append(use)
     return uses
 
 
@@ -319,19 +307,19 @@ def _named(word: str) -> Sequence[str]:
 
 
 def _framed(
-    name: str, point: ProgramPoint, uses: dict[str, _Motions], problems: dict[str, str]
+    name: str, point: ProgramPoint, uses: dict[str, list[_Motion]], problems: dict[str, str]
 ) -> ProgramPoint:
     if name not in uses:
         return point
-    use = uses[name]
-    point = replace(point, order=use.at)
+    motions = uses[name]
+    point = replace(point, order=motions[0].at)
     if point.joints:
         return point
-    if use.free:
+    if all(motion.free for motion in motions):
         point = replace(point, posture=Posture(), marks={})
-    ends = use.tool, use.frame
-    problem = next((problems[one] for one in ends if one in problems), "")
-    if MANY in ends:
-        problem = "motions with different tools or work objects go to it"
-    known = (None if one == MANY else one for one in ends)
-    return replace(point, tool=next(known), frame=next(known), problem=point.problem or problem)
+    ends = {motion.tool for motion in motions}, {motion.frame for motion in motions}
+    tool, frame = (one.pop() if len(one) == 1 else None for one in ends)
+    problem = "motions with different tools or work objects go to it"
+    if tool is not None and frame is not None:
+        problem = problems.get(tool) or problems.get(frame, "")
+    return replace(point, tool=tool, frame=frame, problem=point.problem or problem)
