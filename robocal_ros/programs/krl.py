@@ -11,7 +11,7 @@ Sources are in docs/programs.md.
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -47,6 +47,7 @@ _ABSOLUTE = (
 MOVES = r"S?(?:PTP|LIN|CIRC|SPL)"
 
 _NUMBERED = re.compile(r"\[\d+\]$")
+_COMPONENT = re.compile(r"[^,]+")
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ASSIGNED = re.compile(
     r"(?:\b(?P<type>E6POS|POS|FRAME|E6AXIS|AXIS)\s+)?(?P<name>\$?[A-Za-z_]\w*(?:\[[^\]\r\n]*\])?)"
@@ -143,12 +144,11 @@ class KrlDialect(Dialect):
 def _parts(body: str, at: int) -> dict[str, Field]:
     """Components of an aggregate that begins at ``at``: X, Y … by name."""
     found = {}
-    for part in re.finditer(r"[^,]+", body.partition(":")[2] if ":" in body else body):
-        shift = at + (body.index(":") + 1 if ":" in body else 0)
+    for part in _COMPONENT.finditer(body, body.find(":") + 1):
         name = re.match(r"\s*(\w+(?:\[\])?)\s+", part[0])
         if name:
             value = part[0][name.end() :].rstrip()
-            found[name[1].upper()] = Field(shift + part.start() + name.end(), value)
+            found[name[1].upper()] = Field(at + part.start() + name.end(), value)
     return found
 
 
@@ -220,16 +220,13 @@ def _posture(parts: dict[str, Field]) -> Posture:
     return Posture(ranges, bool(status & BEHIND), bool(status & ABOVE))
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Set:
-    """Tool and base that are set from a place in the text on.
-
-    ``until``: where what a WITH sets ends; None: it holds until something else is set.
-    """
+    """Tool or base, None where it is not known, from a place on; ``until``: of a WITH its end."""
 
     at: int
-    names: dict[str, str] = field(default_factory=dict)
-    until: int | None = None
+    names: dict[str, str | None]
+    until: float = np.inf
 
 
 def _without(clean: str) -> str:
@@ -238,25 +235,23 @@ def _without(clean: str) -> str:
 
 
 def _settings(text: str, clean: str, frames: dict[str, Array]) -> Iterator[_Set]:
+    """What is set, in the order of the text, then what a WITH sets, which goes before it."""
+    for found in _SET.finditer(_without(clean)):
+        yield _Set(found.start(), _given(line_of(text, found.start()), found, frames))
     for found in _WITH.finditer(clean):
         end = _END_OF_BLOCK.search(clean, found.end()) if found["block"] else None
-        inside = _Set(found.start(), until=end.start() if end else found.end())
+        until = end.start() if end else found.end()
         for part in arguments(clean, found.end("motion"), found.end()):
             if given := _SET.match(part.text):
-                inside.names |= _given(line_of(text, part.start), given, frames) or {}
-        if inside.names:
-            yield inside
-    now: dict[str, str] = {}
-    for found in _SET.finditer(_without(clean)):
-        given_here = _given(line_of(text, found.start()), found, frames)
-        now = {} if given_here is None else now | given_here
-        yield _Set(found.start(), now)
+                names = _given(line_of(text, part.start), given, frames)
+                if None not in names.values():
+                    yield _Set(found.start(), names, until)
 
 
-def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[str, str] | None:
-    """Tool or base that a place in the text sets; None where neither is known from it on."""
+def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[str, str | None]:
+    """Tool or base that a place in the text sets; None: not known from it on."""
     if found["routine"] or (found["bas"] or "").upper() == "INITMOV":
-        return None
+        return {"TOOL": None, "BASE": None}
     here = f"of line {line}"  # of what is not read here: unknown
     if found["bas"]:
         kind, number = found["bas"].upper(), found["number"].strip()
@@ -288,12 +283,8 @@ def _framed(
             tool=None if tool is None else f"TOOL_DATA[{tool.text.strip()}]",
             frame=None if base is None else f"BASE_DATA[{base.text.strip()}]",
         )
-    above: dict[str, str] = {}
-    inside: dict[str, str] = {}
+    names: dict[str, str | None] = {}
     for one in set_above:
-        if one.until is None and one.at < at:
-            above = one.names
-        elif one.until is not None and one.at <= at < one.until:
-            inside |= one.names
-    names = above | inside
+        if one.at <= at < one.until:
+            names |= one.names
     return replace(point, tool=names.get("TOOL"), frame=names.get("BASE"))
