@@ -94,15 +94,14 @@ def _range(arm: SerialArm, told: Posture) -> tuple[Array, Array]:
 
 def _turned(arm: SerialArm, q: Array) -> Array:
     """The joints and what is whole turns away, as far as the limits let them (k, n)."""
+    lower, upper = _range(arm, Posture())
     found = []
     for one in _distinct(q):
         choices = []
         for joint in range(arm.n):
             turns = np.array([0.0]) if arm.prismatic[joint] else np.arange(-3.0, 4.0)
             values = one[joint] + 2.0 * np.pi * turns
-            lower = arm.lower[joint] if np.isfinite(arm.lower[joint]) else -WITHOUT_LIMIT
-            upper = arm.upper[joint] if np.isfinite(arm.upper[joint]) else WITHOUT_LIMIT
-            choices.append(values[(values >= lower) & (values <= upper)])
+            choices.append(values[(values >= lower[joint]) & (values <= upper[joint])])
         found += list(product(*choices))
     return np.array(found).reshape(-1, arm.n)
 
