@@ -74,7 +74,6 @@ from robocal_ros.hand_eye.targets import (
     LineTarget,
     SphereTarget,
     Staircase,
-    StepTarget,
     read_target,
 )
 from robocal_ros.kinematics.joint_errors import SIZE_URAD
@@ -161,13 +160,7 @@ def _shown(
     stairs = TrueStairs(T_BASE_USER)
     shots = step_shots(cell, stairs, count, rng)
     same = Staircase(stairs.steps, stairs.length_m, stairs.height_m, stairs.depth_m)
-    target = StepTarget(
-        known,
-        same.marked_corners(),
-        same.edge_user,
-        user_sigma_m=TAUGHT_M,
-        user_sigma_rad=TAUGHT_RAD,
-    )
+    target = same.target(known, user_sigma_m=TAUGHT_M, user_sigma_rad=TAUGHT_RAD)
     return shots, target, truth
 
 

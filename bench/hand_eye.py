@@ -41,7 +41,6 @@ from robocal_ros.hand_eye.planning import (
 )
 from robocal_ros.hand_eye.profiles import SensorRange
 from robocal_ros.hand_eye.result import PoseNoise, expected_error_m, increment
-from robocal_ros.hand_eye.targets import StepTarget
 
 Array = NDArray[np.float64]
 
@@ -233,8 +232,7 @@ def plan_table() -> Table:
     half_m = 0.5 * (CELL.sensor.far_m - CELL.sensor.near_m)
     width_m = 2.0 * 0.2 * float(np.tan(CELL.sensor.half_angle_rad))
     sensor = SensorRange(half_m, -half_m, width_m, noise_m=CELL.sensor.noise_m)
-    corners = STAIRCASE.marked_corners()
-    target = StepTarget(T_BASE_USER, corners, STAIRCASE.edge_user, GAUGED_M)
+    target = STAIRCASE.target(T_BASE_USER, sigma_m=GAUGED_M)
     line = np.stack([LINE.point_base, LINE.direction_base])
     planned: tuple[PlannedTarget, ...] = (
         PlannedSphere(RADIUS_M, sensor, (CENTRE[0], CENTRE[1], CENTRE[2])),

@@ -47,7 +47,6 @@ from robocal_ros.hand_eye.targets import (
     LineTarget,
     SphereTarget,
     Staircase,
-    StepTarget,
 )
 from robocal_ros.hand_eye.tasks import HandEyeData, Task
 from robocal_ros.kinematics.joint_errors import ShotJoints
@@ -141,8 +140,8 @@ def step_set(
     corners = told_corners(rng, machining_m)
     T = known_to(cell.robot) @ T_BASE_USER
     told = (TAUGHT_M, TAUGHT_RAD) if isinstance(cell.robot, ArmRobot) else (0.0, 0.0)
-    target = StepTarget(
-        T, corners, STAIRCASE.edge_user, told_m, user_sigma_m=told[0], user_sigma_rad=told[1]
+    target = STAIRCASE.target(
+        T, corners=corners, sigma_m=told_m, user_sigma_m=told[0], user_sigma_rad=told[1]
     )
     return Calibration(target, data_of(shots, cell.robot))
 
@@ -287,7 +286,7 @@ def step_world(rng: np.random.Generator, poses: int = 5, gauged_m: float = GAUGE
     """Stairs that were measured, to ``gauged_m``."""
     shots = step_shots(CELL, STAIRS, poses, rng, aim_m=AIM_M)
     corners = told_corners(rng, gauged_m)
-    target = StepTarget(T_BASE_USER, corners, STAIRCASE.edge_user, gauged_m)
+    target = STAIRCASE.target(T_BASE_USER, corners=corners, sigma_m=gauged_m)
     return _world(target, T_BASE_USER, Scene((STAIRS.body,)), shots, PoseRobot(), AIM_M)
 
 

@@ -5,8 +5,9 @@ Files are YAML, in millimetres and degrees; the contract is written in docs/hand
 hand_eye_tracker.md and, of a board, hand_eye_node.md.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -209,6 +210,11 @@ class Staircase:
         places = {NEAR: self.length_m / 3.0, FAR: 2.0 * self.length_m / 3.0}
         return {mark: np.insert(section, 0, x, axis=1) for mark, x in places.items()}
 
+    def target(self, T_base_user: Array, **known: Any) -> StepTarget:
+        """The target in its user frame (4, 4), m; ``known``: what else is told, as `StepTarget`."""
+        own: Document = {"corners": self.marked_corners(), "edge_user": self.edge_user}
+        return StepTarget(T_base_user, **(own | {"convex": self.convex} | known))
+
 
 LaserTarget = SphereTarget | StepTarget | LineTarget
 Target = LaserTarget | BoardTarget | TrackerTarget
@@ -365,12 +371,11 @@ def _step(top: Fields) -> StepTarget:
         for key, told in (("edge_user", "x"), ("convex", "told by corners")):
             if key in top.values:
                 top.fail(f"is {told} for a staircase: leave it out", key)
-        staircase = _staircase(top.below("staircase"))
-        corners, edge = staircase.marked_corners(), staircase.edge_user
-        convex: Array | None = staircase.convex
+        placed: Callable[..., StepTarget] = _staircase(top.below("staircase")).target
     else:
         corners, edge = _corners(top.below("corners_mm")), _direction(top, "edge_user")
         convex = _convex(top, corners)
+        placed = partial(StepTarget, corners=corners, edge_user=edge, convex=convex)
     T_base_user = _user_frame(top.below("T_base_user"))
     sigma_m = top.positive("sigma_mm", MACHINING_M * 1e3) * 1e-3
     taught = {}
@@ -380,7 +385,9 @@ def _step(top: Fields) -> StepTarget:
             top.fail(f"is {taught[key]:g}; it must not be below 0", key)
     user_sigma_rad = float(np.radians(taught["user_sigma_deg"]))
     user_sigma_m = taught["user_sigma_mm"] * 1e-3
-    return StepTarget(T_base_user, corners, edge, sigma_m, user_sigma_m, user_sigma_rad, convex)
+    return placed(
+        T_base_user, sigma_m=sigma_m, user_sigma_m=user_sigma_m, user_sigma_rad=user_sigma_rad
+    )
 
 
 def _staircase(fields: Fields) -> Staircase:

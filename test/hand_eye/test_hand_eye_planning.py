@@ -42,7 +42,7 @@ from robocal_ros.hand_eye.result import (
     expected_error_m,
 )
 from robocal_ros.hand_eye.solve import solve_task
-from robocal_ros.hand_eye.targets import Staircase, StepTarget
+from robocal_ros.hand_eye.targets import Staircase
 
 SENSOR = SensorRange(near_m=0.01, far_m=-0.01, width_m=0.09, noise_m=CELL.sensor.noise_m)
 NOISE = PoseNoise(POSE_M, POSE_RAD, 2e-4)
@@ -125,7 +125,7 @@ def test_marks_with_one_corner_each():
     """Only the first step is known: a pose that sees its corner sees all there is."""
     stairs = TrueStairs(T_BASE_USER, steps=2)
     drawn = Staircase(1, stairs.length_m, stairs.height_m, stairs.depth_m)
-    target = StepTarget(T_BASE_USER, drawn.marked_corners(), drawn.edge_user)
+    target = drawn.target(T_BASE_USER)
     poses = step_shots(CELL, stairs, 6, np.random.default_rng(2)).true_T_base_flange
     poses[1, :3, 3] += [0.0, 0.0, 0.1]
     plan = judged(PlannedStairs(target, SENSOR, ("near", "far")), poses, 1e-4)

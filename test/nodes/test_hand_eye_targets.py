@@ -22,7 +22,7 @@ from robocal_ros.bags.bags import write_data_set
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code
 from robocal_ros.hand_eye.result import HandEyeSettings
-from robocal_ros.hand_eye.targets import Staircase, StepTarget
+from robocal_ros.hand_eye.targets import Staircase
 from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.ros import endpoints
 from robocal_ros.ros.conversions import pose_message
@@ -74,8 +74,7 @@ def test_an_edge_and_the_marks_of_a_staircase(graph: Any, tmp_path: Path, kind: 
     file = ""
     if kind == "step":
         file = str(tmp_path / "step.yaml")
-        step = StepTarget(STAIRS.T_base_user, STEPS.marked_corners(), STEPS.edge_user)
-        write_target(Path(file), step)
+        write_target(Path(file), STEPS.target(STAIRS.T_base_user))
         shots = step_shots(cell, STAIRS, 8, rng)
     else:
         shots = edge_shots(cell, STAIRS.T_base_user, 12, rng)

@@ -15,7 +15,7 @@ from joint_errors import with_joint_errors
 from bench.hand_eye_cell import TrueStairs, edge_shots, groove_shots, step_shots
 from robocal_ros.ground import frames
 from robocal_ros.hand_eye.session import HandEyeConfig, HandEyeSession
-from robocal_ros.hand_eye.targets import Staircase, StepTarget, target_document
+from robocal_ros.hand_eye.targets import Staircase, target_document
 from robocal_ros.session import events
 
 SHOTS = list(sphere_shots_of(14))
@@ -23,7 +23,7 @@ FULL = with_joint_errors(ARM.with_mdh(ARM.mdh * 1.0002), 3)
 WARM = ARM.with_model(FULL.mdh, FULL.functions, FULL.load)  # with the payload that the file says
 STAIRS = TrueStairs(frames.transform(frames.exp_rotation([0.02, -0.03, 0.4]), [0.75, -0.1, 0.1]))
 STEPS = Staircase(5, 0.09, 0.01, 0.01)
-STEP = StepTarget(STAIRS.T_base_user, STEPS.marked_corners(), STEPS.edge_user)
+STEP = STEPS.target(STAIRS.T_base_user)
 # Of an edge or a groove nothing is known; the sensor sees 90 mm of depth.
 TARGETS = {
     "edge": ({"target": {"kind": "line"}}, edge_shots, STAIRS.T_base_user, 12),

@@ -26,8 +26,7 @@ FAR_OFF = 22.46  # chi-square of 6 numbers, exceeded once in 1000
 def stairs_target(T_base_user=T_BASE_USER, stairs=STAIRS, corners="convex", **known):
     """As a target file's ``staircase`` tells it."""
     drawn = Staircase(stairs.steps, stairs.length_m, stairs.height_m, stairs.depth_m, corners)
-    known = {"convex": drawn.convex} | known
-    return StepTarget(T_base_user, drawn.marked_corners(), drawn.edge_user, **known)
+    return drawn.target(T_base_user, **known)
 
 
 def sphere_task(target: SphereTarget = SPHERE) -> SphereTask:

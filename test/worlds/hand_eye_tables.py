@@ -42,7 +42,7 @@ SHOTS, CHECKS = 20, 4
 def known_stairs() -> StepTarget:
     """The stairs as they stand: taught without an error."""
     same = Staircase(STAIRS.steps, STAIRS.length_m, STAIRS.height_m, STAIRS.depth_m)
-    return StepTarget(T_BASE_USER, same.marked_corners(), same.edge_user)
+    return same.target(T_BASE_USER)
 
 
 def shots_of(kind: str, count: int = SHOTS + CHECKS, seed: int = 0) -> SimulatedShots:
