@@ -139,13 +139,11 @@ def _one_centre(T: Array) -> bool:
     return bool(spread[1] < LEAST_SHIFT_M)  # along the axis it may move
 
 
-def wrong_scale(pairs: PosePairs, at: Placement) -> str:
-    """Say in words that lengths of robot and board differ by a factor; empty if they do not."""
-    return scale_words(*scale_of_board(pairs, at))
-
-
 def scale_words(factor: float, sigma: float, tolerance: float = SCALE_TOLERANCE) -> str:
-    """The same of a factor and its sigma; empty within the tolerance, or where it may be 1."""
+    """Say that lengths of robot and board differ by a factor, known to a sigma.
+
+    Empty within the tolerance, or where the factor may be 1.
+    """
     away = abs(factor - 1.0)
     if away < tolerance or min(away, factor) < SCALE_SIGMAS * sigma:
         return ""
@@ -189,7 +187,7 @@ def mistake(pairs: PosePairs, at: Placement) -> str:
     best = min(scores, key=lambda words: scores[words])
     if scores[best] < CLEARLY_BETTER * now:
         return best
-    return wrong_scale(pairs, at)
+    return scale_words(*scale_of_board(pairs, at))
 
 
 def _right_handed(pairs: PosePairs) -> dict[str, PosePairs]:
