@@ -88,6 +88,11 @@ def in_plane(value: Array) -> Array:
     return np.stack([value[..., 0], np.zeros(value.shape[:-1]), value[..., 1]], axis=-1)
 
 
+def from_plane(T: Array, value: Array) -> Array:
+    """Points (n, 3) where sensor poses (4, 4) or (n, 4, 4) put features (n, 2 or 3): x, z first."""
+    return np.asarray(value[:, :1] * T[..., :3, 0] + value[:, 1:2] * T[..., :3, 2] + T[..., :3, 3])
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """What a model predicts for m sightings.

@@ -37,6 +37,7 @@ from robocal_ros.hand_eye.mount_problem import (
     SphereModel,
     TargetView,
     circle_centres,
+    from_plane,
     in_plane,
     same_pose,
 )
@@ -401,9 +402,7 @@ class SphereTask(Task):
         s, centre = fit.views[0].sightings, fit.state.places[0]
         far = []
         for name, T_base_flange in zip(s.names, s.T_base_flange, strict=True):
-            x, z = read.points[name].T
-            T = T_base_flange @ fit.state.T_flange_sensor
-            base = np.outer(x, T[:3, 0]) + np.outer(z, T[:3, 2]) + T[:3, 3]
+            base = from_plane(T_base_flange @ fit.state.T_flange_sensor, read.points[name])
             far.append(np.linalg.norm(base - centre, axis=1) - self.target.radius_m)
         return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
 
@@ -572,9 +571,7 @@ class LineTask(Task):
         if known is not None:
             return known
         s = view.sightings
-        T = s.T_base_flange @ T_flange_sensor
-        x, z = s.value[:, :1], s.value[:, 1:2]
-        points = x * T[:, :3, 0] + z * T[:, :3, 2] + T[:, :3, 3]
+        points = from_plane(s.T_base_flange @ T_flange_sensor, s.value)
         middle = np.median(points, axis=0)
         return np.stack([middle, np.linalg.svd(points - middle)[2][0]])
 

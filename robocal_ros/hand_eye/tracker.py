@@ -20,7 +20,7 @@ from robocal_ros.estimation.estimation import Estimate, solve
 from robocal_ros.ground import frames
 from robocal_ros.ground.errors import Code, ResidualError
 from robocal_ros.ground.frames import Array
-from robocal_ros.hand_eye.mount_problem import moved, tangents
+from robocal_ros.hand_eye.mount_problem import from_plane, moved, tangents
 from robocal_ros.hand_eye.result import (
     HandEyeResult,
     Method,
@@ -405,8 +405,7 @@ def profile_distances(
     total, count = np.zeros(len(P)), np.zeros(len(P))
     for index, scan in enumerate(classic.parts):
         own = scan.profile
-        T, x, z = P[own], scan.points[:, :1], scan.points[:, 1:]
-        points = T[:, :3, 0] * x + T[:, :3, 2] * z + T[:, :3, 3]
+        points = from_plane(P[own], scan.points)
         if index < len(FACES):
             off = np.einsum("ni,ni->n", points, normals[own, index]) - offsets[own, index]
         else:

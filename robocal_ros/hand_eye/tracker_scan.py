@@ -24,7 +24,7 @@ from robocal_ros.ground.errors import (
     TooFewSamplesError,
 )
 from robocal_ros.ground.frames import Array, Index, Mask
-from robocal_ros.hand_eye.mount_problem import tangents
+from robocal_ros.hand_eye.mount_problem import from_plane, tangents
 from robocal_ros.hand_eye.targets import TrackerTarget
 from robocal_ros.hand_eye.tracker_data import (
     PARALLEL_FACES,
@@ -80,9 +80,7 @@ class Scan:
 
     def built(self, T_flange_sensor: Array) -> Array:
         """Points (n, 3) in the sensor frame of the first profile."""
-        T = self.carried(T_flange_sensor)[self.profile]
-        x, z = self.points[:, :1], self.points[:, 1:]
-        return np.asarray(T[:, :3, 0] * x + T[:, :3, 2] * z + T[:, :3, 3])
+        return from_plane(self.carried(T_flange_sensor)[self.profile], self.points)
 
     @cached_property
     def _moments(self) -> Array:
