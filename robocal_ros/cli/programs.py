@@ -298,7 +298,9 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
         raise InputError(f"--posture-deg: {models.nominal.name} has {models.nominal.n} joints")
     given = dict(frame_given(dialect.maker, words) for words in args.frame)
     for path in args.frames:
-        given = dict(dialect.read(_program_text(path, dialect)).frames) | given
+        frames = dialect.read(_program_text(path, dialect)).frames
+        # One that is called after its line is that file's own, and has no name elsewhere.
+        given = {name: T for name, T in frames.items() if " of line " not in name} | given
     correction = ProgramCorrection(
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
     )

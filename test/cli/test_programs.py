@@ -86,6 +86,19 @@ def test_a_program_is_corrected_into_another_file(folder: Path, capsys):
     assert (folder / "weld.dat").read_bytes() == before
 
 
+def test_a_tool_that_is_reckoned_is_not_that_of_the_same_line_elsewhere(folder: Path, capsys):
+    weld = (folder / "weld.dat").read_text("latin-1")
+    (place,) = re.findall(r"E6POS XP1=(\{[^}]*\})", weld)
+    routine = "DEF part()\n$TOOL={}\n$BASE=$NULLFRAME\nPTP {}\nEND\n"
+    (folder / "part.src").write_text(routine.format("reckon(1)", place))
+    other = "{X 0.0,Y 0.0,Z 300.0,A 0.0,B 0.0,C 0.0}"
+    (folder / "other.src").write_text(routine.format(other, place))
+    _, document = command(capsys, "part.src", *MODEL, "--frames", "other.src")
+    (point,) = document["points"]
+    assert point["state"] == "not_corrected"
+    assert "unknown tool $TOOL of line 2" in point["reason"]
+
+
 def test_joint_targets_of_kawasaki_are_corrected(folder: Path, capsys):
     rows = "\n".join(
         f"#p{i} " + " ".join(f"{x:.4f}" for x in np.degrees(q))
