@@ -278,7 +278,8 @@ class JointPath:
             lost = float(time_s[~inside][0])
             raise InputError(
                 f"no joint readings around the edge at {lost:.4f} s (they run from "
-                f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s): record the whole motion"
+                f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s): record the whole motion; where "
+                "that was done, the clocks of beams and joints differ: put both on one"
             )
         gap = self.time_s[after] - self.time_s[after - 1]
         worst = int(np.argmax(gap))
