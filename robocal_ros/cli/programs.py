@@ -45,7 +45,7 @@ from robocal_ros.programs.correcting import (
 )
 from robocal_ros.programs.fanuc import FanucDialect
 from robocal_ros.programs.frame_shift import LEVER_M, PARTS, FrameShift, best_shift, given_shift
-from robocal_ros.programs.points import Dialect, frame_given
+from robocal_ros.programs.points import OF_LINE, Dialect, frame_given
 from robocal_ros.thermal.proposing import (
     ShiftedWork,
     keep_shift,
@@ -299,8 +299,7 @@ def run_correct_program(args: argparse.Namespace) -> CliResult:
     given = dict(frame_given(dialect.maker, words) for words in args.frame)
     for path in args.frames:
         frames = dialect.read(_program_text(path, dialect)).frames
-        # One that is called after its line is that file's own, and has no name elsewhere.
-        given = {name: T for name, T in frames.items() if " of line " not in name} | given
+        given = {name: T for name, T in frames.items() if OF_LINE not in name} | given
     correction = ProgramCorrection(
         dialect, models, given, args.tool, args.base, args.posture_deg, dict(args.external)
     )

@@ -30,6 +30,7 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import pose_of
 from robocal_ros.programs.points import (
     NUMBER,
+    OF_LINE,
     Decimals,
     Dialect,
     Field,
@@ -185,7 +186,7 @@ def _set_up(
 ) -> None:
     """The program sets tool or base, whose name is in force from here on."""
     kind, word = setting[1].upper(), setting[2].strip()
-    name = f"{kind} of line {line_of(text, setting.start())}"
+    name = f"{kind}{OF_LINE}{line_of(text, setting.start())}"
     if word.upper() == NULL:
         name = NULL
     elif (T := _constant(clean, setting.start(2), setting.end(2), values)) is not None:

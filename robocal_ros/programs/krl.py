@@ -20,6 +20,7 @@ from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import DEGREE, pose_of
 from robocal_ros.programs.points import (
     EDGE,
+    OF_LINE,
     Decimals,
     Dialect,
     Field,
@@ -252,12 +253,12 @@ def _given(line: int, found: re.Match[str], frames: dict[str, Array]) -> dict[st
     """Tool or base that a place in the text sets; None: not known from it on."""
     if found["routine"] or (found["bas"] or "").upper() == "INITMOV":
         return {"TOOL": None, "BASE": None}
-    here = f"of line {line}"  # of what is not read here: unknown
+    here = f"{OF_LINE}{line}"  # of what is not read here: unknown
     if found["bas"]:
         kind, number = found["bas"].upper(), found["number"].strip()
-        return {kind: f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind} {here}"}
+        return {kind: f"{kind}_DATA[{number}]" if number.isdigit() else f"${kind}{here}"}
     kind, value = found["kind"].upper(), found["value"].strip()
-    name = f"${kind} {here}"
+    name = f"${kind}{here}"
     T = _frame(value[1:-1]) if value.startswith("{") else None
     if T is not None:
         frames[name] = T

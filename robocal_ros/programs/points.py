@@ -22,6 +22,7 @@ _NUMBER = re.compile(NUMBER)
 # How near to zero, or to a quadrant's end, a joint is on either side of it, rad.
 EDGE = 1e-6
 AT_ZERO = 1e-9
+OF_LINE = " of line "  # in the name of a frame that has none: it is of its own file alone
 NOT_CONNECTED = 8.9e8  # ABB writes 9E9, some tools 9E8 or 1E10, for an axis that is not there
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from robocal_ros.ground.frames import Array
 from robocal_ros.programs.conventions import pose_of
 from robocal_ros.programs.points import (
+    OF_LINE,
     Decimals,
     Dialect,
     Field,
@@ -94,7 +95,7 @@ def _targets(text: str, clean: str, frames: dict[str, Array]) -> list[_Target]:
         parts = arguments(clean, call.end() + 1, matching(clean, call.end()))
         if call[1] == "set_tcp":
             fields = _fields(clean, parts[0].start)
-            tool = f"set_tcp of line {line_of(text, call.start())}"
+            tool = f"set_tcp{OF_LINE}{line_of(text, call.start())}"
             if fields is not None and len(fields) == 6 and not require_numbers(fields):
                 frames[tool] = pose_of("ur", [part.value for part in fields])
             continue
