@@ -605,7 +605,7 @@ def _of_few(differences: Array, expected: Array) -> float:
     the larger is taken. What n numbers tell of a variance is its inverse chi-square: n / (n - 2) of
     it in the mean.
     """
-    freedom = max(3.0 * len(differences) - 6.0, 3.0)
+    freedom = 3.0 * len(differences) - 6.0
     parts = [
         np.einsum("mi,mij,mj->", own, np.linalg.inv(V), own)
         for own, V in (
