@@ -164,12 +164,13 @@ class StatedController:
         since_s = at_s + REACTION_S
         # one that is over, or nearly, ends no sooner: a controller would be there in one cycle
         last_s = max(plan.duration_s - since_s, LEAD_S)
-        first_s = min(first_s, last_s)
         if self.velocities:
+            first_s = min(first_s, last_s)
             ahead = plan.time_s - since_s
             times = np.append(first_s, ahead[ahead > first_s + 1e-4])
-        else:
-            left_s = last_s - first_s  # in two lines at least, which slow down
+        else:  # in two lines at least, which slow down, however late the plan was ready
+            first_s = min(first_s, max(last_s - 2.0 * LINES_S, LEAD_S))
+            left_s = last_s - first_s
             lines = max(int(np.ceil(left_s / LINES_S)), 2 if left_s > 1e-3 else 0)
             times = np.linspace(first_s, last_s, lines + 1)
         q, qd = plan.at(times + since_s)

@@ -228,6 +228,23 @@ def own_stop(driven: Driven, deceleration: float, taken: Any) -> tuple[float, np
     return planned.duration_s, driven.obeys(last, 0.008 + taken[-1] * COPY_S)
 
 
+@pytest.mark.parametrize("over_s", [-0.11, -0.1, -0.09, -0.075])
+def test_a_stop_in_lines_slows_down_however_late_its_plan_was_ready(over_s):
+    """Finding: on a busy computer it was one line to where the robot is to stand."""
+    driven = Driven(False, 0.0, told=False)
+    q, qd = driven.motion.last()[1][4:6]
+    plan = stop(NOMINAL, MotionLimits(stop_deceleration=5.0), q, qd).going_on(REACTION_S)
+    at_s = plan.duration_s - REACTION_S + over_s
+    message = driven.stated.stop_message(plan, NAMES, 0.0, at_s=at_s, first_s=FIRST_S)
+    times = np.array([p.time_from_start.nanosec * 1e-9 for p in message.points])
+    places = np.array([p.positions for p in message.points])[:, 0]
+    speeds = np.diff(places) / np.diff(times)
+    assert times[0] >= LEAD_S - 1e-9
+    assert times[-1] == pytest.approx(-over_s, abs=1e-8)
+    assert len(speeds) >= 2
+    assert np.all(np.diff(np.abs(speeds)) < 0.0)
+
+
 @pytest.mark.parametrize("velocities", [True, False])
 @pytest.mark.parametrize("over_s", [-0.02, 0.0, 0.3])
 def test_a_stop_that_is_sent_when_it_should_be_over_is_no_step(over_s, velocities):
