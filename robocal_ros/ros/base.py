@@ -97,6 +97,9 @@ class HouseNode(EndpointNode):
             self._stop_acting()
         self._clean_up()
         self.destroy_node()
+        # Jazzy's rclpy forgets it, and what it holds keeps the DDS participant: that would be taken
+        # down by C's exit amid its running threads, now and then by a SIGSEGV.
+        self._state_machine.destroy_when_not_in_use()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Validate the parameters, then `configure`; undone when it fails."""
@@ -255,9 +258,9 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
     # conversion of a message then fails) nor as a shutdown of the context below it.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = None
+    node, executor = None, _executor(events)
     try:
-        executor, ending = _executor(events), threading.Event()
+        ending = threading.Event()
         _watch_signals(ending, executor.wake)  # before a start that may have kernels to compile
         node = node_class()
         node.autostart()
@@ -272,6 +275,7 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
         # Say good-bye, or others take the node for alive until its lease runs out.
         if node is not None:
             node.close()
+        executor.shutdown()
         rclpy.try_shutdown()
 
 

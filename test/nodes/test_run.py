@@ -52,6 +52,21 @@ def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) 
     assert "Traceback" not in sleeper.output
 
 
+def test_what_dds_runs_has_ended_before_the_process_does(graph: Any, tmp_path: Path) -> None:
+    """Finding: C's exit took it down amid its running threads, by a SIGSEGV of one in a hundred."""
+    path = tmp_path / "sleeper.py"
+    after = "from pathlib import Path\nfor name in Path('/proc/self/task').glob('*/comm'):"
+    after += "\n    print('runs', name.read_text(), flush=True)\n"
+    for events in ("False", "True"):
+        path.write_text(SCRIPT.replace("EVENTS", events) + after)
+        sleeper = graph.start(path)
+        assert graph.call(Trigger, "/sleeper/ping").success
+        assert sleeper.stop() == 0
+        assert "runs python" in sleeper.output
+        left = {line for line in sleeper.output.splitlines() if "runs dds" in line}
+        assert left <= {"runs dds.shm.wdog"}  # of the process, not of a participant
+
+
 def test_a_second_signal_ends_a_start_that_takes_long(graph: Any, tmp_path: Path) -> None:
     path = tmp_path / "sleeper.py"
     text = SCRIPT.replace("EVENTS", "True").replace("import sys", "import sys, time")
