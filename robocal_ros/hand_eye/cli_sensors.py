@@ -171,7 +171,7 @@ def _pairs_of_images(
 
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
-    pairs = board_pairs(seen, table.names, table.T_base_flange, args.mount, table.joints)
+    pairs = board_pairs(seen, board, table.names, table.T_base_flange, args.mount, table.joints)
     return pairs, replace(seen, rejected=unread | seen.rejected)
 
 

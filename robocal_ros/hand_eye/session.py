@@ -281,7 +281,7 @@ def _solved_camera(
     size = int(width), int(height)
     boards = boards_of_corners(names, corners, target.board, size, target.intrinsics)
     return calibrate_camera(
-        board_pairs(boards, names, T_base_flange, data.mount, joints),
+        board_pairs(boards, target.board, names, T_base_flange, data.mount, joints),
         settings,
         rejected=boards.rejected,
         more={"intrinsics": intrinsics_document(boards, target.intrinsics is None)},

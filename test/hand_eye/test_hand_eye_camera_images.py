@@ -6,13 +6,15 @@ from itertools import product
 import numpy as np
 import pytest
 from camera_pairs import BOARD, LENS, error, sound
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens
+from bench.hand_eye_cell import BoardCell, BoardNoise, TrueLens, TruePose
 from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.hand_eye.boards import (
     Chessboard,
     Intrinsics,
+    board_pairs,
     boards_of_corners,
     decode_image,
     find_corners,
@@ -133,6 +135,59 @@ def images():
         for k in range(9)
     ]
     return cell, cell.read_robot(cell.flange(views), rng), views.matrices(), named
+
+
+@pytest.mark.parametrize("mount", ["in-hand", "to-hand"])
+@pytest.mark.parametrize("counts", [(8, 6), (6, 6)])
+def test_a_board_that_looks_alike_from_its_ends_is_taken_from_one(mount, counts) -> None:
+    """Finding: half of the samples, from a camera that rolls by over a right angle, were off."""
+    board = Chessboard(*counts, BOARD.square_m)
+    cell, rng = BoardCell(mount, noise=BoardNoise(1e-4, 2e-4)), np.random.default_rng(29)
+    tilts, rolls = rng.uniform(-0.4, 0.4, (14, 2)), np.linspace(-3.1, 3.1, 14)
+    turn = Rotation.from_rotvec([[0.0, 0.0, roll] for roll in rolls]) * Rotation.from_rotvec(
+        np.column_stack([tilts, np.zeros(14)])
+    )
+    middle = rng.uniform([-0.02, -0.02, 0.45], [0.02, 0.02, 0.6], (14, 3))
+    views = TruePose(turn, middle - turn.apply(0.5 * board.points[-1]))
+    images = [(f"i{k}", LENS.image(views.take(k), *counts, board.square_m)) for k in range(14)]
+    robot, names = cell.read_robot(cell.flange(views), rng), tuple(name for name, _ in images)
+    seen = see_boards(images, board, true_intrinsics())
+    assert len(seen.names) == 14
+    away = np.linalg.norm(seen.T_camera_board - views.matrices(), axis=(1, 2))
+    assert np.any(away > 0.1)  # as OpenCV begins where it is up in the image
+    pairs = board_pairs(seen, board, names, robot, cell.mount)
+    found = calibrate_camera(pairs)
+    assert found.verdict.accept
+    assert not found.rejected
+    e = error(found.T_flange_sensor, cell.camera)
+    assert found.covariance is not None
+    assert sound(float(e @ np.linalg.solve(found.covariance, e)), 6)
+
+
+def test_what_is_told_of_a_board_is_of_the_end_that_it_is_taken_from() -> None:
+    board = Chessboard(8, 6, BOARD.square_m)
+    cell, rng = BoardCell(), np.random.default_rng(31)
+    views = cell.views(rng, 12)
+    robot, names = cell.read_robot(cell.flange(views), rng), tuple(f"i{k}" for k in range(12))
+    corners = [LENS.corners(views.take(k), board.points) for k in range(12)]
+    corners = [each + 0.2 * rng.standard_normal(each.shape) for each in corners]
+    turned = [each[::-1] if k % 3 == 1 else each for k, each in enumerate(corners)]
+    for camera in (true_intrinsics(), None):
+        one, other = (
+            board_pairs(
+                boards_of_corners(names, given, board, (640, 480), camera),
+                board, names, robot, "in-hand",
+            )
+            for given in (corners, turned)
+        )  # fmt: skip
+        assert one.covariance is not None
+        assert other.T_camera_board == pytest.approx(one.T_camera_board, abs=1e-6)
+        assert other.covariance == pytest.approx(one.covariance, rel=1e-3, abs=1e-12)
+        if camera is None:
+            assert one.shared is not None
+            shared = one.shared.sensitivity
+            away = np.abs(other.shared.sensitivity - shared).max(axis=(0, 1))
+            assert np.all(away < 1e-3 * np.abs(shared).max(axis=(0, 1)))
 
 
 def test_images_give_the_camera(images) -> None:
