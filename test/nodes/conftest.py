@@ -58,6 +58,7 @@ LEAVES_WITHIN_S = 3.0
 TRIES = 8
 SHOWN_OF_RERUN = 3000
 LATE_S = 0.03  # half of what stops begin ahead of now
+CALM_S, CALM_WITHIN_S = 0.5, 10.0
 
 
 # All nodes of a cell at once, which take more than a core: first, so that xdist gives them to one
@@ -297,6 +298,15 @@ class Graph:
         )
         return 1e-9 * sum(longest)
 
+    def calm(self) -> None:
+        """Wait until nobody waits long for a core, as long as others may take to start."""
+        ends = time.monotonic() + CALM_WITHIN_S
+        waited_s = LATE_S
+        while waited_s >= LATE_S and time.monotonic() < ends:
+            before = self.waits
+            self.spin_for(CALM_S)
+            waited_s = self.starved_s(before)
+
     def undisturbed(self, trial: Callable[[], None]) -> None:
         """Try anew what jumped while a process waited for a core: once heard late, any plan jumps.
 
@@ -311,6 +321,7 @@ class Graph:
                 if waited_s < LATE_S:
                     raise
                 jumped = error
+                self.calm()
         raise AssertionError(f"each of {TRIES} tries, in the last {waited_s:.3f} s") from jumped
 
     def spin_until(

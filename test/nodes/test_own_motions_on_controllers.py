@@ -225,6 +225,7 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         (SLOW, {"rejected": 2}),
     ):
         for _ in range(TRIES):
+            own.graph.calm()
             *_, waits = own.stop_on_its_way(0.3, slow, **how)
             stood = own.stopped()
             starved_s = own.graph.starved_s(waits)
