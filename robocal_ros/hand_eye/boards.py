@@ -28,7 +28,7 @@ FIRST_WINDOW_PX = 5  # half of the window in which a corner is refined
 LARGEST_FOCAL_SIGMA = 0.03  # of the focal length; more, and the images do not show it
 GROSS_RATIO = 4.0  # medians of the usual misfit, beyond which an image is left out
 MOST_PX = 100_000  # along a side of an image
-CLEARLY_FEWER = 0.5  # of squares; other ends of boards that explain less explain nothing
+CLEAR_RAD = float(np.radians(5.0))  # by which turns of board and robot miss where one is wrong
 MOST_ROUNDS, SETTLED = 30, 1e-12  # of a fisheye's pose
 
 DICTIONARIES = (
@@ -502,11 +502,12 @@ def _posed(
 
 def board_pairs(
     seen: SeenBoards, board: Chessboard, names: tuple[str, ...], T_base_flange: Array,
-    mount: Mount, joints: ShotJoints | None = None,
+    mount: Mount, joints: ShotJoints | None = None, beside: PosePairs | None = None,
 ) -> PosePairs:  # fmt: skip
     """Pairs of the boards with the flange poses (m, 4, 4) of the samples ``names`` (m,).
 
-    A board that looks alike from its other end is taken from one end in all samples, by the robot.
+    A board that looks alike from its other end is taken from one end in all samples, by the robot;
+    ``beside``: from that of other pairs, of the same board.
     """
     row = {name: index for index, name in enumerate(names)}
     rows = np.array([row[name] for name in seen.names], dtype=np.int64)
@@ -521,50 +522,58 @@ def board_pairs(
     )
     if board.markers is not None or (board.columns + board.rows) % 2:
         return pairs
-    return _from_one_end(pairs, board)
-
-
-def _from_one_end(pairs: PosePairs, board: Chessboard) -> PosePairs:
     ends = 4 if board.columns == board.rows else 2
     R = frames.exp_rotation(np.outer(np.arange(ends) * 2.0 * np.pi / ends, [0.0, 0.0, 1.0]))
     middle = 0.5 * board.points[-1]
-    T_end = frames.transform(R, middle - R @ middle)
-    seen, robot = pairs.T_camera_board[:, :3, :3], pairs.T_boardside_cameraside[:, :3, :3]
-    # a board's turn from sample to sample is by the robot's angle, wherever the camera sits
-    angles = np.array([_angles(np.einsum("iab,bc,jac->ij", seen, turn, seen)) for turn in R])
-    end = _ends((angles - _angles(np.einsum("iab,jab->ij", robot, robot))) ** 2)
+    return _turned(pairs, frames.transform(R, middle - R @ middle)[_ends(pairs, R, beside)])
+
+
+def _turned(pairs: PosePairs, T_end: Array) -> PosePairs:
+    """Pairs of the boards' other ends (m, 4, 4), with what is told of them."""
     J = np.tile(np.eye(6), (len(pairs), 1, 1))
-    J[:, :3, 3:] = -frames.skew((seen @ T_end[end, :3, 3, None])[..., 0])
+    lever = pairs.T_camera_board[:, :3, :3] @ T_end[:, :3, 3, None]
+    J[:, :3, 3:] = -frames.skew(lever[..., 0])
     covariance, shared = pairs.covariance, pairs.shared
     return replace(
         pairs,
-        T_camera_board=pairs.T_camera_board @ T_end[end],
+        T_camera_board=pairs.T_camera_board @ T_end,
         covariance=None if covariance is None else J @ covariance @ J.swapaxes(1, 2),
         shared=shared and replace(shared, sensitivity=J @ shared.sensitivity),
     )
 
 
+def _ends(pairs: PosePairs, R: Array, beside: PosePairs | None) -> NDArray[np.int64]:
+    """From which end (m,) each board was seen, of turns R (ends, 3, 3); 0 where the robot is mute.
+
+    From sample to sample a board turns by the robot's angle, wherever the camera sits.
+    """
+    told, ends = beside or pairs, len(R)
+    seen, there = pairs.T_camera_board[:, :3, :3], told.T_camera_board[:, :3, :3]
+    robot, at = (each.T_boardside_cameraside[:, :3, :3] for each in (pairs, told))
+    angles = np.array([_angles(np.einsum("iab,bc,jac->ij", seen, turn, there)) for turn in R])
+    off = np.abs(angles - _angles(np.einsum("iab,jab->ij", robot, at)))
+    off = np.minimum(off, CLEAR_RAD)  # a wrong pose is as wrong from any end
+    each, every = np.arange(len(pairs))[:, None], np.arange(len(told))
+    others = np.zeros(len(told), dtype=np.int64)
+    if beside is None:
+        off[:, every, every] = 0.0
+        tries = []
+        for first in (0, len(pairs) // 2, len(pairs) - 1):
+            end = off[:, :, first].argmin(axis=0)
+            for i in [*every, *every]:  # what the first pair left in doubt
+                end[i] = off[(np.arange(ends)[:, None] - end) % ends, i, every].sum(1).argmin()
+            tries.append((off[(end[:, None] - end) % ends, each, every].sum(), end))
+        others = min(tries, key=lambda pair: float(pair[0]))[1]
+    apart = (np.arange(ends)[:, None, None] - others) % ends
+    usual = np.median(off[apart, each, every], axis=2)
+    end, fits = usual.argmin(axis=0), usual.min(axis=0) < CLEAR_RAD
+    if beside is None and np.any(fits):
+        end = (end - np.bincount(end[fits]).argmax()) % ends
+    return np.asarray(np.where(fits, end, 0), dtype=np.int64)
+
+
 def _angles(trace: Array) -> Array:
     return np.asarray(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
-
-
-def _ends(miss: Array) -> NDArray[np.int64]:
-    """From which end each board (m,) was seen, by what pairs of them miss (ends, m, m) if apart."""
-    ends, count, _ = miss.shape
-    every, none = np.arange(count), np.zeros(count, dtype=np.int64)
-
-    def total(end: NDArray[np.int64]) -> float:
-        return float(miss[(end[:, None] - end) % ends, every[:, None], every].sum())
-
-    best = none
-    for first in {0, count // 2, count - 1}:
-        end = miss[:, :, first].argmin(axis=0)
-        for i in [*every, *every]:  # what the first pair left in doubt
-            tries = (np.arange(ends)[:, None] - end) % ends
-            end[i] = miss[tries, i, every].sum(axis=1).argmin()
-        if total(end) < CLEARLY_FEWER * total(best):
-            best = end
-    return np.asarray((best - np.bincount(best).argmax()) % ends)
 
 
 def intrinsics_document(seen: SeenBoards, from_images: bool) -> dict[str, Any]:

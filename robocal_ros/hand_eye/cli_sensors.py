@@ -134,7 +134,7 @@ def _from_images(args: argparse.Namespace) -> HandEyeResult:
     pairs, seen = _pairs_of_images(used, args, board, intrinsics)
     check = None
     if judges is not None:
-        held, shown = _pairs_of_images(judges, args, board, seen.intrinsics)
+        held, shown = _pairs_of_images(judges, args, board, seen.intrinsics, pairs)
         check = CheckPairs(held, shown.rejected)
     return calibrate_camera(
         pairs,
@@ -166,12 +166,14 @@ def _described(args: argparse.Namespace) -> tuple[Chessboard, Intrinsics | None]
 
 def _pairs_of_images(
     table: PoseTable, args: argparse.Namespace, board: Chessboard,
-    intrinsics: Intrinsics | None,
+    intrinsics: Intrinsics | None, beside: PosePairs | None = None,
 ) -> tuple[PosePairs, SeenBoards]:  # fmt: skip
 
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
-    pairs = board_pairs(seen, board, table.names, table.T_base_flange, args.mount, table.joints)
+    pairs = board_pairs(
+        seen, board, table.names, table.T_base_flange, args.mount, table.joints, beside
+    )
     return pairs, replace(seen, rejected=unread | seen.rejected)
 
 

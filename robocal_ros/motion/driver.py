@@ -168,10 +168,12 @@ class StatedController:
             first_s = min(first_s, last_s)
             ahead = plan.time_s - since_s
             times = np.append(first_s, ahead[ahead > first_s + 1e-4])
-        else:  # in two lines at least, which slow down, however late the plan was ready
+        else:  # in two lines at least, which slow down, while there is time for them
             first_s = min(first_s, max(last_s - 2.0 * LINES_S, LEAD_S))
+            if last_s - first_s < 1e-3:
+                first_s = last_s
             left_s = last_s - first_s
-            lines = max(int(np.ceil(left_s / LINES_S)), 2 if left_s > 1e-3 else 0)
+            lines = max(int(np.ceil(left_s / LINES_S)), 2 if left_s else 0)
             times = np.linspace(first_s, last_s, lines + 1)
         q, qd = plan.at(times + since_s)
         qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest

@@ -273,10 +273,12 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
         sys.exit(1)
     finally:
         # Say good-bye, or others take the node for alive until its lease runs out.
-        if node is not None:
-            node.close()
-        executor.shutdown()
-        rclpy.try_shutdown()
+        try:
+            if node is not None:
+                node.close()
+        finally:
+            executor.shutdown()
+            rclpy.try_shutdown()
 
 
 def _executor(events: bool) -> Executor:

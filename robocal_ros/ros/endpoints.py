@@ -162,8 +162,9 @@ class EndpointNode(LifecycleNode):
 
     @property
     def state(self) -> str:
-        """Label of the lifecycle state."""
-        return str(self._state_machine.current_state[1])
+        """Label of the lifecycle state; of a node that is closed too."""
+        machine = self._state_machine  # one that is destroyed ends the process, if it is asked
+        return str(machine.current_state[1]) if machine.initialized else "finalized"
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the outputs."""

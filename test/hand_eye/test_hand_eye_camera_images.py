@@ -20,7 +20,7 @@ from robocal_ros.hand_eye.boards import (
     find_corners,
     see_boards,
 )
-from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
 from robocal_ros.hand_eye.camera_data import PosePairs
 from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
 
@@ -164,30 +164,85 @@ def test_a_board_that_looks_alike_from_its_ends_is_taken_from_one(mount, counts)
     assert sound(float(e @ np.linalg.solve(found.covariance, e)), 6)
 
 
-def test_what_is_told_of_a_board_is_of_the_end_that_it_is_taken_from() -> None:
-    board = Chessboard(8, 6, BOARD.square_m)
-    cell, rng = BoardCell(), np.random.default_rng(31)
-    views = cell.views(rng, 12)
-    robot, names = cell.read_robot(cell.flange(views), rng), tuple(f"i{k}" for k in range(12))
-    corners = [LENS.corners(views.take(k), board.points) for k in range(12)]
-    corners = [each + 0.2 * rng.standard_normal(each.shape) for each in corners]
-    turned = [each[::-1] if k % 3 == 1 else each for k, each in enumerate(corners)]
-    for camera in (true_intrinsics(), None):
-        one, other = (
-            board_pairs(
-                boards_of_corners(names, given, board, (640, 480), camera),
-                board, names, robot, "in-hand",
-            )
-            for given in (corners, turned)
-        )  # fmt: skip
-        assert one.covariance is not None
-        assert other.T_camera_board == pytest.approx(one.T_camera_board, abs=1e-6)
-        assert other.covariance == pytest.approx(one.covariance, rel=1e-3, abs=1e-12)
-        if camera is None:
-            assert one.shared is not None
-            shared = one.shared.sensitivity
-            away = np.abs(other.shared.sensitivity - shared).max(axis=(0, 1))
-            assert np.all(away < 1e-3 * np.abs(shared).max(axis=(0, 1)))
+def seen_from(board: Chessboard, end: int, corners):
+    """The same corners (n, 2), numbered from another end: by quarter turns."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+    return np.rot90(grid, end).reshape(-1, 2)
+
+
+def from_ends(board: Chessboard, mount: str, count: int = 12):
+    """Flange poses, names, and corners of each sample, in order."""
+    cell, rng = BoardCell(mount, noise=BoardNoise(1e-4, 2e-4)), np.random.default_rng(31)
+    views = cell.views(rng, count)
+    robot, names = cell.read_robot(cell.flange(views), rng), tuple(f"i{k}" for k in range(count))
+    corners = [LENS.corners(views.take(k), board.points) for k in range(count)]
+    return robot, names, [each + 0.2 * rng.standard_normal(each.shape) for each in corners]
+
+
+@pytest.mark.parametrize("mount", ["in-hand", "to-hand"])
+@pytest.mark.parametrize("counts", [(8, 6), (7, 7)])
+@pytest.mark.parametrize("given", [True, False])
+def test_what_is_told_of_a_board_is_of_the_end_that_it_is_taken_from(mount, counts, given) -> None:
+    board, camera = Chessboard(*counts, BOARD.square_m), true_intrinsics() if given else None
+    robot, names, corners = from_ends(board, mount)
+    ends = [2 * (k % 3 == 1) if counts == (8, 6) else (k % 3) * (k % 2) for k in range(12)]
+    turned = [seen_from(board, end, each) for end, each in zip(ends, corners, strict=True)]
+    one, other = (
+        board_pairs(
+            boards_of_corners(names, shown, board, (640, 480), camera), board, names, robot, mount
+        )
+        for shown in (corners, turned)
+    )
+    assert other.T_camera_board == pytest.approx(one.T_camera_board, abs=1e-6)
+    assert one.covariance is not None
+    assert other.covariance == pytest.approx(one.covariance, rel=1e-3, abs=1e-12)
+    if camera is None:
+        assert one.shared is not None
+        shared = one.shared.sensitivity
+        away = np.abs(other.shared.sensitivity - shared).max(axis=(0, 1))
+        assert np.all(away < 1e-3 * np.abs(shared).max(axis=(0, 1)))
+
+
+@pytest.mark.parametrize("counts", [(8, 6), (7, 7)])
+def test_samples_that_judge_are_taken_from_the_end_of_those_that_solved(counts) -> None:
+    """Finding: by themselves they took their own, half a board away."""
+    board, camera = Chessboard(*counts, BOARD.square_m), true_intrinsics()
+    robot, names, corners = from_ends(board, "in-hand")
+    used = boards_of_corners(names[:9], corners[:9], board, (640, 480), camera)
+    pairs = board_pairs(used, board, names, robot, "in-hand")
+    turned = [seen_from(board, 2, each) for each in corners[9:]]
+    held = boards_of_corners(names[9:], turned, board, (640, 480), camera)
+    check = board_pairs(held, board, names, robot, "in-hand", beside=pairs)
+    found = calibrate_camera(pairs, check=CheckPairs(check))
+    assert found.verdict.accept
+    assert found.more["held_out"]["max_mm"] < 2.0
+
+
+def test_wrong_poses_of_the_robot_turn_no_board() -> None:
+    """Finding: of two that were swapped both were turned, and not called swapped any more."""
+    board, camera = Chessboard(8, 6, BOARD.square_m), true_intrinsics()
+    cell, rng = BoardCell(noise=BoardNoise(1e-4, 2e-4)), np.random.default_rng(37)
+    rolls = np.radians([-80.0, 80.0, -60.0, -30.0, 0.0, 30.0, 60.0, 15.0, -15.0, 45.0])
+    turn = Rotation.from_rotvec([[0.0, 0.0, roll] for roll in rolls]) * Rotation.from_rotvec(
+        np.column_stack([rng.uniform(-0.3, 0.3, (10, 2)), np.zeros(10)])
+    )
+    views = TruePose(turn, np.array([0.0, 0.0, 0.5]) - turn.apply(0.5 * board.points[-1]))
+    robot, names = cell.read_robot(cell.flange(views), rng), tuple(f"i{k}" for k in range(10))
+    corners = [LENS.corners(views.take(k), board.points) for k in range(10)]
+    seen = boards_of_corners(names, corners, board, (640, 480), camera)
+    swapped = robot[[1, 0, *range(2, 10)]]
+    pairs = board_pairs(seen, board, names, swapped, "in-hand")
+    assert np.array_equal(pairs.T_camera_board, seen.T_camera_board)
+    found = calibrate_camera(pairs)
+    assert "swapped" in found.rejected["i0"]
+    # One board from the other end, and a robot pose that is wrong beside it: it alone is turned.
+    corners[0] = seen_from(board, 2, corners[0])
+    seen = boards_of_corners(names, corners, board, (640, 480), camera)
+    wrong = robot.copy()
+    wrong[5, :3, :3] = wrong[5, :3, :3] @ Rotation.from_rotvec([0.0, 0.7, 0.0]).as_matrix()
+    pairs = board_pairs(seen, board, names, wrong, "in-hand")
+    away = np.linalg.norm(pairs.T_camera_board - seen.T_camera_board, axis=(1, 2)) > 0.1
+    assert away.tolist() == [True, *[False] * 9]
 
 
 def test_images_give_the_camera(images) -> None:

@@ -225,13 +225,13 @@ def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
         (SLOW, {"rejected": 2}),
     ):
         for _ in range(TRIES):
-            own.graph.calm()
             *_, waits = own.stop_on_its_way(0.3, slow, **how)
             stood = own.stopped()
             starved_s = own.graph.starved_s(waits)
             own.arrive()
             if starved_s < STARVED_S:
                 break
+            own.graph.calm()
         assert stood["failed"] == "", (how, starved_s)
         # Once more where a busy computer hides for 20 ms that it slows down: that does no harm.
         anew = how.get("rejected", how.get("lost") == COPIES)

@@ -9,10 +9,17 @@ import pytest
 from std_srvs.srv import Trigger
 
 SCRIPT = """
+import contextlib
 import sys
+from pathlib import Path
 from std_srvs.srv import Trigger
 from robocal_ros.ros.base import HouseNode
 from robocal_ros.ros.base import run
+
+def threads():
+    for name in Path("/proc/self/task").glob("*/comm"):
+        with contextlib.suppress(OSError):
+            yield name.read_text().strip()
 
 class Sleeper(HouseNode):
     NAME = "sleeper"
@@ -55,16 +62,17 @@ def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) 
 def test_what_dds_runs_has_ended_before_the_process_does(graph: Any, tmp_path: Path) -> None:
     """Finding: C's exit took it down amid its running threads, by a SIGSEGV of one in a hundred."""
     path = tmp_path / "sleeper.py"
-    after = "from pathlib import Path\nfor name in Path('/proc/self/task').glob('*/comm'):"
-    after += "\n    print('runs', name.read_text(), flush=True)\n"
+    text = SCRIPT.replace('print("released"', "print('before', *threads()); print('released'")
     for events in ("False", "True"):
-        path.write_text(SCRIPT.replace("EVENTS", events) + after)
+        path.write_text(text.replace("EVENTS", events) + "print('after', *threads(), flush=True)\n")
         sleeper = graph.start(path)
         assert graph.call(Trigger, "/sleeper/ping").success
         assert sleeper.stop() == 0
-        assert "runs python" in sleeper.output
-        left = {line for line in sleeper.output.splitlines() if "runs dds" in line}
-        assert left <= {"runs dds.shm.wdog"}  # of the process, not of a participant
+        told = {words[0]: words[1:] for words in map(str.split, sleeper.output.splitlines())}
+        assert [name for name in told["before"] if name.startswith("dds.ev")]
+        # the watchdog is of the process, not of a participant
+        left = [name for name in told["after"] if name.startswith("dds") and "wdog" not in name]
+        assert not left
 
 
 def test_a_second_signal_ends_a_start_that_takes_long(graph: Any, tmp_path: Path) -> None:
