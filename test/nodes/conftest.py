@@ -58,7 +58,7 @@ LEAVES_WITHIN_S = 3.0
 TRIES = 8
 SHOWN_OF_RERUN = 3000
 LATE_S = 0.03  # half of what stops begin ahead of now
-CALM_S, CALM_WITHIN_S = 0.5, 10.0
+CALM_S, CALM_SHARE, CALM_WITHIN_S = 0.5, 0.5, 10.0  # a share of waits is usual
 
 
 # All nodes of a cell at once, which take more than a core: first, so that xdist gives them to one
@@ -299,13 +299,13 @@ class Graph:
         return 1e-9 * sum(longest)
 
     def calm(self) -> None:
-        """Wait until nobody waits long for a core, as long as others may take to start."""
+        """Wait until nobody waits most of the time for a core, as others do that start."""
         ends = time.monotonic() + CALM_WITHIN_S
-        waited_s = LATE_S
-        while waited_s >= LATE_S and time.monotonic() < ends:
+        while time.monotonic() < ends:
             before = self.waits
             self.spin_for(CALM_S)
-            waited_s = self.starved_s(before)
+            if self.starved_s(before) < CALM_SHARE * CALM_S:
+                return
 
     def undisturbed(self, trial: Callable[[], None]) -> None:
         """Try anew what jumped while a process waited for a core: once heard late, any plan jumps.
