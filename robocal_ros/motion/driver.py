@@ -170,10 +170,9 @@ class StatedController:
             times = np.append(first_s, ahead[ahead > first_s + 1e-4])
         else:  # in two lines at least, which slow down, while there is time for them
             first_s = min(first_s, max(last_s - 2.0 * LINES_S, LEAD_S))
-            if last_s - first_s < 1e-3:
-                first_s = last_s
-            left_s = last_s - first_s
-            lines = max(int(np.ceil(left_s / LINES_S)), 2 if left_s else 0)
+            first_s = first_s if last_s - first_s > 1e-3 else last_s
+            lines = int(np.ceil((last_s - first_s) / LINES_S))
+            lines = max(lines, 2) if lines else 0
             times = np.linspace(first_s, last_s, lines + 1)
         q, qd = plan.at(times + since_s)
         qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest
