@@ -538,7 +538,7 @@ def _turned(pairs: PosePairs, T_end: Array) -> PosePairs:
         pairs,
         T_camera_board=pairs.T_camera_board @ T_end,
         covariance=None if covariance is None else J @ covariance @ J.swapaxes(1, 2),
-        shared=shared and replace(shared, sensitivity=J @ shared.sensitivity),
+        shared=None if shared is None else replace(shared, sensitivity=J @ shared.sensitivity),
     )
 
 
@@ -547,7 +547,7 @@ def _ends(pairs: PosePairs, R: Array, beside: PosePairs | None) -> NDArray[np.in
 
     From sample to sample a board turns by the robot's angle, wherever the camera sits.
     """
-    told, ends = beside or pairs, len(R)
+    told, ends = pairs if beside is None else beside, len(R)
     seen, there = pairs.T_camera_board[:, :3, :3], told.T_camera_board[:, :3, :3]
     robot, at = (each.T_boardside_cameraside[:, :3, :3] for each in (pairs, told))
     angles = np.array([_angles(np.einsum("iab,bc,jac->ij", seen, turn, there)) for turn in R])

@@ -171,8 +171,7 @@ class StatedController:
         else:  # in two lines at least, which slow down, while there is time for them
             first_s = min(first_s, max(last_s - 2.0 * LINES_S, LEAD_S))
             first_s = first_s if last_s - first_s > 1e-3 else last_s
-            lines = int(np.ceil((last_s - first_s) / LINES_S))
-            lines = max(lines, 2) if lines else 0
+            lines = max(int(np.ceil((last_s - first_s) / LINES_S)), 2) if last_s > first_s else 0
             times = np.linspace(first_s, last_s, lines + 1)
         q, qd = plan.at(times + since_s)
         qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest

@@ -115,7 +115,11 @@ class Stream:
         """`runs_on`, and the command was nowhere much faster than the stream."""
         began_s = self.controller.now_s
         self.runs_on()
-        _, speeds = self.controller.speeds(began_s)
+        self.was_no_faster(began_s)
+
+    def was_no_faster(self, since_s: float) -> None:
+        """The command, than the stream."""
+        _, speeds = self.controller.speeds(since_s)
         no_jump(np.abs(speeds) < FASTEST * np.abs(SPEED), "no faster than the stream")
 
 
@@ -133,6 +137,7 @@ def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
     graph.undisturbed(stream.runs_no_faster)
     stream.wait(CorrectionStatus.ON)
 
+    killed_s = controller.now_s
     node.kill()
     stream.runs = False
     graph.spin_for(2 * PERIOD_S)  # what was on its way
@@ -143,6 +148,7 @@ def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
     assert np.abs(stands - HOME)[0] > 0.2
     _, sent = controller.sent(began_s)
     no_jump(np.diff(sent[:, 0]) > -1e-6, "nothing turns back")
+    stream.was_no_faster(killed_s)
 
     count, again_s = len(stream.sent), controller.now_s
     stream.start()
