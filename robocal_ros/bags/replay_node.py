@@ -404,7 +404,7 @@ class ReplayNode(HouseNode):
         else:
             self.get_logger().info(f"{state}: nothing was lost{topics.alone()}")
         if self.settings["exit_at_end"]:
-            self._status.wait_for_all_acked(Duration(seconds=1))
+            self._status.wait_for_all_acked(Duration(seconds=5))  # it ends with the node
             raise SystemExit(EXIT_LOSS if lost else 0)
 
     def _losses(self, topics: ReplayTopics) -> list[BagLoss]:

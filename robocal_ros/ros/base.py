@@ -258,7 +258,7 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
     # conversion of a message then fails) nor as a shutdown of the context below it.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node, executor = None, _executor(events)
+    node, executor, status = None, _executor(events), 0
     try:
         ending = threading.Event()
         _watch_signals(ending, executor.wake)  # before a start that may have kernels to compile
@@ -270,15 +270,19 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
         pass
     except Exception:
         traceback.print_exc()
-        sys.exit(1)
+        status = 1
     finally:
         # Say good-bye, or others take the node for alive until its lease runs out.
         try:
-            if node is not None:
+            if node is None:
+                gc.collect()  # one that failed half way, which nobody can close
+            else:
                 node.close()
         finally:
             executor.shutdown()
             rclpy.try_shutdown()
+    if status:
+        sys.exit(status)
 
 
 def _executor(events: bool) -> Executor:

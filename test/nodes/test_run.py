@@ -63,20 +63,44 @@ def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) 
     assert "Traceback" not in sleeper.output
 
 
-def test_what_dds_runs_has_ended_before_the_process_does(graph: Any, tmp_path: Path) -> None:
+END = "\nrun(Sleeper, events=EVENTS)\n"
+END_THAT_TELLS = """
+try:
+    run(Sleeper, events=EVENTS)
+finally:
+    ends = time.monotonic() + 5.0  # a thread that has been joined is listed for a moment more
+    while participant() and time.monotonic() < ends:
+        time.sleep(0.01)
+    print("after", *participant(), flush=True)
+"""
+HALF_A_NODE = """
+    def __init__(self):
+        super().__init__()
+        print("before", *participant())
+        1 / 0
+"""
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["whole", "failed half way"])
+def test_what_dds_runs_has_ended_before_the_process_does(
+    graph: Any, tmp_path: Path, whole: bool
+) -> None:
     """Finding: C's exit took it down amid its running threads, by a SIGSEGV of one in a hundred."""
     path = tmp_path / "sleeper.py"
     text = SCRIPT.replace('print("released"', "print('before', *participant()); print('released'")
-    # a thread that has been joined is listed for a moment more
-    text += "ends = time.monotonic() + 5.0\n"
-    text += "while participant() and time.monotonic() < ends: time.sleep(0.01)\n"
-    text += "print('after', *participant(), flush=True)\n"
+    if not whole:
+        text = SCRIPT.replace("    def configure(", f"{HALF_A_NODE}    def configure(")
     for events in ("False", "True"):
-        path.write_text(text.replace("EVENTS", events))
+        path.write_text(text.replace(END, END_THAT_TELLS).replace("EVENTS", events))
         sleeper = graph.start(path)
-        assert graph.call(Trigger, "/sleeper/ping").success
-        assert sleeper.stop() == 0
-        told = {words[0]: words[1:] for words in map(str.split, sleeper.output.splitlines())}
+        if whole:
+            assert graph.call(Trigger, "/sleeper/ping").success
+            assert sleeper.stop() == 0
+        else:
+            assert sleeper.process.wait(60) == 1
+            assert "ZeroDivisionError" in sleeper.output
+        lines = [line.split() for line in sleeper.output.splitlines() if line]
+        told = {words[0]: words[1:] for words in lines}
         assert told["before"]
         assert not told["after"]
 
