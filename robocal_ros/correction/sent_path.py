@@ -26,6 +26,7 @@ class SentPath:
     known: Array  # (4, r, n)
     stage: StagedCorrection | None  # that it was made with
     led_from: Array  # (k,) where the controller leads in from
+    led_rate: Array | None  # (k,) and how fast it is there; None: not known
     put_s: float  # since when
     at_once: bool  # it begins as it goes out
     replaced: "SentPath | None" = None  # by it, until the controller accepts it
@@ -74,11 +75,16 @@ class SentPath:
     def place(self, now_s: float) -> Array:
         """Where the controller is (k,), between the points as it drives there."""
         t, times, out = self.time(now_s), self.command.time_from_start_s, self.command.position
-        if t < times[0]:
-            lead = times[0] + self.begin_s - self.put_s
-            part = np.clip((times[0] - t) / lead, 0.0, 1.0) if lead > 0.0 else 0.0
-            return np.asarray(out[0] + part * (self.led_from - out[0]))
-        return driven(times, out, self.command.velocity, self.command.acceleration, t)
+        velocity = self.command.velocity
+        if t >= times[0]:
+            return driven(times, out, velocity, self.command.acceleration, t)
+        way = np.array([self.put_s - self.begin_s, times[0]])
+        if way[0] >= way[1]:
+            return out[0].copy()
+        ends, rates = np.stack([self.led_from, out[0]]), None
+        if velocity is not None and self.led_rate is not None:
+            rates = np.stack([self.led_rate, velocity[0]])
+        return spline(way, ends, rates, None, 0, max(t, float(way[0])))[0]
 
     def withheld(self, now_s: float) -> Array:
         """What of the offset the limiter adds now (n,)."""

@@ -106,6 +106,7 @@ class TrajectoryCorrector:
             known=sent,
             stage=self._desired.stage if result is not None else None,
             led_from=out[0, index] if led_from is None else led_from,
+            led_rate=self._rate(index, now_s),
             put_s=now_s,
             at_once=starts_in_s == 0.0,
         )
@@ -278,9 +279,18 @@ class TrajectoryCorrector:
             known=np.stack([offsets, rates * slow[:, None], 0.0 * rates, withheld]),
             stage=path.stage,
             led_from=path.place(now_s),
+            led_rate=self._rate(path.index, now_s),
             put_s=now_s,
             at_once=True,
         )
+
+    def _rate(self, index: Index, now_s: float) -> Array | None:
+        """How fast the controller moves joints (k,); None where it follows targets."""
+        path, rate = self._output.path, np.zeros(self._arm.n)
+        if path is None:
+            return rate[index] if self._robot.stands(index, now_s) else None
+        rate[path.index] = _motion(path, np.array([now_s]), 1.0)[1][0]
+        return rate[index]
 
     def _slow_down(
         self, path: SentPath, begin_s: float, rate: float, left: float

@@ -441,7 +441,7 @@ def test_whether_a_robot_follows_its_path(late_s):
         TrajectoryCommand(NAMES, np.stack([HOME, HOME + lasts_s * SPEED]), times),
         index=np.arange(6), begin_s=began_s - late_s, known_times=times,
         known=np.zeros((4, 2, 6)), stage=None,
-        led_from=HOME, put_s=began_s, at_once=True,
+        led_from=HOME, led_rate=None, put_s=began_s, at_once=True,
     )  # fmt: skip
     assert robot.state.follows(path, robot.now_s)  # nothing tells otherwise
     robot.qd = np.zeros(6)

@@ -201,6 +201,14 @@ COARSE = [("tool", 50, 1.0, 0.3, True, False, 0.6), ("on", 20, 1.0, 0.3, True, F
 @settings(max_examples=amount(10, 25), deadline=None)
 @example([*COARSE, ("off", 30, 0.2, 0.05, True, False, 0.5)])
 @example([*COARSE[::-1], ("model", 30, 0.01, 0.05, False, False, 0.5)])
+@example(
+    [
+        *[("on", 0, 0.004, 0.0, False, False, 1.0)] * 3,
+        ("tool", 9, 0.004, 0.0, False, False, 1.25),
+        ("off", 0, 0.004, 0.3, False, True, 0.1015625),
+        ("on", 0, 0.004, 0.0, False, False, 1.0),
+    ]
+)
 @given(st.lists(LEG, min_size=1, max_size=6))
 def test_between_the_points_too(legs: list) -> None:
     """One after the other, from rest and in place of one that is under way."""
