@@ -33,6 +33,19 @@ def test_tests_that_pages_name_are_there() -> None:
         assert not name or f"def {name}(" in file.read_text(), f"{page}: {path}::{name}"
 
 
+@pytest.mark.parametrize(
+    "node", ["thermal_node", "tcf_node", "hand_eye_node", "adapter_node", "cell_sim_node"]
+)
+def test_the_page_of_a_node_has_its_outputs_and_services(node: str) -> None:
+    """But the twins for a PLC of services that are there."""
+    page = (ROOT / "docs" / f"{node}.md").read_text()
+    names = (ROOT / "test" / "public_names.txt").read_text()
+    declared = {*re.findall(rf"^{node} (?:publishes|serves|executes) (\S+)", names, re.MULTILINE)}
+    wanted = {name for name in declared if name.removesuffix("_trigger") not in declared - {name}}
+    assert wanted
+    assert {name for name in wanted if f"`{name}`" not in page} == set()
+
+
 def commands(page: str) -> list[list[str]]:
     text = (ROOT / page).read_text().replace("\\\n", " ")
     blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
