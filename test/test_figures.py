@@ -43,6 +43,88 @@ SENTENCES = [
     ),
     ("ur10_known_geometry", r"functions to a mean of ([\d.]+), ([\d.]+) and ([\d.]+) mm"),
 ]
+# Of speed: page and words; of each number there the table, cells of its row, the column, the unit.
+SPEEDS = [
+    (
+        "accuracy",
+        r"forward kinematics, 10 000 poses \| ([\d.]+) ms .*?: ([\d.]+) ms \| (\d+) times",
+        "speed",
+        [("kinematics", ("forward kinematics",), column, 1.0) for column in (1, 2, 3)],
+    ),
+    (
+        "accuracy",
+        r"Jacobian, 10 000 poses \| ([\d.]+) ms .*?: ([\d.]+) ms \| (\d+) times",
+        "speed",
+        [("kinematics", ("Jacobian",), column, 1.0) for column in (1, 2, 3)],
+    ),
+    (
+        "accuracy",
+        r"least squares \| ([\d.]+) ms .*? in NumPy: (\d+) ms \| ([\d.]+) of .*? takes ([\d.]+) ms",
+        "speed",
+        [
+            ("identification", ("ours",), 1, 1.0),
+            ("identification", ("scipy, Jacobian in NumPy",), 1, 1.0),
+            ("identification", ("ours",), 2, 1.0),
+            ("identification", ("scipy, our compiled Jacobian",), 1, 1.0),
+        ],
+    ),
+    (
+        "accuracy",
+        r"robust \(default\) \| ([\d.]+) ms .*? loss: (\d+) ms \| ([\d.]+) of .*? over ([\d.]+) s",
+        "speed",
+        [
+            ("identification", ("ours, robust (the default)",), 1, 1.0),
+            ("identification", ("scipy, the same with Huber's loss",), 1, 1.0),
+            ("identification", ("ours, robust (the default)",), 2, 1.0),
+            ("identification", ("pybotics",), 1, 1e-3),
+        ],
+    ),
+    (
+        "accuracy",
+        r"UR10, 250 poses \| ([\d.]+) s \| ([\d.]+) s as .*? 5961 poses \| ([\d.]+) s",
+        "speed",
+        [
+            ("full_model_speed", ("UR10", 250), 2, 1.0),
+            ("full_model_speed", ("UR10", 250), 4, 1.0),
+            ("full_model_speed", ("UR10", 5961), 2, 1.0),
+        ],
+    ),
+    (
+        "accuracy",
+        r"under load, 250, 6000, 20 000 poses \| ([\d.]+), ([\d.]+), ([\d.]+) s",
+        "speed",
+        [("full_model_speed", ("KR 150, simulated", n), 2, 1.0) for n in (250, 6000, 20000)],
+    ),
+    (
+        "replay",
+        r"per second of a core \| ([\d.]+) million, ([\d.]+) times",
+        "replay_speed",
+        [
+            ("joint_ingestion", ("ours, as far as the desk",), 1, 1e-6),
+            ("joint_ingestion", ("ours, as far as the desk",), 2, 1.0),
+        ],
+    ),
+    (
+        "replay",
+        r"whole replay \| ([\d.]+) s, (\d+) times .*?"
+        r"([\d.]+) s and ([\d.]+) s .*? (\d+) MB and (\d+) MB",
+        "replay_speed",
+        [
+            ("replay_speed", (cycles,), column, 1.0)
+            for cycles, column in ((96, 4), (96, 6), (24, 8), (96, 8), (24, 10), (96, 10))
+        ],
+    ),
+    (
+        "replay",
+        r"two processes over one \| (\d+) s, ([\d.]+) times .*? count were ([\d.]+) times",
+        "replay_speed",
+        [
+            ("many_bags", ("validate", 2), 2, 1.0),
+            ("many_bags", ("validate", 2), 4, 1.0),
+            ("many_bags", ("counting", 2), 4, 1.0),
+        ],
+    ),
+]
 
 
 def figures(part, name):
@@ -330,6 +412,29 @@ def test_where_a_correction_gets_has_the_kept_figures():
             words = f"all of {count:,}".replace(",", " ") if count >= 10_000 else f"all of {count}"
             assert beyond == 0
             assert cell.strip().startswith(words if count else "none"), cell
+
+
+@pytest.mark.parametrize(
+    ("page", "words", "part", "where"),
+    SPEEDS,
+    ids=[f"{page} {where[0][0]} {where[0][1][0]}" for page, _, _, where in SPEEDS],
+)
+def test_what_is_said_of_speed_has_the_kept_figures(page, words, part, where):
+    text = " ".join((DOCS / f"{page}.md").read_text().split())
+    found = re.search(words, text).groups()
+    for quoted, (name, cells, column, unit) in zip(found, where, strict=True):
+        (row,) = (row for row in figures(part, name)[1] if all(cell in row for cell in cells))
+        assert rounded(quoted, row[column] * unit), (quoted, row)
+
+
+def test_how_long_a_mount_takes_has_the_kept_figures():
+    _, rows = figures("speed", "hand_eye_speed")
+    page = " ".join((DOCS / "hand_eye_node.md").read_text().split())
+    words = r"poses: ([\d.]+) to ([\d.]+) s in the median, ([\d.]+) s at the longest"
+    medians, longest = [row[1] for row in rows], max(row[2] for row in rows)
+    quoted = re.search(words, page).groups()
+    for one, kept in zip(quoted, (min(medians), max(medians), longest), strict=True):
+        assert rounded(one, kept), (one, kept)
 
 
 @pytest.mark.parametrize(
