@@ -208,6 +208,8 @@ class PanelState:
                 Instruction("state/HISTORY", Code.STORAGE_FAILED.name, self.history_trouble)
             )
         level = named(LEVELS, accuracy["state"])
+        if level == "DEGRADED" and accuracy["reason"].startswith("correction: "):
+            level = "UNCORRECTED"  # drift and tool are known well enough: no gap mends it
         if level != "OK" or not found:
             found.append(Instruction(f"state/{level}", detail=accuracy["reason"]))
         return list({task.key: task for task in reversed(found)}.values())[::-1]

@@ -220,6 +220,19 @@ def test_of_a_correction_only_what_stops_or_what_it_spoils_is_told():
         assert told(spoils, "DEGRADED") == f"correction/{spoils}"
 
 
+def test_no_gap_is_asked_for_where_the_correction_alone_is_amiss():
+    """As accuracy_of of maintenance has it: its reason names the parts at the worst level."""
+    old = "correction: joint_correction_node corrects with tool revision 2, in force is revision 3"
+    degraded = accuracy("DEGRADED", reason=old)
+    assert keys(shown(**{ACCURACY: degraded})) == ["state/UNCORRECTED"]
+    for state, first in (("ON", []), ("OFF", ["correction/OFF"])):
+        told = {"state": CORRECTIONS.index(state), "reason": ""}
+        panel = shown(**{CORRECTION: told, ACCURACY: degraded})
+        assert keys(panel) == [*first, "state/UNCORRECTED"]
+    with_drift = accuracy("DEGRADED", reason=f"drift: below 0.4 mm; {old}")
+    assert keys(shown(**{ACCURACY: with_drift})) == ["state/DEGRADED"]
+
+
 def test_a_gap_that_was_broken_off_is_measured_again():
     panel = shown(**{STATUS: status(last=ended(code=int(Code.CONFLICT)))})
     assert "again in the next gap" in told(panel, NOW_S)["en"]
