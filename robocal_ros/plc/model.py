@@ -141,12 +141,12 @@ SHOWN = (
     Shown(
         "LastCycle",
         STATUS,
-        "How the last cycle ended",
+        "How the cycle that ended last did; while one runs it is the one before: look at CycleId",
         (
             Item("CycleId", "String", "last.cycle_id", "Its id"),
-            Item("Ended", "DateTime", lambda m: time_of(m.last.stamp), "When; running: begun"),
+            Item("Ended", "DateTime", lambda m: time_of(m.last.stamp), "When; node killed: begun"),
             Item("Run", "UInt32", "last.run", "The how many-th since the state folder was made"),
-            Item("Code", CODE, "last.code", "NONE: it runs; ACCEPT: as planned"),
+            Item("Code", CODE, "last.code", "ACCEPT: as planned; NONE: none has ended yet"),
             Item("Message", "String", "last.message", "In words"),
             Item("Complete", "Boolean", "last.complete", "Nothing is left for the next gap"),
             Item("Left", "String[]", "last.left", "What is left"),

@@ -31,7 +31,8 @@ class Cell:
     """What the bridge shows, and how it answers a call: with a code, too late, or never."""
 
     def __init__(self) -> None:
-        self.beat, self.state, self.code, self.last = 3_000_000_000, IDLE, 0, 0
+        self.beat, self.state = 3_000_000_000, IDLE
+        self.code = self.last = self.running = 0  # code, last: of the cycle that ended last
         self.at_home = self.heard = True
         self.begins: list[int] = []  # a cycle that was accepted and is not shown yet
         self.answers: list[Any] = []
@@ -48,12 +49,13 @@ class Cell:
         """The status comes behind the answer: until then it is the one of before."""
         self.beat += 1
         if self.begins:
-            cycle = self.begins.pop()
+            self.running = self.begins.pop()
             if not self.begins:
-                self.state, self.code, self.last, self.at_home = RUNNING, 0, cycle, False
+                self.state, self.at_home = RUNNING, False
 
     def end(self, state: int = IDLE) -> None:
-        self.state, self.code, self.at_home = state, int(Code.ACCEPT), state == IDLE
+        self.state, self.at_home = state, state == IDLE
+        self.code, self.last = int(Code.ACCEPT), self.running
 
 
 class ByOpcUa:
