@@ -295,6 +295,15 @@ def test_of_a_cell_that_is_not_heard_nothing_is_believed(plc: Plc) -> None:
     plc.until(plc.produces, 2.0)
 
 
+def test_while_the_cell_is_not_heard_no_gap_begins(plc: Plc) -> None:
+    plc.until(plc.produces)
+    plc.cell.heard = False
+    plc.program["bPause"] = True
+    plc.stays(plc.produces)
+    plc.cell.heard = True
+    plc.runs()
+
+
 def test_a_fence_that_is_opened_closes_the_gap_at_once(plc: Plc) -> None:
     plc.runs()
     plc.program["bCellSafe"] = False
