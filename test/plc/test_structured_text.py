@@ -37,11 +37,12 @@ class Cell:
         self.begins: list[int] = []  # a cycle that was accepted and is not shown yet
         self.answers: list[Any] = []
         self.called: list[int] = []
+        self.known: set[int] = set()  # of cycles that ran: an id is accepted, nothing begins
 
     def run(self, cycle: int) -> Any:
         self.called.append(cycle)
         answer = self.answers.pop(0) if self.answers else Code.ACCEPT
-        if answer == Code.ACCEPT:
+        if answer == Code.ACCEPT and cycle not in self.known:
             self.begins = [cycle] * SHOWN_LATE
         return answer
 
@@ -282,6 +283,25 @@ def test_a_plc_that_starts_in_a_cycle_waits_for_its_end(plc: Plc) -> None:
     plc.until(plc.produces, 1.0)
     plc.runs()
     assert plc.cell.called[1] > plc.cell.called[0], "never given again"
+
+
+def test_a_number_that_was_lost_goes_on_behind_the_last_cycles(plc: Plc) -> None:
+    plc.cell.last, plc.cell.code, plc.cell.known = 187, int(Code.ACCEPT), {*range(188)}
+    plc.runs()
+    assert plc.cell.called == [188]
+    plc.cell.end()
+    plc.until(plc.produces)
+
+
+def test_a_cycle_that_ran_before_holds_nothing_up(plc: Plc) -> None:
+    """The number was lost, and a cycle without one ended last."""
+    plc.cell.known = {1}
+    plc.pause()
+    plc.until(lambda: plc.cell.called)
+    plc.until(plc.produces, 6.0)
+    plc.stays(lambda: plc.produces() and not plc.given)
+    plc.runs()
+    assert plc.cell.called == [1, 2]
 
 
 def test_of_a_cell_that_is_not_heard_nothing_is_believed(plc: Plc) -> None:

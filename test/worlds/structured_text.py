@@ -300,6 +300,8 @@ class StructuredText:
         _same(kind, before)
         if after == STRING:
             return STRING, lambda: str(value())
+        if before == STRING:
+            return after, lambda: _within(after, _number(value()), name)
         return after, lambda: _within(after, value(), name)
 
 
@@ -322,6 +324,11 @@ def _joined(one: str, other: str) -> str:
     kinds = {one, other} - {LITERAL}
     assert len(kinds) <= 1, f"{one} beside {other}"
     return kinds.pop() if kinds else LITERAL
+
+
+def _number(text: str) -> int:
+    """Of a STRING; 0 where it is none, which the standard leaves to the maker."""
+    return int(text) if text.isdecimal() else 0
 
 
 def _same(given: str, wanted: str) -> None:
