@@ -321,8 +321,8 @@ class RegisterImage:
         """Run or cancel."""
         name = {modbus.RUN: "Run", modbus.CANCEL: "Cancel"}.get(command)
         method = next((m for m in METHODS if m.name == name), None)
-        if method is None:
-            return int(Code.BAD_INPUT)
+        if method is None or (command == modbus.RUN and not cycle):
+            return int(Code.BAD_INPUT)  # cycle 0 reads as none in `CYCLE`
         fields = {"cycle_id": str(cycle), "gap_s": float(gap_s)} if method.inputs else {}
         until_s = time.monotonic() + ANSWER_S
         outputs = await self._cell.carry_out(method, writer, fields, until_s)

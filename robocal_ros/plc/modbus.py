@@ -83,7 +83,7 @@ HOLDINGS = (
     Register(REQUEST_AT, "Request.Number", "I", "A new one is carried out; 0: none"),
     Register(4, "Request.Command", "H", "1: run, 2: cancel"),
     Register(5, "Request.GapS", "H", "Length of the gap, s"),
-    Register(6, "Request.Cycle", "I", "Number of the cycle; its id"),
+    Register(6, "Request.Cycle", "I", "Number of the cycle; its id, not 0"),
 )
 INPUT_WORDS = 58
 

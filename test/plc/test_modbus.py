@@ -15,6 +15,9 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from bench.live.opc_ua import free_port
+from robocal_ros.adapter.inputs import InputTiming
+from robocal_ros.ground.errors import Code
+from robocal_ros.plc.cell import Cell, MethodCalled, RegisterImage
 from robocal_ros.plc.modbus import (
     BUSY,
     HOLDING_WORDS,
@@ -24,6 +27,7 @@ from robocal_ros.plc.modbus import (
     INPUT_WORDS,
     INPUTS,
     NO_ANSWER,
+    RUN,
     ModbusServer,
     words_of,
 )
@@ -175,6 +179,17 @@ def test_what_a_connection_finds_latched_is_not_carried_out(served: Served) -> N
     client.write_registers(2, written(9, command=2))
     assert served.answered(9) == 1
     assert image.requests == [(1, 4711, 60), (2, 4711, 60)]
+
+
+def test_a_cycle_without_a_number_is_not_run() -> None:
+    handed: list[Any] = []
+    cell = Cell((), InputTiming(0.0, 1e-3), handed.append)
+    cell.active = True
+    image = RegisterImage(cell)
+    assert asyncio.run(image.request("gateway", RUN, 0, 60)) == Code.BAD_INPUT
+    assert not handed
+    assert asyncio.run(image.request("gateway", RUN, 1, 60)) == NO_ANSWER
+    assert [type(one) for one in handed] == [MethodCalled]
 
 
 def test_a_value_beyond_four_bytes_is_the_largest() -> None:
