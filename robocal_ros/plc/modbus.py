@@ -55,7 +55,7 @@ INPUTS = (
     Register(
         17, ANSWER, "H", "Code that answers the request; 0: it is carried out; 255: no answer"
     ),
-    Register(18, ANSWERED, "I", "Number of the request that is answered"),
+    Register(18, ANSWERED, "I", "Number of the request that Answer.Status is of"),
     Register(20, "Accuracy.PredictedErrorMm", "f", "rms, mm; -1: not known"),
     Register(22, "Accuracy.BoundMm", "f", "95 % are below, mm; -1: not known"),
     Register(24, "Accuracy.DueInS", "f", "Until the next gap is due, s"),
@@ -239,7 +239,7 @@ class ModbusServer:
             if number == self._number:
                 self._answer, self._answered = answer, number
 
-        self._answer = 0
+        self._answer, self._answered = 0, number
         task = asyncio.get_running_loop().create_task(carry_out())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

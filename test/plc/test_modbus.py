@@ -32,6 +32,7 @@ from robocal_ros.plc.modbus import (
     words_of,
 )
 
+WAITS = 8  # a command that is carried out until the test lets it end
 VALUES = {"Gap.Beat": 70_000, "Accuracy.State": 1, "Accuracy.BoundMm": 0.25, "Valid": True}
 
 
@@ -42,6 +43,7 @@ class Recorded:
         self.echoes: list[int] = []
         self.requests: list[tuple[int, int, int]] = []
         self.busy = False
+        self.goes_on = asyncio.Event()
         self.ended: list[str] = []
 
     def values(self) -> Mapping[str, Any]:
@@ -58,6 +60,8 @@ class Recorded:
         self.requests.append((command, cycle, gap_s))
         if command == 9:
             raise ZeroDivisionError("of this test")
+        if command == WAITS:
+            await self.goes_on.wait()
         await asyncio.sleep(0.01)
         return 1
 
@@ -75,7 +79,7 @@ class Served:
     def answered(self, number: int) -> int:
         """What answers a request."""
         until_s = time.monotonic() + 10.0
-        while (found := self.inputs())["Answer.Number"] != number:
+        while (found := self.inputs())["Answer.Number"] != number or not found["Answer.Status"]:
             assert time.monotonic() < until_s, found
         return int(found["Answer.Status"])
 
@@ -161,6 +165,18 @@ def test_a_request_is_carried_out_once_however_often_the_image_is_written(served
     assert served.answered(3) == 1
     assert image.requests[1:] == [(9, 4711, 60), (2, 4711, 60)]
     assert image.echoes == [7] * 5
+
+
+def test_a_request_that_is_carried_out_is_named_at_once(served: Served) -> None:
+    client, image = served.client, served.image
+    client.write_registers(2, written(0))
+    client.write_registers(2, written(7))
+    assert served.answered(7) == 1
+    client.write_registers(2, written(8, command=WAITS))
+    found = served.inputs()
+    assert (found["Answer.Number"], found["Answer.Status"]) == (8, 0)
+    served.loop.call_soon_threadsafe(image.goes_on.set)
+    assert served.answered(8) == 1
 
 
 def test_what_a_connection_finds_latched_is_not_carried_out(served: Served) -> None:
