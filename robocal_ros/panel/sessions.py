@@ -56,11 +56,10 @@ class PanelSessions:
 
     def login(self, name: str, password: str, now_s: float) -> tuple[str, PanelSession] | str:
         """A new session with its token; or why there is none, in words."""
-        role = self._logins.login(name, password, now_s)
-        if isinstance(role, str):
-            return role
-        account = Users(self._folder).accounts[name]
-        made = PanelSession(name, role, account, secrets.token_urlsafe(32), now_s, now_s)
+        account = self._logins.login(name, password, now_s)
+        if isinstance(account, str):
+            return account
+        made = PanelSession(name, account.role, account, secrets.token_urlsafe(32), now_s, now_s)
         token = secrets.token_urlsafe(32)
         lasting = {t: s for t, s in [*self._sessions.items()] if not s.ended(now_s)}
         while len(lasting) >= MOST_SESSIONS:

@@ -106,13 +106,13 @@ class Users:
         del self.accounts[name]
         self._save()
 
-    def login(self, name: str, password: str) -> Role | None:
-        """The role, where the password is right; a name that nobody has takes as long."""
+    def login(self, name: str, password: str) -> Account | None:
+        """The account, where the password is right; a name that nobody has takes as long."""
         account = self.accounts.get(name)
         salt = account.salt if account else b"\0" * 16
         digest = _digest(password[: 4 * LONGEST], salt)
         right = account is not None and hmac.compare_digest(digest, account.digest)
-        return account.role if account and right else None
+        return account if right else None
 
     def _save(self) -> None:
         users = {
@@ -130,22 +130,22 @@ class Logins:
         self._folder = folder
         self._wrong: dict[str, list[float]] = {}
 
-    def login(self, name: str, password: str, now_s: float) -> Role | str:
-        """The role, or why there is none, in words; ``now_s``: steady clock."""
+    def login(self, name: str, password: str, now_s: float) -> Account | str:
+        """The account, or why there is none, in words; ``now_s``: steady clock."""
         name = name[:LONGEST]
         wrong = [at_s for at_s in self._wrong.get(name, ()) if now_s - at_s < LOCKED_S]
         if len(wrong) >= LOCKED_AFTER:
             return f"login of {quoted(name)} is locked: {len(wrong)} wrong passwords"
         try:
-            role = Users(self._folder).login(name, password)
+            account = Users(self._folder).login(name, password)
         except InputError as error:
             return f"nobody can log in: {error}"
-        if role is None:
+        if account is None:
             lately = {of: at for of, at in self._wrong.items() if now_s - at[-1] < LOCKED_S}
             self._wrong = lately | {name: [*wrong, now_s]}  # of a guess each 50 ms at the most
             return f"login of {quoted(name)} is refused: no such user, or password"
         self._wrong.pop(name, None)
-        return role
+        return account
 
 
 def write_private(path: Path, data: bytes) -> None:

@@ -16,7 +16,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -38,9 +38,11 @@ from robocal_ros.ground.errors import InputError
 from robocal_ros.plc.access import (
     KEY,
     SERVER,
+    Account,
     Logins,
     Role,
     Trust,
+    Users,
     application_uri,
     read_certificate,
 )
@@ -76,12 +78,12 @@ class ServerSettings:
     modbus_port: int = 502
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PlcUser(User):
-    """Who has logged in."""
+    """Who has logged in, and as what."""
 
     role: UserRole = UserRole.User  # of asyncua: may not change nodes
-    rights: Role = Role.OPERATOR
+    account: Account = field(repr=False)  # as it was then; no hash goes into a log
 
 
 class Login(NamedTuple):
@@ -110,6 +112,7 @@ class Door:
 
     def __init__(self, folder: Path, hand: Handover) -> None:
         self._hand, self._trust, self._logins = hand, Trust(folder), Logins(folder)
+        self._folder = folder
         self.answers: dict[Login, PlcUser | None] = {}  # for the one pass that follows
         # One thread: glibc keeps the 16 MB of a hash for the thread that asked for them.
         self._one = ThreadPoolExecutor(1, "login")
@@ -147,11 +150,18 @@ class Door:
         if why := self.untrusted(login.certificate):
             self._hand(Notice(f"a client is turned away: {why}"))
             return None
-        rights = self._logins.login(name, login.password, time.monotonic())
-        if isinstance(rights, str):
-            self._hand(Notice(rights))
+        account = self._logins.login(name, login.password, time.monotonic())
+        if isinstance(account, str):
+            self._hand(Notice(account))
             return None
-        return PlcUser(name=name, rights=rights)
+        return PlcUser(name=name, account=account)
+
+    def accounts(self) -> Mapping[str, Account] | None:
+        """The users as they are now; None: their table cannot be read, for a moment perhaps."""
+        try:
+            return Users(self._folder).accounts
+        except (OSError, InputError):
+            return None
 
 
 class CellSession(InternalSession):
@@ -166,7 +176,7 @@ class CellSession(InternalSession):
     @property
     def rights(self) -> Role | int:
         """Of the user who is logged in; 0: nobody is."""
-        return self.user.rights if isinstance(self.user, PlcUser) else 0
+        return self.user.account.role if isinstance(self.user, PlcUser) else 0
 
     @property
     def user_name(self) -> str:
@@ -580,5 +590,18 @@ class ServerThread:
         model = self.cell.model
         await model.look(time.monotonic())
         await model.set(ACTIVE, ua.Variant(self.cell.active))
+        await self._expel(server.iserver)
         names = [s.label for s in server.iserver.sessions if s.is_activated()]
         self.state.sessions = tuple(sorted(names))
+
+    async def _expel(self, iserver: CellInternalServer) -> None:
+        """End the sessions of users who were taken out, or given another password or role."""
+        users = [(s, s.user) for s in iserver.sessions if s.is_activated()]
+        accounts = await asyncio.to_thread(iserver.door.accounts) if users else None
+        if accounts is None:
+            return
+        for session, user in users:
+            if accounts.get(user.name) != user.account:
+                words = "its user was taken out, or has another password or role"
+                self._hand(Notice(f"{session.label} is ended: {words}"))
+                await session.close_session()

@@ -27,8 +27,9 @@ def test_a_password_is_kept_as_a_hash_that_its_owner_alone_reads(folder):
     for name in (access.USERS, access.KEY, f"{access.CLIENTS}/line_key.pem"):
         assert stat.S_IMODE((folder / name).stat().st_mode) == 0o600
     users = Users(folder)
-    assert users.login(*OPERATOR) is Role.OPERATOR
-    assert users.login("ada", "an engineer's password") is Role.ENGINEER
+    assert users.login(*OPERATOR) == users.accounts["plc"]
+    assert users.accounts["plc"].role is Role.OPERATOR
+    assert users.login("ada", "an engineer's password").role is Role.ENGINEER
     for name, password in (
         ("plc", ""),
         ("plc", "a plc's Password"),

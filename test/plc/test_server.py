@@ -182,6 +182,35 @@ def test_names_that_nobody_has_unlock_none(tmp_path: Path, monkeypatch: pytest.M
     assert "'plc' is locked" in told[-1].words
 
 
+@pytest.mark.parametrize("role", [None, access.Role.OPERATOR])
+def test_who_is_taken_out_or_has_another_role_loses_his_session(
+    served: Served, role: access.Role | None
+) -> None:
+    users, password = access.Users(served.folder), "ten letters."
+    users.put("guest", access.Role.ENGINEER, password)
+
+    def is_in() -> bool:
+        return any(name.startswith("guest") for name in served.thread.state.sessions)
+
+    with contextlib.closing(PlcClient(served.folder, served.port, "guest", "panel")) as guest:
+        guest.client = guest.do(guest.secured(guest.made("guest", password)))
+        guest.do(guest.client.connect())
+        _until(is_in)
+        assert guest.do(guest.read("Active")) is True
+        if role is None:
+            users.remove("guest")
+        else:
+            users.put("guest", role, password)
+        _until(lambda: not is_in())
+        served.forget()
+        beat = ua.Variant(1, ua.VariantType.UInt32)
+        for asked in (guest.call("Accept", 1, "x"), guest.write("Gap.Heartbeat", beat)):
+            with pytest.raises((ua.UaError, ConnectionError)):
+                guest.do(asked)
+    assert not served.acted
+    served.works()
+
+
 def test_logins_are_looked_at_in_one_thread(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
