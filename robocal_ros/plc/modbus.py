@@ -127,8 +127,13 @@ class ModbusServer:
         self._numbers: dict[str, int] = {}  # of each connection, the request that it wrote last
         self._number = self._answered = self._answer = 0
 
+    @property
+    def is_listening(self) -> bool:
+        """Whether it does."""
+        return self._server is not None
+
     async def start(self, host: str, port: int) -> None:
-        """Listen. Raises `OSError` where the port is taken."""
+        """Listen. Raises `OSError` where the port is taken or refused; it may be tried again."""
         self._server = await asyncio.start_server(self._connected, host, port, limit=1024)
 
     async def stop(self) -> None:

@@ -437,11 +437,6 @@ class CellServer(Server):
         gc.collect()
         gc.freeze()
 
-    @property
-    def is_listening(self) -> bool:
-        """Whether it does."""
-        return self.bserver is not None and self.bserver._server is not None
-
     async def start(self) -> None:
         """Listen. Raises `OSError` where the port is taken; it may then be tried again."""
         if not self._policies:
@@ -555,11 +550,12 @@ class ServerThread:
             lambda words: self._hand(Notice(words)),
         )
         try:
-            await self._listen(server, registers)
+            await self._listen(server)
             for source, latest in list(self._latest.items()):
                 await self.cell.model.show(source, *latest)
             while not self._stopped:
                 await self._look(server)
+                await self._open_registers(registers)
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._ending.wait(), LOOK_S)
         finally:
@@ -570,14 +566,11 @@ class ServerThread:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(server.stop(), STOP_S)
 
-    async def _listen(self, server: CellServer, registers: ModbusServer) -> None:
+    async def _listen(self, server: CellServer) -> None:
         assert self._ending is not None
         while not self._stopped:
             try:
-                if not server.is_listening:
-                    await server.start()
-                if self._settings.modbus_clients:
-                    await registers.start(self._settings.host, self._settings.modbus_port)
+                await server.start()
             except OSError as error:
                 self.state.trouble = f"cannot listen: {error.strerror or error}"
                 with contextlib.suppress(TimeoutError):
@@ -585,6 +578,17 @@ class ServerThread:
             else:
                 self.state.listening, self.state.trouble = True, ""
                 return
+
+    async def _open_registers(self, registers: ModbusServer) -> None:
+        """Listen by Modbus too; a port that is refused is tried again, and holds up no OPC UA."""
+        if not self._settings.modbus_clients or registers.is_listening:
+            return
+        try:
+            await registers.start(self._settings.host, self._settings.modbus_port)
+        except OSError as error:
+            self.state.trouble = f"Modbus: cannot listen: {error.strerror or error}"
+        else:
+            self.state.trouble = ""
 
     async def _look(self, server: CellServer) -> None:
         model = self.cell.model

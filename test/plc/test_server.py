@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -429,6 +430,30 @@ def test_a_port_that_is_taken_is_waited_for(tmp_path: Path) -> None:
     plc.do(plc.connect())
     assert plc.do(plc.client.get_namespace_index(NAMESPACE)) == 2
     plc.close()
+    thread.stop()
+    assert not thread._thread.is_alive()
+
+
+def test_a_modbus_port_that_is_taken_holds_up_no_opc_ua(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port, modbus_port = free_port(), taken.getsockname()[1]
+        numbers = NUMBERS | {name: {"NONE": 0} for name in OTHERS}
+        settings = ServerSettings(
+            "127.0.0.1", port, security_folder(tmp_path), (), InputTiming(0.0, 1e-3), numbers,
+            ("127.0.0.1",), modbus_port,
+        )  # fmt: skip
+        thread = ServerThread(settings, lambda handed: None)
+        _until(lambda: thread.state.trouble.startswith("Modbus: cannot listen"))
+        reason = ("Cell.Accuracy.Reason", ua.Variant("so it is", ua.VariantType.String))
+        thread.show("accuracy_state", [reason], datetime.now(UTC), time.monotonic())
+        plc = PlcClient(tmp_path, port)
+        plc.do(plc.connect())
+        _until(lambda: plc.do(plc.read("Accuracy.Reason")) == "so it is")
+        plc.close()
+    _until(lambda: not thread.state.trouble)
+    socket.create_connection(("127.0.0.1", modbus_port)).close()
     thread.stop()
     assert not thread._thread.is_alive()
 
