@@ -31,7 +31,9 @@ STEPS: Mapping[str, str] = {
 }
 """What maintenance_node says that it does, by the keys of its texts; groups are their numbers."""
 
-TOO_SHORT = re.compile(r"(?:beam station|tool measurement \(\w+\)): the gap is [\d.]+ s too short")
+TOO_SHORT = re.compile(
+    r"(?:beam station|tool measurement \(\w+\)|fixture): the gap is [\d.]+ s too short"
+)
 """How maintenance_node says in a result's message that something was due and did not fit."""
 
 Table = Mapping[str, Mapping[str, Mapping[str, str]]]

@@ -131,9 +131,9 @@ def test_each_fault_that_must_be_told_has_its_place():
     assert SENDS_TO.keys() == RIGHT.keys()
 
 
-@pytest.mark.parametrize("what", ["beam station", "tool measurement (full)"])
+@pytest.mark.parametrize("what", ["tool: beam station", "tool: tool measurement (full)", "fixture"])
 def test_a_gap_that_is_too_short_for_what_is_due_is_told_until_one_is_not(what):
-    short = f"tool: pass; tool: {what}: the gap is 12.0 s too short, one of 120 s would do"
+    short = f"tool: pass; {what}: the gap is 12.0 s too short, one of 120 s would do"
     panel = shown(**{STATUS: status(last=ended(message=short, complete=False))})
     assert keys(panel) == ["LIMIT_EXCEEDED/gap"]
     assert panel.tasks(NOW_S)[0].detail == short
