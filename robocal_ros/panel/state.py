@@ -36,6 +36,7 @@ MOVES = ("RUNNING", "BREAKING_OFF")
 STOPS = ("MISMATCH", "OTHER_COMMANDER")  # the line stands, whatever is known of the accuracy
 UNCORRECTED = ("OFF", "WITHOUT_MODEL")  # where the accuracy is not what it should be
 WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
+LASTING = (Code.WRONG_ROBOT, Code.STORAGE_FAILED)  # of a gap: another one ends so again
 SILENT, FAULT = "SILENT", "FAULT"
 
 
@@ -196,10 +197,11 @@ class PanelState:
             found.append(_task(code_of(status["fault_code"]), "fault", status["fault"]))
         else:
             found += self._measured()
-            last = status["last"]
-            if code_of(last["code"]) not in WELL:
-                code = code_of(last["code"]).name
-                found.append(Instruction("state/BROKEN_OFF", code, last["message"]))
+            code, words = code_of(status["last"]["code"]), status["last"]["message"]
+            if code in LASTING:
+                found.append(_task(code, "gap", words))
+            elif code not in WELL:
+                found.append(Instruction("state/BROKEN_OFF", code.name, words))
         if status["thermal_pending"] or status["tool_pending"]:
             found.append(Instruction("state/DECIDE"))
         found += self._corrected(now_s)

@@ -238,6 +238,13 @@ def test_a_gap_that_was_broken_off_is_measured_again():
     assert "again in the next gap" in told(panel, NOW_S)["en"]
 
 
+@pytest.mark.parametrize("code", [Code.WRONG_ROBOT, Code.STORAGE_FAILED])
+def test_what_the_next_gap_does_not_mend_calls_the_engineer(code):
+    panel = shown(**{STATUS: status(last=ended(code=code))})
+    assert keys(panel) == [code.name]
+    assert "Call the engineer" in told(panel, NOW_S)["en"]
+
+
 # ---- a gap, step by step ------------------------------------------------------------------------
 
 
