@@ -23,7 +23,7 @@ HEARTBEAT, BLOCKED, TIME = f"{GAP}.Heartbeat", "Blocked", "Time"
 ACTIVE = f"{CELL}.Active"
 CODE = "Code"
 MM = 1e3
-LONGEST_SHOWN = 254  # the longest STRING of an S7-1500
+LONGEST_SHOWN = 254  # bytes of UTF-8, so that a STRING(254) takes them
 LONGEST_TEXT = 1000
 # Silent for so long a variable is Uncertain: its last value, which nobody stands by any more.
 SILENT = ua.StatusCodes.UncertainNoCommunicationLastUsableValue
@@ -42,6 +42,14 @@ ENUMERATION = ua.VariantType.Int32, 0  # (OPC 10000-3, 8.14)
 def time_of(stamp: Any) -> datetime:
     """A message's stamp."""
     return datetime.fromtimestamp(stamp.sec + 1e-9 * stamp.nanosec, UTC)
+
+
+def _cut(text: str) -> str:
+    """A text as long as a PLC's STRING can take it."""
+    sent = text.encode()
+    if len(sent) <= LONGEST_SHOWN:
+        return text
+    return sent[: LONGEST_SHOWN - 3].decode(errors="ignore") + "..."
 
 
 @dataclass(frozen=True)
@@ -76,9 +84,7 @@ class Item:
         """Its value in a message."""
         found = (attrgetter(self.read) if isinstance(self.read, str) else self.read)(message)
         if self.scalar == "String":
-            cut = [t if len(t) <= LONGEST_SHOWN else f"{t[: LONGEST_SHOWN - 1]}…" for t in
-                   (found if self.is_array else [found])]  # fmt: skip
-            return cut if self.is_array else cut[0]
+            return [_cut(text) for text in found] if self.is_array else _cut(found)
         return list(found) if self.is_array else found
 
     def variant(self, value: Any) -> ua.Variant:
