@@ -34,6 +34,7 @@ MOST_REJECTED = 20  # certificates that are kept for a person to look at
 KEY_BITS = 2048  # the least that Basic256Sha256 takes (OPC 10000-7), and quick for a PLC
 SCRYPT = {"n": 2**14, "r": 8, "p": 1}  # RFC 7914; 16 MB and some 50 ms for each guess
 SHORTEST_PASSWORD, LONGEST = 10, 100
+LONGEST_CLIENT = 64  # of a common name (RFC 5280, appendix A)
 LOCKED_AFTER, LOCKED_S = 5, 10.0  # wrong passwords of a name, and how long nobody has it then
 FILE_VERSION = 1
 
@@ -164,7 +165,8 @@ def made_certificate(name: str, uri: str, hosts: Sequence[str], days: int) -> tu
     """A self-signed application instance certificate, DER, and its key, PEM without a password.
 
     With what OPC 10000-6, 6.2.2 asks for: the application's URI and its hosts as alternative
-    names, both ends' uses. ``hosts``: names or addresses.
+    names, both ends' uses. ``hosts``: names or addresses. Raises `InputError` for a name that is
+    not ASCII.
     """
     key = rsa.generate_private_key(public_exponent=65537, key_size=KEY_BITS)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -173,6 +175,8 @@ def made_certificate(name: str, uri: str, hosts: Sequence[str], days: int) -> tu
         try:
             alternatives.append(x509.IPAddress(ip_address(host)))
         except ValueError:
+            if not host.isascii():
+                raise InputError(f"{quoted(host)}: write it as its A-label, xn--...") from None
             alternatives.append(x509.DNSName(host))
     now = datetime.now(UTC)
     uses = dict.fromkeys(
@@ -229,8 +233,10 @@ def make_client_certificate(folder: Path, name: str, days: int) -> Path:
 
     Raises `InputError` where there is one of this name, or it is none of a file.
     """
-    if not name or not name.replace("-", "").replace("_", "").isalnum() or len(name) > LONGEST:
-        raise InputError(f"{quoted(name)} is no name of a client: letters, digits, - and _")
+    plain = name.isascii() and name.replace("-", "").replace("_", "").isalnum()
+    if not plain or len(name) > LONGEST_CLIENT:
+        words = f"up to {LONGEST_CLIENT} letters of ASCII, digits, - and _"
+        raise InputError(f"{quoted(name)} is no name of a client: {words}")
     path = folder / CLIENTS / f"{name}.der"
     if path.exists():
         raise InputError("is there already: remove it to make it anew", file=str(path))

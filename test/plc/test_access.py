@@ -93,10 +93,17 @@ def test_nothing_is_made_over_what_is_there(folder):
         access.make_server_certificate(folder, [], 30)
     with pytest.raises(InputError, match="is there already"):
         access.make_client_certificate(folder, "line", 30)
-    for name in ("", "../evil", "a b", "a" * 101):
-        with pytest.raises(InputError):
-            access.make_client_certificate(folder, name, 30)
     assert (folder / access.SERVER).read_bytes() == before
+
+
+def test_a_name_that_no_certificate_can_have_is_refused(folder, tmp_path):
+    for name in ("", "../evil", "a b", "Pr\u00fcfstand", "a" * 65):
+        with pytest.raises(InputError, match="is no name of a client: up to 64 letters"):
+            access.make_client_certificate(folder, name, 30)
+    access.make_client_certificate(folder, "a" * 64, 30)
+    with pytest.raises(InputError, match="xn--"):
+        access.make_server_certificate(tmp_path, ["pr\u00fcfstand.local"], 30)
+    assert not (tmp_path / access.SERVER).exists()
 
 
 def test_only_the_very_certificate_that_a_person_trusts_is_trusted(folder, tmp_path):
