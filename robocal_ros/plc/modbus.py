@@ -65,8 +65,10 @@ INPUTS = (
     Register(32, "Candidates.ToolId", "I", "Tool candidate that waits; 0: none"),
     Register(34, "LastCycle.ThermalId", "I", "Candidate of the last thermal cycle"),
     Register(36, "LastCycle.ToolId", "I", "Candidate of the last tool measurement"),
-    Register(38, "Fixture.Id", "I", "The fixture's new frame, to be decided; 0: none"),
-    Register(40, "Fixture.Code", "H", "What its last measurement said; 0: none was yet"),
+    Register(
+        38, "Fixture.Id", "I", "Candidate of the last fixture measurement, decided or not; 0: none"
+    ),
+    Register(40, "Fixture.Code", "H", "What that measurement said; 0: none was yet"),
     Register(41, "LastCycle.FixtureCode", "H", "Verdict of the fixture; 0: not measured"),
     Register(42, "LastCycle.FixtureId", "I", "Its candidate of that cycle; 0: none"),
     Register(44, "LastCycle.StationId", "I", "Candidate of the beams that were found again"),

@@ -207,7 +207,7 @@ SHOWN = (
         "What its last measurement said",
         (
             Item("Code", CODE, "code", "ACCEPT: it has moved, or was taught"),
-            Item("Id", "UInt32", "candidate_id", "Its new frame, to be decided; 0: none"),
+            Item("Id", "UInt32", "candidate_id", "Its candidate, decided or not; 0: none"),
             Item("Reason", "String", "reason", "In words, with what moved by how much"),
         ),
     ),
