@@ -168,8 +168,7 @@ class HouseNode(EndpointNode):
         except Exception as error:
             if not isinstance(error, RobocalError):
                 self.get_logger().error(traceback.format_exc())
-            name = "" if isinstance(error, RobocalError) else f"{type(error).__name__}: "
-            message = f"cannot {what}: {name}{error}"
+            message = f"cannot {what}: {_named(error)}"
             self.get_logger().error(message)
             return self._fail(Health(ERROR, message))
         self._failure = None
@@ -202,11 +201,18 @@ class HouseNode(EndpointNode):
     def _serial(self) -> str:
         return str(self.get_parameter(SERIAL.name).value)
 
+    def _acting_health(self) -> Health:
+        try:
+            return self.health()
+        except Exception as error:  # a disk that fails below the history, too: the node works on
+            self._log("health", error)
+            return Health(ERROR, f"cannot tell how it is: {_named(error)}")
+
     def _full_health(self) -> Health:
         if self._failure is not None:
             health = replace(self._failure)
         elif self.is_active:
-            health = self.health()
+            health = self._acting_health()
         else:
             health = Health(message=self.state)
         values: dict[str, object] = {"state": self.state}
@@ -217,6 +223,11 @@ class HouseNode(EndpointNode):
             values[f"{topic} lost"] = count.lost
         health.values = values | health.values
         return health
+
+
+def _named(error: Exception) -> str:
+    """Its words; of one that no user can act on with its kind."""
+    return str(error) if isinstance(error, RobocalError) else f"{type(error).__name__}: {error}"
 
 
 # Python looks for garbage when so many objects were made, which is in the middle of a callback,

@@ -24,6 +24,7 @@ from robocal_ros.ros.parameters import Setting
 from robocal_ros.session.inputs import MOST_REASONS
 
 BUG = 5e5  # of this number the callback has a defect
+UNTOLD = 7.0  # with this factor it cannot tell its health
 
 
 class Doubler(HouseNode):
@@ -80,6 +81,8 @@ class Doubler(HouseNode):
         raise KeyError("a bug")
 
     def health(self) -> Health:
+        if self.factor == UNTOLD:
+            raise OSError(5, "Input/output error")
         health = Health(values={"factor": self.factor})
         if self.factor > 5:
             health.worsen(WARN, "a large factor")
@@ -256,6 +259,19 @@ def test_diagnostics_tell_the_health_of_an_active_node_once_a_second(graph: Any)
     assert values["state"] == "active"
     assert values["factor"] == "6.0"
     assert values["number received"] == "0"
+
+
+def test_a_health_that_cannot_be_told_is_an_error_and_the_node_lives_on(graph: Any) -> None:
+    statuses = graph.collect(DiagnosticArray, "/diagnostics")
+    graph.add(Doubler, {"factor": UNTOLD})
+    graph.spin_until(
+        lambda: any(one.status[0].level == DiagnosticStatus.ERROR for one in statuses), "an error"
+    )
+    status = statuses[-1].status[0]
+    assert status.message == "cannot tell how it is: OSError: [Errno 5] Input/output error"
+    assert {item.key: item.value for item in status.values}["state"] == "active"
+    assert set_parameter(graph, factor=2.0).successful
+    graph.spin_until(lambda: statuses[-1].status[0].message == "ok", "it is told again")
 
 
 def test_configures_again_after_cleanup(graph: Any) -> None:
