@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small helpers that the readers and writers of files share."""
 
+import contextlib
 import difflib
 import fcntl
 import json
@@ -96,7 +97,8 @@ def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> None:
         if durable:
             sync_folder(path.parent)
     except OSError as error:
-        draft.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a disk that is read-only refuses this too
+            draft.unlink()
         reason = error.strerror or error
         raise InputError(f"cannot be written: {reason}", file=str(path)) from error
 

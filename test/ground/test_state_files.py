@@ -75,6 +75,16 @@ def test_a_state_that_is_no_document_is_refused(history):
             keeper.load()
 
 
+def test_a_state_whose_place_takes_nothing_is_not_saved(history):
+    """A file in the folder's place: as on a disk that is read-only the draft cannot be removed."""
+    keeper = StateFile(history, "maintenance")
+    keeper.path.unlink()
+    keeper.path.parent.rmdir()
+    keeper.path.parent.touch()
+    with pytest.raises(StorageError, match=r"state\.json: cannot be written: Not a directory"):
+        keeper.save({"a": 1})
+
+
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_number_that_is_not_finite_is_not_kept(history, bad):
     keeper = StateFile(history, "maintenance")
