@@ -599,7 +599,7 @@ class JointStream:
         high = int(np.searchsorted(stamps, last_ns, side="left"))
         if low < 0:
             raise NotStillError("no joint readings from before the measurement")
-        gap = float(np.max(np.diff(stamps[low : high + 1]))) * 1e-9
+        gap = float(np.max(np.diff(stamps[low : high + 1]), initial=0)) * 1e-9
         if gap > rule.gap_s:
             raise NotStillError(
                 f"joint readings pause for {gap:.3f} s (allowed {rule.gap_s:.3f} s)"

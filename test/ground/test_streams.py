@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint readings by stamp: interpolation, standstill, gaps, order and memory."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,14 @@ def test_at_a_reading_that_reading_counts():
     reading = stream.standstill(1500 * MS, RULE)
     assert reading is not None
     assert reading.q[0] == 1500e-6
+
+
+def test_a_window_without_length_may_hold_one_reading():
+    stream = JointStream(("a", "b"))
+    fill(stream, range(1000, 2001, 50))
+    reading = stream.standstill(1500 * MS, replace(RULE, before_s=0.0, after_s=0.0))
+    assert reading is not None
+    assert (reading.q.tolist(), reading.ready_ns) == ([0.5, -0.5], 1500 * MS)
 
 
 def test_the_answer_waits_for_the_window_and_not_longer():
