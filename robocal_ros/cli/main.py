@@ -316,9 +316,9 @@ class CliResult:
     exit_code: int = DONE
 
 
-def exit_status(error: RobocalError) -> int:
-    """Exit status of a command that ends with this error."""
-    return BAD_REQUEST if error.code in _REQUEST_CODES else NO_ANSWER
+def exit_status(code: Code) -> int:
+    """Exit status of a command that ends with an error of this code."""
+    return BAD_REQUEST if code in _REQUEST_CODES else NO_ANSWER
 
 
 def failure(error: RobocalError) -> "FailureDocument":
@@ -472,7 +472,7 @@ def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
         if isinstance(error, UsageError):
             print(error.usage.rstrip(), file=sys.stderr)
         tell(error.code.name, error)
-        document, status = failure(error), exit_status(error)
+        document, status = failure(error), exit_status(error.code)
     except BrokenPipeError:
         raise
     except Exception as error:

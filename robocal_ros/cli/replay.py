@@ -20,12 +20,11 @@ from robocal_ros.bags.foreign import StreamAverage, stream_timing
 from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
 from robocal_ros.cli.identify import show_identification
 from robocal_ros.cli.main import (
-    BAD_REQUEST,
     DONE,
-    NO_ANSWER,
     ROBOT_HELP,
     CliResult,
     Document,
+    exit_status,
     input_topic,
     print_table,
     print_words,
@@ -458,7 +457,6 @@ def _show_candidates(console: "Console", candidates: list[Document]) -> None:
     print_table(console, title, _COLUMNS, rows, words=(1, 2, 7))
 
 
-_NO_ANSWER = (Code.RANK_DEFICIENT.name, Code.TOO_FEW_SAMPLES.name)
 _SHOW_EVERY = 100
 
 
@@ -523,9 +521,7 @@ def run_replay(args: argparse.Namespace) -> CliResult:
     )
     document = replay_bag(request, _watch)
     document["warnings"] = [*warnings, *document["warnings"]]
-    status = DONE
-    if "error" in document:
-        status = NO_ANSWER if document["error"]["code"] in _NO_ANSWER else BAD_REQUEST
+    status = exit_status(Code[document["error"]["code"]]) if "error" in document else DONE
     return CliResult(document, show_replay, status)
 
 

@@ -224,7 +224,7 @@ class TestOutcomes:
         for code in set(Code) - {Code.ACCEPT}:
             error = RobocalError("x")
             error.code = code
-            assert exit_status(error) in (2, 3)
+            assert exit_status(error.code) in (2, 3)
             conforms(failure(error), "error.json")
 
     def test_missing_file_is_no_crash(self, monkeypatch, capsys):

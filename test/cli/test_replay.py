@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from campaign import ROBOT
 from command import conforms, environment, robocal, robocal_json
@@ -332,6 +333,21 @@ class TestDamage:
         assert status == 3
         assert document["error"]["code"] == "TOO_FEW_SAMPLES"
         assert document["verdict"]["accept"] is False
+
+    def test_a_cold_window_that_misses_the_robot(self, folder: Path, visits, replay) -> None:
+        """The data cannot answer, whichever code says so; the usage is right."""
+        rng = np.random.default_rng(5)
+        scattered = [
+            s
+            if isinstance(s, JointSample)
+            else dataclasses.replace(s, position_m=s.position_m + rng.normal(0.0, 0.015, 3))
+            for s in visits[0]
+        ]
+        path = plain_bag(folder / "scattered.mcap", [scattered, visits[1]])
+        windows = ["--cold", "0:10", "--warm", f"{BETWEEN_S}:{BETWEEN_S + 10}"]
+        status, document = replay(path, "--robot", ROBOT, *windows)
+        assert document["error"]["code"] == "RESIDUAL_TOO_LARGE"
+        assert status == 3
 
 
 class TestUsage:
