@@ -143,7 +143,8 @@ def show_acknowledged(console: "Console", document: "HistoryAcknowledgeDocument"
 
 def show_decided(console: "Console", document: "HistoryDecisionDocument") -> None:
     _show_damage(console, document)
-    print_words(console, document["verdict"]["reason"].capitalize())
+    said = document["verdict"]["reason"]
+    print_words(console, said[0].upper() + said[1:])
 
 
 def _show_damage(console: "Console", document: Mapping[str, Any]) -> None:

@@ -229,6 +229,13 @@ class TestDeciding:
         done = robocal("history", "accept", tools[1], "--state", state)
         assert done.stdout == f"Calibration {tools[1]} is in force as tool revision 1\n"
 
+    def test_a_kind_is_told_as_it_is_named(self, state):
+        kind = "hand_eye/LLT30_front"
+        with CalibrationHistory.open(SERIAL, state_dir=state) as history:
+            sensor = history.propose(proposal(kind=kind))
+        done = robocal("history", "accept", sensor, "--state", state)
+        assert done.stdout == f"Calibration {sensor} is in force as {kind} revision 1\n"
+
     def test_rollbacks(self, state):
         def rollback(*more):
             return robocal_json(
